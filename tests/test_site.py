@@ -4,6 +4,8 @@ import ast
 import html
 import importlib
 import re
+import shutil
+import subprocess
 from collections import Counter
 from urllib.parse import unquote
 
@@ -156,3 +158,34 @@ def test_notebooks_come_with_their_pictures(site):
             len(pictures) == text.count('"image/png"') and "image/" in text
         )  # or animations
         assert all((site / "notebooks" / name).exists() for name in pictures)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", ["play", "simulator"])
+def test_animations_of_notebooks_run_in_a_browser(site, notebook, tmp_path):
+    """Of two pictures that lie upon each other, the script changes the second."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    if browser is None:
+        pytest.skip("there is no Chromium here: its packages are called 'chromium'")
+
+    def pictures(text):
+        boxes = re.findall(r'<div id="motion-.*?<script>', text, re.DOTALL)
+        return [re.findall(r'<img[^>]*src="([^"]+)"', box)[1] for box in boxes]
+
+    page = site / f"notebooks/{notebook}.html"
+    first = pictures(page.read_text())
+    count = (ROOT / f"notebooks/{notebook}.ipynb").read_text().count('id=\\"motion-')
+    assert len(first) == count > 0
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
+    profile, moved = f"--user-data-dir={tmp_path}", set()
+    for time in (
+        300,
+        700,
+    ):  # ms after the start (a cycle may be as short as one of them)
+        budget = f"--virtual-time-budget={time}"
+        run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
+        shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout
+        now = pictures(shown)
+        moved |= {k for k in range(count) if now[k] != first[k]}
+    assert moved == set(range(count))

@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File
 
 
@@ -14,6 +15,10 @@ LISTS = {
     "CLAIMS.md": "claims.md",
     "KNOWN_GAPS.md": "known-gaps.md",
 }
+
+
+_outputs: dict[str, str] = {}
+"""Tables and animations of notebooks, by what stands for them in the Markdown."""
 
 
 def on_files(files, config):
@@ -40,6 +45,14 @@ def on_page_markdown(markdown: str, page, **_) -> str:
     return markdown
 
 
+@event_priority(-100)  # after all that change pages
+def on_page_content(html: str, **_) -> str:
+    """Outputs of notebooks as they are, in place of their marks."""
+    for mark, output in _outputs.items():
+        html = html.replace(mark, output)
+    return html
+
+
 def _pages(path: Path) -> dict[str, str | bytes]:
     """A notebook as a page, and its pictures."""
     parts, pictures = [], {}
@@ -52,8 +65,10 @@ def _pages(path: Path) -> dict[str, str | bytes]:
         for output in cell["outputs"]:
             data = output.get("data", {"text/plain": output.get("text")})
             if "text/html" in data:
-                # (On one line, lest Markdown take part of it for its own.)
-                parts.append("".join(data["text/html"]).replace("\n", "&#10;"))
+                # (Markdown would take part of it for its own, and scripts would not run.)
+                mark = f'<div id="output-{path.stem}-{len(_outputs)}"></div>'
+                _outputs[mark] = "".join(data["text/html"])
+                parts.append(mark)
             elif "image/png" in data:
                 name = f"{path.stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])

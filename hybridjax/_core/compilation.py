@@ -28,7 +28,7 @@ from jax.core import eval_context
 
 from ..errors import ComputationError
 from . import executor
-from .executor import from_host, is_hidden, on_cpu, on_the_cpu, to_host
+from .executor import as_numpy, from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .progress import say_compiling
 
 
@@ -193,7 +193,7 @@ def host_first(
 
     def compile_(arguments):
         # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
-        with on_the_cpu():  # (under JAX's settings of this thread)
+        with on_the_cpu(), as_numpy():  # (under JAX's settings of this thread)
             programs[kind(arguments)] = compiled.lower(*arguments).compile()  # type: ignore
 
     @ft.wraps(function)

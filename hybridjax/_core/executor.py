@@ -214,6 +214,24 @@ def on_cpu() -> bool:
     return (getattr(device, "platform", device) or jax.default_backend()) == "cpu"
 
 
+_AS_IT_IS = contextlib.nullcontext()
+
+
+def as_numpy() -> contextlib.AbstractContextManager:
+    """A context in which JAX combines arrays of different ranks and types as NumPy does, on which
+    this package relies. (Users may forbid it for their own lines, which are outside.)"""
+    config: Any = jax.config
+    if (
+        config.jax_numpy_rank_promotion == "allow"
+        and config.jax_numpy_dtype_promotion == "standard"
+    ):
+        return _AS_IT_IS
+    both = contextlib.ExitStack()
+    both.enter_context(jax.numpy_rank_promotion("allow"))
+    both.enter_context(jax.numpy_dtype_promotion("standard"))
+    return both
+
+
 def on_the_cpu() -> contextlib.AbstractContextManager:
     """A context in which JAX computes on the CPU. (A few lanes take longer on an accelerator, whose
     programs call hundreds of small kernels one after the other.)"""

@@ -15,6 +15,8 @@ WINDOW = 2**26
 """Samples of one input in one window of a design."""
 RECORDED = 2**29
 """Samples of all signals of one trial, on one axis of time."""
+NESTED = 64
+"""Groups, structs or cells of a file, each within the one before."""
 TEXT = 2**26
 """Bytes of a header or a manifest."""
 

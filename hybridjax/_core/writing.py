@@ -38,7 +38,11 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _refuse_link(path: Path) -> None:
-    if path.is_symlink() or (path.exists() and not (path.is_file() or path.is_dir())):
+    try:
+        special = path.exists() and not (path.is_file() or path.is_dir())
+    except OSError as error:  # (a name that no file can have)
+        raise DefinitionError(f"cannot write '{path}': {error.strerror}.") from error
+    if path.is_symlink() or special:
         raise DefinitionError(
             f"'{path}' is a link or a device: choose another name, since nothing is written there."
         )

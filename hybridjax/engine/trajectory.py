@@ -302,7 +302,8 @@ def recorded(
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
-    nu, value = len(system.inputs), np.asarray(0.0)
+    names = system.inputs
+    nu, value = len(names), np.asarray(0.0)
     if callable(input):
         with evaluating("input, a function of t alone,"):
             shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
@@ -312,7 +313,7 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
     if shape not in ((), (nu,)):
         raise DefinitionError(
             f"the input has shape {shape}, but {type(system).__name__} has the inputs "
-            f"({', '.join(system.inputs)}): give one number for each."
+            f"({', '.join(names)}): give one number for each."
         )
     return np.broadcast_to(value, (nu,))
 

@@ -242,7 +242,7 @@ def column_name(s: Structure, a: int, j: int) -> str:
         return f"rate of '{states[j]}'"
     row, column = divmod(j - n, max(s.nu, 1))
     if row < n and s.nu:
-        return f"gain from '{s.system.inputs[column]}' to the rate of '{states[row]}'"
+        return f"gain from '{s.inputs[column]}' to the rate of '{states[row]}'"
     return f"guard of '{s.transitions[s.guards(a)[j - n * (1 + s.nu)]].name}'"
 
 

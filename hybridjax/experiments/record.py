@@ -17,7 +17,7 @@ from .._core.text import folded, listed
 from ..errors import DefinitionError
 
 
-Drift = Annotated[float, Number("a positive number of cycles", above=0, infinite=True)]
+Drift = Annotated[float, Number("two cycles or more", low=2, infinite=True)]
 
 
 @checked

@@ -214,7 +214,7 @@ class ResponseFunction(eqx.Module):
         """
         require_x64(system)
         u, placed = jnp.asarray(u, float), self.placed
-        require_shape(u.shape, placed.n_sections, len(placed.cycle.system.inputs))
+        require_shape(u.shape, placed.n_sections, placed.cycle.structure.nu)
         if system is None:
             placed.cycle.require_current()
         else:

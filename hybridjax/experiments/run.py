@@ -359,7 +359,7 @@ def prepare(
         else options.discard
     )
     N = placed.n_sections
-    inputs = check_inputs(design, discard, N, cycle.system.inputs)
+    inputs = check_inputs(design, discard, N, cycle.structure.inputs)
     if noise is not None:
         noise.require(N)
     if start != "cycle" and inputs.cycles % inputs.periods:

@@ -210,7 +210,7 @@ class ExperimentJob:
         """Return the job, and the form of its records."""
         campaign, text = self.campaign, self.description
         placed, values = campaign.placed, campaign.at_sections
-        n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.system.inputs
+        n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.structure.inputs
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
             "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),

@@ -56,7 +56,8 @@ class LDTP(eqx.Module):
 
     - `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d): the matrices, padded with zeros.
     - `D` (N, ny, nu): feed-through; `None` means zero.
-    - `dims` (N,): the true dimension of each `x[n]`; `None` means `d` everywhere.
+    - `dims` (N,): the true dimension of each `x[n]`, from 0 to d; `None` means `d` everywhere.
+      Without any coordinate (d = 0) the arrays are padded to d = 1.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`. Default: `u` and `y`, or
       `u0, u1, ...` for several.
     - `coordinates`: names of the coordinates at each section, for documentation.
@@ -86,7 +87,9 @@ class LDTP(eqx.Module):
         coordinates: Sequence[Sequence[str]] | None = None,
     ):
         require_x64()
-        A, B, C = from_host((A, B, C))
+        if A.shape[1] == 0 and dims is None:
+            dims = np.zeros(len(A), int)
+        A, B, C = from_host(_with_a_coordinate(A, B, C))
         n_sections, d = A.shape[:2]
         ny, nu = C.shape[1], B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
@@ -460,15 +463,27 @@ class LDTP(eqx.Module):
             )
 
 
+def _with_a_coordinate(A, B, C) -> tuple[Any, Any, Any]:
+    """The matrices, padded to one coordinate if there is none: no axis of an array is empty."""
+    if 0 not in A.shape[1:] or A.shape[1] != A.shape[2]:
+        return A, B, C
+    xp = namespace(A)
+    return (
+        xp.pad(A, ((0, 0), (0, 1), (0, 1))),
+        xp.pad(B, ((0, 0), (0, 1 - B.shape[1]), (0, 0))),
+        xp.pad(C, ((0, 0), (0, 0), (0, 1 - C.shape[2]))),
+    )
+
+
 def _dimensions(dims, n_sections, d):
     if dims is None:
         return from_host(np.full(n_sections, d))
     require_axes("`dims`", dims, {"sections": n_sections})
     if not is_traced(dims):
         dims = np.asarray(dims)
-        if np.any((dims < 1) | (dims > d)):
+        if np.any((dims < 0) | (dims > d)):
             raise DefinitionError(
-                f"`dims` must lie between 1 and {d}, the size of `A[n]`: {dims}."
+                f"`dims` must lie between 0 and {d}, the size of `A[n]`: {dims}."
             )
     return from_host(dims)
 

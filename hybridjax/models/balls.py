@@ -142,7 +142,7 @@ class BouncingChain(HybridSystem):
     n: Count = eqx.field(
         static=True, default=2, metadata={"unit": "", "doc": "number of masses"}
     )
-    m: Parameter = parameter(1.0, unit="kg", doc="mass of each")
+    m: Parameter = parameter(1.0, unit="kg", positive=True, doc="mass of each")
     k: Parameter = parameter(0.3, unit="N/m", doc="stiffness between neighbors")
     c: Parameter = parameter(0.05, unit="N s/m", doc="damping between neighbors")
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")

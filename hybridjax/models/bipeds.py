@@ -98,9 +98,9 @@ class TorsoWalker(HybridSystem):
     input_units = ("N m",)
     time_unit = "s"
 
-    m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
-    mH: Parameter = parameter(15.0, unit="kg", doc="mass of the hip")
-    mT: Parameter = parameter(10.0, unit="kg", doc="mass of the torso")
+    m: Parameter = parameter(5.0, unit="kg", positive=True, doc="mass of a leg")
+    mH: Parameter = parameter(15.0, unit="kg", positive=True, doc="mass of the hip")
+    mT: Parameter = parameter(10.0, unit="kg", positive=True, doc="mass of the torso")
     r: Parameter = parameter(
         1.0, unit="m", doc="length of a leg, with its mass in the middle"
     )
@@ -201,9 +201,15 @@ class FiveLinkBiped(HybridSystem):
     input_units = ("N m",)
     time_unit = "s"
 
-    torso_mass: Parameter = parameter(12.0, unit="kg", doc="mass of the torso")
-    thigh_mass: Parameter = parameter(6.8, unit="kg", doc="mass of a thigh")
-    shin_mass: Parameter = parameter(3.2, unit="kg", doc="mass of a shin")
+    torso_mass: Parameter = parameter(
+        12.0, unit="kg", positive=True, doc="mass of the torso"
+    )
+    thigh_mass: Parameter = parameter(
+        6.8, unit="kg", positive=True, doc="mass of a thigh"
+    )
+    shin_mass: Parameter = parameter(
+        3.2, unit="kg", positive=True, doc="mass of a shin"
+    )
     torso_inertia: Parameter = parameter(
         1.33, unit="kg m^2", doc="of the torso, about the hip"
     )

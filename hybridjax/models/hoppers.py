@@ -37,8 +37,8 @@ class VerticalHopper(HybridSystem):
     input_units: ClassVar[tuple[str, ...]] = ("N",)
     time_unit = "s"
 
-    m: Parameter = parameter(1.0, unit="kg", doc="mass of the foot")
-    M: Parameter = parameter(2.0, unit="kg", doc="mass of the body")
+    m: Parameter = parameter(1.0, unit="kg", positive=True, doc="mass of the foot")
+    M: Parameter = parameter(2.0, unit="kg", positive=True, doc="mass of the body")
     k: Parameter = parameter(10.0, unit="N/m", doc="stiffness of the leg")
     b: Parameter = parameter(5.0, unit="N s/m", doc="damping of the foot in flight")
     l0: Parameter = parameter(2.0, unit="m", doc="rest length of the leg")

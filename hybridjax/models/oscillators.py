@@ -189,7 +189,7 @@ class BeltOscillator(HybridSystem):
     input_units = ("N",)
     time_unit = "s"
 
-    m: Parameter = parameter(1.0, unit="kg", doc="mass")
+    m: Parameter = parameter(1.0, unit="kg", positive=True, doc="mass")
     k: Parameter = parameter(1.0, unit="N/m", doc="stiffness")
     belt: Parameter = parameter(0.2, unit="m/s", doc="speed of the belt")
     friction: Parameter = parameter(

@@ -43,8 +43,10 @@ class TwoLeggedBar(HybridSystem):
     input_units = ("N",)
     time_unit = "s"
 
-    m: Parameter = parameter(1.0, unit="kg", doc="mass of the bar")
-    J: Parameter = parameter(0.2, unit="kg m^2", doc="moment of inertia of the bar")
+    m: Parameter = parameter(1.0, unit="kg", positive=True, doc="mass of the bar")
+    J: Parameter = parameter(
+        0.2, unit="kg m^2", positive=True, doc="moment of inertia of the bar"
+    )
     hind: Parameter = parameter(-0.5, unit="m", doc="position of the hind hip")
     front: Parameter = parameter(0.55, unit="m", doc="position of the front hip")
     k: Parameter = parameter(15.0, unit="N/m", doc="stiffness of a leg")
@@ -180,7 +182,7 @@ class SLIPRunner(HybridSystem):
     input_units = ("rad",)
     time_unit = "s"
 
-    m: Parameter = parameter(80.0, unit="kg", doc="mass")
+    m: Parameter = parameter(80.0, unit="kg", positive=True, doc="mass")
     k: Parameter = parameter(20000.0, unit="N/m", doc="stiffness of the leg")
     l0: Parameter = parameter(1.0, unit="m", doc="rest length of the leg")
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")

@@ -172,8 +172,8 @@ class CompassGait(HybridSystem):
     input_units = ("N m",)
     time_unit = "s"
 
-    mH: Parameter = parameter(10.0, unit="kg", doc="mass of the hip")
-    m: Parameter = parameter(5.0, unit="kg", doc="mass of a leg")
+    mH: Parameter = parameter(10.0, unit="kg", positive=True, doc="mass of the hip")
+    m: Parameter = parameter(5.0, unit="kg", positive=True, doc="mass of a leg")
     a: Parameter = parameter(0.5, unit="m", doc="from the foot to the leg's mass")
     b: Parameter = parameter(0.5, unit="m", doc="from the leg's mass to the hip")
     g: Parameter = parameter(9.81, unit="m/s^2", doc="gravity")

@@ -22,7 +22,7 @@ from .._core.progress import say, working
 from .._core.results import Result
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import Guess, copies_of
+from ..systems.system import Guess, copies_of, require_positive
 from .batches import front
 from .branch_ends import explained
 from .coincidence import SAME, coincident
@@ -206,6 +206,8 @@ def continuation(
     values = _check(cycle, values)
     cycle = _at_event(cycle)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
+    for value in values:
+        require_positive(curve.system_at(value))
     if not values.min() <= curve.value <= values.max():
         raise DefinitionError(
             f"the cycle has {parameter} = {curve.value:.6g}, outside of the values "

@@ -11,7 +11,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked_methods
@@ -26,6 +26,11 @@ from .responses import Phases, loop, surface
 from .return_map import SINGULAR
 from .sensitivity import section_delay
 
+
+# Largest standard deviation, relative to the largest to which the same noise could lead, that is
+# rounding and becomes zero. Smaller: what the noise does not reach gets digits of chance, and roots
+# of negative variances. Larger: noise that reaches a state through a weak coupling alone is lost.
+_ROUNDING = 1e-12
 
 Strengths = Mapping[str, NonNegative]
 Resets = Mapping[str, Strengths]
@@ -54,6 +59,8 @@ class Fluctuations(eqx.Module):
     """From states, the delay of the last event and durations to those one turn later."""
     joint: Float[Array, "n n"]
     """Their stationary covariance."""
+    varies: Bool[Array, " E"]
+    """Whether the noise reaches each duration."""
     at_nodes: Float[Array, "P K d d"]
     unresolved: Float[Array, ""]
     """The largest difference of covariances at ends of pieces, computed in two ways."""
@@ -85,9 +92,9 @@ class Fluctuations(eqx.Module):
         before, with those `lag` turns before. The sum of all entries is the covariance of periods
         from the last event to the next such event."""
         n = len(self.joint) - len(self.events)
-        return (namespace(self.joint).linalg.matrix_power(self.step, lag) @ self.joint)[
-            n:, n:
-        ]
+        xp, varies = namespace(self.joint), self.varies
+        later = xp.linalg.matrix_power(self.step, lag) @ self.joint
+        return xp.where(varies[:, None] & varies, later[n:, n:], 0.0)
 
     def __repr__(self):
         name, unit = (
@@ -127,6 +134,7 @@ def _noisy(
         [] if clocked else [str(map.base)]
     )
     n, E = d + 1 + len(names), len(names)
+    sizes = map.scale[flow.chart]
     # Noise in the states, collected over each piece.
     B, (free, _) = _columns(s, flow, white), flow.forward
     turned = xp.swapaxes(flow.adjoint, -1, -2) @ B
@@ -161,7 +169,9 @@ def _noisy(
     (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
     M = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0)
     _, Z = loop(map, M[:d, :d], f)
-    diffusion, to_end = Z @ Q[:d, :d] @ Z / period, flow.covectors(xp.eye(d))
+    spread, to_end = Z @ Q[:d, :d] @ Z, flow.covectors(xp.eye(d))
+    reached = spread > _rounding(Z, Q[:d, :d], map.sizes)
+    diffusion = xp.where(reached, spread / period, 0.0)
     # (A state ahead of the cycle meets the next events earlier.)
     ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
     last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
@@ -191,6 +201,18 @@ def _noisy(
     size = xp.sqrt(xp.max(xp.abs(xp.diagonal(C, axis1=2, axis2=3)), axis=(0, 1)))
     unresolved = xp.max(off / xp.maximum(size[:, None] * size, 1e-300))
     C = across @ C @ xp.swapaxes(across, -1, -2)
+    variance = xp.diagonal(C, axis1=2, axis2=3) / sizes[:, None] ** 2
+    random = variance > _ROUNDING**2 * xp.max(variance)
+    C = xp.where(random[..., None] & random[..., None, :], C, 0.0)
+    # A delay of an event counts for the durations before and after it.
+    before, by_level = after[:, :d, :d], xp.asarray(levels)[flow.event]
+    late = xp.sum(xp.einsum("pi,pij->pj", delay, before) * delay, axis=-1)
+    of_chance = xp.stack(
+        [_rounding(*x) for x in zip(delay, before, sizes, strict=True)]
+    )
+    by_noise = hit & ((late > of_chance) | (by_level * jumps.delay_by_level != 0))
+    late_ends = xp.any(by_noise[:, None] & slot, axis=0)
+    varies = late_ends | xp.roll(late_ends, 1)
     to_end = last[:d, :d] @ xp.swapaxes(to_end, -1, -2)
     return Fluctuations(
         diffusion,
@@ -200,11 +222,25 @@ def _noisy(
         period,
         step,
         joint,
+        varies,
         C,
         unresolved,
         across @ free @ begin[:, None, :d, :d],
         to_end,
     )
+
+
+def _rounding(
+    gradient: Float[Array, " d"],
+    covariance: Float[Array, "d d"],
+    sizes: Float[Array, " d"],
+) -> Float[Array, ""]:
+    """The variance of a function with this gradient that may be rounding: that of the most random
+    state, times the square of the largest derivative, both by sizes."""
+    xp = namespace(covariance)
+    steepest = xp.max(xp.abs(gradient) * sizes)
+    widest = xp.max(xp.abs(xp.diagonal(covariance)) / sizes**2)
+    return _ROUNDING**2 * steepest**2 * widest
 
 
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:

@@ -21,7 +21,7 @@ from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem, copies_of
+from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
 from .batches import Rounds, Tiles, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes
@@ -164,10 +164,11 @@ def find_limit_cycles(
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
 
-    **Raises:** `DefinitionError` for systems that do not belong together.
+    **Raises:** `DefinitionError` for systems that do not belong together, or have no parameters.
     """
     execution = Execution() if execution is None else execution
     systems = _stacked(systems)
+    require_positive(systems)
     require_x64(systems)
     settings = Settings() if settings is None else settings
     systems = settings.system(systems)
@@ -232,6 +233,12 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
 
 
 def _stacked(systems) -> HybridSystem:
+    first, *_ = [systems] if isinstance(systems, HybridSystem) else [*systems, None]
+    if first is not None and not arrays_of(first):
+        raise DefinitionError(
+            f"{type(first).__name__} has no parameters, in which systems could differ: use "
+            "`find_limit_cycle` for the one that there is."
+        )
     if isinstance(systems, HybridSystem):
         shapes = {
             x.shape[:1]

@@ -1,10 +1,12 @@
 """Sliders for parameters: the limit cycle, its multipliers and its gain follow them."""
 
+import functools as ft
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib import pyplot
+from matplotlib.colors import to_rgba
 from matplotlib.widgets import Slider
 
 from .._core.arguments import package, require_among, searching
@@ -15,7 +17,7 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..systems.system import HybridSystem, unit_of_parameter
+from ..systems.system import HybridSystem, require_positive, unit_of_parameter
 from ..systems.varied import parameter_of, with_parameters
 from .film import PNG, Easel, png
 from .frequency import FREQUENCY
@@ -26,8 +28,12 @@ from .orbit import plane_of
 
 # Input frequencies of the gain, in cycles per period. Fewer: resonances have corners. More: slow.
 _FREQUENCIES = np.linspace(0.02, 1.98, 197)
+# The background of a picture that is not that of the sliders.
+_OLD = "0.88"
 # Sliders, and the picture that comes from Python. While one is on its way, only the last place of
-# the sliders is kept; once they rest, the gain is asked for.
+# the sliders is kept; once they rest, the gain is asked for. A picture of values that are not those
+# of the sliders fades after a third of a second (sooner: pictures flicker while a slider moves), and
+# a line below says so, until their own picture comes.
 _PAGE = """
 function render({ model, el }) {
   const values = { ...model.get("asked").values };
@@ -37,19 +43,29 @@ function render({ model, el }) {
     model.set("asked", { values: { ...values }, gain, number: ++number });
     model.save_changes();
   };
+  const mark = () => {
+    const shown = model.get("answer").values;
+    const fits = Object.keys(values).every((name) => values[name] === shown[name]);
+    picture.style.transition = fits ? "" : "opacity 0.1s 0.3s";
+    picture.style.opacity = fits ? 1 : 0.25;
+    state.textContent = fits ? "" : "searching for the cycle; the picture is that before";
+  };
   const row = ([name, label, min, max]) => `<label style="display: block">
     <input type="range" name="${name}" min="${min}" max="${max}" step="${(max - min) / 100}"
     value="${values[name]}"> ${label} = <output>${values[name].toPrecision(4)}</output></label>`;
-  el.innerHTML = model.get("answer").sliders.map(row).join("") + '<img style="max-width: 100%">';
-  const picture = el.querySelector("img");
+  el.innerHTML = model.get("answer").sliders.map(row).join("")
+    + '<img style="max-width: 100%"><div style="min-height: 1.4em"></div>';
+  const picture = el.querySelector("img"), state = el.querySelector("img + div");
   el.oninput = ({ target }) => {
     target.nextElementSibling.value = (+target.value).toPrecision(4);
     [values[target.name], moved] = [+target.value, true];
+    mark();
     if (!waiting) ask(false);
   };
   const update = () => {
     const answer = model.get("answer");
     [picture.src, waiting] = [answer.picture, false];
+    mark();
     if (moved || !answer.gain) ask(!moved);
   };
   model.on("change:answer", update);
@@ -63,7 +79,8 @@ class Explorer:
     """Sliders that move parameters of a system. A notebook shows them (with the extra `explore`).
 
     **Fields:** `cycle`: the last limit cycle that was found; `message`: "", or where and why the
-    cycle was lost; `figure`: orbit, multipliers and gain, below the message.
+    cycle was lost, and at which values of the parameters it was found last; `figure`: orbit,
+    multipliers and gain of `cycle`, below the message, on gray where the cycle was lost.
     """
 
     def __init__(self, cycle: LimitCycle, sliders: list, plane: tuple[str, str]):
@@ -124,8 +141,14 @@ class Explorer:
             elif step > 1 / 16:
                 step /= 4
             else:
-                shown = ", ".join(f"{n} = {x:.4g}" for n, x in mixed.items())
-                self.message = f"The cycle is lost at {shown}: {Result(int(cycle.result)).message}."
+                found = {
+                    name: float(parameter_of(self.cycle.system, name)) for name in mixed
+                }
+                self.message = (
+                    f"The cycle is lost at {_written(mixed)}: "
+                    f"{Result(int(cycle.result)).message}. The picture is that at "
+                    f"{_written(found)}."
+                )
                 break
 
     def _draw(self, gain: bool = True) -> None:
@@ -137,9 +160,27 @@ class Explorer:
             self._gain.set_data(f, np.abs(htf[0][:, 0, 0]))
         self._gain.set_alpha(1.0 if gain else 0.3)
         self._lost.set_text(self.message)
+        self._shade(bool(self.message))
         self._moving = [*self._portrait(cycle), self._gain, self._lost]
         if any([widened(ax) for ax in self._axes]):
             self._easel = None
+
+    def _shade(self, is_old: bool) -> None:
+        """Make the background gray where the picture is not that of the sliders."""
+        color = _OLD if is_old else "white"
+        if self._axes[0].get_facecolor() == to_rgba(color):
+            return
+        for ax in self._axes:
+            ax.set_facecolor(color)
+        self._easel = None
+
+    def _slide(self, name: str, value: float) -> None:
+        """Follow a slider of the window: the picture is marked until the search ends."""
+        self._lost.set_text(f"Searching for the cycle at {name} = {value:.4g}.")
+        self._shade(True)
+        self.figure.canvas.draw()
+        self.figure.canvas.flush_events()
+        self.move({name: value})
 
     def show(self) -> None:
         """Open a window with the sliders (in scripts)."""
@@ -150,8 +191,7 @@ class Explorer:
             self._widgets.append(
                 Slider(ax, label, low, high, valinit=self.values[name])
             )
-            move = lambda value, name=name: self.move({name: value})  # type: ignore[misc]  # noqa: E731
-            self._widgets[-1].on_changed(move)
+            self._widgets[-1].on_changed(ft.partial(self._slide, name))
         pyplot.show()
 
     def widget(self) -> Any:
@@ -184,6 +224,7 @@ class Explorer:
         picture = png(self._easel.image(self._moving), compress_level=1)
         return {
             "picture": picture,
+            "values": dict(values),
             "gain": gain,
             "number": number,
             "sliders": self._sliders,
@@ -197,6 +238,10 @@ class Explorer:
         data, about = self._widget._repr_mimebundle_(**options)
         still = self._widget.answer["picture"].removeprefix(PNG)  # where no kernel runs
         return {**data, "text/plain": "Explorer", "image/png": still}, about
+
+
+def _written(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {x:.4g}" for name, x in values.items())
 
 
 @checked
@@ -233,6 +278,8 @@ def explore(
             raise DefinitionError(
                 f"`ranges` of '{name}' must enclose its value, {value:.6g}."
             )
+        for end in (low, high):
+            require_positive(with_parameters(cycle.system, {name: end}))
         sliders.append(
             [name, with_unit(name, unit_of_parameter(cycle.system, name)), low, high]
         )

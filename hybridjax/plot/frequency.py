@@ -49,8 +49,9 @@ def magnitude(
     the arguments. HTFs with a variance have a band that holds the true value at each frequency with
     a probability of 95 %.
 
-    **Arguments:** `output`, `input`: names or indices. `decades`: how far below the largest value
-    the scale reaches. `ax`: Axes. Default: a new figure.
+    **Arguments:** `output`, `input`: names or indices. Default: the first; the axis names the input
+    if there are several. `decades`: how far below the largest value the scale reaches. `ax`: Axes.
+    Default: a new figure.
 
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
@@ -71,7 +72,8 @@ def magnitude(
                 line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
-        label = with_unit(f"$|H_m|$, {name}", ratio(name, pushed))
+        curve = _curve(name, pushed, first)
+        label = with_unit(f"$|H_m|$, {curve}", ratio(name, pushed))
         panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
         _frequency_limits(panel, f)
         top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
@@ -120,10 +122,11 @@ def bode(
     fits: Fit | Sequence[Fit] = (),
     harmonic: int = 0,
     outputs: SignalNames | None = None,
-    input: str | int = 0,
+    input: str | int | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Magnitude and phase of one harmonic for several outputs, with fits in black on top.
+    """Magnitude and phase of one harmonic for several outputs and inputs, with fits in black on
+    top.
 
     **Arguments:**
 
@@ -131,28 +134,46 @@ def bode(
       drawn as broad pale lines under the estimates. HTFs with a variance have bands that contain
       the true values with a probability of 95 %. Their phase is not drawn where the band of the
       magnitude contains zero.
-    - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs.
-    - `outputs`: names of outputs, one color for each. Default: all.
+    - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
+      that it has.
+    - `outputs`: names of outputs. Default: all.
+    - `input`: name or index of one input. Default: all. Each output and input has a curve of its
+      own color.
     - `ax`: two Axes, for magnitude and phase. Default: a new figure.
 
-    **Raises:** `DefinitionError` for a name or harmonic that is not there.
+    **Raises:** `DefinitionError` for a name or harmonic that is not there, and for fits that have
+    none of the inputs.
     """
     first, *_ = drawn = _exact_first(htfs)
     names = first.outputs if outputs is None else outputs
-    pushed = _pick("input", input, first.inputs)
-    units = [ratio(_pick("output", name, first.outputs), pushed) for name in names]
+    chosen = range(len(first.inputs)) if input is None else [input]
+    curves = [
+        (
+            _pick("output", name, first.outputs),
+            _pick("input", which, first.inputs),
+            which,
+        )
+        for name in names
+        for which in chosen
+    ]
+    units = [ratio(name, pushed) for name, pushed, _ in curves]
     same = (
         units[0] if len(set(units)) == 1 else ""
     )  # else the label of each curve has its own
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
+    fitted = [fit.htf(drawn[-1].f) for fit in fits]
+    for htf in fitted:
+        if all(pushed not in htf.inputs for _, pushed, _ in curves):
+            _pick("input", curves[0][1], htf.inputs)
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         upper, lower = axes[:, 0]
-        for number, (name, unit) in enumerate(zip(names, units, strict=True)):
+        for number, (name, pushed, which) in enumerate(curves):
             color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
-            label = with_unit(name, "" if same else unit)
+            curve = _curve(name, pushed, first) if input is None else name
+            label = with_unit(curve, "" if same else units[number])
             for htf in drawn:
                 f, values, radius = _values(
-                    htf, harmonic, name, _same(pushed, input, htf.inputs)
+                    htf, harmonic, name, _same(pushed, which, htf.inputs)
                 )
                 size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
@@ -169,8 +190,10 @@ def bode(
                         np.arcsin(np.where(is_certain, radius, np.nan) / size)
                     )
                     _band(lower, f, phase, turn, color)
-            for fit in fits:
-                values = _values(fit.htf(f), harmonic, name, pushed)[1]
+            for htf in fitted:
+                if pushed not in htf.inputs:
+                    continue
+                f, values, _ = _values(htf, harmonic, name, pushed)
                 phase = _phase(f, values, np.full(len(f), True), reference)
                 upper.plot(f, np.abs(values), **_FIT_STYLE, zorder=5)
                 lower.plot(f, phase, **_FIT_STYLE, zorder=5)
@@ -192,7 +215,7 @@ def bodes(
     *,
     fits: Mapping[str, Fit | Sequence[Fit]] | None = None,
     harmonic: int = 0,
-    input: str | int = 0,
+    input: str | int | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
     """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
@@ -259,6 +282,11 @@ def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
 
 def _pick(kind: str, which: str | int, names: Sequence[str]) -> str:
     return names[channel_index(kind, which, names)]
+
+
+def _curve(output: str, pushed: str, htf: HTF) -> str:
+    """The name of a curve, with the input where an HTF has several."""
+    return output if len(htf.inputs) == 1 else f"{output} from {pushed}"
 
 
 def _same(name: str, which: str | int, names: Sequence[str]) -> str | int:

@@ -1,12 +1,14 @@
 """Limit cycles over parameters: branches, and maps of sweeps."""
 
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
+from .._core.boundary.values import show
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..orbits.continuation import KINDS, Branch
@@ -109,6 +111,10 @@ def sweep(
 
     **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
     """
+    if not isinstance(getattr(maps, "data_vars", None), Mapping):
+        raise DefinitionError(
+            f"`maps` must be the dataset that `hj.sweep` returns, not {show(maps)}."
+        )
     drawable = [
         str(key) for key, values in maps.data_vars.items() if 1 <= values.ndim <= 2
     ]

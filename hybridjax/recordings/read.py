@@ -87,17 +87,19 @@ def read_tables(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** as `read_recording`.
     """
-    if (
-        reader := read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
-    ) is None:
-        kinds = ", ".join(_READERS)
-        raise DefinitionError(f"'{path}' ends in '{path.suffix}'; formats are {kinds}.")
     try:
+        reader = read_bag if path.is_dir() else _READERS.get(path.suffix.lower())
+        if reader is None:
+            kinds = ", ".join(_READERS)
+            raise DefinitionError(
+                f"'{path}' ends in '{path.suffix}'; formats are {kinds}."
+            )
         if path.stat().st_size == 0:
             raise FileFormatError(f"'{path}' is empty: export it again.")
         return reader(path, wanted)
     except OSError as error:
-        raise DefinitionError(f"cannot read '{path}': {error.strerror}.") from error
+        why = error.strerror or error
+        raise DefinitionError(f"cannot read '{path}': {why}.") from error
 
 
 def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:

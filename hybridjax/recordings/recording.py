@@ -167,9 +167,10 @@ class Recording(eqx.Module):
         for other in recordings:
             pair = f"trials '{first.trials[0].name}' and '{other.trials[0].name}'"
             require_equal(pair, "signals", sorted(units), sorted(other.signals))
+            column = {key: k for k, key in enumerate(other.signals)}
             for key, unit in units.items():
-                require_equal(pair, f"units of {key}", unit, other.unit(key))
-            order = list(map(other.column, units))
+                require_equal(pair, f"units of {key}", unit, other.units[column[key]])
+            order = [column[key] for key in units]
             for t in other.trials:  # (signals in the same order are not copied)
                 same = order == sorted(order)
                 trials.append(t if same else replace(t, values=t.values[:, order]))

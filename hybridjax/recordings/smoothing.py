@@ -17,6 +17,9 @@ Series = Float[np.ndarray, " n"]
 Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
 """In Hz; infinite: nothing is smoothed."""
 
+# Bandwidth, in cycles per sample, at which a spline is a straight line. Smaller: its weight
+# overflows. Larger: slow changes of long recordings are not passed.
+_STRAIGHT = 1e-12
 # Fewest samples of a spline. More: short stretches are left out. Fewer than 3: the band matrix is
 # empty.
 FEWEST = 5
@@ -64,7 +67,7 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     time, values = time[finite], values[finite]
     step = float(np.median(np.diff(time)))
     h = np.diff(time) / step
-    weight = (2 * np.pi * bandwidth * step) ** -4.0
+    weight = (2 * np.pi * max(bandwidth * step, _STRAIGHT)) ** -4.0
     # (R + weight Q'Q) curvature = Q' y; the columns of Q are second divided differences.
     q = np.stack([1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]])
     band = np.zeros((3, len(h) - 1))

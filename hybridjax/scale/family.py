@@ -20,7 +20,13 @@ from .._core.pieces.store import Constant
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..orbits.checks import check_periodic
-from ..systems.system import HybridSystem, describe, parameters_of, unit_of_parameter
+from ..systems.system import (
+    HybridSystem,
+    describe,
+    parameters_of,
+    require_positive,
+    unit_of_parameter,
+)
 from ..systems.varied import with_parameters
 
 
@@ -137,9 +143,14 @@ class Family:
         return with_parameters(self.model, {name: values[name] for name in self.names})
 
     def systems(self, values: Mapping[str, np.ndarray]) -> HybridSystem:
-        """Return the systems at several points as one, whose arrays have a leading axis."""
+        """Return the systems at several points as one, whose arrays have a leading axis.
+
+        **Raises:** `DefinitionError` for a parameter that must be positive and is not.
+        """
         arrays = {name: jnp.asarray(x) for name, x in values.items()}
-        return current(eqx.filter_vmap(self.system)(arrays))
+        systems = current(eqx.filter_vmap(self.system)(arrays))
+        require_positive(systems)
+        return systems
 
     def check(self, values: Mapping[str, float]) -> HybridSystem:
         """Return the system at one point.

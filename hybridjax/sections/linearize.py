@@ -51,8 +51,8 @@ def linearize(
 
     The coordinates on a section are deviations of the chart's states; on a state-based section of a
     clocked system the time of crossing comes first. On a section given by a level function, the
-    state that the flow changes fastest across the section is left out. `ldtp.coordinates` lists
-    them.
+    state that the flow changes fastest across the section is left out: of a chart with one state,
+    nothing remains, and the dimension there is 0. `ldtp.coordinates` lists them.
 
     **Arguments:**
 

@@ -76,7 +76,7 @@ class SectionMap(eqx.Module):
                 f"`q` must be a state on {self.placed.family.describe(self.i)}, where the map "
                 f"starts and states have the shape {self.dims[:1]}; got {q.shape}."
             )
-        nu = len(self.placed.cycle.system.inputs)
+        nu = self.placed.cycle.structure.nu
         held = np.zeros(nu) if u is None else u
         require_axes("`u`", held, {}, {"inputs": nu})
         arrival = _map(self, q, held, t)

@@ -15,8 +15,8 @@ from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart
-from .structure import Structure, hashable, quoted
-from .system import HybridSystem, Output, arrays_of
+from .structure import Structure, hashable, quoted, require_inputs_apart
+from .system import HybridSystem, Output, arrays_of, require_positive
 from .transition import Scheduled, Transition
 
 
@@ -45,6 +45,7 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
                 f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
             )
             raise DefinitionError(f"{text}; every parameter must be finite.")
+    require_positive(system)
     leaves, structure = jax.tree_util.tree_flatten(system)
     parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
     form = hashable((structure, *parts))
@@ -79,7 +80,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
         s.chart_index(name)
     for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
         _check_names(f"chart '{name}'", "inputs", chart.inputs or ())
-        require_among("input", chart.inputs or (), system.inputs, f"chart '{name}': ")
+        require_among("input", chart.inputs or (), s.inputs, f"chart '{name}': ")
         _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
         _check_names(f"chart '{name}'", "states", chart.states, chart.units)
         s.method(a)
@@ -100,6 +101,8 @@ def _check_functions(s: Structure) -> Iterator[str]:
         yield from _check_transition(s, g)
     names = [output.name for output in system.outputs()]
     _check_names(kind, "states and outputs", (*map(str, s.state_names()), *names))
+    absent = [name for chart in s.charts for name in chart.absent]
+    require_inputs_apart(kind, s.inputs, [*s.state_names(), *absent, *names])
     for output in system.outputs():
         yield from check_output(s, output)
 

@@ -9,11 +9,17 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .._core.boundary.values import show
 from ..errors import DefinitionError
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
-    array = jnp.asarray(value, float)
+    try:
+        array = jnp.asarray(value, float)
+    except (TypeError, ValueError):
+        raise DefinitionError(
+            f"Drawing: '{name}' must be numbers in an array, not {show(value)}."
+        ) from None
     fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
     if array.ndim != len(shape) or not all(fits):
         text = str(shape).replace("None", "k")
@@ -27,6 +33,11 @@ def _shapes(*shape: int | None, **options: Any) -> Any:
     """A field of shapes by name."""
 
     def arrays(shapes: Mapping[str, Any]) -> dict[str, Any]:
+        named = isinstance(shapes, Mapping) and all(isinstance(x, str) for x in shapes)
+        if not named:
+            raise DefinitionError(
+                f"Drawing: shapes must be a dictionary of arrays by name, not {show(shapes)}."
+            )
         return {name: _array(name, x, shape) for name, x in shapes.items()}
 
     return eqx.field(converter=arrays, default_factory=dict, **options)
@@ -67,9 +78,10 @@ class Drawing(eqx.Module):
     velocity: Any = eqx.field(converter=_velocity, default=(0.0, 0.0), kw_only=True)
 
     def __check_init__(self):
-        if self.body is not None and self.body not in {**self.circles, **self.points}:
+        places = [*self.circles, *self.points]
+        if self.body is not None and self.body not in places:
             raise DefinitionError(
-                f"Drawing: `body` must be a circle or point, not '{self.body}'."
+                f"Drawing: `body` must be a circle or point, not {show(self.body)}."
             )
 
     @property
@@ -85,8 +97,12 @@ class Drawing(eqx.Module):
         end: ArrayLike | Sequence[ArrayLike],
         width: ArrayLike = 0.08,
     ) -> Float[Array, "15 2"]:
-        """The points of a zigzag line of this half width, in meters. Default: 0.08."""
-        a, b = jnp.asarray(start, float), jnp.asarray(end, float)
+        """The points of a zigzag line of this half width, in meters. Default: 0.08.
+
+        **Raises:** `DefinitionError` for ends that are no points of the plane.
+        """
+        a, b = _array("start", start, (2,)), _array("end", end, (2,))
+        width = _array("width", width, ())
         along = b - a
         length = jnp.sqrt(
             jnp.maximum(along @ along, 1e-18)

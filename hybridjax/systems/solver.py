@@ -96,12 +96,18 @@ def solvers(
     )
 
 
-@ft.lru_cache
 def as_method(solver: Any) -> Method:
     """The Runge-Kutta method of a solver.
 
     **Raises:** `DefinitionError` for what is none with an error estimate.
     """
+    if not isinstance(solver, Method | eqx.Module):
+        raise _no_solver(solver)
+    return _as_method(solver)
+
+
+@ft.lru_cache
+def _as_method(solver: Any) -> Method:
     if isinstance(solver, Method):
         return solver
     if isinstance(solver, Radau):

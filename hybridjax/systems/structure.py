@@ -291,7 +291,7 @@ class Structure:
             u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
         if (names := self.charts[a].inputs) is None:
             return u
-        return u[np.array([self.system.inputs.index(n) for n in names], int)]
+        return u[np.array([self.inputs.index(n) for n in names], int)]
 
     def field(self, a: int, t: Array, q: Array, u: Array) -> jax.Array:
         return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
@@ -473,6 +473,20 @@ class Structure:
         )
 
 
+def require_inputs_apart(
+    what: str, inputs: Iterable[str], states_and_outputs: Iterable[str]
+) -> None:
+    """**Raises:** `DefinitionError` for an input that has the name of a state or of an output."""
+    taken = set(map(str, states_and_outputs))
+    for name in map(str, inputs):
+        if name in taken:
+            raise DefinitionError(
+                f"{what}: '{name}' is an input and a state or an output, and results by names "
+                f"could not tell them apart: give the input another name, as in `inputs = "
+                f"('{name}_in',)`, or write `inputs = ()` for a system without."
+            )
+
+
 class Outputs:
     """Several outputs of a system as one vector function per chart."""
 
@@ -485,6 +499,14 @@ class Outputs:
             "output", [x for x in items if isinstance(x, str)], structure.output_names()
         )
         states = {str(name): name for name in structure.state_names()}
+        made = [x.name for x in items if isinstance(x, Output)]
+        for name in made:
+            if name in states:
+                raise DefinitionError(
+                    f"the output '{name}' has the name of a state: ask for the state by its name "
+                    f"alone, or give the output another one."
+                )
+        require_inputs_apart(type(structure.system).__name__, structure.inputs, made)
         self.names = tuple(
             states[o] if isinstance(o, str) else Signal(o.name, o.unit)
             for o in self.items

@@ -1,6 +1,7 @@
 """A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
 
 import abc
+import contextvars
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
-from .._core.boundary.kinds import Scalar, Vector
+from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import code_digest, current
 from .._core.pieces.description import digest_of
@@ -55,18 +56,26 @@ Parameter = Float[Array, ""] | float
 
 
 @checked
-def parameter(default: float | None = None, *, doc: str = "", unit: str = "") -> Any:
+def parameter(
+    default: float | None = None,
+    *,
+    doc: str = "",
+    unit: str = "",
+    positive: bool = False,
+) -> Any:
     """A physical parameter: a field of a `HybridSystem` that is stored as a floating-point array.
 
     An array is differentiable, and another value does not cause recompilation; a Python float has
     neither property. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
 
     **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
-    `unit`, as text.
+    `unit`, as text; `positive`, whether zero and negative values are refused, as of a mass.
+    Default: False.
     """
-    metadata = {"doc": doc, "unit": unit}
+    metadata = {"doc": doc, "unit": unit, "positive": positive}
     options: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(converter=_number, metadata=metadata, **options)
+    converter = _positive_number if positive else _number
+    return eqx.field(converter=converter, metadata=metadata, **options)
 
 
 def unit_of_parameter(system: Any, path: str) -> str:
@@ -122,6 +131,31 @@ def _number(x: Scalar) -> Array:
     return real(x)
 
 
+def _positive_number(x: PositiveScalar) -> Array:
+    return real(x)
+
+
+def require_positive(system: "HybridSystem") -> None:
+    """**Raises:** `DefinitionError` for a parameter of a system, or of one of several, that must be
+    positive and is not. (The constructor does not see values that are traced or put in later.)"""
+    for part in jax.tree_util.tree_leaves(
+        system, is_leaf=lambda x: isinstance(x, HybridSystem) and x is not system
+    ):
+        if isinstance(part, HybridSystem):
+            require_positive(part)
+    for field in own_fields(system):
+        value = getattr(system, field.name)
+        if not field.metadata.get("positive") or is_tracer(value):
+            continue
+        wrong = np.asarray(value)[~(np.asarray(value) > 0)]
+        if wrong.size:
+            name, unit = type(system).__name__, field.metadata.get("unit", "")
+            raise DefinitionError(
+                f"parameter `{field.name}` of {name} is {wrong.flat[0]:g} {unit}".rstrip()
+                + ": it must be positive."
+            )
+
+
 @checked
 class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time.
@@ -148,6 +182,33 @@ class Guess(eqx.Module):
     __repr__ = fields
 
 
+DEFAULT_INPUT, SECOND_NAME = "u", "input"
+"""The name of the input of a system whose author named none, and its name where a state or an
+output is called so."""
+
+_being_named: contextvars.ContextVar[tuple[int, ...]] = contextvars.ContextVar(
+    "being named", default=()
+)
+
+
+class _DefaultInputs:
+    """The inputs of a system whose author named none: one, whose name yields to those of states and
+    outputs."""
+
+    def __get__(self, system: "HybridSystem | None", owner: type) -> tuple[str, ...]:
+        if system is None or id(system) in _being_named.get():
+            return (DEFAULT_INPUT,)
+        # (Charts that ask their system for its inputs get the default.)
+        token = _being_named.set((*_being_named.get(), id(system)))
+        try:
+            taken = {output.name for output in system.outputs()}
+            for chart in system.charts().values():
+                taken.update(chart.states, chart.absent)
+        finally:
+            _being_named.reset(token)
+        return (SECOND_NAME if DEFAULT_INPUT in taken else DEFAULT_INPUT,)
+
+
 class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
@@ -169,12 +230,13 @@ class HybridSystem(Definition):
     Every system defines `charts`, and `transitions` if it has events; `period`, `outputs` and
     `guess` are optional. The class attribute `inputs` names the exogenous inputs û; `inputs = ()`
     for a system without. `input_units` gives their units in the same order (none, or one for each),
-    and `time_unit` that of time. `solver`, a keyword of every constructor, is the method of
-    integration of all charts, or of some by name (`{"stance": hj.Radau()}`); it overrides
-    `Chart.solver`.
+    and `time_unit` that of time. States, inputs and outputs share one space of names: without
+    `inputs`, there is one input `u`, or `input` if a state or an output is called `u`. `solver`, a
+    keyword of every constructor, is the method of integration of all charts, or of some by name
+    (`{"stance": hj.Radau()}`); it overrides `Chart.solver`.
     """
 
-    inputs: ClassVar[tuple[str, ...]] = ("u",)
+    inputs: ClassVar[tuple[str, ...]] = _DefaultInputs()  # type: ignore[assignment]
     input_units: ClassVar[tuple[str, ...]] = ()
     time_unit: ClassVar[str] = ""
 

@@ -154,7 +154,7 @@ def test_other_experiments_are_refused(made, arguments):
     cycle, placed, _, _ = arguments
     where = lambda p: (p.cycle.system.damping, p.cycle.numbers["damping"])  # noqa: E731
     other = eqx.tree_at(where, placed, (jnp.asarray(0.11),) * 2)
-    velocity = hj.Output("v", lambda t, q, u: -q[1], "m/s")
+    velocity = hj.Output("speed", lambda t, q, u: -q[1], "m/s")
     cases = (
         (
             dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)),

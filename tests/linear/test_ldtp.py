@@ -96,7 +96,7 @@ GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1,
     ("change", "message"),
     [
         ({"C": np.zeros((2, 0, 3))}, "without empty axes"),
-        ({"dims": [3, 4]}, "`dims` must lie between 1 and 3"),
+        ({"dims": [3, 4]}, "`dims` must lie between 0 and 3"),
         ({"dims": [3, 2], "A": np.ones((2, 3, 3))}, r"`A\[0\]` has entries outside"),
         ({"dims": [3, 2], "B": np.ones((2, 3, 1))}, r"`B\[0\]` has entries outside"),
         ({"dims": [3, 2], "C": np.ones((2, 1, 3))}, r"`C\[1\]` has entries outside"),

@@ -148,3 +148,37 @@ def test_noise_that_does_not_fit_is_refused(juggler):
     unstable = hj.find_limit_cycle(hj.models.BuckConverter(Vin=26.0))
     with pytest.raises(hj.ComputationError, match="not stable"):
         unstable.fluctuations({"v": 1.0})
+
+
+class _Adaptive(hj.Chart):
+    """An integrate-and-fire neuron, and a state that follows it; the input acts on that alone."""
+
+    states = ("v", "w")
+
+    def field(self, t, q, u):
+        return 1.2 - q[0], q[0] - q[1] + u[0]
+
+
+class _Follower(hj.HybridSystem):
+    inputs = ("u", "idle")
+
+    def charts(self):
+        return {"sub": _Adaptive()}
+
+    def transitions(self):
+        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
+        after = lambda t, q, u: (0.0, q[1] + 1)  # noqa: E731
+        return [hj.Transition("spike", "sub", "sub", guard=threshold, reset=after)]
+
+
+def test_noise_without_an_effect_gives_zero():
+    cycle = hj.find_limit_cycle(_Follower(), hj.Guess("sub", (0.5, 1.0)))
+    follower = np.array([[0, 0], [0, 0.2**2 / 2]])  # w' = -w + noise, unless v matters
+    for strength, expected in (({"u": 0.2}, follower), ({"idle": 0.2}, 0 * follower)):
+        noisy = cycle.fluctuations(white=strength)
+        assert noisy.diffusion == 0
+        assert np.array_equal(noisy.durations(), [[0]])
+        assert np.array_equal(noisy.durations(lag=1), [[0]])
+        assert "0: standard deviation from spike to spike" in str(noisy)
+        for C in noisy.covariance([0.2, 0.7]):
+            np.testing.assert_allclose(C, expected, rtol=1e-10, atol=0)

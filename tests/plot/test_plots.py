@@ -105,7 +105,34 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     with pytest.raises(
         hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
-        hj.plot.bode(exact, fits=hj.fit_rational(exact, input=1))
+        hj.plot.bode(exact, fits=hj.fit_rational(exact, input=1), input=0)
+
+
+def test_every_input_is_drawn_and_named():
+    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    fit = hj.fit_rational(exact, input=1)
+    assert len(exact.inputs) == 2
+    pairs = [(i, j) for i in range(len(exact.outputs)) for j in range(2)]
+    names = [f"{exact.outputs[i]} from {exact.inputs[j]}" for i, j in pairs]
+    expected = [np.abs(exact[0][:, i, j]) for i, j in pairs]
+    for draw in (hj.plot.bode, lambda *x, **y: hj.plot.bodes({"a": x}, **y)):
+        upper = np.ravel(draw(exact).figure.axes)[0]
+        curves = [x for x in upper.get_lines() if len(x.get_xdata())]
+        for line, values in zip(curves, expected, strict=True):
+            np.testing.assert_allclose(line.get_ydata(), values)
+        assert len({x.get_color() for x in curves}) == len(pairs)
+        assert list(labeled(upper)) == [*names, "exact"]
+    # A fit lies over the curves of its own input.
+    with_fit = hj.plot.bode(exact, fits=fit).figure.axes[0].get_lines()
+    fitted = [x for x in with_fit if len(x.get_xdata()) and x.get_color() == "black"]
+    assert len(fitted) == len(exact.outputs)
+    # Where one input is drawn, its name is on the axis.
+    for draw in (hj.plot.magnitude, lambda x, **y: hj.plot.harmonics({"a": x}, **y)):
+        for given, pushed in (({}, 0), ({"input": 1}, 1)):
+            label = draw(exact, harmonics=[0], **given).figure.axes[0].get_ylabel()
+            assert label.startswith(
+                f"$|H_m|$, {exact.outputs[0]} from {exact.inputs[pushed]}"
+            )
 
 
 def test_bodes(estimate, exact, rational):

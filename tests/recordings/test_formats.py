@@ -1,13 +1,16 @@
 """Files of each kind, written by the library of their kind, and what is refused in one sentence."""
 
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
+from scipy.sparse import eye_array
 
 import hybridjax as hj
 from hybridjax._core import limits
 from hybridjax.errors import FileFormatError
+from hybridjax.recordings.formats import arrays
 
 
 SLOW, FAST = np.arange(20) / 100, np.arange(190) / 1000
@@ -391,8 +394,122 @@ def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
     zeros = {"time": np.zeros(2**17), "x": np.zeros(2**17)}
     write_v5(tmp_path / "x.mat", zeros, do_compression=True)
     monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
-    refused("declares arrays of 2097152 bytes", tmp_path / "x.mat")
+    refused("declares arrays of 1048576 bytes or more", tmp_path / "x.mat")
     monkeypatch.setattr(limits, "RECORDED", 100)
     parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
     with pytest.raises(hj.DefinitionError, match="2 signals at 191 times are too many"):
         hj.Recording.beside(parts)
+
+
+# Costs, and errors that are not the file's
+
+
+def memory_of(call):
+    """Bytes that Python and numpy hold at most during a call, beside those before."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_packed_struct_is_refused_before_it_takes_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
+    path, zeros = tmp_path / "x.mat", np.zeros(2**22)  # 32 MB
+    nested = {"imu": {"gyro": {"time": SLOW, "x": X, "more": zeros}}}
+    write_v5(path, nested, do_compression=True)
+    assert path.stat().st_size < 2**17
+    refused("declares arrays of .* or more", path)
+    assert memory_of(lambda: refused("declares arrays of .* or more", path)) < 2**21
+    # Cells, empty ones too, complex numbers and sparse zeros count as they are.
+    empty = np.empty(2**12, object)
+    empty[:] = [np.zeros(0)] * len(empty)
+    write_v5(path, {"time": SLOW, "x": X, "c": empty}, do_compression=True)
+    refused("declares arrays of .* or more", path)
+    few = {"c": np.array([1, "text", {"a": X}], object), "z": 1j * X, "on": X > 0}
+    sparse = {"s": eye_array(10**6, format="csc")}
+    write_v5(path, {"time": SLOW, "x": X} | few | sparse, do_compression=True)
+    np.testing.assert_array_equal(samples(hj.read_recording(path), "x")[1], X)
+    deep = {"time": SLOW, "x": X}
+    for _ in range(limits.NESTED + 1):
+        deep = {"g": deep}
+    write_v5(path, deep, do_compression=True)
+    refused(f"in more than {limits.NESTED} structs", path)
+
+
+def test_one_blank_does_not_fill_a_sheet(tmp_path, monkeypatch):
+    written, line = [], arrays._line
+
+    def counted(*row):
+        written.append(row)
+        assert len(written) < 100
+        return line(*row)
+
+    monkeypatch.setattr(arrays, "_line", counted)
+    book = pytest.importorskip("openpyxl").Workbook()
+    book.active.append(["time", "x", "y"])
+    for row in zip(SLOW, X, strict=True):
+        book.active.append([*map(float, row)])  # y is missing everywhere but once
+    book.active["C4"] = 2.0
+    path = tmp_path / "x.xlsx"
+    book.save(path)
+    expected = hj.read_recording(path)
+    for corner in ("XFD3", "B1048576", "XFD1048576"):
+        book.active[corner] = " "
+        book.save(path)
+        written.clear()
+        found = hj.read_recording(path)
+        assert found.signals == expected.signals == ("x", "y")
+        np.testing.assert_array_equal(found.trials[0].values, expected.trials[0].values)
+
+
+def test_columns_take_time_in_proportion_to_their_number(tmp_path):
+    """Counted, not measured: the comparisons of names."""
+    h5py = pytest.importorskip("h5py")
+
+    class Name(str):
+        compared = 0
+
+        def __eq__(self, other):
+            Name.compared += 1
+            return str.__eq__(self, other)
+
+        __hash__ = str.__hash__
+
+    counts = []
+    for n in (200, 400):
+        Name.compared = 0
+        signals = {Name(f"x{k}"): X for k in range(n)}
+        parts = [hj.Recording(SLOW, signals), hj.Recording(SLOW, {"y": X})]
+        hj.Recording.join([hj.Recording.beside(parts)] * 2)
+        counts.append(Name.compared)
+    assert counts[1] < 3 * max(counts[0], 1)
+    groups = "/".join("g" * (limits.NESTED + 1))
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["time"], file[f"{groups}/x"] = SLOW, X
+    refused(f"groups in more than {limits.NESTED} others", tmp_path / "x.h5")
+
+
+@pytest.mark.parametrize("error", [MemoryError("no memory"), OSError(5, "broken")])
+def test_errors_of_the_computer_are_not_those_of_a_file(tmp_path, monkeypatch, error):
+    scipy_io = pytest.importorskip("scipy.io")
+
+    def fails(*_, **__):
+        raise error
+
+    path = tmp_path / "x.mat"
+    write_v5(path, {"time": SLOW, "x": X})
+    monkeypatch.setattr(scipy_io, "loadmat", fails)
+    kind = MemoryError if isinstance(error, MemoryError) else hj.DefinitionError
+    with pytest.raises(kind, match="no memory|cannot read .*: broken"):
+        hj.read_recording(path)
+
+
+def test_errors_of_a_reader_itself_are_no_damage(tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        file["time"], file["x"] = SLOW, X
+    monkeypatch.setattr(arrays, "Columns", None)
+    with pytest.raises(TypeError, match="'NoneType' object is not callable"):
+        hj.read_recording(tmp_path / "x.h5")

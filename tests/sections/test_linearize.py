@@ -182,3 +182,48 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late):
 def test_delays_at_sections_of_the_state_are_refused(hopper_cycle):
     with pytest.raises(hj.DefinitionError, match="needs sections at equal times"):
         hj.linearize(hopper_cycle, KINEMATIC, OUTPUTS, delay=(0.1, 0.0))
+
+
+class _Leaky(hj.Chart):
+    states = ("v",)
+
+    def field(self, t, q, u):
+        return (1.2 - q[0] + u[0],)
+
+
+class _Neuron(hj.HybridSystem):
+    """Integrate and fire: on a section, its only state is known, and nothing is left to deviate."""
+
+    def charts(self):
+        return {"below": _Leaky()}
+
+    def transitions(self):
+        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
+        after = lambda t, q, u: (0.0,)  # noqa: E731
+        return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
+
+
+def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
+    cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
+    half, most = (hj.Crossing("v", "rising", value) for value in (0.5, 0.8))
+    current = hj.Output("current", lambda t, q, u: 3 * q[0] + 2 * u[0])
+    for sections, dims in (
+        ([half, hj.AtEvent("spike")], [0, 1]),
+        ([half, most], [0, 0]),
+        (half, [0]),
+    ):
+        model = hj.linearize(cycle, sections, outputs=current)
+        np.testing.assert_array_equal(model.dims, dims)
+        assert [len(x) for x in model.coordinates] == dims
+        assert len(model.multipliers) == 0
+        # The voltage of a section does not change, the current does.
+        H = model.htf((0.1, 0.2, 0.4))
+        np.testing.assert_allclose(H[0][:, 0, 0], 2)
+        assert all(np.all(H[m] == 0) for m in H.harmonics if m)
+        for system in (model, model.feedback(np.zeros((1, 1)))):
+            np.testing.assert_allclose(
+                system.simulate(np.ones((4, 1))), 2 * np.ones((4, 1))
+            )
+        design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
+        data = hj.run_experiments(cycle, sections, design, current, start="periodic")
+        np.testing.assert_allclose(data.y, 2 * data.u, rtol=1e-9)

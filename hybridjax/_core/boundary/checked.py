@@ -11,7 +11,7 @@ import jax
 
 from ...errors import DefinitionError
 from ..arguments import require_among
-from ..executor import is_hidden
+from ..executor import as_numpy, is_hidden
 from ..memo import Memory
 from .kinds import kind_of
 from .values import Kind, Misfit
@@ -103,7 +103,8 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     def call(*args, **kwargs):
         try:
             args, kwargs = kinds.take(args, kwargs)
-            return function(*args, **kwargs)
+            with as_numpy():
+                return function(*args, **kwargs)
         except Misfit as misfit:
             raise DefinitionError(
                 f"{name}: `{misfit.path}` {misfit.problem}."

@@ -123,6 +123,11 @@ def multisine(
         raise DefinitionError(
             f"`amplitude` must return real numbers, not {size.dtype}."
         )
+    if size.shape not in ((), line.shape):
+        raise DefinitionError(
+            f"`amplitude` must return a number for each of {len(line)} frequencies, not an array "
+            f"of the shape {size.shape}."
+        )
     cosines = (
         experiment,
         line,

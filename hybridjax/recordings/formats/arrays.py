@@ -3,6 +3,8 @@ Excel)."""
 
 import csv
 import io
+import itertools
+import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,14 +13,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..._core import limits
 from ..._core.archive import read_arrays
 from ..._core.arguments import package
 from ..._core.signal import with_unit
 from ...errors import DefinitionError, FileFormatError
 from .columns import EVENT, Columns, Wanted, check_declared, reading, split_header
+from .matlab_sizes import declared
 from .text import read_plain
 
 
+# The rows of a sheet of Excel. Smaller: long recordings are refused. Larger: a row with a wrong
+# number takes memory for all rows before it.
+_MOST_ROWS = 2**20
 Place = tuple[str, ...]
 """Names of groups, from the outermost on, and of an array."""
 
@@ -41,6 +48,11 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
 
     def visit(name: str, node: Any) -> None:
         place = tuple(name.split("/"))
+        if len(place) > limits.NESTED:  # (each is opened through all around it)
+            raise FileFormatError(
+                f"'{path}' has groups in more than {limits.NESTED} others: copy their arrays into "
+                "fewer."
+            )
         if not isinstance(node, h5py.Dataset) or name.startswith(
             "#"
         ):  # MATLAB's own data
@@ -61,9 +73,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
-        check_declared(
-            path, 8 * sum(int(np.prod(x.array.shape)) for x in leaves.values())
-        )
+        check_declared(path, 8 * sum(math.prod(x.array.shape) for x in leaves.values()))
         return _read_tree(path, leaves, separator, wanted)
 
 
@@ -76,10 +86,15 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
     from scipy.io import loadmat, matlab, whosmat
 
     with reading(path, "MATLAB file"):
-        if matlab.matfile_version(path)[0] == 2:
+        version, _ = matlab.matfile_version(path)
+        if version == 2:
             return read_hdf5(path, wanted, ".")
+        # (`whosmat` unpacks whole arrays of version 5. Version 4 does not pack.)
+        for size in itertools.accumulate(declared(path) if version == 1 else ()):
+            check_declared(path, size)
         shapes = {name: shape for name, shape, _ in whosmat(path)}
-        check_declared(path, 8 * sum(int(np.prod(shape)) for shape in shapes.values()))
+        if version == 0:
+            check_declared(path, 8 * sum(map(math.prod, shapes.values())))
         # (If a name is wrong, all are read, for the message.)
         wrong = not {x.split(".")[0] for x in wanted.signals or ()} <= set(shapes)
         chosen = [x for x in shapes if wrong or wanted.includes(x) or wanted.reaches(x)]
@@ -199,18 +214,46 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
             check_declared(path, sum(x.file_size for x in archive.infolist()))
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         names = book.sheetnames
-        lines = [_line(row) for row in book.worksheets[0].iter_rows(values_only=True)]
+        rows = _rows(path, book.worksheets[0])
         book.close()
-    table = read_plain(path, lines)
+    width = max(map(len, rows), default=0)
+    check_declared(path, width * sum(map(bool, rows)))
+    table = read_plain(path, [_line(row, width) for row in rows])
     note = f"of {len(names)} sheets the first one, '{names[0]}', was read"
     return [table._replace(notes=(*table.notes, note)) if len(names) > 1 else table]
 
 
-def _line(row: tuple) -> str:
-    """Join cells with tabs, in quotes where necessary."""
+def _rows(path: Path, sheet: Any) -> list[list[str]]:
+    """Return the texts of the cells of a sheet, without empty ones at the end of a row and without
+    empty rows at the end.
+
+    **Raises:** `FileFormatError` for a row that Excel does not have.
+    """
+    # A sheet says how far its cells reach, and one with a blank would fill a million rows. Without
+    # this, rows end at their last cell.
+    sheet.reset_dimensions()
+    filled: dict[int, list[str]] = {}
+    for number, row in enumerate(sheet.iter_rows(values_only=True)):
+        if number >= _MOST_ROWS:
+            raise FileFormatError(
+                f"'{path}' is no Excel file, or damaged: it has rows after row {_MOST_ROWS}, the "
+                "last of Excel."
+            )
+        cells = ["" if x is None else " ".join(str(x).split()) for x in row]
+        while cells and not cells[-1]:
+            cells.pop()
+        if cells:
+            filled[number] = cells
+    return [filled.get(k, []) for k in range(1 + max(filled, default=-1))]
+
+
+def _line(cells: list[str], width: int) -> str:
+    """Join cells with tabs, in quotes where necessary, as many in each row that is not empty."""
+    if not cells:
+        return ""
     text = io.StringIO()
-    cells = ["" if x is None else " ".join(str(x).split()) for x in row]
-    csv.writer(text, delimiter="\t", lineterminator="").writerow(cells)
+    filled = [*cells, *[""] * (width - len(cells))]
+    csv.writer(text, delimiter="\t", lineterminator="").writerow(filled)
     return text.getvalue()
 
 

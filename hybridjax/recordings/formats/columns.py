@@ -1,5 +1,7 @@
 """The interface of all readers of files: which columns are wanted, and which were read."""
 
+import errno
+import functools as ft
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
@@ -11,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._core import limits
-from ..._core.archive import damaged
 from ..._core.boundary.values import unmasked
 from ..._core.signal import SECONDS
 from ...errors import DefinitionError, FileFormatError, HybridJaxError
@@ -141,14 +142,14 @@ class Wanted(NamedTuple):
         name = split_header(header)[0]
         if self.signals is None or name.startswith(EVENT) or self.is_time(header):
             return True
-        return any(_belongs(name, x) for x in self.signals)
+        return not _with_groups(name).isdisjoint(_set(self.signals))
 
     def reaches(self, group: str) -> bool:
         """Return whether a signal, or a member of a group, is wanted."""
-        wanted = self.signals or ()
-        return self.signals is None or any(
-            _belongs(group, x) or _belongs(x, group) for x in wanted
-        )
+        if self.signals is None:
+            return True
+        within = not _with_groups(group).isdisjoint(_set(self.signals))
+        return within or group in _set_with_groups(self.signals)
 
     def is_time(self, header: str) -> bool:
         """Return whether a column may hold the times."""
@@ -161,10 +162,10 @@ class Wanted(NamedTuple):
 
         **Raises:** `DefinitionError` that lists up to 20 names.
         """
+        known, with_groups = _set(tuple(names)), _set_with_groups(tuple(names))
         for name in self.signals or ():
-            if not any(
-                _belongs(x, name) or (groups and _belongs(name, x)) for x in names
-            ):
+            within = groups and not _with_groups(name).isdisjoint(known)
+            if not (within or name in with_groups):
                 listed = (
                     ", ".join([*names[:20], *["..."][: len(names) // 21]]) or "none"
                 )
@@ -173,10 +174,21 @@ class Wanted(NamedTuple):
                 )
 
 
-def _belongs(name: str, group: str) -> bool:
-    """Return whether a signal has this name or is in the group of this name: `imu.gyro.x` belongs
-    to `imu`."""
-    return name == group or name.startswith((f"{group}.", f"{group}/"))
+def _with_groups(name: str) -> set[str]:
+    """The name of a signal, and those of the groups that it is in: `imu.gyro.x`, `imu.gyro` and
+    `imu`."""
+    return {name, *(name[:k] for k, letter in enumerate(name) if letter in "./")}
+
+
+# Names are compared as sets, since a file may have thousands, and a user want as many.
+@ft.lru_cache(maxsize=8)
+def _set(names: tuple[str, ...]) -> frozenset[str]:
+    return frozenset(names)
+
+
+@ft.lru_cache(maxsize=8)
+def _set_with_groups(names: tuple[str, ...]) -> frozenset[str]:
+    return frozenset().union(*map(_with_groups, names))
 
 
 def split_header(header: str) -> tuple[str, str]:
@@ -213,22 +225,55 @@ def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
 
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a library raises about broken bytes into a `FileFormatError`. (The library's
-    text is for the user, and nothing reads it.)"""
+    """Turn errors of a library about broken bytes into a `FileFormatError`. (The library's text is
+    for the user, and nothing reads it.)
+
+    Libraries stumble over broken bytes in any way, so that an error of any kind that one of their
+    lines raises is about the file, unless it is about the computer. Errors that lines of this
+    package raise are its own.
+    """
     try:
         yield
-    except HybridJaxError:
+    except (HybridJaxError, MemoryError, Warning):
         raise
     except Exception as error:
+        of_system = isinstance(error, OSError) and error.errno in _OF_SYSTEM
+        if of_system or _raised_here(error):
+            raise
         reason = textwrap.shorten(str(error) or type(error).__name__, 100)
         raise FileFormatError(
             f"'{path}' is no {kind}, or damaged ({reason})."
         ) from error
 
 
+# Errors of the system that say nothing about the content of a file.
+_OF_SYSTEM = (
+    errno.EACCES,
+    errno.EIO,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOENT,
+    errno.ENOMEM,
+    errno.ENOSPC,
+    errno.EPERM,
+    errno.ETIMEDOUT,
+)
+
+
+def _raised_here(error: Exception) -> bool:
+    """Return whether a line of this package raised an error, and no library that it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    package = __name__.partition(".")[0]
+    module = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+    return module.partition(".")[0] == package
+
+
 def check_declared(path: Path, size: int) -> None:
     """**Raises:** `FileFormatError` if a file declares more than a file of its size can hold."""
     if size > limits.unpacked(path.stat().st_size):
-        raise damaged(
-            path, f"it declares arrays of {size} bytes, and is not that large"
+        raise FileFormatError(
+            f"'{path}' is damaged or almost empty: it declares arrays of {size} bytes or more, "
+            "and is not that large; write it without compression, or without what is empty."
         )

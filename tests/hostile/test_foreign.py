@@ -1,0 +1,139 @@
+"""Wrong values end in a sentence of this package, at the call that was wrong."""
+
+import jax
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.recordings.sampling import without_drift
+
+
+class Leaky(hj.Chart):
+    states = ("v",)
+
+    def field(self, t, q, u):
+        return (1.2 - q[0] + u[0],)
+
+
+class Neuron(hj.HybridSystem):
+    def charts(self):
+        return {"below": Leaky()}
+
+    def transitions(self):
+        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
+        after = lambda t, q, u: (0.0,)  # noqa: E731
+        return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
+
+
+def refused(match, call):
+    with pytest.raises(hj.DefinitionError, match=match):
+        call()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: hj.Drawing(3),
+        lambda: hj.Drawing([[0, 0], [1, 1]]),
+        lambda: hj.Drawing({1: [[0, 0], [1, 1]]}),
+        lambda: hj.Drawing({"leg": "x"}),
+        lambda: hj.Drawing({"leg": None}),
+        lambda: hj.Drawing({"leg": [[0, 0], [1]]}),
+        lambda: hj.Drawing({}, circles=3),
+        lambda: hj.Drawing({}, velocity="x"),
+        lambda: hj.Drawing({}, body=["x"]),
+        lambda: hj.Drawing.spring("a", (1, 2)),
+        lambda: hj.Drawing.spring((0, 0), (1, 2), "wide"),
+        lambda: hj.Drawing.spring((0, 0, 0), (1, 2, 3)),
+    ],
+)
+def test_drawings(call):
+    refused("Drawing: ", call)
+
+
+@pytest.mark.parametrize("maps", [0, None, "map.zarr", {}, [1]])
+def test_figures_of_sweeps(maps):
+    refused(
+        "`maps` must be the dataset that `hj.sweep` returns",
+        lambda: hj.plot.sweep(maps),
+    )
+
+
+@pytest.mark.parametrize("amplitude", [{}, [], "x", lambda f: {}, lambda f: f[:2]])
+def test_amplitudes(amplitude):
+    refused("`amplitude` must", lambda: hj.multisine(4, 8, amplitude=amplitude))
+
+
+@pytest.mark.parametrize("solver", [3, [], {"below": 3}, np.zeros(3), hj.Radau])
+def test_solvers(solver):
+    class Stiff(Leaky):
+        pass
+
+    class Other(Neuron):
+        def charts(self):
+            return {"below": Stiff()}
+
+    Stiff.solver = solver
+    for system in (lambda: Neuron(solver=solver), Other):
+        refused(
+            "a solver must be `hj.Radau",
+            lambda system=system: hj.find_limit_cycle(
+                system(), hj.Guess("below", (0.5,))
+            ),
+        )
+
+
+def test_sweeps_of_systems_without_parameters():
+    cycle = hj.find_limit_cycle(Neuron(), hj.Guess("below", (0.5,)))
+    for systems in ([Neuron(), Neuron()], Neuron()):
+        refused(
+            "Neuron has no parameters", lambda x=systems: hj.find_limit_cycles(x, cycle)
+        )
+
+
+def test_names_that_no_file_can_have(tmp_path):
+    name = tmp_path / ("n" * 300)
+    htf = hj.testing.synthetic_ldtp().htf([0.1, 0.2])
+    for call in (
+        lambda: hj.read_recording(f"{name}.csv"),
+        lambda: hj.load(f"{name}.npz"),
+        lambda: hj.save(f"{name}.npz", htf),
+        lambda: hj.plot.save(name, hj.plot.bode(htf)),
+    ):
+        refused("cannot (read|write) .*: File name too long", call)
+
+
+def test_bandwidths_and_drifts_beyond_all_records():
+    time = np.arange(4000) / 100
+    x = 1 + np.sin(2 * np.pi * time)
+    recording = hj.Recording(time, {"x": x + 0.01 * time})
+    phase = hj.recordings.estimate_phase(recording, hj.Crossing("x", "rising", 1.2))
+    flat = [
+        without_drift(recording, phase, "x", cycles).trials[0].values
+        for cycles in (1e9, 1e300)
+    ]
+    np.testing.assert_allclose(*flat, rtol=1e-6)  # a straight line is left out
+    slopes = (np.polyfit(time, values, 1)[0] for values in (flat[1][:, 0], x))
+    np.testing.assert_allclose(*slopes, atol=2e-4)
+    refused(
+        "`drift` must be two cycles or more",
+        lambda: hj.Record(np.ones((8, 1)), np.ones((8, 1)), n_sections=4, drift=1e-20),
+    )
+
+
+def test_settings_of_jax_for_the_lines_of_users():
+    """A user may forbid that JAX broadcasts and converts; lines of this package do both."""
+
+    def results():
+        cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
+        model = hj.linearize(cycle, hj.ClockPhase(4), outputs="yM")
+        design = hj.multisine(4, 8, (0, 1.9)).scaled(0.001)
+        data = hj.run_experiments(cycle, hj.ClockPhase(4), design, "yM")
+        estimate = hj.estimate_htf(data, harmonics=0)
+        print(cycle, model, data.summary())
+        return cycle.multipliers, model.htf([0.1, 0.3]).H, estimate.H
+
+    expected = results()
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        for x, y in zip(results(), expected, strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12)
