@@ -17,6 +17,7 @@ from jaxtyping import Float, Inexact
 from .._core.executor import for_each_row, namespace
 from ..systems.solver import Method
 from .arrays import AnyTimes, Array, States, Times
+from .halfway import halfway
 
 
 LaneField = Callable[[Array, Array], Array]
@@ -39,6 +40,10 @@ class Step(NamedTuple):
     """Embedded estimate: the error is a power of it, relative to the size of what changes."""
     error: States
     """Estimate of the error, however little is excited."""
+    bend: States
+    """State halfway, less that of the cubic Hermite interpolant."""
+    twist: States
+    """Rate halfway, less that of this interpolant, times h."""
 
 
 def take_step(
@@ -59,12 +64,14 @@ def take_step(
         return _implicit_step(method, field, t, q, h, still)
     unroll = unroll or q.shape[1] >= _UNROLLED_LANES
     K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
-    weights = np.array(method.b), np.array(method.error)
-    change, error = (
-        _combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights
+    combined = _combine if unroll else lambda w, K: jnp.tensordot(w, K, 1)
+    error = h * combined(np.array(method.error), K)
+    end = q + h * combined(np.array(method.b), K)
+    f1 = field(t + h, end)
+    bend, twist = (
+        h * (combined(w[:-1], K) + float(w[-1]) * f1) for w in halfway(method)
     )
-    end = q + h * change
-    return Step(end, K[0], field(t + h, end), h * error, h * error)
+    return Step(end, K[0], f1, error, error, bend, twist)
 
 
 def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
@@ -189,7 +196,11 @@ def _implicit_step(
     local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
     estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     end = q + change
-    return Step(end, field(t, q), field(t + h, end), estimate, local)
+    f1 = field(t + h, end)
+    bend, twist = (
+        jnp.tensordot(x[:-1], w, 1) + float(x[-1]) * h * f1 for x in halfway(method)
+    )
+    return Step(end, field(t, q), f1, estimate, local, bend, twist)
 
 
 def step_along(
