@@ -128,6 +128,15 @@ def interpolate(x, h, q0, q1, f0, f1):
     )
 
 
+def halfway_cubic(q0, q1, f0, f1, h) -> tuple[Array, Array]:
+    """The cubic and its rate halfway through a step of length h, from the states at its ends and
+    the fields there."""
+    xp = namespace(q1)
+    state = 0.5 * (q0 + q1) + 0.125 * h * (f0 - f1)
+    rate = 1.5 * (q1 - q0) / xp.where(h == 0, 1.0, h) - 0.25 * (f0 + f1)
+    return state, rate
+
+
 def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
     """Bounds of a function over a step that is as far from its cubic interpolant as the margin: the
     Bernstein coefficients of the quartics that are so far from it halfway."""

@@ -10,7 +10,7 @@ from ..._core.executor import cond, namespace, put
 from ..._core.lanes import pick, put_rows, take_rows
 from ...systems.structure import Structure
 from ..arrays import AnyTimes, Array, Mask, Padded, States, Times
-from ..cubic import NEAR, bounds, root_near_end
+from ..cubic import NEAR, bounds, halfway_cubic, root_near_end
 from ..events import INSTANT, width
 from ..lanes import Lanes, for_each_chart, only
 from ..runge_kutta import Step, rounding_error
@@ -61,18 +61,23 @@ class Landing(NamedTuple):
     lands: Mask
     error: Times
     """Error of the way from the step's end to the zero, relative to the tolerance."""
+    middle: States
+    """State halfway from the start of the step to the zero."""
+    rate: States
+    """Its rate there."""
 
 
 def land(
     flow: ChartFlow,
     before: Watch,
+    q: States,
     step: Step,
     allowed: States,
     t: Times,
     aim: Aim,
     span: Times,
 ) -> Landing:
-    """The zero of the function aimed at, before or beyond the end of a step from t.
+    """The zero of the function aimed at, before or beyond the end of a step from (t, q).
 
     `before` are the watched functions at its start, `allowed` the errors that it may have.
     """
@@ -96,12 +101,15 @@ def land(
     error = xp.max(end.error / allowed * weight, axis=0)
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
+    middle, rate = _halfway(q, step, end.q, end.f, tau, tau + end.past)
     return Landing(
         xp.where(lands, end.q, step.q),
         xp.where(lands, end.f, step.f1),
         xp.where(near, end.past, by_newton),
         lands,
         xp.where(lands, xp.abs(error), 0.0),
+        xp.where(lands, middle, step.middle),
+        xp.where(lands, rate, step.rate),
     )
 
 
@@ -137,7 +145,7 @@ def attempt(
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
             out = out._replace(along=along)
-        end = Landing(step.q, step.f1, zero, no, zero)
+        end = Landing(step.q, step.f1, zero, no, zero, step.middle, step.rate)
         if rows:
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
@@ -146,7 +154,14 @@ def attempt(
                 end = cond(
                     (which >= 0).any(),
                     lambda: land(
-                        flow.only(which >= 0), before, step, allowed, t, goal, task.span
+                        flow.only(which >= 0),
+                        before,
+                        q,
+                        step,
+                        allowed,
+                        t,
+                        goal,
+                        task.span,
                     ),
                     lambda: end,
                 )
@@ -154,7 +169,7 @@ def attempt(
             after = cond(
                 present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
             )
-            margin = _margin(flow, before, after, q, step, end, t, tau, moved, task)
+            margin = _margin(flow, before, after, end, t, moved, task.span)
             bent = _bent(before, after, margin)
             chosen = (np.array(rows)[:, None] == which) & end.lands
             # (Where events coincide, the step to the second is rounding, and tells no speed.)
@@ -246,40 +261,42 @@ def _errors(
     return allowed, xp.where(finite, error, xp.inf)
 
 
+def _halfway(
+    q: States, step: Step, end: States, f: States, tau: Times, moved: Times
+) -> tuple[States, States]:
+    """The state and its rate halfway from q to the `end`, where the field is f and which has
+    `moved` a little farther or less far than the step over tau.
+
+    They are those of the cubic, and that by which the step differs from its own, which grows as h^4
+    and h^3.
+    """
+    xp = namespace(q)
+    middle, rate = halfway_cubic(q, step.q, step.f0, step.f1, tau)
+    bend, twist = step.middle - middle, step.rate - rate
+    share = moved / xp.where(tau == 0, 1.0, tau)
+    middle, rate = halfway_cubic(q, end, step.f0, f, moved)
+    return middle + bend * share**4, rate + twist * share**3
+
+
 def _margin(
     flow: ChartFlow,
     before: Watch,
     after: Watch,
-    q: States,
-    step: Step,
     end: Landing,
     t: AnyTimes,
-    tau: AnyTimes,
     moved: AnyTimes,
-    task: Task,
+    span: Times,
 ) -> Float[Array, "W L"]:
-    """How far watched functions may be from their cubic interpolants: by the values and rates that
-    they have halfway, less those of the interpolants, beyond rounding errors.
-
-    `q` is the state at the start of the step, which covers tau; of lanes that land, the way to the
-    zero has `moved` a little farther or less far.
-    """
-    xp = namespace(q)
-    # The state halfway: that of the cubic, and what is left of it, which grows as h^4 and h^5.
-    share = moved / xp.where(tau == 0, 1.0, tau)
-    bend, twist = step.bend * share**4, step.twist * share**5
-    f0, f1 = moved * step.f0, moved * end.f
-    middle = 0.5 * (q + end.q) + 0.125 * (f0 - f1) + bend
-    change = 1.5 * (end.q - q) - 0.25 * (f0 + f1) + twist
-    rate = change / xp.where(moved == 0, 1.0, moved)
-    true = flow.watch(t + 0.5 * moved, middle, rate)
-    # Those of the functions themselves.
+    """How far watched functions may be from their cubic interpolants over a way that has `moved`:
+    by their values and rates halfway, less those of the interpolants, beyond rounding errors."""
+    xp = namespace(moved)
+    true = flow.watch(t + 0.5 * moved, end.middle, end.rate)
     d0, d1 = moved * before.rate, moved * after.rate
     value = 0.5 * (before.value + after.value) + 0.125 * (d0 - d1)
     slope = 1.5 * (after.value - before.value) - 0.25 * (d0 + d1)
     missing = xp.abs(true.value - value) + 0.5 * xp.abs(moved * true.rate - slope)
     fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
-    return xp.maximum(missing - width(t, task.span, fastest), 0.0)
+    return xp.maximum(missing - width(t, span, fastest), 0.0)
 
 
 def _bent(before: Watch, after: Watch, margin: Float[Array, "W L"]) -> Mask:
