@@ -20,6 +20,11 @@ TOUCH = 1e-10
 NEAR = 1e-2
 
 
+# Points of a step at which a guard is compared with the error of its cubic. Fewer: it may fall
+# through zero between them where the cubic is far from it. More: time.
+_POINTS = tuple(k / 8 for k in range(1, 8))
+
+
 class CubicCrossing(NamedTuple):
     """Zeros and extrema of a guard within a step."""
 
@@ -28,7 +33,8 @@ class CubicCrossing(NamedTuple):
     touch: Bool[Array, "*shape"]
     """The guard touches zero without a clear crossing."""
     near: Bool[Array, "*shape"]
-    """It comes so close to zero without crossing that the interpolant cannot be trusted."""
+    """It comes so close to zero, before the first crossing, that the interpolant cannot be
+    trusted."""
 
 
 Values = Float[Array, "*shape"]
@@ -36,11 +42,17 @@ Flags = Bool[Array, "*shape"]
 
 
 def first_crossing(
-    v0: Values, v1: Values, d0: Values, d1: Values, armed: Flags
+    v0: Values,
+    v1: Values,
+    d0: Values,
+    d1: Values,
+    armed: Flags,
+    margin: Values | float = 0.0,
 ) -> CubicCrossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 
-    A guard that is not armed at the start counts only after it has become positive.
+    A guard that is not armed at the start counts only after it has become positive. Halfway it may
+    be as far from the cubic as the `margin`.
     """
     xp, rise = namespace(v1), v1 - v0
     b, c = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
@@ -74,14 +86,26 @@ def first_crossing(
         guess = s - _divide(value, slope(s))
         s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
+    position = xp.where(crosses, s, xp.inf)
     scale = xp.maximum(xp.abs(v0), xp.abs(v1))
     small = TOUCH * scale
     touch = near = xp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
-        touch = touch | (dips & (xp.abs(value) <= small))
+        sure = _beside(node, margin) <= small
+        touch = touch | (dips & (xp.abs(value) <= small) & sure)
         near = near | (dips & (value > small) & (value < NEAR * scale))
-    return CubicCrossing(xp.where(crosses, s, xp.inf), touch, near & ~crosses)
+    # Before the first crossing, the guard may have another sign than the cubic.
+    for node in (sa, sb, *_POINTS):
+        unsure = xp.abs(cubic(node)) < _beside(node, margin)
+        near = near | (unsure & (node > 0) & (node < 1) & (node < position))
+    return CubicCrossing(position, touch, near)
+
+
+def _beside(s, margin):
+    """The distance at s of a function from its cubic interpolant that is the margin at 1/2: zero to
+    second order at the ends."""
+    return 16 * (s * (1 - s)) ** 2 * margin
 
 
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
@@ -104,9 +128,25 @@ def interpolate(x, h, q0, q1, f0, f1):
     )
 
 
-def control_points(v0, v1, d0, d1) -> tuple[Array, ...]:
-    """The cubic's Bernstein coefficients: it stays between the smallest and the largest of them."""
-    return v0, v0 + d0 / 3, v1 - d1 / 3, v1
+def halfway_cubic(q0, q1, f0, f1, h) -> tuple[Array, Array]:
+    """The cubic and its rate halfway through a step of length h, from the states at its ends and
+    the fields there."""
+    xp = namespace(q1)
+    state = 0.5 * (q0 + q1) + 0.125 * h * (f0 - f1)
+    rate = 1.5 * (q1 - q0) / xp.where(h == 0, 1.0, h) - 0.25 * (f0 + f1)
+    return state, rate
+
+
+def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
+    """Bounds of a function over a step that is as far from its cubic interpolant as the margin: the
+    Bernstein coefficients of the quartics that are so far from it halfway."""
+    xp = namespace(v1)
+    first, last = v0 + d0 / 4, v1 - d1 / 4
+    middle = 0.5 * (v0 + v1) + (d0 - d1) / 6
+    beside = 8 / 3 * margin
+    low = xp.minimum(xp.minimum(v0, first), xp.minimum(last, v1))
+    high = xp.maximum(xp.maximum(v0, first), xp.maximum(last, v1))
+    return xp.minimum(low, middle - beside), xp.maximum(high, middle + beside)
 
 
 def _divide(a, b):

@@ -77,7 +77,8 @@ def step_along(
     rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(
         t, q, u, h, along, some=some
     )
-    return Step(*rows[:5]), rows[5], rows[6]
+    *step, end, estimate = rows
+    return Step(*step), end, estimate
 
 
 def linear_step(

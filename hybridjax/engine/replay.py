@@ -38,7 +38,7 @@ from .lanes import (
     needed,
     only,
 )
-from .runge_kutta import Step, take_step
+from .runge_kutta import take_step
 from .target import Target
 from .watch import ChartFlow, slopes
 
@@ -125,15 +125,16 @@ def _advance(
         method = flow.method
         crossing = jnp.where(here, which, -1)
         # (A branch of its own, lest XLA masks the states again in every stage.)
-        step = jax.lax.cond(
-            here.any(),
-            lambda: take_step(method, flow.field, t0, q0, h0, unroll, still.field),
-            lambda: Step(*[q0] * 5),
-        )
-        q1, t1 = step.q, t0 + h0
+
+        def step():
+            end = take_step(method, flow.field, t0, q0, h0, unroll, still.field)
+            return end.q, end.f1
+
+        q1, f1 = jax.lax.cond(here.any(), step, lambda: (q0, q0))
+        t1 = t0 + h0
 
         def land():
-            zero = flow.locate(t1, q1, step.f1, crossing)
+            zero = flow.locate(t1, q1, f1, crossing)
             return t1 + zero.past, zero.q
 
         if flow.rows:

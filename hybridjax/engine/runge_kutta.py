@@ -17,6 +17,8 @@ from jaxtyping import Float, Inexact
 from .._core.executor import for_each_row, namespace
 from ..systems.solver import Method
 from .arrays import AnyTimes, Array, States, Times
+from .cubic import halfway_cubic
+from .halfway import halfway
 
 
 LaneField = Callable[[Array, Array], Array]
@@ -39,6 +41,10 @@ class Step(NamedTuple):
     """Embedded estimate: the error is a power of it, relative to the size of what changes."""
     error: States
     """Estimate of the error, however little is excited."""
+    middle: States
+    """State halfway, of lower order."""
+    rate: States
+    """Rate halfway."""
 
 
 def take_step(
@@ -59,12 +65,16 @@ def take_step(
         return _implicit_step(method, field, t, q, h, still)
     unroll = unroll or q.shape[1] >= _UNROLLED_LANES
     K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
-    weights = np.array(method.b), np.array(method.error)
-    change, error = (
-        _combine(w, K) if unroll else jnp.tensordot(w, K, 1) for w in weights
-    )
-    end = q + h * change
-    return Step(end, K[0], field(t + h, end), h * error, h * error)
+    combined = _combine if unroll else lambda w, K: jnp.tensordot(np.array(w), K, 1)
+    error = h * combined(np.array(method.error), K)
+    end = q + h * combined(np.array(method.b), K)
+    f1 = field(t + h, end)
+    weights = halfway(method)
+    if weights is None:
+        middle = halfway_cubic(q, end, K[0], f1, h)
+    else:
+        middle = q + h * combined(weights.state, K), combined(weights.rate, K)
+    return Step(end, K[0], f1, error, error, *middle)
 
 
 def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
@@ -189,7 +199,14 @@ def _implicit_step(
     local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
     estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     end = q + change
-    return Step(end, field(t, q), field(t + h, end), estimate, local)
+    f0, f1 = field(t, q), field(t + h, end)
+    halves = halfway(method)
+    if halves is None:
+        middle = halfway_cubic(q, end, f0, f1, h)
+    else:
+        before, rate = (jnp.tensordot(np.array(x), w, 1) for x in halves)
+        middle = q + before, rate / jnp.where(h == 0, 1.0, h)
+    return Step(end, f0, f1, estimate, local, *middle)
 
 
 def step_along(

@@ -11,7 +11,6 @@ from ..arrays import Array, Index, Mask, Times
 from ..cubic import CubicCrossing, first_crossing
 from ..events import INSTANT, width
 from ..lanes import Lanes
-from ..watch import Watch
 from .attempt import LANDING, LANDING_TRIES
 from .state import Aim, Attempt, State, Task
 
@@ -92,14 +91,14 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
     looked_at, moved = fresh | lands, step_length(aim, new)
-    crossing = _crossing(looked_at, state.watched, end, moved, state.ready)
+    crossing = _crossing(looked_at, state, new, moved)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
     positions = xp.where(chosen | at_end, xp.inf, crossing.position)
     position, bent = xp.min(positions, axis=0), fresh & new.bent
     crosses = looked_at & xp.isfinite(position) & ~bent
-    refine = bent | (looked_at & ~crosses & (crossing.near & ~chosen).any(axis=0))
+    refine = bent | (looked_at & ~crosses & crossing.near.any(axis=0))
     lands = lands & ~crosses & ~refine
     return Verdict(
         plain=fresh & ~crosses & ~refine & ~lands,
@@ -139,12 +138,13 @@ def of_row(x: Array, which: Index) -> Times:
     return pick(x, range(len(x)), which)
 
 
-def _crossing(
-    some: Mask, start: Watch, end: Watch, moved: Times, ready: Bool[Array, "W L"]
-) -> CubicCrossing:
+def _crossing(some: Mask, state: State, new: Attempt, moved: Times) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
+    start, end, ready = state.watched, new.watched, state.ready
     xp = namespace(ready)
     cubic = start.value, end.value, moved * start.rate, moved * end.rate
     no, nowhere = xp.zeros_like(ready), xp.full_like(end.value, xp.inf)
     none = CubicCrossing(nowhere, no, no)
-    return cond(some.any(), lambda: first_crossing(*cubic, ready), lambda: none)
+    return cond(
+        some.any(), lambda: first_crossing(*cubic, ready, new.margin), lambda: none
+    )

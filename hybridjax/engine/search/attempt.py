@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..._core.executor import cond, namespace, put
-from ..._core.lanes import pick, take_rows
+from ..._core.lanes import pick, put_rows, take_rows
 from ...systems.structure import Structure
 from ..arrays import AnyTimes, Array, Mask, Padded, States, Times
-from ..cubic import NEAR, control_points, root_near_end
+from ..cubic import NEAR, bounds, halfway_cubic, root_near_end
 from ..events import INSTANT, width
 from ..lanes import Lanes, for_each_chart, only
 from ..runge_kutta import Step, rounding_error
@@ -26,9 +26,10 @@ Present = Bool[Array, ""]
 # Higher: crossings whose times are right to five digits are called grazing. Lower: derivatives of
 # crossing times lose more digits before a grazing is reported.
 SLOW = 1e-5
-# A step is too long for a watched function if halfway its cubic interpolant misses it by more than
-# this part of its size. Higher: narrow dips below zero are missed. Lower: more steps.
-_BEND = 2e-3
+# A step is too long for a watched function if the cubic interpolant misses it by more than this part
+# of its size. Higher: functions that turn many times within a step are taken for their interpolant,
+# and events are missed. Lower: more steps.
+_BEND = 1e-2
 # The error of a derivative is estimated by a step from a state that is shifted by this part of its
 # size. Higher: second derivatives contribute. Lower: rounding errors do.
 _ASIDE = 1e-4
@@ -60,18 +61,23 @@ class Landing(NamedTuple):
     lands: Mask
     error: Times
     """Error of the way from the step's end to the zero, relative to the tolerance."""
+    middle: States
+    """State halfway from the start of the step to the zero."""
+    rate: States
+    """Its rate there."""
 
 
 def land(
     flow: ChartFlow,
     before: Watch,
+    q: States,
     step: Step,
     allowed: States,
     t: Times,
     aim: Aim,
     span: Times,
 ) -> Landing:
-    """The zero of the function aimed at, before or beyond the end of a step from t.
+    """The zero of the function aimed at, before or beyond the end of a step from (t, q).
 
     `before` are the watched functions at its start, `allowed` the errors that it may have.
     """
@@ -95,12 +101,15 @@ def land(
     error = xp.max(end.error / allowed * weight, axis=0)
     fine = xp.abs(end.last) <= LANDING * xp.abs(tau + end.past) + INSTANT * span
     lands = near & fine & (share <= _LANDING_REACH) & (xp.abs(error) <= 1.0)
+    middle, rate = _halfway(q, step, end.q, end.f, tau, tau + end.past)
     return Landing(
         xp.where(lands, end.q, step.q),
         xp.where(lands, end.f, step.f1),
         xp.where(near, end.past, by_newton),
         lands,
         xp.where(lands, xp.abs(error), 0.0),
+        xp.where(lands, middle, step.middle),
+        xp.where(lands, rate, step.rate),
     )
 
 
@@ -115,8 +124,9 @@ def attempt(
     s, lanes, L = task.s, state.lanes, state.lanes.t.shape[0]
     xp = namespace(lanes.t)
     zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
+    nothing = no_events(s, lanes.t)
     empty = Attempt(
-        lanes.q, no_events(s, lanes.t), zero, zero, no, no, no, state.along, yes
+        lanes.q, nothing, nothing.rate, zero, zero, no, no, no, state.along, yes
     )
 
     def work(a, here, out):
@@ -135,7 +145,7 @@ def attempt(
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
             out = out._replace(along=along)
-        end = Landing(step.q, step.f1, zero, no, zero)
+        end = Landing(step.q, step.f1, zero, no, zero, step.middle, step.rate)
         if rows:
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
@@ -144,7 +154,14 @@ def attempt(
                 end = cond(
                     (which >= 0).any(),
                     lambda: land(
-                        flow.only(which >= 0), before, step, allowed, t, goal, task.span
+                        flow.only(which >= 0),
+                        before,
+                        q,
+                        step,
+                        allowed,
+                        t,
+                        goal,
+                        task.span,
                     ),
                     lambda: end,
                 )
@@ -152,16 +169,18 @@ def attempt(
             after = cond(
                 present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
             )
-            bent = _bent(flow, before, after, (q, step.f0), end, t, moved, task.span)
+            margin = _margin(flow, before, after, end, t, moved, task.span)
+            bent = _bent(before, after, margin)
             chosen = (np.array(rows)[:, None] == which) & end.lands
             # (Where events coincide, the step to the second is rounding, and tells no speed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
             far, slow = _clearance(
-                before, after, moved, take_rows(state.ready, rows), judged
+                before, after, margin, moved, take_rows(state.ready, rows), judged
             )
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
+                margin=put_rows(out.margin, rows, here, margin),
                 past=xp.where(here, end.past, out.past),
                 lands=xp.where(here, end.lands, out.lands),
                 slow=xp.where(here, slow, out.slow),
@@ -201,7 +220,7 @@ def _step(
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
-    step = cond(present, plain, lambda: Step(*[q] * 5))
+    step = cond(present, plain, lambda: Step(*[q] * len(Step._fields)))
     if task.tangents is False:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
@@ -242,34 +261,66 @@ def _errors(
     return allowed, xp.where(finite, error, xp.inf)
 
 
-def _bent(
-    flow: ChartFlow, before: Watch, after: Watch, start, end, t, moved, span
-) -> Mask:
-    """Test whether the cubic interpolant misses a watched function halfway, or there is none.
-    `start`: the state and the field at the start of the step."""
-    xp, (q, f0) = namespace(moved), start
-    middle = 0.5 * (q + end.q) + 0.125 * moved * (f0 - end.f)
-    true = flow.watch(t + 0.5 * moved, middle, end.f).value
-    cubic = 0.5 * (before.value + after.value)
-    cubic = cubic + 0.125 * (moved * before.rate - moved * after.rate)
-    size = xp.abs(before.value) + xp.abs(after.value) + xp.abs(true)
+def _halfway(
+    q: States, step: Step, end: States, f: States, tau: Times, moved: Times
+) -> tuple[States, States]:
+    """The state and its rate halfway from q to the `end`, where the field is f and which has
+    `moved` a little farther or less far than the step over tau.
+
+    They are those of the cubic, and that by which the step differs from its own, which grows as h^4
+    and h^3.
+    """
+    xp = namespace(q)
+    middle, rate = halfway_cubic(q, step.q, step.f0, step.f1, tau)
+    bend, twist = step.middle - middle, step.rate - rate
+    share = moved / xp.where(tau == 0, 1.0, tau)
+    middle, rate = halfway_cubic(q, end, step.f0, f, moved)
+    return middle + bend * share**4, rate + twist * share**3
+
+
+def _margin(
+    flow: ChartFlow,
+    before: Watch,
+    after: Watch,
+    end: Landing,
+    t: AnyTimes,
+    moved: AnyTimes,
+    span: Times,
+) -> Float[Array, "W L"]:
+    """How far watched functions may be from their cubic interpolants over a way that has `moved`:
+    by their values and rates halfway, less those of the interpolants, beyond rounding errors."""
+    xp = namespace(moved)
+    true = flow.watch(t + 0.5 * moved, end.middle, end.rate)
+    d0, d1 = moved * before.rate, moved * after.rate
+    value = 0.5 * (before.value + after.value) + 0.125 * (d0 - d1)
+    slope = 1.5 * (after.value - before.value) - 0.25 * (d0 + d1)
+    missing = xp.abs(true.value - value) + 0.5 * xp.abs(moved * true.rate - slope)
     fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
-    bent = xp.abs(true - cubic) > _BEND * size + width(t, span, fastest)
+    return xp.maximum(missing - width(t, span, fastest), 0.0)
+
+
+def _bent(before: Watch, after: Watch, margin: Float[Array, "W L"]) -> Mask:
+    """Test whether a watched function is not resolved by its cubic interpolant, or there is
+    none."""
+    xp = namespace(margin)
+    size = xp.abs(before.value) + xp.abs(after.value)
+    bent = (margin > _BEND * size) | xp.isnan(margin)
     return (bent | xp.isnan(after.value) | xp.isnan(after.rate)).any(axis=0)
 
 
 def _clearance(
-    before: Watch, after: Watch, moved: AnyTimes, armed: Flags, judged: Flags
+    before: Watch,
+    after: Watch,
+    margin: Float[Array, "W L"],
+    moved: AnyTimes,
+    armed: Flags,
+    judged: Flags,
 ) -> tuple[Flags, Mask]:
-    """Test whether watched functions stay away from zero, by bounds of their interpolants, and find
-    lanes that land on a `judged` zero at a vanishing speed."""
+    """Test whether watched functions stay away from zero, by bounds of their interpolants and the
+    margin of these, and find lanes that land on a `judged` zero at a vanishing speed."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate
-    points = control_points(*ends)
-    low = xp.minimum(xp.minimum(points[0], points[1]), xp.minimum(points[2], points[3]))
-    high = xp.maximum(
-        xp.maximum(points[0], points[1]), xp.maximum(points[2], points[3])
-    )
+    low, high = bounds(*ends, margin)
     far = xp.where(
         armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0
     )

@@ -150,6 +150,8 @@ class Attempt(NamedTuple):
     """The state at its end: on the zero that the lane aims at, if it lands."""
     watched: Watch
     """The watched functions there."""
+    margin: Float[Array, "W L"]
+    """How far watched functions may be from their cubic interpolants over the step."""
     error: Times
     """Estimate of the step's error, relative to the tolerance."""
     past: Times
