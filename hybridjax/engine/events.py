@@ -52,7 +52,38 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     """
     zero = width(lanes.t, span, watched.rate)
     armed = (lanes.armed & (watched.value >= -zero)[:-1]) | (watched.value > zero)[:-1]
-    return lanes._replace(armed=armed & belongs(s, lanes.chart)[:-1])
+    armed = armed & belongs(s, lanes.chart)[:-1]
+    waiting = await_schedules(s, lanes.armed, lanes.t, lanes.t)
+    return lanes._replace(armed=with_schedules(s, armed, waiting))
+
+
+def with_schedules(
+    s: Structure, armed: Bool[Array, "G L"], scheduled: Bool[Array, "G L"]
+) -> Bool[Array, "G L"]:
+    """`armed` of guards, and of `scheduled` events, in every chart."""
+    by_clock = (s.clocks >= 0)[:, None]
+    return namespace(armed).where(by_clock, scheduled, armed)
+
+
+def await_schedules(
+    s: Structure, armed: Bool[Array, "G L"], before: Times, t: Times
+) -> Bool[Array, "G L"]:
+    """`armed` after a step from `before` to t, with all scheduled events but those that are due at
+    both times: an event that has happened is not armed until its time is over, so that it happens
+    once; another one that is due at the same time is still to come."""
+    xp = namespace(t)
+    for g, transition in enumerate(s.transitions):
+        if isinstance(transition.guard, Scheduled):
+            due, (_, period) = transition.guard.nearest(before), transition.guard.numbers(t)
+            away = xp.maximum(xp.abs(due - before), xp.abs(due - t))
+            armed = put(armed, g, armed[g] | (away > SAME_TIME * period))
+    return armed
+
+
+def overdue(watched: Watch, span: Times) -> Bool[Array, "G L"]:
+    """Guards that are beyond zero, by more than rounding of times, and move on from there."""
+    value, rate = watched.value[:-1], watched.rate[:-1]
+    return (rate < 0) & (value < SAME_TIME * span * rate)
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
@@ -72,24 +103,32 @@ def rearm(
     span: Times,
     u: Inputs,
     residue: Times,
+    crossed: Bool[Array, "G L"],
 ) -> Lanes:
     """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
-    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
-    until it has left zero. The one exception are events at the same instant: where another guard of
-    the old chart was at its zero, too (`together`), a guard other than the one that fired, at zero
-    and falling, is still due.
+    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, and
+    rises, waits until it has left zero. One that falls is due at once, unless it is the guard that
+    was just crossed: the one that fired, or one that was `crossed` with it, at zero before the
+    reset, too. (Where another guard of the old chart was at its zero, too, `together`, it is due
+    nevertheless.) A guard that the reset puts beyond zero, and that falls, is due at once (see
+    `overdue`).
     """
     xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
-    zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
+    zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
-    due = together & other & (xp.abs(value) <= zero) & (rate < 0)
-    armed = ((value > zero) | due) & belongs(s, lanes.chart)[:-1]
+    at_zero = xp.abs(value) <= xp.maximum(zero, SAME_TIME * span * xp.abs(rate))
+    due = other & at_zero & (value <= zero) & (rate < 0) & (together | ~crossed)
+    beyond = overdue(watched, span) & (value < -zero)
+    armed = ((value > zero) | due | beyond) & belongs(s, lanes.chart)[:-1]
+    clocks = np.append(s.clocks, -2)
+    happened = s.clocks[:, None] == xp.asarray(clocks)[fired]
+    armed = with_schedules(s, armed, lanes.armed & ~happened)
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
-def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G L"]:
+def guard_noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G L"]:
     """A bound on the rounding errors of the guards of the charts that lanes are in."""
 
     def work(a, here, out):
@@ -158,20 +197,22 @@ def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
 
 
 def next_schedule(
-    s: Structure, t: Times, chart: Index, end: Times
+    s: Structure, t: Times, chart: Index, end: Times, armed: Bool[Array, "G L"]
 ) -> tuple[Times, Index]:
-    """Time of the next scheduled event after t (infinity if there is none), and its transition.
+    """Time of the next scheduled event (infinity if there is none), and its transition.
 
-    Times that differ by rounding are one: an event that was due at t is past, and one that is due
-    at `end` happens at `end`.
+    Times that differ by rounding are one: an event that is due at t comes at once if it is `armed`
+    (it has not happened at t), and one that is due at `end` happens at `end`.
     """
     xp = namespace(t)
     best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
             offset, period = transition.guard.numbers(t)
-            k = xp.floor((t - offset) / period + SAME_TIME) + 1
-            time = offset + k * period
+            k = xp.floor((t - offset) / period + SAME_TIME)
+            past, later = offset + k * period, offset + (k + 1) * period
+            now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
+            time = xp.where(now, xp.maximum(past, t), later)
             time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
             sooner = (chart == s.chart_index(transition.source)) & (time < best)
             best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)

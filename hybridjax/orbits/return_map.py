@@ -255,7 +255,7 @@ class ReturnMap(eqx.Module):
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
-            steps = Tape(tape.h, tape.code, tape.t, None, None, None)
+            steps = Tape(tape.h, tape.code, tape.t, None, None, None, tape.at_once)
             return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)

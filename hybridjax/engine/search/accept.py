@@ -92,7 +92,9 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
     looked_at, moved = fresh | lands, step_length(aim, new)
-    crossing = _crossing(looked_at, state.watched, end, moved, state.ready)
+    # (Where an event is at once, nothing is crossed.)
+    ready = state.ready & ~aim.at_once
+    crossing = _crossing(looked_at & ~aim.at_once, state.watched, end, moved, ready)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)

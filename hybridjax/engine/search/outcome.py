@@ -1,11 +1,23 @@
 """Outcome of attempted steps: accepted states, events, and reasons to stop."""
 
+import numpy as np
 from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
 from ..arrays import Array, Index, Mask, Times
-from ..events import INSTANT, SAME_TIME, apply_resets, enabled, keep_pace, rearm, width
+from ..events import (
+    INSTANT,
+    SAME_TIME,
+    apply_resets,
+    await_schedules,
+    enabled,
+    guard_noise,
+    keep_pace,
+    rearm,
+    width,
+    with_schedules,
+)
 from ..lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..watch import Watch, watch
 from .accept import Verdict, accept, next_step, of_row, step_length
@@ -25,7 +37,8 @@ def without_events(
     t = xp.where(on_time, aim.due, lanes.t + moved)
     arrived = level | on_time
     pace = put(lanes.pace, 0, lanes.pace[0] + moved)
-    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
+    armed = await_schedules(task.s, lanes.armed, lanes.t, t)
+    lanes = Lanes(t, lanes.chart, new.q, armed, lanes.events, pace)
     h = next_step(state.h, aim, new.error, lanes, task)
     late = active & ~arrived & (t >= task.target.limit)
     code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
@@ -40,7 +53,8 @@ def without_events(
         arrived=state.arrived | arrived,
         i=state.i + 1,
     )
-    return end, Tape(moved, code, t, new.q, new.q, lanes.chart)
+    at_once = xp.zeros_like(active)
+    return end, Tape(moved, code, t, new.q, new.q, lanes.chart, at_once)
 
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
@@ -53,7 +67,9 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
     by_clock = verdict.plain & (aim.schedule >= 0)
-    fired = xp.where(fires, aim.which, xp.where(by_clock, aim.schedule, -1))
+    overdue = xp.where(aim.at_once, aim.schedule, -1)
+    happens = by_clock & enabled(s, t, new.q, task.u, overdue)
+    fired = xp.where(fires, aim.which, xp.where(happens, aim.schedule, -1))
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
@@ -100,7 +116,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(
         xp.int32
     )
-    return end, Tape(moved, code, t, new.q, after.q, after.chart)
+    at_once = aim.at_once & (fired >= 0)
+    return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once)
 
 
 def _after(
@@ -116,8 +133,11 @@ def _after(
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
     lanes, end, accepted, xp = state.lanes, new.watched, verdict.accepted, namespace(t)
     zero = width(t, task.span, end.rate)
-    ready = (state.ready & ((end.value > 0) | verdict.lands)) | (end.value > zero)
-    ready = xp.where(accepted, ready & ~verdict.chosen, state.ready)
+    stays = verdict.lands | aim.at_once
+    ready = (state.ready & ((end.value > 0) | stays)) | (end.value > zero)
+    row = np.arange(len(zero))[:, None]
+    chosen = verdict.chosen | (aim.at_once & (row == aim.schedule))
+    ready = xp.where(accepted, ready & ~chosen, state.ready)
     speed = xp.abs(of_row(end.rate, aim.which))
     on = state.approach.on
     slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
@@ -125,11 +145,13 @@ def _after(
     pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow)
     falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
+    t = xp.where(accepted, t, lanes.t)
+    waiting = await_schedules(task.s, lanes.armed, lanes.t, t)
     after = Lanes(
-        xp.where(accepted, t, lanes.t),
+        t,
         lanes.chart,
         xp.where(accepted, new.q, lanes.q),
-        ready[:-1],
+        with_schedules(task.s, ready[:-1], waiting),
         lanes.events + (fired >= 0),
         pace,
     )
@@ -149,11 +171,28 @@ def _reset(
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(of_row(watched.value, fired))
-        new = rearm(s, new, after, fired, together, task.span, task.u, residue)
+        crossed = _crossed(lanes, new, fired, task)
+        new = rearm(s, new, after, fired, together, task.span, task.u, residue, crossed)
         counts = xp.where(fires, level_counts(after, task.span), aimed)
         return new, _merge(fires, after, watched), counts
 
     return cond(fires.any(), work, lambda: (lanes, watched, aimed))
+
+
+def _crossed(lanes: Lanes, new: Lanes, fired: Index, task: Task) -> Bool[Array, "G L"]:
+    """Guards of the charts that lanes have just entered that were at zero before the reset, too,
+    where a guard fired: an event through a guard that the new chart also has.
+
+    A chart with another number of states has other ones.
+    """
+    s, xp = task.s, namespace(fired)
+    dims, by_clock = np.array(s.dims), np.append(s.clocks >= 0, True)
+    same = xp.asarray(dims)[lanes.chart] == xp.asarray(dims)[new.chart]
+    some = same & ~xp.asarray(by_clock)[fired]
+    before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, some)
+    noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, some)
+    zero = SAME_TIME * task.span * xp.abs(before.rate[:-1]) + noise
+    return some & (xp.abs(before.value[:-1]) <= zero)
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
