@@ -81,9 +81,8 @@ def await_schedules(
 
 
 def overdue(watched: Watch, span: Times) -> Bool[Array, "G L"]:
-    """Guards that are beyond zero, by more than rounding of times, and move on from there."""
-    value, rate = watched.value[:-1], watched.rate[:-1]
-    return (rate < 0) & (value < SAME_TIME * span * rate)
+    """Guards that are beyond zero, by more than rounding errors of times."""
+    return watched.value[:-1] < -SAME_TIME * span * abs(watched.rate[:-1])
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
@@ -97,6 +96,7 @@ def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
 def rearm(
     s: Structure,
     lanes: Lanes,
+    chart: Index,
     watched: Watch,
     fired: Index,
     together: Mask,
@@ -105,14 +105,15 @@ def rearm(
     residue: Times,
     crossed: Bool[Array, "G L"],
 ) -> Lanes:
-    """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
+    """Arm the guards of the charts that lanes have just entered, from `chart`, through the
+    transitions `fired`.
 
     A guard that is zero there, up to rounding and to the `residue` of the guard that fired, and
     rises, waits until it has left zero. One that falls is due at once, unless it is the guard that
     was just crossed: the one that fired, or one that was `crossed` with it, at zero before the
     reset, too. (Where another guard of the old chart was at its zero, too, `together`, it is due
-    nevertheless.) A guard that the reset puts beyond zero, and that falls, is due at once (see
-    `overdue`).
+    nevertheless.) A guard that the reset puts beyond zero is due at once (see `overdue`) if it was
+    armed before, in the same chart, or falls.
     """
     xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
@@ -120,7 +121,8 @@ def rearm(
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     at_zero = xp.abs(value) <= xp.maximum(zero, SAME_TIME * span * xp.abs(rate))
     due = other & at_zero & (value <= zero) & (rate < 0) & (together | ~crossed)
-    beyond = overdue(watched, span) & (value < -zero)
+    passed = (lanes.chart == chart) & lanes.armed
+    beyond = overdue(watched, span) & (value < -zero) & (passed | (rate < 0))
     armed = ((value > zero) | due | beyond) & belongs(s, lanes.chart)[:-1]
     clocks = np.append(s.clocks, -2)
     happened = s.clocks[:, None] == xp.asarray(clocks)[fired]
@@ -230,7 +232,7 @@ def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask
+    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask, span: Times
 ) -> tuple[Float[Array, "4 L"], Mask]:
     """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
     shrink with a sum that converges.
@@ -239,6 +241,8 @@ def keep_pace(
     """
     xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
+    # (Events at one time, which take each other's place, are apart by rounding.)
+    since = xp.where(event & (since <= INSTANT * span), 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)
     shrinks = (since < gap) | (
         since == 0

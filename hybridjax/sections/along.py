@@ -85,6 +85,7 @@ def flow_along(
     ends = rearm(
         s,
         arm(s, ends, watched, period),
+        ends.chart,
         watched,
         fired,
         none > 0,

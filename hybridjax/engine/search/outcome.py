@@ -67,8 +67,7 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
     by_clock = verdict.plain & (aim.schedule >= 0)
-    overdue = xp.where(aim.at_once, aim.schedule, -1)
-    happens = by_clock & enabled(s, t, new.q, task.u, overdue)
+    happens = by_clock & enabled(s, t, new.q, task.u, aim.schedule)
     fired = xp.where(fires, aim.which, xp.where(happens, aim.schedule, -1))
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
@@ -136,17 +135,17 @@ def _after(
     stays = verdict.lands | aim.at_once
     ready = (state.ready & ((end.value > 0) | stays)) | (end.value > zero)
     row = np.arange(len(zero))[:, None]
-    chosen = verdict.chosen | (aim.at_once & (row == aim.schedule))
-    ready = xp.where(accepted, ready & ~chosen, state.ready)
+    due = verdict.plain & (row == aim.schedule)
+    ready = xp.where(accepted, ready & ~verdict.chosen & ~due, state.ready)
     speed = xp.abs(of_row(end.rate, aim.which))
     on = state.approach.on
     slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
     passed = xp.where(accepted, step_length(aim, new), 0.0)
-    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow)
+    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span)
     falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
     t = xp.where(accepted, t, lanes.t)
-    waiting = await_schedules(task.s, lanes.armed, lanes.t, t)
+    waiting = await_schedules(task.s, lanes.armed, lanes.t, t) & ~due[:-1]
     after = Lanes(
         t,
         lanes.chart,
@@ -156,11 +155,18 @@ def _after(
         pace,
     )
     watched = _merge(accepted, end, state.watched)
-    return *_reset(after, watched, ready[-1], fired, together, task), zeno, slow
+    end = _reset(after, watched, ready[-1], fired, together, aim.at_once, task)
+    return *end, zeno, slow
 
 
 def _reset(
-    lanes: Lanes, watched: Watch, aimed: Mask, fired: Index, together: Mask, task: Task
+    lanes: Lanes,
+    watched: Watch,
+    aimed: Mask,
+    fired: Index,
+    together: Mask,
+    at_once: Mask,
+    task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
@@ -171,8 +177,19 @@ def _reset(
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(of_row(watched.value, fired))
-        crossed = _crossed(lanes, new, fired, task)
-        new = rearm(s, new, after, fired, together, task.span, task.u, residue, crossed)
+        crossed = _crossed(lanes, new, fired, task) & ~at_once
+        new = rearm(
+            s,
+            new,
+            lanes.chart,
+            after,
+            fired,
+            together,
+            task.span,
+            task.u,
+            residue,
+            crossed,
+        )
         counts = xp.where(fires, level_counts(after, task.span), aimed)
         return new, _merge(fires, after, watched), counts
 

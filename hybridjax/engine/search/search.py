@@ -144,10 +144,13 @@ def take_aim(state: State, task: Task) -> Aim:
     )
     due = xp.minimum(target.time, scheduled)
     schedule = xp.where(scheduled <= target.time, which, -1)
-    beyond = lanes.armed & overdue(state.watched, task.span) & ~approach.on
-    at_once = state.active & beyond.any(axis=0)
+    # Events at once: of guards that a reset has put beyond zero.
+    beyond = lanes.armed & overdue(state.watched, task.span)
+    at_once = state.active & ~approach.on & beyond.any(axis=0)
     due = xp.where(at_once, lanes.t, due)
-    schedule = xp.where(at_once, xp.argmax(beyond, axis=0).astype(xp.int32), schedule)
+    if s.transitions:
+        overdue_first = xp.argmax(beyond, axis=0).astype(xp.int32)
+        schedule = xp.where(at_once, overdue_first, schedule)
     left = xp.maximum(due - lanes.t, 0.0)
     pieces = xp.ceil(xp.where(xp.isfinite(left), left / state.h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
