@@ -3,6 +3,8 @@
 Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `replay.py`.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -74,7 +76,10 @@ def await_schedules(
     xp = namespace(t)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
-            due, (_, period) = transition.guard.nearest(before), transition.guard.numbers(t)
+            due, (_, period) = (
+                transition.guard.nearest(before),
+                transition.guard.numbers(t),
+            )
             away = xp.maximum(xp.abs(due - before), xp.abs(due - t))
             armed = put(armed, g, armed[g] | (away > SAME_TIME * period))
     return armed
@@ -93,44 +98,55 @@ def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
     return (source == chart) | (source == -1)
 
 
+class Entry(NamedTuple):
+    """The guards of the charts that lanes enter, as far as the charts before had them, too."""
+
+    known: Bool[Array, "G L"]
+    """Whether the chart before has this guard: in the same chart, or with the same value."""
+    armed: Bool[Array, "G L"]
+    """Whether that guard was armed."""
+
+
 def rearm(
     s: Structure,
     lanes: Lanes,
-    chart: Index,
     watched: Watch,
     fired: Index,
     together: Mask,
     span: Times,
     u: Inputs,
     residue: Times,
-    crossed: Bool[Array, "G L"],
+    entry: Entry,
 ) -> Lanes:
-    """Arm the guards of the charts that lanes have just entered, from `chart`, through the
-    transitions `fired`.
+    """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
-    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, and
-    rises, waits until it has left zero. One that falls is due at once, unless it is the guard that
-    was just crossed: the one that fired, or one that was `crossed` with it, at zero before the
-    reset, too. (Where another guard of the old chart was at its zero, too, `together`, it is due
-    nevertheless.) A guard that the reset puts beyond zero is due at once (see `overdue`) if it was
-    armed before, in the same chart, or falls.
+    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
+    until it has left zero, if it rises, or if it was crossed before (see `Entry`). Otherwise the
+    reset has put it there, and it is due at once if it falls, as it is if it was at its zero in
+    the old chart, together with the guard that fired.
+
+    A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
+    that the reset has led across it, or if it falls, and the old chart does not have it.
     """
     xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
-    at_zero = xp.abs(value) <= xp.maximum(zero, SAME_TIME * span * xp.abs(rate))
-    due = other & at_zero & (value <= zero) & (rate < 0) & (together | ~crossed)
-    passed = (lanes.chart == chart) & lanes.armed
-    beyond = overdue(watched, span) & (value < -zero) & (passed | (rate < 0))
-    armed = ((value > zero) | due | beyond) & belongs(s, lanes.chart)[:-1]
+    falls, late = rate < 0, overdue(watched, span) & (value < -zero)
+    at_zero = xp.abs(value) <= zero
+    due = together & other & at_zero & falls
+    put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
+    late = late & (entry.armed | (falls & ~entry.known))
+    armed = ((value > zero) | due | put | late) & belongs(s, lanes.chart)[:-1]
     clocks = np.append(s.clocks, -2)
     happened = s.clocks[:, None] == xp.asarray(clocks)[fired]
     armed = with_schedules(s, armed, lanes.armed & ~happened)
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
-def guard_noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G L"]:
+def guard_noise(
+    s: Structure, lanes: Lanes, u: Inputs, mask: Mask
+) -> Float[Array, "G L"]:
     """A bound on the rounding errors of the guards of the charts that lanes are in."""
 
     def work(a, here, out):

@@ -97,7 +97,9 @@ def replay(
     h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
     at_once = jnp.pad(at_once, fill).reshape(-1, _BLOCK, L)
     code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
-    (t, q, _), _ = jax.lax.scan(block, (lanes.t, lanes.q, lanes.chart), (h, code, at_once))
+    (t, q, _), _ = jax.lax.scan(
+        block, (lanes.t, lanes.q, lanes.chart), (h, code, at_once)
+    )
     return t, q
 
 

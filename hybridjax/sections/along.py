@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..engine import kernels, lanes
-from ..engine.events import arm, rearm
+from ..engine.events import Entry, arm, rearm
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.state import Moved
@@ -85,14 +85,13 @@ def flow_along(
     ends = rearm(
         s,
         arm(s, ends, watched, period),
-        ends.chart,
         watched,
         fired,
         none > 0,
         period,
         u,
         none,
-        none > 0,
+        Entry(ends.armed, ends.armed),
     )
     legs = Lanes(
         *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))

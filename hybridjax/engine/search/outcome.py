@@ -9,8 +9,10 @@ from ..arrays import Array, Index, Mask, Times
 from ..events import (
     INSTANT,
     SAME_TIME,
+    Entry,
     apply_resets,
     await_schedules,
+    belongs,
     enabled,
     guard_noise,
     keep_pace,
@@ -155,7 +157,7 @@ def _after(
         pace,
     )
     watched = _merge(accepted, end, state.watched)
-    end = _reset(after, watched, ready[-1], fired, together, aim.at_once, task)
+    end = _reset(after, watched, ready[-1], fired, together, task)
     return *end, zeno, slow
 
 
@@ -165,7 +167,6 @@ def _reset(
     aimed: Mask,
     fired: Index,
     together: Mask,
-    at_once: Mask,
     task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
@@ -177,39 +178,50 @@ def _reset(
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(of_row(watched.value, fired))
-        crossed = _crossed(lanes, new, fired, task) & ~at_once
-        new = rearm(
-            s,
-            new,
-            lanes.chart,
-            after,
-            fired,
-            together,
-            task.span,
-            task.u,
-            residue,
-            crossed,
-        )
+        entry = _entry(lanes, watched, new, task)
+        new = rearm(s, new, after, fired, together, task.span, task.u, residue, entry)
         counts = xp.where(fires, level_counts(after, task.span), aimed)
         return new, _merge(fires, after, watched), counts
 
     return cond(fires.any(), work, lambda: (lanes, watched, aimed))
 
 
-def _crossed(lanes: Lanes, new: Lanes, fired: Index, task: Task) -> Bool[Array, "G L"]:
-    """Guards of the charts that lanes have just entered that were at zero before the reset, too,
-    where a guard fired: an event through a guard that the new chart also has.
+def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
+    """The guards of the charts of lanes after resets, `new`, that the charts before had, too.
 
-    A chart with another number of states has other ones.
+    (Charts of other numbers of states have no guards in common.)
     """
-    s, xp = task.s, namespace(fired)
-    dims, by_clock = np.array(s.dims), np.append(s.clocks >= 0, True)
-    same = xp.asarray(dims)[lanes.chart] == xp.asarray(dims)[new.chart]
-    some = same & ~xp.asarray(by_clock)[fired]
-    before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, some)
-    noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, some)
-    zero = SAME_TIME * task.span * xp.abs(before.rate[:-1]) + noise
-    return some & (xp.abs(before.value[:-1]) <= zero)
+    s, xp = task.s, namespace(lanes.t)
+    dims, same = xp.asarray(np.array(s.dims)), lanes.chart == new.chart
+    alike = ~same & (dims[lanes.chart] == dims[new.chart])
+
+    def compare():
+        before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
+        noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
+        value, rate = before.value[:-1], before.rate[:-1]
+        zero = SAME_TIME * task.span * xp.abs(rate) + noise
+        apart = xp.abs(value[:, None] - watched.value[None, :-1])
+        equal = (apart <= zero[:, None]) & belongs(s, lanes.chart)[None, :-1]
+        return equal.any(axis=1) & alike, (equal & lanes.armed).any(axis=1) & alike
+
+    no = xp.zeros_like(lanes.armed)
+    if not _share_guards(s):
+        return Entry(no | same, xp.where(same, lanes.armed, no))
+    known, armed = cond(alike.any(), compare, lambda: (no, no))
+    return Entry(known | same, xp.where(same, lanes.armed, armed))
+
+
+def _share_guards(s: Structure) -> bool:
+    """Test whether any transition leads to another chart that may have guards of the first one."""
+    ends = (
+        (s.chart_index(x.source), s.chart_index(x.target))
+        for x in s.transitions
+        if x.source != x.target
+    )
+    return any(
+        s.dims[a] == s.dims[b] and bool(s.guards(a)) and bool(s.guards(b))
+        for a, b in ends
+    )
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:

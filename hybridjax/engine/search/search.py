@@ -139,9 +139,7 @@ def take_aim(state: State, task: Task) -> Aim:
     s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
     xp = namespace(lanes.t)
     # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    scheduled, which = next_schedule(
-        s, lanes.t, lanes.chart, target.time, lanes.armed
-    )
+    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
     due = xp.minimum(target.time, scheduled)
     schedule = xp.where(scheduled <= target.time, which, -1)
     # Events at once: of guards that a reset has put beyond zero.
