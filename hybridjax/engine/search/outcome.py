@@ -5,6 +5,7 @@ from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
+from ...systems.structure import Structure
 from ..arrays import Array, Index, Mask, Times
 from ..events import (
     INSTANT,
