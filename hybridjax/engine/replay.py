@@ -182,7 +182,9 @@ def chain(
     end, by = linear_moves(s, moves, target)
     if across is not None:
         f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
-        by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
+        flows = ~moves.at_once  # (there is no flow before an event at once)
+        project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
+        by[flows, :, 1:n] = by[flows, :, 1:n] @ project
     columns, ends = (
         _products(moves, by, len(lanes.t)),
         np.concatenate([lanes.t[None], lanes.q]),
@@ -277,7 +279,9 @@ class Variation:
             f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(
                 M, P, n - 1
             )
-            by[..., 1:n] = by[..., 1:n] @ projections(f, sizes[moves.chart][:, None])
+            flows = ~moves.at_once
+            project = projections(f[flows], sizes[moves.chart[flows]][:, None])
+            by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
         lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
         moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
         return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(

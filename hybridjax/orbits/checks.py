@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels, unresolved
+from ..engine.events import SAME_TIME
 from ..engine.trajectory import simulate
 from ..engine.unresolved import (
     column_name,
@@ -67,7 +68,7 @@ def check_clock(s: Structure) -> None:
                     _no_period(s.system, f"'{transition.name}' is scheduled")
                 )
             ratio = period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < SAME:
+            if not abs(ratio - round(min(ratio, 1e9))) < SAME_TIME * ratio:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise events do not repeat in each period."
@@ -80,7 +81,7 @@ def check_clock(s: Structure) -> None:
             times[x.name] = (offset + every * np.arange(round(period / every))) % period
         for (name, first), (other, second) in itertools.combinations(times.items(), 2):
             apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
-            if np.min(np.abs(apart)) < SAME * period:
+            if np.min(np.abs(apart)) <= SAME_TIME * period:
                 raise DefinitionError(
                     f"'{name}' and '{other}' are scheduled for the same time in chart '{chart}': "
                     "write them as one event, or let one lead to a chart that the other leaves."
