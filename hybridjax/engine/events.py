@@ -3,6 +3,7 @@
 Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `replay.py`.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.executor import cond, namespace, put
 from .._core.lanes import put_rows
 from ..systems.structure import Kind, Member, Structure
-from ..systems.transition import Scheduled
+from ..systems.transition import SAME_TIME, Scheduled
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .lanes import Lanes, for_each_chart, needed, only
@@ -23,12 +24,6 @@ from .watch import Watch
 # counts as zero if its rate would have made its value in an instant. Higher: separate events are
 # taken for simultaneous ones. Lower: simultaneous ones for separate ones.
 INSTANT = 1e-12
-# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
-# steps if they differ by less than it; a target's level counts once it is above the change that its
-# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
-# event has it, and a level that falls right after the start is missed. Lower: an event happens
-# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
-SAME_TIME = 1e-11
 # Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
 # lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
@@ -138,10 +133,23 @@ def rearm(
     put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
     late = late & (entry.armed | (falls & ~entry.known))
     armed = ((value > zero) | due | put | late) & belongs(s, lanes.chart)[:-1]
-    clocks = np.append(s.clocks, -2)
-    happened = s.clocks[:, None] == xp.asarray(clocks)[fired]
-    armed = with_schedules(s, armed, lanes.armed & ~happened)
+    armed = with_schedules(s, armed, lanes.armed & ~_over(s, lanes.t, fired))
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
+
+
+def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
+    """Scheduled events that are over after the transitions `fired` at t: those of the same clock,
+    and of clocks of the same period, those that belong to an earlier period."""
+    xp, G = namespace(t), len(s.transitions)
+    over = xp.zeros((G, t.shape[0]), bool)
+    clocks = [g for g in range(G) if s.clocks[g] >= 0]
+    for g, h in itertools.product(clocks, clocks):
+        offset, period = s.transitions[g].guard.numbers(t)
+        later, other = s.transitions[h].guard.numbers(t)
+        earlier = xp.round((t - offset) / period) < xp.round((t - later) / other)
+        same = (s.clocks[g] == s.clocks[h]) | ((period == other) & earlier)
+        over = put(over, g, over[g] | ((fired == h) & same))
+    return over
 
 
 def guard_noise(
@@ -224,6 +232,7 @@ def next_schedule(
     """
     xp = namespace(t)
     best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
+    first = xp.full_like(t, xp.inf)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
             offset, period = transition.guard.numbers(t)
@@ -232,8 +241,12 @@ def next_schedule(
             now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
             time = xp.where(now, xp.maximum(past, t), later)
             time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
-            sooner = (chart == s.chart_index(transition.source)) & (time < best)
+            # (Of several that are due now, the one of an earlier period is first.)
+            rank = xp.where(now, k, xp.inf)
+            sooner = (time < best) | ((time == best) & (rank < first))
+            sooner = sooner & (chart == s.chart_index(transition.source))
             best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)
+            first = xp.where(sooner, rank, first)
     return best, which
 
 

@@ -1,8 +1,7 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
-import itertools
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,7 +9,6 @@ from jaxtyping import Float, Int
 from .._core.executor import Array, is_traced, to_host
 from .._core.results import Result
 from ..engine import kernels, unresolved
-from ..engine.events import SAME_TIME
 from ..engine.trajectory import simulate
 from ..engine.unresolved import (
     column_name,
@@ -21,11 +19,11 @@ from ..engine.unresolved import (
 )
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
-from ..systems.check import check_output, check_system
+from ..systems.check import check_output, check_schedules, check_system
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
-from ..systems.transition import Scheduled
+from ..systems.transition import SAME_TIME, Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
@@ -73,19 +71,7 @@ def check_clock(s: Structure) -> None:
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise events do not repeat in each period."
                 )
-    for a, chart in enumerate(s.names):
-        times: dict[str, np.ndarray] = {}
-        for x in (s.transitions[g] for g in s.schedules(a)):
-            guard = cast(Scheduled, x.guard)
-            every, offset = float(guard.period), float(guard.offset)
-            times[x.name] = (offset + every * np.arange(round(period / every))) % period
-        for (name, first), (other, second) in itertools.combinations(times.items(), 2):
-            apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
-            if np.min(np.abs(apart)) <= SAME_TIME * period:
-                raise DefinitionError(
-                    f"'{name}' and '{other}' are scheduled for the same time in chart '{chart}': "
-                    "write them as one event, or let one lead to a chart that the other leaves."
-                )
+    check_schedules(s)
 
 
 def check_claims(

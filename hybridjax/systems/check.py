@@ -2,7 +2,10 @@
 
 import contextlib
 import functools as ft
+import itertools
+import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +20,7 @@ from .chart import Chart
 from .solver import ByChart
 from .structure import Structure, hashable, quoted
 from .system import HybridSystem, Output, arrays_of
-from .transition import Scheduled, Transition
+from .transition import SAME_TIME, Scheduled, Transition
 
 
 # Systems that have passed, but for their numbers. (A `Memory` forgets with its object, and each
@@ -102,6 +105,44 @@ def _check_functions(s: Structure) -> Iterator[str]:
     _check_names(kind, "states and outputs", (*map(str, s.state_names()), *names))
     for output in system.outputs():
         yield from check_output(s, output)
+
+
+def check_schedules(s: Structure) -> None:
+    """**Raises:** `DefinitionError` for two schedules of one chart, or of a chart and of one that
+    the first leads to, that are due at the same time.
+
+    Of schedules with the same period, the event that belongs to an earlier period comes first: at
+    duty 1, `Scheduled(T, duty * T)` comes before `Scheduled(T)`. Transitions of one clock (see
+    `Structure.clocks`) wait for its next tick.
+    """
+    clocks = [g for g, number in enumerate(s.clocks) if number >= 0]
+    for g, h in itertools.combinations(clocks, 2):
+        first, second = s.transitions[g], s.transitions[h]
+        one_clock = s.clocks[g] == s.clocks[h]
+        chain = first.target == second.source or second.target == first.source
+        if first.source != second.source and (one_clock or not chain):
+            continue
+        if not is_traced((first.guard, second.guard)) and _meet(
+            first.guard, second.guard
+        ):
+            raise DefinitionError(
+                f"'{first.name}' and '{second.name}' are scheduled for the same time in chart "
+                f"'{second.source}', so that their order is not defined: write them as one event, "
+                "or give them different times."
+            )
+
+
+def _meet(first: Any, second: Any) -> bool:
+    """Test whether the events of two schedules, or if their periods are the same, those of one
+    period, have the same time."""
+    (a, p), (b, other) = ((float(x.offset), float(x.period)) for x in (first, second))
+    same = SAME_TIME * min(p, other)
+    if abs(p - other) <= SAME_TIME * p:
+        return abs(a - b) <= same
+    ratio = p / other if p > other else other / p
+    if abs(ratio - round(ratio)) > SAME_TIME * ratio:
+        return False  # (they meet by chance)
+    return abs(math.remainder(a - b, min(p, other))) <= same
 
 
 def check_output(s: Structure, output: Output, kind: str = "output") -> Iterator[str]:

@@ -23,6 +23,14 @@ Direction = Literal["falling", "rising"]
 TOGETHER = 1e-9
 
 
+# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
+# steps if they differ by less than it; a target's level counts once it is above the change that its
+# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
+# event has it, and a level that falls right after the start is missed. Lower: an event happens
+# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
+SAME_TIME = 1e-11
+
+
 @checked
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""

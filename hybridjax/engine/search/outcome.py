@@ -6,10 +6,10 @@ from jaxtyping import Bool
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
+from ...systems.transition import SAME_TIME
 from ..arrays import Array, Index, Mask, Times
 from ..events import (
     INSTANT,
-    SAME_TIME,
     Entry,
     apply_resets,
     await_schedules,

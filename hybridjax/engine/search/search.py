@@ -10,8 +10,9 @@ from ..._core.executor import cond, namespace, on_host, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
+from ...systems.transition import SAME_TIME
 from ..arrays import Index, Inputs, Mask, Times
-from ..events import SAME_TIME, arm, next_schedule, overdue
+from ..events import arm, next_schedule, overdue
 from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
