@@ -256,14 +256,23 @@ def _in_own_sizes(
     map: ReturnMap, solution: Solution, given: Sizes
 ) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
-    s = map.structure
+    s, resting = map.structure, False
+    distant = _is_distant(map, solution)
     while solution.is_fixed_point:
         turn, rough = solution.turn, sizes_of(s, map.scale)
-        sizes = sizes_on(s, turn.legs, float(turn.period))
+        own = sizes_on(s, turn.legs, float(turn.period))
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
-        moving = {k: x for k, x in sizes.items() if x > SAME * rough[k]}
-        sizes = (rough | moving if moving else sizes) | given
+        moving = {k: x for k, x in own.items() if x > SAME * rough[k]}
+        sizes = rough | moving if moving else own
+        # The sizes of a distant guess say nothing: states have smaller ones until they move.
+        shrinks = distant and not resting and bool(moving)
+        if shrinks:
+            sizes = {
+                k: max(own[k], SAME * x) if k not in moving else own[k]
+                for k, x in rough.items()
+            }
+        sizes = sizes | given
         fine = dataclasses.replace(
             map,
             settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
@@ -281,10 +290,30 @@ def _in_own_sizes(
             return fine, solution._replace(turn=turn._replace(distance=distance))
         say("Newton's method, in the sizes of the cycle")
         again = solve(fine, False, True, (turn.legs, side_by_side(to_host(turn.tapes))))
-        if not again.is_fixed_point:
+        if again.is_fixed_point:
+            map, solution = fine, again._replace(steps=solution.steps)
+        elif shrinks and int(again.result) in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+            resting = (
+                True  # (steps are as short as rounding errors of states at rest demand)
+            )
+        elif shrinks:
+            return fine, again
+        else:
             break
-        map, solution = fine, again._replace(steps=solution.steps)
     return map, solution
+
+
+def _is_distant(map: ReturnMap, solution: Solution) -> bool:
+    """Test whether a state at the guess is far larger than on the cycle that was found."""
+    if not solution.is_fixed_point:
+        return False
+    s, a = map.structure, int(np.asarray(map.anchor.chart)[0])
+    own = sizes_on(s, solution.turn.legs, float(solution.turn.period))
+    guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
+    return any(
+        SAME * x > own[str(name)]
+        for name, x in zip(s.charts[a].states, guess, strict=True)
+    )
 
 
 def _cycle(

@@ -43,8 +43,8 @@ class LimitCycles(eqx.Module):
 
     **Fields**, with the systems on the first axis:
 
-    - `systems`; `period` (S,); `anchor`, the lanes at which they begin; `legs`, `factors`: see
-        `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `systems`; `period` (S,), NaN where there is no cycle; `anchor`, the lanes at which they
+        begin; `legs`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
     `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
@@ -221,11 +221,12 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
         check_found(cycles[int(good[k])])
     rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
-    if all(commutes(cycles[i]) for i in few):
-        return cycles
     result = cycles.result.copy()
-    result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
-    return dataclasses.replace(cycles, result=result)
+    if not all(commutes(cycles[i]) for i in few):
+        result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+    found = np.isin(result, [Result.OK, Result.SINGULAR, Result.COINCIDENCE])
+    period = np.where(found, cycles.period, np.nan)
+    return dataclasses.replace(cycles, result=result, period=period)
 
 
 def _stacked(systems) -> HybridSystem:

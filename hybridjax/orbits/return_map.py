@@ -62,6 +62,9 @@ SINGULAR = 1e-7
 # Largest distance, in sizes of the states, at which a turn closes. Smaller: rounding rejects cycles
 # of sweeps. Larger: turns that Newton's method has not finished are accepted.
 CLOSED = 2e-8
+# A turn closes at most at this multiple of the accuracy of the flow, or of the derivative of the
+# turn. Smaller: rounding rejects cycles. Larger: errors of the cycle exceed the accuracy asked for.
+_ACCURACIES, _ROUNDED = 20.0, 1e-12
 # Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
 # for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
@@ -345,9 +348,15 @@ class ReturnMap(eqx.Module):
         singular = svdvals(defect * sizes[..., None, :] / sizes[..., None])
         counts = np.arange(self.structure.d) < valid.sum(axis=-1)[..., None]
         smallest = xp.min(xp.where(counts, singular, np.inf), axis=-1)
+        # (Where derivatives are large, rounding errors of the start are, too, at the end.)
+        grown = xp.max(
+            xp.abs(defect * sizes[..., None, :] / sizes[..., None]), axis=(-2, -1)
+        )
+        accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
+        closed_enough = turn.closed & (turn.distance <= accuracy)
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(turn.closed & ~xp.isnan(smallest), closed, code)
+        code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
             same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
             apart = xp.max(

@@ -186,7 +186,7 @@ def test_derivatives_across_an_event_at_once():
     )
     multiplier = 0.8 * (1 + low) * np.exp(-0.7)
     np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
-    ldtp = hj.linearize(cycle, hj.ClockPhase(3))
+    ldtp = hj.linearize(cycle, hj.ClockPhase(3, 0.3))
     np.testing.assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
     at = lambda rate: hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]  # noqa: E731
     by_steps = (float(at(0.7 + 1e-5)) - float(at(0.7 - 1e-5))) / 2e-5
