@@ -38,6 +38,11 @@ _BASE = 0.0729
 _TIMES = 1024
 
 
+# The distance, in sizes of the states, beyond which a turn does not nearly close. Smaller: searches
+# that have come close are told that there is no cycle. Larger: those that found none are not.
+_FAR = 1e-2
+
+
 def check_periodic(system: HybridSystem) -> None:
     """Check a system of which limit cycles are wanted.
 
@@ -327,6 +332,12 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
         reason = (
             "derivatives of the flow over one period are not finite: a function has none where the "
             "cycle meets it, such as `sqrt(x)` and `x**0.0` at 0"
+        )
+    elif code == Result.NOT_CONVERGED and float(cycle.residual) > _FAR:
+        reason = (
+            "Newton did not converge, and from where it was nearest to a cycle, one turn ends "
+            f"{float(cycle.residual):.2g} of the sizes of the states away from its beginning: "
+            "there may be no cycle near the guess, but an equilibrium, a torus or chaos"
         )
     elif code == Result.NOT_CONVERGED:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
