@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import host_first
-from .._core.executor import to_host
+from .._core.executor import Array, namespace, stop_gradient, to_host
 from .._core.results import Result
 from ..engine import kernels
+from ..engine.lanes import Tape
 from ..engine.settings import ROUNDING
 from ..engine.target import until
 from ..engine.trajectory import Trajectory
@@ -165,6 +166,22 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
         for other in _missed(s, [g], t, period):
             return g, other
     return None
+
+
+def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
+    """Test whether two events of a turn coincide whose order may be another one beside it; also in
+    programs, where their orders are not compared."""
+    codes, times, at_once = (
+        stop_gradient(x.ravel()) for x in (tape.code, tape.t, tape.at_once)
+    )
+    xp = namespace(times)
+    times = xp.where(codes >= 0, times, xp.inf)
+    order = xp.argsort(times, stable=True)
+    codes, times, at_once = codes[order], times[order], at_once[order]
+    by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
+    close = times[1:] <= times[:-1] + TOGETHER * stop_gradient(period)
+    fixed = at_once[1:] | (by_clock[1:] & by_clock[:-1])
+    return (close & (codes[1:] >= 0) & ~fixed).any()
 
 
 def together(

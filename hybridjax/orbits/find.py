@@ -16,7 +16,7 @@ from .._core.compilation import uncollected
 from .._core.executor import is_traced, is_tracer, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
-from .._core.results import Result
+from .._core.results import Result, update_result
 from ..engine.lanes import side_by_side
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.unresolved import has_kinks
@@ -26,7 +26,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
-from .coincidence import SAME, check_begin, coincident, commutes, events_of
+from .coincidence import SAME, check_begin, coincident, commutes, events_of, meet
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
@@ -184,6 +184,11 @@ def find_limit_cycle(
     near = last_turn(guess) if isinstance(guess, LimitCycle) else None
     if isinstance(guess, LimitCycle) and traced:
         solution = solve(map, True, True, near)
+        # (Of events that coincide on the guess, too, its search has compared the orders.)
+        if near is None or not meet(map.structure, guess.period, near[1]):
+            together = meet(map.structure, solution.turn.period, solution.turn.tapes)
+            code = update_result(solution.result, together, Result.COINCIDENCE)
+            solution = solution._replace(result=code)
         cycle = _cycle(map, solution, guess.event_sequence)
         keep_turn(cycle, solution.turn)
         return cycle

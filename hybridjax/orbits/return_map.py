@@ -30,7 +30,7 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.events import arm
+from ..engine.events import arm, await_schedules, belongs
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -41,6 +41,7 @@ from ..engine.watch import Watch, slopes, watch
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from ..systems.transition import TOGETHER
 from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
@@ -364,6 +365,9 @@ class ReturnMap(eqx.Module):
             )
             farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
             still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
+            if self.event >= 0:
+                ends_at_once = turn.closed & self._follows(turn.end)
+                code = xp.where(ends_at_once, Result.COINCIDENCE, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
@@ -373,6 +377,21 @@ class ReturnMap(eqx.Module):
             early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
             code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
+
+    def _follows(self, end: Lanes) -> Bool[Array, ""]:
+        """Test whether another event follows at once on the one with which a turn ends, so that the
+        next turn would begin without it."""
+        s, xp = self.structure, namespace(end.t)
+        watched = self.watch(end, until(end.t))
+        value, rate = watched.value[:-1], watched.rate[:-1]
+        span = xp.atleast_1d(self.expected)
+        by_guard = end.armed & (value <= TOGETHER * span * xp.abs(rate)) & (rate < 0)
+        by_guard = by_guard & (s.clocks < 0)[:, None]
+        waiting = (
+            xp.asarray(s.clocks >= 0)[:, None] & end.armed & belongs(s, end.chart)[:-1]
+        )
+        idle = await_schedules(s, xp.zeros_like(end.armed), end.t, end.t)
+        return self.each((by_guard | (waiting & ~idle)).any(axis=0))
 
     def held(
         self, q: Float[Array, " d"], varied: Varied | None = None

@@ -229,3 +229,36 @@ def test_a_guard_that_both_charts_have_happens_once():
     )
     path = hj.simulate(system, "day", (-0.5,), 3.3)
     assert [e.name for e in path.events] == ["by day", "dusk", "dawn", "dusk"]
+
+
+def test_a_turn_cannot_begin_between_events_at_once():
+    """Right after the spike of x that y follows at once; that of y may begin a turn."""
+    guess = hj.Guess("rest", (0.4, 0.1))
+    with pytest.raises(hj.ComputationError, match="two events coincide"):
+        hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("X"))
+    cycle = hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("Y"))
+    np.testing.assert_allclose(cycle.period, np.log(1.2 / 0.5), rtol=1e-10)
+
+
+def test_programs_refuse_events_that_coincide():
+    """Close to full duty, where the comparator trips right before the tick."""
+    cycle = hj.find_limit_cycle(Converter(0.95), hj.Guess("on", (0.9, 0.9), time=0.9))
+    result = jax.jit(
+        jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
+    )
+    np.testing.assert_array_equal(
+        result(jnp.array([0.95, 0.99, 1 - 1e-10])),
+        [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE],
+    )
+
+
+def test_experiments_near_full_and_zero_duty():
+    """The states of the converter are linear between events at fixed times, so that deviations
+    decay by e each period; with a ramp, no perturbation of x moves an event."""
+    for duty in (1e-9, 1 - 1e-7):
+        for by_ramp in (True, False):
+            chart = "off" if duty < 0.5 else "on"
+            guess = hj.Guess(chart, (0.3, 0.9), time=0.9)
+            cycle = hj.find_limit_cycle(Converter(duty, by_ramp), guess)
+            ldtp = hj.linearize(cycle, hj.ClockPhase(4, 0.3), "x")
+            np.testing.assert_allclose(ldtp.multipliers, [np.exp(-1)], rtol=1e-9)
