@@ -284,6 +284,8 @@ def check_begin(map: ReturnMap) -> None:
     due = rates < -TOGETHER * np.abs(rates).max(initial=0.0)
     due &= np.abs(guards) <= -TOGETHER * float(map.expected) * rates
     if base is not None:
+        # (Events that follow at once have been armed by the event that led to the anchor.)
+        due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)
         due[map.event] = False
     if due.any():
         name = s.transitions[int(np.argmax(due))].name

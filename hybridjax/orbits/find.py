@@ -48,6 +48,10 @@ from .scale import (
 # A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
+# The rough size of a state that does not move is made smaller this many times, if the guess was far
+# from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
+# of a guess that is more than 1e18 times too large keep their errors.
+_SHRINKS = 3
 # Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
 # Fewer: neurons have no cycle. More: vain searches last longer.
 _ENOUGH = 4096
@@ -261,7 +265,8 @@ def _in_own_sizes(
     map: ReturnMap, solution: Solution, given: Sizes
 ) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
-    s, resting = map.structure, False
+    s, shrunk = map.structure, 0
+    at_rest = sizes_of(s, map.scale)
     distant = _is_distant(map, solution)
     while solution.is_fixed_point:
         turn, rough = solution.turn, sizes_of(s, map.scale)
@@ -269,14 +274,13 @@ def _in_own_sizes(
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
         moving = {k: x for k, x in own.items() if x > SAME * rough[k]}
-        sizes = rough | moving if moving else own
+        sizes = at_rest | moving if moving else own
         # The sizes of a distant guess say nothing: states have smaller ones until they move.
-        shrinks = distant and not resting and bool(moving)
+        shrinks = distant and shrunk < _SHRINKS and 0 < len(moving) < len(own)
         if shrinks:
-            sizes = {
-                k: max(own[k], SAME * x) if k not in moving else own[k]
-                for k, x in rough.items()
-            }
+            shrunk += 1
+            smaller = {k: max(own[k], SAME * x) for k, x in rough.items()}
+            sizes = smaller | moving
         sizes = sizes | given
         fine = dataclasses.replace(
             map,
@@ -298,9 +302,7 @@ def _in_own_sizes(
         if again.is_fixed_point:
             map, solution = fine, again._replace(steps=solution.steps)
         elif shrinks and int(again.result) in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
-            resting = (
-                True  # (steps are as short as rounding errors of states at rest demand)
-            )
+            shrunk = _SHRINKS  # (rounding errors of states at rest make steps short)
         elif shrinks:
             return fine, again
         else:
