@@ -82,13 +82,16 @@ class Transition(eqx.Module):
         is the event, or a `Scheduled` (then `direction` has no meaning).
     - `direction`: "falling" (from positive to negative) or "rising".
     - `reset`: (t, q, u) -> state in `target`, as an array or a tuple. Identity by default.
-    - `enabled`: optional predicate (t, q, u) -> bool, evaluated at the crossing; where it is false
-        the crossing is passed without an event.
+    - `enabled`: optional predicate (t, q, u) -> bool, evaluated at the crossing or the scheduled
+        time; where it is false there is no event.
 
-    A guard is armed once it has left zero on the side from which it crosses: a guard that is zero
-    right after a reset does not fire at once. If a reset puts the state on a guard, and the state
-    then passes through it, `simulate` ends. This does not apply if the state was on this guard
-    before the reset, too.
+    A guard is armed once it has left zero on the side from which it crosses, so that a guard that
+    was just crossed does not fire again. If a reset leads to a chart whose guard is at zero or
+    beyond it, and moves on, the event happens at once, unless the old chart has this guard, too. It
+    also happens at once if a reset within a chart leads across an armed guard.
+
+    Scheduled transitions with the same formulas for period and offset are those of one clock: each
+    tick leads to one event.
     """
 
     name: str = eqx.field(static=True)
