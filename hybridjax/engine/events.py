@@ -3,13 +3,16 @@
 Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `replay.py`.
 """
 
+import itertools
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import cond, namespace, put
 from .._core.lanes import put_rows
 from ..systems.structure import Kind, Member, Structure
-from ..systems.transition import Scheduled
+from ..systems.transition import SAME_TIME, Scheduled
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .lanes import Lanes, for_each_chart, needed, only
@@ -21,12 +24,6 @@ from .watch import Watch
 # counts as zero if its rate would have made its value in an instant. Higher: separate events are
 # taken for simultaneous ones. Lower: simultaneous ones for separate ones.
 INSTANT = 1e-12
-# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
-# steps if they differ by less than it; a target's level counts once it is above the change that its
-# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
-# event has it, and a level that falls right after the start is missed. Lower: an event happens
-# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
-SAME_TIME = 1e-11
 # Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
 # lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
@@ -52,7 +49,40 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     """
     zero = width(lanes.t, span, watched.rate)
     armed = (lanes.armed & (watched.value >= -zero)[:-1]) | (watched.value > zero)[:-1]
-    return lanes._replace(armed=armed & belongs(s, lanes.chart)[:-1])
+    armed = armed & belongs(s, lanes.chart)[:-1]
+    waiting = await_schedules(s, lanes.armed, lanes.t, lanes.t)
+    return lanes._replace(armed=with_schedules(s, armed, waiting))
+
+
+def with_schedules(
+    s: Structure, armed: Bool[Array, "G L"], scheduled: Bool[Array, "G L"]
+) -> Bool[Array, "G L"]:
+    """`armed` of guards, and of `scheduled` events, in every chart."""
+    by_clock = (s.clocks >= 0)[:, None]
+    return namespace(armed).where(by_clock, scheduled, armed)
+
+
+def await_schedules(
+    s: Structure, armed: Bool[Array, "G L"], before: Times, t: Times
+) -> Bool[Array, "G L"]:
+    """`armed` after a step from `before` to t, with all scheduled events but those that are due at
+    both times: an event that has happened is not armed until its time is over, so that it happens
+    once; another one that is due at the same time is still to come."""
+    xp = namespace(t)
+    for g, transition in enumerate(s.transitions):
+        if isinstance(transition.guard, Scheduled):
+            due, (_, period) = (
+                transition.guard.nearest(before),
+                transition.guard.numbers(t),
+            )
+            away = xp.maximum(xp.abs(due - before), xp.abs(due - t))
+            armed = put(armed, g, armed[g] | (away > SAME_TIME * period))
+    return armed
+
+
+def overdue(watched: Watch, span: Times) -> Bool[Array, "G L"]:
+    """Guards that are beyond zero, by more than rounding errors of times."""
+    return watched.value[:-1] < -SAME_TIME * span * abs(watched.rate[:-1])
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
@@ -61,6 +91,15 @@ def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
         :, None
     ]
     return (source == chart) | (source == -1)
+
+
+class Entry(NamedTuple):
+    """The guards of the charts that lanes enter, as far as the charts before had them, too."""
+
+    known: Bool[Array, "G L"]
+    """Whether the chart before has this guard: in the same chart, or with the same value."""
+    armed: Bool[Array, "G L"]
+    """Whether that guard was armed."""
 
 
 def rearm(
@@ -72,24 +111,50 @@ def rearm(
     span: Times,
     u: Inputs,
     residue: Times,
+    entry: Entry,
 ) -> Lanes:
     """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
     A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
-    until it has left zero. The one exception are events at the same instant: where another guard of
-    the old chart was at its zero, too (`together`), a guard other than the one that fired, at zero
-    and falling, is still due.
+    until it has left zero, if it rises, or if it was crossed before (see `Entry`). Otherwise the
+    reset has put it there, and it is due at once if it falls, as it is if it was at its zero in
+    the old chart, together with the guard that fired.
+
+    A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
+    that the reset has led across it, or if it falls, and the old chart does not have it.
     """
     xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
-    zero = width(lanes.t, span, rate) + _noise(s, lanes, u, fired >= 0)
+    zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
-    due = together & other & (xp.abs(value) <= zero) & (rate < 0)
-    armed = ((value > zero) | due) & belongs(s, lanes.chart)[:-1]
+    falls, late = rate < 0, overdue(watched, span) & (value < -zero)
+    at_zero = xp.abs(value) <= zero
+    due = together & other & at_zero & falls
+    put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
+    late = late & (entry.armed | (falls & ~entry.known))
+    armed = ((value > zero) | due | put | late) & belongs(s, lanes.chart)[:-1]
+    armed = with_schedules(s, armed, lanes.armed & ~_over(s, lanes.t, fired))
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
-def _noise(s: Structure, lanes: Lanes, u: Inputs, mask: Mask) -> Float[Array, "G L"]:
+def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
+    """Scheduled events that are over after the transitions `fired` at t: those of the same clock,
+    and of clocks of the same period, those that belong to an earlier period."""
+    xp, G = namespace(t), len(s.transitions)
+    over = xp.zeros((G, t.shape[0]), bool)
+    clocks = [g for g in range(G) if s.clocks[g] >= 0]
+    for g, h in itertools.product(clocks, clocks):
+        offset, period = s.transitions[g].guard.numbers(t)
+        later, other = s.transitions[h].guard.numbers(t)
+        earlier = xp.round((t - offset) / period) < xp.round((t - later) / other)
+        same = (s.clocks[g] == s.clocks[h]) | ((period == other) & earlier)
+        over = put(over, g, over[g] | ((fired == h) & same))
+    return over
+
+
+def guard_noise(
+    s: Structure, lanes: Lanes, u: Inputs, mask: Mask
+) -> Float[Array, "G L"]:
     """A bound on the rounding errors of the guards of the charts that lanes are in."""
 
     def work(a, here, out):
@@ -158,23 +223,30 @@ def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
 
 
 def next_schedule(
-    s: Structure, t: Times, chart: Index, end: Times
+    s: Structure, t: Times, chart: Index, end: Times, armed: Bool[Array, "G L"]
 ) -> tuple[Times, Index]:
-    """Time of the next scheduled event after t (infinity if there is none), and its transition.
+    """Time of the next scheduled event (infinity if there is none), and its transition.
 
-    Times that differ by rounding are one: an event that was due at t is past, and one that is due
-    at `end` happens at `end`.
+    Times that differ by rounding are one: an event that is due at t comes at once if it is `armed`
+    (it has not happened at t), and one that is due at `end` happens at `end`.
     """
     xp = namespace(t)
     best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
+    first = xp.full_like(t, xp.inf)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
             offset, period = transition.guard.numbers(t)
-            k = xp.floor((t - offset) / period + SAME_TIME) + 1
-            time = offset + k * period
+            k = xp.floor((t - offset) / period + SAME_TIME)
+            past, later = offset + k * period, offset + (k + 1) * period
+            now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
+            time = xp.where(now, xp.maximum(past, t), later)
             time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
-            sooner = (chart == s.chart_index(transition.source)) & (time < best)
+            # (Of several that are due now, the one of an earlier period is first.)
+            rank = xp.where(now, k, xp.inf)
+            sooner = (time < best) | ((time == best) & (rank < first))
+            sooner = sooner & (chart == s.chart_index(transition.source))
             best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)
+            first = xp.where(sooner, rank, first)
     return best, which
 
 
@@ -189,7 +261,7 @@ def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask
+    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask, span: Times
 ) -> tuple[Float[Array, "4 L"], Mask]:
     """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
     shrink with a sum that converges.
@@ -198,6 +270,8 @@ def keep_pace(
     """
     xp, (since, gap, streak, total) = namespace(pace), pace
     since = since + moved
+    # (Events at one time, which take each other's place, are apart by rounding.)
+    since = xp.where(event & (since <= INSTANT * span), 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)
     shrinks = (since < gap) | (
         since == 0

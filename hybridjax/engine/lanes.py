@@ -23,7 +23,8 @@ class Lanes(NamedTuple):
     chart: Index
     q: Padded
     armed: Bool[Array, "G L"]
-    """Which transitions (rows, by index) would fire at their guard's next falling zero."""
+    """Which transitions (rows, by index) would fire at their guard's next falling zero, or at once
+    if it is beyond zero; which scheduled ones would fire if they are due at t."""
     events: Index
     """Number of events so far."""
     pace: Float[Array, "4 L"]
@@ -135,6 +136,9 @@ class Tape(NamedTuple):
     """State after the reset."""
     chart: Int[Array, "R L"]
     """Chart after the reset."""
+    at_once: Bool[Array, "R L"]
+    """Whether the move is an event at once, whose guard was beyond zero: its time is that of the
+    event before."""
 
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
@@ -142,7 +146,8 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     xp, (d, L) = namespace(lanes.q), lanes.q.shape
     times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
     code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
-    return Tape(times(), code, times(), states(), states(), chart)
+    at_once = xp.zeros((rows, L), bool)
+    return Tape(times(), code, times(), states(), states(), chart, at_once)
 
 
 def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
@@ -57,13 +57,13 @@ def replay(
     unroll: bool = False,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
-    h, code = tape.h, tape.code
+    h, code, at_once = tape.h, tape.code, tape.at_once
     scheduled = jnp.array(
         [isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False]
     )
 
     def row(carry, row):
-        h, code = row
+        h, code, at_once = row
 
         def move(carry):
             t, q, chart = carry
@@ -73,7 +73,7 @@ def replay(
                 code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h)
             )
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
-            which = jnp.where(by_clock, -1, which)
+            which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
             t, q = _advance(s, begin, code != IDLE, u, target, h1, which, unroll)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
@@ -95,8 +95,11 @@ def replay(
     rows, L = h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
     h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
+    at_once = jnp.pad(at_once, fill).reshape(-1, _BLOCK, L)
     code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
-    (t, q, _), _ = jax.lax.scan(block, (lanes.t, lanes.q, lanes.chart), (h, code))
+    (t, q, _), _ = jax.lax.scan(
+        block, (lanes.t, lanes.q, lanes.chart), (h, code, at_once)
+    )
     return t, q
 
 
@@ -157,6 +160,8 @@ class Moves(NamedTuple):
     lane: Int[np.ndarray, " M"]
     order: Int[np.ndarray, " M"]
     """Number of moves of the same lane before this one."""
+    at_once: Bool[np.ndarray, " M"]
+    """See `Tape`."""
 
 
 def chain(
@@ -178,7 +183,9 @@ def chain(
     end, by = linear_moves(s, moves, target)
     if across is not None:
         f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
-        by[:, :, 1:n] = by[:, :, 1:n] @ projections(f, np.asarray(across)[moves.chart])
+        flows = ~moves.at_once  # (there is no flow before an event at once)
+        project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
+        by[flows, :, 1:n] = by[flows, :, 1:n] @ project
     columns, ends = (
         _products(moves, by, len(lanes.t)),
         np.concatenate([lanes.t[None], lanes.q]),
@@ -273,7 +280,9 @@ class Variation:
             f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(
                 M, P, n - 1
             )
-            by[..., 1:n] = by[..., 1:n] @ projections(f, sizes[moves.chart][:, None])
+            flows = ~moves.at_once
+            project = projections(f[flows], sizes[moves.chart[flows]][:, None])
+            by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
         lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
         moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
         return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(
@@ -328,6 +337,7 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
         np.asarray(tape.code)[row, lane],
         lane,
         order,
+        np.asarray(tape.at_once)[row, lane],
     )
 
 
@@ -340,7 +350,7 @@ def _linear(
     by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
     goal = target.time[moves.lane]
-    h = np.where(on_time, goal - moves.t, moves.h)
+    h = np.where(on_time, goal - moves.t, np.where(moves.at_once, 0.0, moves.h))
     expanded = np.array(
         np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0)
     )
@@ -360,7 +370,9 @@ def _linear(
     dt[:, 0, 0] += 1.0
 
     which = np.where(
-        code == ARRIVE_LEVEL, len(s.transitions), np.where(by_clock, -1, code)
+        code == ARRIVE_LEVEL,
+        len(s.transitions),
+        np.where(by_clock | moves.at_once, -1, code),
     )
     lands = np.flatnonzero(which >= 0)
     if len(lands):

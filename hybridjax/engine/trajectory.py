@@ -20,7 +20,7 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
-from ..systems.check import check_system, evaluating
+from ..systems.check import check_schedules, check_system, evaluating
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
@@ -246,6 +246,7 @@ def simulate(
     check_symmetry(system)
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
+    check_schedules(s)
     start = Guess(chart, state, time)
     lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
     settings, u, end = (

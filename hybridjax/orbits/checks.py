@@ -1,8 +1,7 @@
 """Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
 
-import itertools
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,11 +19,11 @@ from ..engine.unresolved import (
 )
 from ..errors import DefinitionError
 from ..linear.time_response import monodromy
-from ..systems.check import check_output, check_system
+from ..systems.check import check_output, check_schedules, check_system
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
-from ..systems.transition import Scheduled
+from ..systems.transition import SAME_TIME, Scheduled
 from .coincidence import SAME, coincident, events_of
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
@@ -38,6 +37,11 @@ _BASE = 0.0729
 # Times of a period at which functions are compared that may have pulses. Fewer: short pulses of
 # another period are missed. More: time.
 _TIMES = 1024
+
+
+# The distance, in sizes of the states, beyond which a turn does not nearly close. Smaller: searches
+# that have come close are told that there is no cycle. Larger: those that found none are not.
+_FAR = 1e-2
 
 
 def check_periodic(system: HybridSystem) -> None:
@@ -68,24 +72,12 @@ def check_clock(s: Structure) -> None:
                     _no_period(s.system, f"'{transition.name}' is scheduled")
                 )
             ratio = period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < SAME:
+            if not abs(ratio - round(min(ratio, 1e9))) < SAME_TIME * ratio:
                 raise DefinitionError(
                     f"the schedule of '{transition.name}' must divide the clock's period, which is "
                     f"{period}: otherwise events do not repeat in each period."
                 )
-    for a, chart in enumerate(s.names):
-        times: dict[str, np.ndarray] = {}
-        for x in (s.transitions[g] for g in s.schedules(a)):
-            guard = cast(Scheduled, x.guard)
-            every, offset = float(guard.period), float(guard.offset)
-            times[x.name] = (offset + every * np.arange(round(period / every))) % period
-        for (name, first), (other, second) in itertools.combinations(times.items(), 2):
-            apart = np.abs(first[:, None] - second + period / 2) % period - period / 2
-            if np.min(np.abs(apart)) < SAME * period:
-                raise DefinitionError(
-                    f"'{name}' and '{other}' are scheduled for the same time in chart '{chart}': "
-                    "write them as one event, or let one lead to a chart that the other leaves."
-                )
+    check_schedules(s)
 
 
 def check_claims(
@@ -345,6 +337,12 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
         reason = (
             "derivatives of the flow over one period are not finite: a function has none where the "
             "cycle meets it, such as `sqrt(x)` and `x**0.0` at 0"
+        )
+    elif code == Result.NOT_CONVERGED and float(cycle.residual) > _FAR:
+        reason = (
+            "Newton did not converge, and from where it was nearest to a cycle, one turn ends "
+            f"{float(cycle.residual):.2g} of the sizes of the states away from its beginning: "
+            "there may be no cycle near the guess, but an equilibrium, a torus or chaos"
         )
     elif code == Result.NOT_CONVERGED:
         reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"

@@ -17,10 +17,13 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import host_first
-from .._core.executor import to_host
+from .._core.executor import Array, namespace, stop_gradient, to_host
 from .._core.results import Result
 from ..engine import kernels
+from ..engine.lanes import Tape
+from ..engine.settings import ROUNDING
 from ..engine.target import until
+from ..engine.trajectory import Trajectory
 from ..errors import ComputationError
 from ..systems.structure import Structure
 from ..systems.transition import TOGETHER, Scheduled
@@ -64,6 +67,12 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     as ok; otherwise its result is `Result.COINCIDENCE` (`find_limit_cycle` returns it with
     `throw=False`). A group contains at least one event that is not scheduled.
     """
+    return [group for group in _groups(cycle) if group is not None]
+
+
+def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
+    """The groups of events that happen at the same time; `None` for one whose order is the same for
+    all neighbors of the cycle."""
     cycle = to_host(cycle)
     if cycle.result != Result.COINCIDENCE:
         cycle.require_found()
@@ -84,7 +93,11 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
             continue
         group = path.event[at[first:after]].tolist()
         events = {*group, *_missed(s, group, t, period)}
-        if len(events) > 1:
+        together = range(at[first], at[after - 1])
+        in_order = all(_follows_at_once(path, k, period) for k in together)
+        if len(events) > 1 and len(events) == len(group) and in_order:
+            groups.append(None)
+        elif len(events) > 1:
             a = int(path.chart[k - 1])
             n = s.dims[a]
             before = _Order((), a, path.before[k, :n], np.eye(n))
@@ -99,10 +112,37 @@ def coincidences(cycle: LimitCycle) -> list[Coincidence]:
     return groups
 
 
+def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
+    """True if event k + 1 of a path follows event k in all neighbors, at once: both are scheduled,
+    or the reset of event k puts the guard of the next one beyond zero, or at zero in each neighbor.
+    """
+    s, (g, later) = path.structure, path.event[k : k + 2].tolist()
+    first, second = (isinstance(s.transitions[x].guard, Scheduled) for x in (g, later))
+    if second or later < 0:
+        return first and second
+    a, b = (int(x) for x in path.chart[k - 1 : k + 1])
+    n, m, time, u = s.dims[a], s.dims[b], path.t[[k]], np.zeros((s.nu, 1))
+    before, after = path.before[k, :n, None], path.after[k, :m, None]
+    index = np.zeros(1, np.int32)
+    row = kernels.watched(s, b, None, time, after, u, index)[s.guards(b).index(later)]
+    value, by_t, by_q, by_u = row[0, 0], row[1, 0], row[2 : 2 + m, 0], row[2 + m :, 0]
+    rate = by_t + by_q @ kernels.field(s, b, time, after, u)[:, 0, 0]
+    if value < -TOGETHER * period * abs(rate):
+        return True
+    by_reset = kernels.reset(s, s.member(g), time, before, u)[:, 1:, 0]
+    change = np.concatenate([[by_t], np.zeros(n), by_u]) + by_q @ by_reset
+    size = np.concatenate([[abs(by_t)], np.zeros(n), abs(by_u)])
+    size = size + np.abs(by_q) @ np.abs(by_reset)
+    if first:  # (its time is the same in all neighbors)
+        change[0] = 0.0
+    return bool((np.abs(change) <= ROUNDING * size).all())
+
+
 def commutes(cycle: LimitCycle) -> bool:
-    """True if the orders of all events that coincide on a cycle commute; False if none do."""
-    groups = coincidences(cycle)
-    return bool(groups) and all(group.commute for group in groups)
+    """True if the orders of all events that coincide on a cycle commute, or are the same for all
+    of its neighbors; False if no events do."""
+    groups = _groups(cycle)
+    return bool(groups) and all(group is None or group.commute for group in groups)
 
 
 def events_of(turn: Turn) -> list[tuple[int, float]]:
@@ -118,12 +158,30 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
     if map.event >= 0:  # the turn begins with the event that ends it
         events = [(map.event, float(np.asarray(turn.legs.t)[0])), *events]
     for (g, t), (other, later) in itertools.pairwise(events):
-        if later - t <= TOGETHER * period:
+        # (Clocks tick in the same order for all neighbors.)
+        by_clock = s.clocks[g] >= 0 and s.clocks[other] >= 0
+        if later - t <= TOGETHER * period and not by_clock:
             return g, other
     for g, t in events[map.event >= 0 :]:
         for other in _missed(s, [g], t, period):
             return g, other
     return None
+
+
+def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
+    """Test whether two events of a turn coincide whose order may be another one beside it; also in
+    programs, where their orders are not compared."""
+    codes, times, at_once = (
+        stop_gradient(x.ravel()) for x in (tape.code, tape.t, tape.at_once)
+    )
+    xp = namespace(times)
+    times = xp.where(codes >= 0, times, xp.inf)
+    order = xp.argsort(times, stable=True)
+    codes, times, at_once = codes[order], times[order], at_once[order]
+    by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
+    close = times[1:] <= times[:-1] + TOGETHER * stop_gradient(period)
+    fixed = at_once[1:] | (by_clock[1:] & by_clock[:-1])
+    return (close & (codes[1:] >= 0) & ~fixed).any()
 
 
 def together(
@@ -152,13 +210,13 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
         return set()
     ends = ((s.transitions[g].source, s.transitions[g].target) for g in group)
     charts = {s.chart_index(name) for pair in ends for name in pair}
-    due = {
+    happened = {int(s.clocks[g]) for g in group}
+    return {
         g
         for a in charts
         for g in s.schedules(a)
-        if _scheduled_at(s, g, t, TOGETHER * period)
+        if _scheduled_at(s, g, t, TOGETHER * period) and s.clocks[g] not in happened
     }
-    return due - set(group)
 
 
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
@@ -187,8 +245,11 @@ def _orders(
     a, q, u = before.chart, before.state[:, None], np.zeros((s.nu, 1))
     time, n = np.array([t]), len(before.state)
     field = kernels.field(s, a, time, q, u)[:, 0, 0]
+    happened = [s.clocks[g] for g in before.events]
     events = [
-        (g, np.zeros(n), 0.0) for g in s.schedules(a) if _scheduled_at(s, g, t, due)
+        (g, np.zeros(n), 0.0)
+        for g in s.schedules(a)
+        if _scheduled_at(s, g, t, due) and s.clocks[g] not in happened
     ]
     if guards := s.guards(a):
         rows = kernels.watched(s, a, None, time, q, u, np.zeros(1, np.int32))[..., 0]
@@ -223,6 +284,8 @@ def check_begin(map: ReturnMap) -> None:
     due = rates < -TOGETHER * np.abs(rates).max(initial=0.0)
     due &= np.abs(guards) <= -TOGETHER * float(map.expected) * rates
     if base is not None:
+        # (Events that follow at once have been armed by the event that led to the anchor.)
+        due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)
         due[map.event] = False
     if due.any():
         name = s.transitions[int(np.argmax(due))].name

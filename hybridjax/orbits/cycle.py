@@ -527,10 +527,12 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
         structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))
     ).T
     frames: list[tuple[int, np.ndarray, Matrix]] = []
-    for chart, f in zip(moves.chart, fields, strict=True):
+    for chart, f, at_once in zip(moves.chart, fields, moves.at_once, strict=True):
         n = structure.dims[chart]
         size, basis = np.append(map.expected, map.scale[chart, :n]), np.eye(1 + n)
-        if map.base is not None:
+        if map.base is not None and at_once:  # (there is no flow before it)
+            basis = basis[:, 1:]
+        elif map.base is not None:
             basis = np.pad(
                 np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)]
             )

@@ -16,7 +16,7 @@ from .._core.compilation import uncollected
 from .._core.executor import is_traced, is_tracer, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
-from .._core.results import Result
+from .._core.results import Result, update_result
 from ..engine.lanes import side_by_side
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.unresolved import has_kinks
@@ -26,7 +26,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
-from .coincidence import SAME, check_begin, coincident, commutes, events_of
+from .coincidence import SAME, check_begin, coincident, commutes, events_of, meet
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
@@ -52,6 +52,10 @@ _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
 # chart than it began. Fewer: slow transients remain. More: a vain search takes longer.
 _LATER = 8, 40
+# The rough size of a state that does not move is made smaller this many times, if the guess was far
+# from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
+# of a guess that is more than 1e18 times too large keep their errors.
+_SHRINKS = 3
 
 
 @checked
@@ -185,6 +189,11 @@ def find_limit_cycle(
     near = last_turn(guess) if isinstance(guess, LimitCycle) else None
     if isinstance(guess, LimitCycle) and traced:
         solution = solve(map, True, True, near)
+        # (Of events that coincide on the guess, too, its search has compared the orders.)
+        if near is None or not meet(map.structure, guess.period, near[1]):
+            together = meet(map.structure, solution.turn.period, solution.turn.tapes)
+            code = update_result(solution.result, together, Result.COINCIDENCE)
+            solution = solution._replace(result=code)
         cycle = _cycle(map, solution, guess.event_sequence)
         keep_turn(cycle, solution.turn)
         return cycle
@@ -320,14 +329,23 @@ def _in_own_sizes(
     map: ReturnMap, solution: Solution, given: Sizes
 ) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
-    s = map.structure
+    s, shrunk = map.structure, 0
+    at_rest = sizes_of(s, map.scale)
+    distant = _is_distant(map, solution)
     while solution.is_fixed_point:
         turn, rough = solution.turn, sizes_of(s, map.scale)
-        sizes = sizes_on(s, turn.legs, float(turn.period))
+        own = sizes_on(s, turn.legs, float(turn.period))
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
-        moving = {k: x for k, x in sizes.items() if x > SAME * rough[k]}
-        sizes = (rough | moving if moving else sizes) | given
+        moving = {k: x for k, x in own.items() if x > SAME * rough[k]}
+        sizes = at_rest | moving if moving else own
+        # The sizes of a distant guess say nothing: states have smaller ones until they move.
+        shrinks = distant and shrunk < _SHRINKS and 0 < len(moving) < len(own)
+        if shrinks:
+            shrunk += 1
+            smaller = {k: max(own[k], SAME * x) for k, x in rough.items()}
+            sizes = smaller | moving
+        sizes = sizes | given
         fine = dataclasses.replace(
             map,
             settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
@@ -345,10 +363,28 @@ def _in_own_sizes(
             return fine, solution._replace(turn=turn._replace(distance=distance))
         say("Newton's method, in the sizes of the cycle")
         again = solve(fine, False, True, (turn.legs, side_by_side(to_host(turn.tapes))))
-        if not again.is_fixed_point:
+        if again.is_fixed_point:
+            map, solution = fine, again._replace(steps=solution.steps)
+        elif shrinks and int(again.result) in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+            shrunk = _SHRINKS  # (rounding errors of states at rest make steps short)
+        elif shrinks:
+            return fine, again
+        else:
             break
-        map, solution = fine, again._replace(steps=solution.steps)
     return map, solution
+
+
+def _is_distant(map: ReturnMap, solution: Solution) -> bool:
+    """Test whether a state at the guess is far larger than on the cycle that was found."""
+    if not solution.is_fixed_point:
+        return False
+    s, a = map.structure, int(np.asarray(map.anchor.chart)[0])
+    own = sizes_on(s, solution.turn.legs, float(solution.turn.period))
+    guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
+    return any(
+        SAME * x > own[str(name)]
+        for name, x in zip(s.charts[a].states, guess, strict=True)
+    )
 
 
 def _cycle(

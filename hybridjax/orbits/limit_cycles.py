@@ -44,8 +44,8 @@ class LimitCycles(eqx.Module):
 
     **Fields**, with the systems on the first axis:
 
-    - `systems`; `period` (S,); `anchor`, the lanes at which they begin; `legs`, `factors`: see
-        `LimitCycle`; `residual`, `iterations`, `result` (S,).
+    - `systems`; `period` (S,), NaN where there is no cycle; `anchor`, the lanes at which they
+        begin; `legs`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
     `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
@@ -229,7 +229,9 @@ def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycl
         check_found(cycles[i])
     if any(verdict(cycles[i]).refused for i in tested):
         result[good] = [verdict(cycles[i]).result for i in good]
-    return dataclasses.replace(cycles, result=result)
+    found = np.isin(result, [Result.OK, Result.SINGULAR, Result.COINCIDENCE])
+    period = np.where(found, cycles.period, np.nan)
+    return dataclasses.replace(cycles, result=result, period=period)
 
 
 def _stacked(systems) -> HybridSystem:

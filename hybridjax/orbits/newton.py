@@ -26,7 +26,7 @@ from ..engine.replay import Moves, Variation
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
-from .return_map import SINGULAR, ReturnMap, Turn, across
+from .return_map import SINGULAR, Return, ReturnMap, Turn, across
 from .shooting import (
     ATOL,
     RTOL,
@@ -48,6 +48,9 @@ FEW_STEPS = 8
 # Steps before a cycle is given up. Fewer: cycles far from the guess are lost. More: hopeless
 # searches last longer.
 MAX_STEPS = 32
+# Levenberg-Marquardt steps in which the residual falls by less than a tenth, where the search ends.
+# Fewer: slow searches are given up. More: searches where there is no cycle last longer.
+STALLED = 10
 
 
 class Solution(NamedTuple):
@@ -79,13 +82,27 @@ def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
         solution = solve(
             dataclasses.replace(map, anchor=solution.anchor, expected=expected)
         )
-    final = (Result.EQUILIBRIUM, Result.STEP_LIMIT)[: 1 + patient]
-    if not solution.is_fixed_point and int(solution.result) not in final:
+    code = int(solution.result)
+    strays = code == Result.STEP_LIMIT and _ends(map)
+    final = code == Result.STEP_LIMIT and patient and not strays
+    if not solution.is_fixed_point and code != Result.EQUILIBRIUM and not final:
         # Newton's method may have left the domain of the return map.
         say("Levenberg-Marquardt steps")
         second = _solve_damped(map)
-        solution = second if int(second.result) == Result.OK else solution
+        better = strays or int(second.result) == Result.OK
+        solution = second if better else solution
     return solution
+
+
+def _ends(map: ReturnMap) -> bool:
+    """Test whether the turn from the anchor's state ends within the limit on steps: if it does,
+    a search that comes to the limit has left for states where the flow is another one."""
+    return int(_first_turn(map).result) == Result.OK
+
+
+@host_first
+def _first_turn(map: ReturnMap) -> Return:
+    return map.turn(map.anchor.q[:, 0])
 
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
@@ -261,6 +278,7 @@ def _damped_on_host(
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Levenberg-Marquardt steps, with the constants of optimistix."""
     sizes, least, damping, best = map.sizes, np.inf, 1.0, None
+    history: list[float] = []
     x, step = map.anchor.q[:, 0] / sizes, 0.0
     for steps in itertools.count(1):
         turn = map.turn_with_jacobian((x + step) * sizes)
@@ -278,7 +296,9 @@ def _damped_on_host(
         jacobian[len(x) :] = np.sqrt(damping) * np.eye(len(x))
         step = -np.linalg.lstsq(jacobian, error)[0]
         # (Short steps are at the end, or where none helps.)
-        if excess(x[None], step[None])[0] < 1 or steps == max_steps:
+        history.append(least)
+        stalls = steps > STALLED and least > 0.9 * history[-1 - STALLED]
+        if excess(x[None], step[None])[0] < 1 or steps == max_steps or stalls:
             break
     return x * sizes, best or turn, np.asarray(steps)
 

@@ -30,7 +30,7 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.events import arm, belongs, enabled
+from ..engine.events import arm, await_schedules, belongs, enabled
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -41,6 +41,7 @@ from ..engine.watch import Watch, slopes, watch
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
+from ..systems.transition import TOGETHER
 from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
@@ -65,6 +66,9 @@ SINGULAR = 1e-7
 # Largest distance, in sizes of the states, at which a turn closes. Smaller: rounding rejects cycles
 # of sweeps. Larger: turns that Newton's method has not finished are accepted.
 CLOSED = 2e-8
+# A turn closes at most at this multiple of the accuracy of the flow, or of the derivative of the
+# turn. Smaller: rounding rejects cycles. Larger: errors of the cycle exceed the accuracy asked for.
+_ACCURACIES, _ROUNDED = 20.0, 1e-12
 # Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
 # for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
@@ -258,7 +262,7 @@ class ReturnMap(eqx.Module):
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
-            steps = Tape(tape.h, tape.code, tape.t, None, None, None)
+            steps = Tape(tape.h, tape.code, tape.t, None, None, None, tape.at_once)
             return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)
@@ -348,9 +352,15 @@ class ReturnMap(eqx.Module):
         singular = svdvals(defect * sizes[..., None, :] / sizes[..., None])
         counts = np.arange(self.structure.d) < valid.sum(axis=-1)[..., None]
         smallest = xp.min(xp.where(counts, singular, np.inf), axis=-1)
+        # (Where derivatives are large, rounding errors of the start are, too, at the end.)
+        grown = xp.max(
+            xp.abs(defect * sizes[..., None, :] / sizes[..., None]), axis=(-2, -1)
+        )
+        accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
+        closed_enough = turn.closed & (turn.distance <= accuracy)
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(turn.closed & ~xp.isnan(smallest), closed, code)
+        code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
             same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
             apart = xp.max(
@@ -358,6 +368,9 @@ class ReturnMap(eqx.Module):
             )
             farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
             still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
+            if self.event >= 0:
+                ends_at_once = turn.closed & self._follows(turn.end)
+                code = xp.where(ends_at_once, Result.COINCIDENCE, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
@@ -400,6 +413,21 @@ class ReturnMap(eqx.Module):
             for x in (passed & xp.stack(holds), fine)
         )
         return (passed & ~fine).any(axis=0)
+
+    def _follows(self, end: Lanes) -> Bool[Array, ""]:
+        """Test whether another event follows at once on the one with which a turn ends, so that the
+        next turn would begin without it."""
+        s, xp = self.structure, namespace(end.t)
+        watched = self.watch(end, until(end.t))
+        value, rate = watched.value[:-1], watched.rate[:-1]
+        span = xp.atleast_1d(self.expected)
+        by_guard = end.armed & (value <= TOGETHER * span * xp.abs(rate)) & (rate < 0)
+        by_guard = by_guard & (s.clocks < 0)[:, None]
+        waiting = (
+            xp.asarray(s.clocks >= 0)[:, None] & end.armed & belongs(s, end.chart)[:-1]
+        )
+        idle = await_schedules(s, xp.zeros_like(end.armed), end.t, end.t)
+        return self.each((by_guard | (waiting & ~idle)).any(axis=0))
 
     def held(
         self, q: Float[Array, " d"], varied: Varied | None = None

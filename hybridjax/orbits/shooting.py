@@ -110,10 +110,11 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     if pieces is None or pieces[-1] > CLOSED:
         return None
     legs, moved, tape, gap = pieces
-    end = jax.tree_util.tree_map(lambda x: x[..., -1], moved.lanes)
-    residual = np.where(map.valid, end.q, 0.0) - q - map.held(q)[0]
+    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
+    residual = np.where(map.valid, end.q[:, 0], 0.0) - q - map.held(q)[0]
     residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
-    turn = Return(residual, end.t - map.anchor.t[0], np.asarray(moved.result[-1]), end)
+    period = end.t[0] - map.anchor.t[0]
+    turn = Return(residual, period, np.asarray(moved.result[-1]), end)
     return turn, jax.tree_util.tree_map(one_by_one, (legs, None, tape)), gap
 
 

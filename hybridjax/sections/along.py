@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..engine import kernels, lanes
-from ..engine.events import arm, rearm
+from ..engine.events import Entry, arm, rearm
 from ..engine.lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.state import Moved
@@ -83,13 +83,22 @@ def flow_along(
     )
     watched, u = map.watch(ends, until(ends.t)), np.zeros((s.nu, 1))
     ends = rearm(
-        s, arm(s, ends, watched, period), watched, fired, none > 0, period, u, none
+        s,
+        arm(s, ends, watched, period),
+        watched,
+        fired,
+        none > 0,
+        period,
+        u,
+        none,
+        Entry(ends.armed, ends.armed),
     )
     legs = Lanes(
         *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
     )
     before = np.where(code >= 0, before[:, keys[:-1] % M], q[:, 1:])
-    tape = Tape(*(x[None] for x in (h, code, times[1:], before, q[:, 1:], chart[1:])))
+    rows = h, code, times[1:], before, q[:, 1:], chart[1:], np.zeros(len(h), bool)
+    tape = Tape(*(x[None] for x in rows))
     flow = legs, Moved(ends, none, none, none), lanes.regrouped(tape, piece, legs)
     last = Lanes(*(x[..., -1:] for x in ends))
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)

@@ -479,7 +479,7 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     s, N, tape, lanes = placed.structure(), placed.n_sections, placed.tape, placed.lanes
     still = np.zeros((s.nu, 1))
     # The steps of one period, and the section at their start or -1.
-    t, chart, q, h, _, lane, order = recorded_moves(lanes, tape)
+    t, chart, q, h, _, lane, order, _ = recorded_moves(lanes, tape)
     section, after = np.where(order == 0, lane, -1), tape.before.transpose(2, 0, 1)
     after = after[tape.code.T != IDLE].T
     f0, f1 = slopes(s, t, chart, q, still), slopes(s, t + h, chart, after, still)

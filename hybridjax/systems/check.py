@@ -2,10 +2,14 @@
 
 import contextlib
 import functools as ft
+import itertools
+import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
@@ -15,9 +19,15 @@ from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart
-from .structure import Structure, hashable, quoted, require_inputs_apart
+from .structure import (
+    Structure,
+    hashable,
+    jaxprs,
+    quoted,
+    require_inputs_apart,
+)
 from .system import HybridSystem, Output, arrays_of, require_positive
-from .transition import Scheduled, Transition
+from .transition import SAME_TIME, Scheduled, Transition
 
 
 # Systems that have passed, but for their numbers. (A `Memory` forgets with its object, and each
@@ -107,6 +117,44 @@ def _check_functions(s: Structure) -> Iterator[str]:
         yield from check_output(s, output)
 
 
+def check_schedules(s: Structure) -> None:
+    """**Raises:** `DefinitionError` for two schedules of one chart, or of a chart and of one that
+    the first leads to, that are due at the same time.
+
+    Of schedules with the same period, the event that belongs to an earlier period comes first: at
+    duty 1, `Scheduled(T, duty * T)` comes before `Scheduled(T)`. Transitions of one clock (see
+    `Structure.clocks`) wait for its next tick.
+    """
+    clocks = [g for g, number in enumerate(s.clocks) if number >= 0]
+    for g, h in itertools.combinations(clocks, 2):
+        first, second = s.transitions[g], s.transitions[h]
+        one_clock = s.clocks[g] == s.clocks[h]
+        chain = first.target == second.source or second.target == first.source
+        if first.source != second.source and (one_clock or not chain):
+            continue
+        if not is_traced((first.guard, second.guard)) and _meet(
+            first.guard, second.guard
+        ):
+            raise DefinitionError(
+                f"'{first.name}' and '{second.name}' are scheduled for the same time in chart "
+                f"'{second.source}', so that their order is not defined: write them as one event, "
+                "or give them different times."
+            )
+
+
+def _meet(first: Any, second: Any) -> bool:
+    """Test whether the events of two schedules, or if their periods are the same, those of one
+    period, have the same time."""
+    (a, p), (b, other) = ((float(x.offset), float(x.period)) for x in (first, second))
+    same = SAME_TIME * min(p, other)
+    if abs(p - other) <= SAME_TIME * p:
+        return abs(a - b) <= same
+    ratio = p / other if p > other else other / p
+    if abs(ratio - round(ratio)) > SAME_TIME * ratio:
+        return False  # (they meet by chance)
+    return abs(math.remainder(a - b, min(p, other))) <= same
+
+
 def check_output(s: Structure, output: Output, kind: str = "output") -> Iterator[str]:
     """Check an output in each chart; yield its name in those where it uses the time."""
     for name in () if callable(output.function) else output.function:
@@ -115,7 +163,7 @@ def check_output(s: Structure, output: Output, kind: str = "output") -> Iterator
         if s.resolve_outputs(output).defined(a):
             what = f"{kind} '{output.name}' in chart '{name}'"
             values = lambda s, *x, a=a: s.resolve_outputs(output)(a, *x)  # noqa: E731
-            yield from _check_shape(s, a, what, values, (1,), "")
+            yield from _check_shape(s, a, what, values, (1,), "", in_flow=False)
 
 
 def _check_transition(s: Structure, g: int) -> Iterator[str]:
@@ -142,20 +190,98 @@ def _check_shape(
     function: Callable,
     shape: tuple[int, ...],
     reason: str,
+    in_flow: bool = True,
 ) -> Iterator[str]:
     """Check the shape of a function of a structure and (t, q, u) in chart a. `reason`: why it must
-    be this one. Yield its name, `what`, if it uses t."""
+    be this one. Check the precision of a function that takes part in the flow (`in_flow`). Yield
+    its name, `what`, if it uses t."""
     shapes = (), (s.dims[a],), (s.nu,)
     with evaluating(what, " (`t`, `q[0]` and `u[0]` are numbers, q and u are arrays)"):
-        points = [jax.ShapeDtypeStruct(x, jnp.result_type(float)) for x in shapes]
+        real = jnp.result_type(float)
+        points = [jax.ShapeDtypeStruct(x, real) for x in shapes]
         program, *_ = eqx.filter_make_jaxpr(function)(s, *points)
         _check_indices(ft.partial(function, s), *(np.full(x, 0.5) for x in shapes))
     (actual,) = (x.shape for x in program.out_avals)
     if actual != shape:
         raise DefinitionError(f"the {what} returns shape {actual}, but {reason}.")
-    _, uses = dce_jaxpr(program.jaxpr, [True])
-    if uses[-3]:
+    needed, uses = dce_jaxpr(program.jaxpr, [True])
+    point = [False] * (len(uses) - 3) + [True] * 3
+    kept = [x for x, used in zip(point, uses, strict=True) if used]
+    if in_flow and real == np.float64 and (low := _rounded_to(needed, kept)):
+        raise DefinitionError(
+            f"the {what} is computed in {low}, whose rounding errors are jumps for the accuracy of "
+            f"the flow: write `float` in place of `jnp.{low}`."
+        )
+    if uses[-3] and _depends_on(
+        needed, [x == len(uses) - 3 for x in np.flatnonzero(uses)]
+    ):
         yield what
+
+
+def _rounded_to(program: jex.Jaxpr, moving: Sequence[bool]) -> str:
+    """A type of few digits in which a program computes with arguments that are `moving`; "" for
+    none. (Constants of such a type are exact.)"""
+    depends = dict(zip(program.invars, moving, strict=True))
+    for equation in program.eqns:
+        inputs = [_is_in(depends, x) for x in equation.invars]
+        for inner in jaxprs(equation.params):
+            same = len(inner.invars) == len(inputs)
+            found = _rounded_to(
+                inner, inputs if same else [any(inputs)] * len(inner.invars)
+            )
+            if found:
+                return found
+        for x in equation.outvars:
+            depends[x] = any(inputs)
+            kind = (
+                np.dtype(x.aval.dtype) if hasattr(x.aval, "dtype") else np.dtype(float)
+            )
+            low = jnp.issubdtype(kind, jnp.floating) and jnp.finfo(kind).bits < 64
+            if low and any(inputs):
+                return kind.name
+    return ""
+
+
+def _depends_on(program: jex.Jaxpr, moving: Sequence[bool]) -> bool:
+    """Test whether a result of a program depends on arguments that are `moving`, but for products
+    with the number zero."""
+    return any(_dependence(program, [(x, False) for x in moving]))
+
+
+def _dependence(
+    program: jex.Jaxpr, arguments: Sequence[tuple[bool, bool]]
+) -> list[bool]:
+    """Whether each result of a program depends on arguments, of which each is given by whether it
+    moves, and whether it is the number zero."""
+    states = dict(zip(program.invars, arguments, strict=True))
+
+    def state(x) -> tuple[bool, bool]:
+        if isinstance(x, jex.Literal):
+            return False, bool(np.all(np.asarray(x.val) == 0))
+        return states.get(x, (False, False))
+
+    for equation in program.eqns:
+        name, inputs = equation.primitive.name, [state(x) for x in equation.invars]
+        moves, zeros = any(x for x, _ in inputs), [zero for _, zero in inputs]
+        inner = list(jaxprs(equation.params))
+        results = [(moves, False)] * len(equation.outvars)
+        if name == "mul" and any(zeros):
+            results = [(False, True)]
+        elif name in _SAME_ZERO and zeros[0]:
+            results = [(False, True)]
+        elif len(inner) == 1 and len(inner[0].invars) == len(inputs) and name in _CALLS:
+            results = [(x, False) for x in _dependence(inner[0], inputs)]
+        states.update(zip(equation.outvars, results, strict=True))
+    return [state(x)[0] for x in program.outvars]
+
+
+# Operations that leave zero as it is, and those that call another program.
+_SAME_ZERO = ("broadcast_in_dim", "convert_element_type", "reshape", "neg", "squeeze")
+_CALLS = ("pjit", "jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
+
+
+def _is_in(depends: Mapping, x) -> bool:
+    return not isinstance(x, jex.Literal) and depends.get(x, False)
 
 
 def _check_indices(function: Callable, *point: np.ndarray) -> None:

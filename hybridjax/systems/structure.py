@@ -21,6 +21,7 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
@@ -150,6 +151,7 @@ class ByName(dict):
 
 
 _kinds = Memory()
+_all_clocks = Memory()
 
 
 @jax.tree_util.register_pytree_node_class
@@ -352,6 +354,40 @@ class Structure:
         return [
             g for g in range(len(self.transitions)) if self._leaves(g, a, by_clock=True)
         ]
+
+    @property
+    def clocks(self) -> Int[np.ndarray, " G"]:
+        """The clock of each transition by number, negative for those of a guard.
+
+        Schedules with the same formulas for period and offset are one clock, each of whose ticks
+        leads to one event: of a chart that a tick enters, the transition of the same clock waits
+        for the next tick. Clocks of other formulas may tick at the same time, such as
+        `Scheduled(T)` and `Scheduled(T, duty * T)` at duty 0, and each then leads to an event.
+        """
+        return _all_clocks.recall(self.source, None, self._clocks)
+
+    def _clocks(self) -> Int[np.ndarray, " G"]:
+        numbers, formulas = np.full(len(self.transitions), -1), []
+        for g, transition in enumerate(self.transitions):
+            if isinstance(transition.guard, Scheduled):
+                formula = self._formula(g)
+                if formula not in formulas:
+                    formulas.append(formula)
+                numbers[g] = formulas.index(formula)
+        return numbers
+
+    def _formula(self, g: int) -> Hashable:
+        """How the period and the offset of a schedule follow from the numbers of the system."""
+
+        def schedule(system: HybridSystem):
+            guard = list(system.transitions())[g].guard
+            assert isinstance(guard, Scheduled)
+            return guard.period, guard.offset
+
+        program, *_ = eqx.filter_make_jaxpr(schedule)(one_lane(self.source))
+        needed, _ = dce_jaxpr(program.jaxpr, [True, True], instantiate=True)
+        constants = tuple(np.asarray(x).tobytes() for x in program.consts)
+        return str(needed), constants
 
     def _leaves(self, g: int, a: int, by_clock: bool) -> bool:
         tr = self.transitions[g]

@@ -23,6 +23,14 @@ Direction = Literal["falling", "rising"]
 TOGETHER = 1e-9
 
 
+# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
+# steps if they differ by less than it; a target's level counts once it is above the change that its
+# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
+# event has it, and a level that falls right after the start is missed. Lower: an event happens
+# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
+SAME_TIME = 1e-11
+
+
 @checked
 class Scheduled(eqx.Module):
     """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
@@ -74,13 +82,16 @@ class Transition(eqx.Module):
         is the event, or a `Scheduled` (then `direction` has no meaning).
     - `direction`: "falling" (from positive to negative) or "rising".
     - `reset`: (t, q, u) -> state in `target`, as an array or a tuple. Identity by default.
-    - `enabled`: optional predicate (t, q, u) -> bool, evaluated at the crossing; where it is false
-        the crossing is passed without an event.
+    - `enabled`: optional predicate (t, q, u) -> bool, evaluated at the crossing or the scheduled
+        time; where it is false there is no event.
 
-    A guard is armed once it has left zero on the side from which it crosses: a guard that is zero
-    right after a reset does not fire at once. If a reset puts the state on a guard, and the state
-    then passes through it, `simulate` ends. This does not apply if the state was on this guard
-    before the reset, too.
+    A guard is armed once it has left zero on the side from which it crosses, so that a guard that
+    was just crossed does not fire again. If a reset leads to a chart whose guard is at zero or
+    beyond it, and moves on, the event happens at once, unless the old chart has this guard, too. It
+    also happens at once if a reset within a chart leads across an armed guard.
+
+    Scheduled transitions with the same formulas for period and offset are those of one clock: each
+    tick leads to one event.
     """
 
     name: str = eqx.field(static=True)

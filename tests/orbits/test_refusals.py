@@ -112,3 +112,68 @@ def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
         cycle.result == hj.Result.OK
         and cycle.event_sequence == hopper_cycle.event_sequence
     )
+
+
+def test_a_guess_that_is_far_too_large_in_one_state_leads_to_the_same_accuracy(
+    hopper_cycle,
+):
+    """States were small beside the guess, and errors relative to that: 1e-3 in multipliers."""
+    system = hj.models.VerticalHopper()
+    far = hj.find_limit_cycle(system, hj.Guess("stance", (2e6, 1.9e6), 0.5))
+    np.testing.assert_allclose(far.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+
+
+def test_failed_cycles_of_a_sweep_have_no_period():
+    """Oscillators with the energy x^2 + v^2 = mu, which have no cycle for negative mu."""
+
+    def make(mu):
+        def field(t, q, u):
+            rate = mu - q[0] ** 2 - q[1] ** 2
+            return rate * q[0] + q[1], rate * q[1] - q[0]
+
+        return {"a": Field(("x", "v"), field)}, ()
+
+    section = hj.Crossing("x", "falling")
+    guess = hj.Guess("a", (0.1, 1.0))
+    cycle = hj.find_limit_cycle(Toys(make, [1.0]), guess, section=section)
+    found = hj.find_limit_cycles([Toys(make, [mu]) for mu in (1.0, -1.0)], cycle)
+    np.testing.assert_array_equal(found.ok, [True, False])
+    np.testing.assert_allclose(found.period, [2 * np.pi, np.nan], rtol=1e-8)
+
+
+def oscillator(force):
+    """Van der Pol's oscillator with a further force."""
+
+    def field(t, q, u):
+        return q[1], (1 - q[0] ** 2) * q[1] - q[0] + force(t, q)
+
+    return toy({"a": Field(("x", "v"), field)})
+
+
+@pytest.mark.parametrize(
+    "force", [lambda t, q: 0.0 * t, lambda t, q: 0 * jnp.sin(t) * q[0]]
+)
+def test_time_times_zero_is_no_clock(force):
+    cycle = hj.find_limit_cycle(oscillator(force), hj.Guess("a", (2.0, 0.0)))
+    np.testing.assert_allclose(cycle.period, 6.663286859, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        lambda t, q: 0.1 * q[0].astype(jnp.float32),
+        lambda t, q: 0.1 * jax.jit(lambda x: jnp.sin(x.astype(jnp.float32)))(q[0]),
+    ],
+)
+def test_a_field_in_float32_is_named(force):
+    with pytest.raises(
+        hj.DefinitionError, match="field of chart 'a' is computed in float32"
+    ):
+        hj.find_limit_cycle(oscillator(force), hj.Guess("a", (2.0, 0.0)))
+
+
+def test_constants_in_float32_are_exact():
+    cycle = hj.find_limit_cycle(
+        oscillator(lambda t, q: jnp.float32(0.0) * q[0]), hj.Guess("a", (2.0, 0.0))
+    )
+    np.testing.assert_allclose(cycle.period, 6.663286859, rtol=1e-8)

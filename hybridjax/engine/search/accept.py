@@ -91,7 +91,9 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
     looked_at, moved = fresh | lands, step_length(aim, new)
-    crossing = _crossing(looked_at, state, new, moved)
+    # (Where an event is at once, nothing is crossed.)
+    ready = state.ready & ~aim.at_once
+    crossing = _crossing(looked_at & ~aim.at_once, state, new, moved, ready)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
@@ -138,9 +140,11 @@ def of_row(x: Array, which: Index) -> Times:
     return pick(x, range(len(x)), which)
 
 
-def _crossing(some: Mask, state: State, new: Attempt, moved: Times) -> CubicCrossing:
+def _crossing(
+    some: Mask, state: State, new: Attempt, moved: Times, ready: Bool[Array, "W L"]
+) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
-    start, end, ready = state.watched, new.watched, state.ready
+    start, end = state.watched, new.watched
     xp = namespace(ready)
     cubic = start.value, end.value, moved * start.rate, moved * end.rate
     no, nowhere = xp.zeros_like(ready), xp.full_like(end.value, xp.inf)

@@ -1,11 +1,26 @@
 """Outcome of attempted steps: accepted states, events, and reasons to stop."""
 
+import numpy as np
 from jaxtyping import Bool
 
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
+from ...systems.structure import Structure
+from ...systems.transition import SAME_TIME
 from ..arrays import Array, Index, Mask, Times
-from ..events import INSTANT, SAME_TIME, apply_resets, enabled, keep_pace, rearm, width
+from ..events import (
+    INSTANT,
+    Entry,
+    apply_resets,
+    await_schedules,
+    belongs,
+    enabled,
+    guard_noise,
+    keep_pace,
+    rearm,
+    width,
+    with_schedules,
+)
 from ..lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..watch import Watch, watch
 from .accept import Verdict, accept, next_step, of_row, step_length
@@ -25,7 +40,8 @@ def without_events(
     t = xp.where(on_time, aim.due, lanes.t + moved)
     arrived = level | on_time
     pace = put(lanes.pace, 0, lanes.pace[0] + moved)
-    lanes = Lanes(t, lanes.chart, new.q, lanes.armed, lanes.events, pace)
+    armed = await_schedules(task.s, lanes.armed, lanes.t, t)
+    lanes = Lanes(t, lanes.chart, new.q, armed, lanes.events, pace)
     h = next_step(state.h, aim, new.error, lanes, task)
     late = active & ~arrived & (t >= task.target.limit)
     code = xp.where(on_time, ARRIVE_TIME, xp.where(level, ARRIVE_LEVEL, MOVE))
@@ -40,7 +56,8 @@ def without_events(
         arrived=state.arrived | arrived,
         i=state.i + 1,
     )
-    return end, Tape(moved, code, t, new.q, new.q, lanes.chart)
+    at_once = xp.zeros_like(active)
+    return end, Tape(moved, code, t, new.q, new.q, lanes.chart, at_once)
 
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
@@ -53,7 +70,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
     by_clock = verdict.plain & (aim.schedule >= 0)
-    fired = xp.where(fires, aim.which, xp.where(by_clock, aim.schedule, -1))
+    happens = by_clock & enabled(s, t, new.q, task.u, aim.schedule)
+    fired = xp.where(fires, aim.which, xp.where(happens, aim.schedule, -1))
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
@@ -100,7 +118,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(
         xp.int32
     )
-    return end, Tape(moved, code, t, new.q, after.q, after.chart)
+    at_once = aim.at_once & (fired >= 0)
+    return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once)
 
 
 def _after(
@@ -116,29 +135,40 @@ def _after(
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
     lanes, end, accepted, xp = state.lanes, new.watched, verdict.accepted, namespace(t)
     zero = width(t, task.span, end.rate)
-    ready = (state.ready & ((end.value > 0) | verdict.lands)) | (end.value > zero)
-    ready = xp.where(accepted, ready & ~verdict.chosen, state.ready)
+    stays = verdict.lands | aim.at_once
+    ready = (state.ready & ((end.value > 0) | stays)) | (end.value > zero)
+    row = np.arange(len(zero))[:, None]
+    due = verdict.plain & (row == aim.schedule)
+    ready = xp.where(accepted, ready & ~verdict.chosen & ~due, state.ready)
     speed = xp.abs(of_row(end.rate, aim.which))
     on = state.approach.on
     slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
     passed = xp.where(accepted, step_length(aim, new), 0.0)
-    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow)
+    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span)
     falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
     together = (ready & falls)[:-1].any(axis=0)
+    t = xp.where(accepted, t, lanes.t)
+    waiting = await_schedules(task.s, lanes.armed, lanes.t, t) & ~due[:-1]
     after = Lanes(
-        xp.where(accepted, t, lanes.t),
+        t,
         lanes.chart,
         xp.where(accepted, new.q, lanes.q),
-        ready[:-1],
+        with_schedules(task.s, ready[:-1], waiting),
         lanes.events + (fired >= 0),
         pace,
     )
     watched = _merge(accepted, end, state.watched)
-    return *_reset(after, watched, ready[-1], fired, together, task), zeno, slow
+    end = _reset(after, watched, ready[-1], fired, together, task)
+    return *end, zeno, slow
 
 
 def _reset(
-    lanes: Lanes, watched: Watch, aimed: Mask, fired: Index, together: Mask, task: Task
+    lanes: Lanes,
+    watched: Watch,
+    aimed: Mask,
+    fired: Index,
+    together: Mask,
+    task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
@@ -149,11 +179,50 @@ def _reset(
         new = lanes._replace(q=q, chart=chart)
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(of_row(watched.value, fired))
-        new = rearm(s, new, after, fired, together, task.span, task.u, residue)
+        entry = _entry(lanes, watched, new, task)
+        new = rearm(s, new, after, fired, together, task.span, task.u, residue, entry)
         counts = xp.where(fires, level_counts(after, task.span), aimed)
         return new, _merge(fires, after, watched), counts
 
     return cond(fires.any(), work, lambda: (lanes, watched, aimed))
+
+
+def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
+    """The guards of the charts of lanes after resets, `new`, that the charts before had, too.
+
+    (Charts of other numbers of states have no guards in common.)
+    """
+    s, xp = task.s, namespace(lanes.t)
+    dims, same = xp.asarray(np.array(s.dims)), lanes.chart == new.chart
+    alike = ~same & (dims[lanes.chart] == dims[new.chart])
+
+    def compare():
+        before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
+        noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
+        value, rate = before.value[:-1], before.rate[:-1]
+        zero = SAME_TIME * task.span * xp.abs(rate) + noise
+        apart = xp.abs(value[:, None] - watched.value[None, :-1])
+        equal = (apart <= zero[:, None]) & belongs(s, lanes.chart)[None, :-1]
+        return equal.any(axis=1) & alike, (equal & lanes.armed).any(axis=1) & alike
+
+    no = xp.zeros_like(lanes.armed)
+    if not _share_guards(s):
+        return Entry(no | same, xp.where(same, lanes.armed, no))
+    known, armed = cond(alike.any(), compare, lambda: (no, no))
+    return Entry(known | same, xp.where(same, lanes.armed, armed))
+
+
+def _share_guards(s: Structure) -> bool:
+    """Test whether any transition leads to another chart that may have guards of the first one."""
+    ends = (
+        (s.chart_index(x.source), s.chart_index(x.target))
+        for x in s.transitions
+        if x.source != x.target
+    )
+    return any(
+        s.dims[a] == s.dims[b] and bool(s.guards(a)) and bool(s.guards(b))
+        for a, b in ends
+    )
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:

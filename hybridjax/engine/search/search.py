@@ -10,8 +10,9 @@ from ..._core.executor import cond, namespace, on_host, put, while_loop
 from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
+from ...systems.transition import SAME_TIME
 from ..arrays import Index, Inputs, Mask, Times
-from ..events import SAME_TIME, arm, next_schedule
+from ..events import arm, next_schedule, overdue
 from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
 from ..target import Target
@@ -139,9 +140,16 @@ def take_aim(state: State, task: Task) -> Aim:
     s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
     xp = namespace(lanes.t)
     # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time)
+    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
     due = xp.minimum(target.time, scheduled)
     schedule = xp.where(scheduled <= target.time, which, -1)
+    # Events at once: of guards that a reset has put beyond zero.
+    beyond = lanes.armed & overdue(state.watched, task.span)
+    at_once = state.active & ~approach.on & beyond.any(axis=0)
+    due = xp.where(at_once, lanes.t, due)
+    if s.transitions:
+        overdue_first = xp.argmax(beyond, axis=0).astype(xp.int32)
+        schedule = xp.where(at_once, overdue_first, schedule)
     left = xp.maximum(due - lanes.t, 0.0)
     pieces = xp.ceil(xp.where(xp.isfinite(left), left / state.h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
@@ -158,6 +166,7 @@ def take_aim(state: State, task: Task) -> Aim:
     expected = (
         state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
     )
+    expected = expected & ~at_once
     guess = xp.where(expected, guess, xp.inf)
     nearest = xp.min(guess, axis=0)
     lands = xp.isfinite(nearest)
@@ -166,7 +175,7 @@ def take_aim(state: State, task: Task) -> Aim:
     last = last & ~lands & state.active
     step = xp.where(state.active, xp.where(approach.on, approach.tau, step), 0.0)
     reach = xp.where(approach.on, approach.reach, step)
-    return Aim(which, step, reach, due, xp.where(last, schedule, -1), last)
+    return Aim(which, step, reach, due, xp.where(last, schedule, -1), last, at_once)
 
 
 def initial_step(

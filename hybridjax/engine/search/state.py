@@ -141,6 +141,9 @@ class Aim(NamedTuple):
     """The scheduled transition that is due at the end of this step; -1 for none."""
     last: Mask
     """Whether this step ends at the known time."""
+    at_once: Mask
+    """Whether `schedule` is no scheduled transition, but one whose guard is beyond zero: the step
+    has no length."""
 
 
 class Attempt(NamedTuple):

@@ -1,0 +1,264 @@
+"""Events that follow each other at once: clocks that tick together, and guards that a reset puts at
+zero or beyond. Converters at full and at zero duty are of this kind."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+from ..toys import Field, toy
+
+
+DUTIES = (0.0, 1e-12, 1e-9, 1e-7, 0.5, 1 - 1e-7, 1 - 1e-9, 1.0)
+CASES = [(duty, True) for duty in DUTIES] + [(duty, False) for duty in DUTIES[2:]]
+
+
+class Converter(hj.HybridSystem):
+    """x' = 1 - x while on and -x while off; on at whole times, and off a part `duty` later.
+
+    A comparator with a ramp, which each tick sets back, switches off, or a second clock.
+    """
+
+    duty: float = hj.parameter(0.5)
+    by_ramp: bool = True
+
+    def charts(self):
+        def circuit(supply):
+            return Field(("x", "ramp"), lambda t, q, u: (supply + u[0] - q[0], 1.0))
+
+        return {"off": circuit(0.0), "on": circuit(1.0)}
+
+    def transitions(self):
+        tick = hj.Scheduled(1.0)
+        anew = lambda t, q, u: (q[0], 0.0)  # noqa: E731
+        if self.by_ramp:
+            trip = lambda t, q, u: self.duty - q[1]  # noqa: E731
+        else:
+            trip = hj.Scheduled(1.0, 1.0 * self.duty)
+        return (
+            hj.Transition("trip", "on", "off", trip),
+            hj.Transition("tick", "off", "on", tick, reset=anew),
+            hj.Transition("tick on", "on", "on", tick, reset=anew),
+        )
+
+    def period(self):
+        return 1.0
+
+
+def at_tick(duty):
+    """x on the limit cycle where a period begins, in closed form."""
+    return (np.exp(duty - 1) - np.exp(-1)) / (1 - np.exp(-1))
+
+
+@pytest.mark.parametrize("duty, by_ramp", CASES)
+def test_a_converter_at_any_duty(duty, by_ramp):
+    """Ten periods from rest approach the cycle by a factor of e each, and start where it is on."""
+    system = Converter(duty, by_ramp)
+    path = hj.simulate(system, "off", (0.0, 0.5), 10.5, time=0.5)
+    exact = at_tick(duty) * (1 - np.exp(-10.0))
+    np.testing.assert_allclose(path.after[-1, 0], exact, atol=1e-9)
+
+
+@pytest.mark.parametrize("duty, by_ramp", CASES)
+def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
+    """A comparator that trips within rounding of the tick is refused by name."""
+    system, chart = Converter(duty, by_ramp), "off" if duty <= 0.5 else "on"
+    guess = hj.Guess(chart, (0.3, 0.9), time=0.6 if duty == 0.5 else 0.9)
+    if by_ramp and duty > 1 - 1e-8:
+        with pytest.raises(hj.ComputationError, match="'trip' and 'tick' coincide"):
+            hj.find_limit_cycle(system, guess)
+        return
+    cycle = hj.find_limit_cycle(system, guess)
+    later = float(cycle.anchor.t[0]) - duty
+    at_trip = at_tick(duty) * np.exp(-duty) + 1 - np.exp(-duty)
+    if chart == "off":
+        exact = at_trip * np.exp(-later)
+    else:
+        exact = 1 + (at_tick(duty) - 1) * np.exp(-float(cycle.anchor.t[0]))
+    np.testing.assert_allclose(cycle.state["x"], exact, atol=1e-11)
+    np.testing.assert_allclose(cycle.multipliers, [np.exp(-1)], rtol=1e-9)
+
+
+def test_schedules_whose_order_is_not_defined():
+    """At duty 0, both begin their period at the same time."""
+    system = Converter(0.0, by_ramp=False)
+    refused = pytest.raises(hj.DefinitionError, match="'trip' and 'tick' are scheduled")
+    with refused:
+        hj.simulate(system, "off", (0.0, 0.5), 3.0, time=0.5)
+    with refused:
+        hj.find_limit_cycle(system, hj.Guess("off", (0.3, 0.9), time=0.9))
+
+
+class PeakCurrent(hj.HybridSystem):
+    """A coil whose current rises by 1 - i / 10 while on, decays by i / 10 while off; a clock
+    switches it on, and a comparator off at a limit."""
+
+    limit: float = hj.parameter(0.5)
+    allows: bool = False
+
+    def charts(self):
+        circuit = lambda v: Field(("i",), lambda t, q, u: (v - 0.1 * q[0],))  # noqa: E731
+        return {"off": circuit(0.0), "on": circuit(1.0)}
+
+    def transitions(self):
+        below = (lambda t, q, u: q[0] < self.limit) if self.allows else None
+        tick = hj.Scheduled(1.0)
+        return (
+            hj.Transition("trip", "on", "off", lambda t, q, u: self.limit - q[0]),
+            hj.Transition("tick", "off", "on", tick, enabled=below),
+            hj.Transition("tick on", "on", "on", tick),
+        )
+
+    def period(self):
+        return 1.0
+
+
+@pytest.mark.parametrize("allows, events", [(False, ["tick", "trip"] * 5), (True, [])])
+def test_a_current_above_its_limit_at_the_tick(allows, events):
+    """The comparator trips at once, or the tick is not enabled: the current decays either way."""
+    path = hj.simulate(PeakCurrent(allows=allows), "off", (2.0,), 5.0, time=0.5)
+    assert [e.name for e in path.events] == events
+    np.testing.assert_allclose(path.after[-1], [2.0 * np.exp(-0.5)], rtol=1e-9)
+
+
+def neurons(push):
+    """Two neurons, of which each spike pushes the other one. In `x`, both are set back."""
+    pulse = lambda t, q, u: (0.0, q[1] + push)  # noqa: E731
+    other = lambda t, q, u: (q[0] + push, 0.0)  # noqa: E731
+    charts = {"rest": Field(("x", "y"), lambda t, q, u: (1.5 - q[0], 1.4 - q[1]))}
+    return toy(
+        charts,
+        [
+            hj.Transition("X", "rest", "rest", lambda t, q, u: 1 - q[0], reset=pulse),
+            hj.Transition("Y", "rest", "rest", lambda t, q, u: 1 - q[1], reset=other),
+        ],
+    )
+
+
+@pytest.mark.parametrize("push", [0.3, 0.8])
+def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
+    """Also to above where it would come to rest, so that it moves back from there. By hand: x
+    spikes first, y at once, and leaves (push, 0)."""
+    cycle = hj.find_limit_cycle(neurons(push), hj.Guess("rest", (push + 0.05, 0.1)))
+    period = np.log((1.5 - push) / 0.5)
+    assert [neurons(push).transitions()[g].name for g in cycle.event_sequence] == [
+        "X",
+        "Y",
+    ]
+    np.testing.assert_allclose(cycle.period, period, rtol=1e-10)
+    assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
+    assert hj.coincidences(cycle) == []
+
+
+class Kicked(hj.HybridSystem):
+    """x decays, a clock kicks it by 1, and where it is then above 1.2 it falls at once."""
+
+    rate: float = hj.parameter(0.7)
+
+    def charts(self):
+        decay = Field(("x",), lambda t, q, u: (u[0] - self.rate * q[0],))
+        ready = Field(("x",), lambda t, q, u: (u[0] + 1.0 - self.rate * q[0],))
+        return {"calm": decay, "kicked": ready}
+
+    def transitions(self):
+        kick = lambda t, q, u: (q[0] + 1.0,)  # noqa: E731
+        halve = lambda t, q, u: (0.4 * q[0] ** 2,)  # noqa: E731
+        return (
+            hj.Transition("kick", "calm", "kicked", hj.Scheduled(1.0), reset=kick),
+            hj.Transition(
+                "halve", "kicked", "calm", lambda t, q, u: 1.2 - q[0], reset=halve
+            ),
+        )
+
+    def period(self):
+        return 1.0
+
+
+def test_derivatives_across_an_event_at_once():
+    """Of the map x -> (1 + x exp(-rate))^2 0.4 between kicks, and of its fixed point."""
+    system = Kicked()
+    cycle = hj.find_limit_cycle(system, hj.Guess("calm", (0.5,), time=0.5))
+    low = np.exp(-0.5 * 0.7) * float(cycle.anchor.q[0, 0])
+    np.testing.assert_allclose(
+        cycle.state["x"], np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2, rtol=1e-11
+    )
+    multiplier = 0.8 * (1 + low) * np.exp(-0.7)
+    np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
+    ldtp = hj.linearize(cycle, hj.ClockPhase(3, 0.3))
+    np.testing.assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
+    at = lambda rate: hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]  # noqa: E731
+    by_steps = (float(at(0.7 + 1e-5)) - float(at(0.7 - 1e-5))) / 2e-5
+    np.testing.assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(at))(jnp.asarray(0.7)), by_steps, rtol=1e-7
+    )
+
+
+def test_events_that_take_each_others_place_at_once():
+    """A relay whose thresholds are in the wrong order."""
+    fields = {
+        "on": Field(("x",), lambda t, q, u: (1.0,)),
+        "off": Field(("x",), lambda t, q, u: (-1.0,)),
+    }
+    relay = toy(
+        fields,
+        [
+            hj.Transition("up", "on", "off", lambda t, q, u: 0.5 - q[0]),
+            hj.Transition("down", "off", "on", lambda t, q, u: q[0] - 0.9),
+        ],
+    )
+    with pytest.raises(hj.ComputationError, match="events accumulate"):
+        hj.simulate(relay, "on", (0.0,), 2.0)
+
+
+def test_a_guard_that_both_charts_have_happens_once():
+    """x rises through zero once; a clock changes the chart, in which it has the same guard."""
+    fields = {name: Field(("x",), lambda t, q, u: (1.0,)) for name in ("day", "night")}
+    cross = lambda t, q, u: q[0]  # noqa: E731
+    system = toy(
+        fields,
+        [
+            hj.Transition("by day", "day", "day", cross, "rising"),
+            hj.Transition("by night", "night", "night", cross, "rising"),
+            hj.Transition("dusk", "day", "night", hj.Scheduled(1.0)),
+            hj.Transition("dawn", "night", "day", hj.Scheduled(1.0)),
+        ],
+        period=2.0,
+    )
+    path = hj.simulate(system, "day", (-0.5,), 3.3)
+    assert [e.name for e in path.events] == ["by day", "dusk", "dawn", "dusk"]
+
+
+def test_a_turn_cannot_begin_between_events_at_once():
+    """Right after the spike of x that y follows at once; that of y may begin a turn."""
+    guess = hj.Guess("rest", (0.4, 0.1))
+    with pytest.raises(hj.ComputationError, match="event .Y. coincides with .X."):
+        hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("X"))
+    cycle = hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("Y"))
+    np.testing.assert_allclose(cycle.period, np.log(1.2 / 0.5), rtol=1e-10)
+
+
+def test_programs_refuse_events_that_coincide():
+    """Close to full duty, where the comparator trips right before the tick."""
+    cycle = hj.find_limit_cycle(Converter(0.95), hj.Guess("on", (0.9, 0.9), time=0.9))
+    result = jax.jit(
+        jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
+    )
+    np.testing.assert_array_equal(
+        result(jnp.array([0.95, 0.99, 1 - 1e-10])),
+        [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE],
+    )
+
+
+def test_experiments_near_full_and_zero_duty():
+    """The states of the converter are linear between events at fixed times, so that deviations
+    decay by e each period; with a ramp, no perturbation of x moves an event."""
+    for duty in (1e-9, 1 - 1e-7):
+        for by_ramp in (True, False):
+            chart = "off" if duty < 0.5 else "on"
+            guess = hj.Guess(chart, (0.3, 0.9), time=0.9)
+            cycle = hj.find_limit_cycle(Converter(duty, by_ramp), guess)
+            ldtp = hj.linearize(cycle, hj.ClockPhase(4, 0.3), "x")
+            np.testing.assert_allclose(ldtp.multipliers, [np.exp(-1)], rtol=1e-9)
