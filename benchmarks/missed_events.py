@@ -75,7 +75,9 @@ def drawn_polynomials(rng, flows):
         else:
             points = (1 - np.cos(np.pi * np.arange(degree + 1) / degree)) / 2
             values = rng.normal(size=degree + 1)
-            c[k, : degree + 1] = np.polynomial.polynomial.polyfit(points, values, degree)
+            c[k, : degree + 1] = np.polynomial.polynomial.polyfit(
+                points, values, degree
+            )
     return c
 
 
@@ -220,9 +222,7 @@ def draw(family: Family, flows: int, tolerance: np.ndarray, rng) -> Flows:
         if k % 2 and len(inside):
             near = tolerance[k] * 10 ** rng.uniform(0, 4) * rng.choice([-1, 1])
             offset[k] = near * amplitude[k] - rng.choice(inside)
-    heights = [
-        (x + o) / a for x, o, a in zip(values, offset, amplitude, strict=True)
-    ]
+    heights = [(x + o) / a for x, o, a in zip(values, offset, amplitude, strict=True)]
     return Flows(c, offset, amplitude, ends, heights)
 
 
@@ -317,7 +317,9 @@ def compare(
             count["events"] += 1
             count["found"] += within == 1
             if within == 0:
-                count[kind(family, flows, k, found, left, right, excursion, tolerance)] += 1
+                count[
+                    kind(family, flows, k, found, left, right, excursion, tolerance)
+                ] += 1
         wrong = within > 1 if falls else within > 0
         count["spurious"] += wrong and excursion > 10 * tolerance
     return Count(**count)
@@ -334,7 +336,11 @@ def kind(family, flows, k, found, left, right, excursion, tolerance) -> str:
     # The positive part ends at the zero, the negative one begins there.
     for far, here in ((place - 2, place - 1), (place + 1, place)):
         outside = 0 <= far < len(ends) and heights[far] * heights[here] < 0
-        other = crossing(family, flows, k, *sorted((ends[far], ends[here]))) if outside else ends[here]
+        other = (
+            crossing(family, flows, k, *sorted((ends[far], ends[here])))
+            if outside
+            else ends[here]
+        )
         lasts.append(abs(other - zero))
     step = np.searchsorted(found.steps, zero)
     length = np.diff(found.steps)[min(step, len(found.steps) - 1) - 1]
@@ -372,7 +378,9 @@ def campaign(flows: int, seed: int, methods=tuple(METHODS), families=tuple(FAMIL
                     name,
                     method,
                     accuracy,
-                    total([compare(family, drawn, k, found[k], accuracy) for k in lanes]),
+                    total(
+                        [compare(family, drawn, k, found[k], accuracy) for k in lanes]
+                    ),
                 )
 
 
@@ -390,9 +398,15 @@ def main() -> int:
         options.flows, options.seed, options.methods, options.families
     ):
         counts.append(count)
-        print(f"{name:12} {method:8} {accuracy:8.0e}", *(f"{int(x):8}" for x in count), flush=True)
+        print(
+            f"{name:12} {method:8} {accuracy:8.0e}",
+            *(f"{int(x):8}" for x in count),
+            flush=True,
+        )
     whole = total(counts)
-    print(f"{'all':30}", *(f"{int(x):8}" for x in whole), f"  {time.time() - begin:.0f} s")
+    print(
+        f"{'all':30}", *(f"{int(x):8}" for x in whole), f"  {time.time() - begin:.0f} s"
+    )
     return int(whole.high + whole.long + whole.spurious > 0)
 
 

@@ -181,16 +181,30 @@ def _walk_along(cycle) -> _Path:
     moves = recorded_moves(*last_turn(cycle))
     t = np.append(moves.t, moves.t[0] + float(cycle.period))
     event = np.maximum(moves.code, -1)
-    stretch = Stretch(t[:-1], t[1:], moves.chart, moves.q)
+    length = np.diff(t)
+    # (A short move is known to more digits than the times of its ends.)
+    length = np.where(
+        np.abs(moves.h - length) <= 1e-14 * np.abs(t[1:]), moves.h, length
+    )
+    stretch = Stretch(t[:-1], length, moves.chart, moves.q)
     walked = walk(s, stretch, scale)
     chart, q = moves.chart.copy(), walked.q.copy()
     by_state = np.moveaxis(walked.by_state, -1, 0).copy()
     findings: list[Finding] = []
+    delay = np.zeros(s.d)
     for k in np.flatnonzero(event >= 0):
-        jump = _jump(s, int(event[k]), float(t[k + 1]), int(chart[k]), q[:, k], scale)
+        at = float(t[k + 1]), int(chart[k]), q[:, k]
+        if moves.at_once[k]:  # (The event before it has brought this one about.)
+            jump = _jump_at_once(s, int(event[k]), *at, scale)
+            by_state[k - 1] = jump.by_state @ by_state[k - 1]
+            by_state[k - 1] += np.outer(jump.slip, delay)
+        else:
+            jump = _jump(s, int(event[k]), *at, scale)
+            delay = jump.delay @ by_state[k]
+            by_state[k] = jump.by_state @ by_state[k]
+            by_state[k] += np.outer(jump.slip, delay)
         findings += jump.findings
         chart[k], q[:, k] = jump.chart, jump.q
-        by_state[k] = jump.by_state @ by_state[k]
     monodromy = np.eye(s.d)
     for of_move in by_state:
         monodromy = of_move @ monodromy
@@ -212,40 +226,68 @@ def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
 
 
 class _Jump(NamedTuple):
-    """A state after an event, with its derivative by the state before."""
+    r"""An event.
+
+    A deviation $x$ before it, at a fixed time, becomes $R_q x + (R_q f^- + R_t - f^+)\,\delta$
+    with the delay $\delta = -h_q x / \dot h$ of the event: the saltation matrix (M. A. Aizerman and
+    F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11, 1958). Scheduled events
+    have no delay.
+    """
 
     chart: int
+    """After the event, as `q`."""
     q: Float[np.ndarray, " d"]
     by_state: Float[np.ndarray, "d d"]
+    """$R_q$."""
+    slip: Float[np.ndarray, " d"]
+    """$R_q f^- + R_t - f^+$."""
+    delay: Float[np.ndarray, " d"]
+    """Derivative of the time of the event by the state before it."""
     findings: list[Finding]
 
 
 def _jump(s: Structure, g: int, t: float, a: int, q, scale) -> _Jump:
-    r"""Event g of a state of chart a.
-
-    The saltation matrix is $R_q + (R_q f^- + R_t - f^+) h_q / \dot h$ for a guard h with the rate
-    $\dot h$ before the event, and $R_q$ for a scheduled event (M. A. Aizerman and F. R. Gantmacher,
-    Quarterly J. Mechanics and Applied Mathematics 11, 1958).
-    """
+    """Event g of a state of chart a, at its own time."""
     transition, n = s.transitions[g], s.dims[a]
-    b = s.chart_index(transition.target)
-    state, time, u = q[:n, None], np.array([t]), np.zeros((s.nu, 1))
-    reset = kernels.reset(s, s.member(g), time, state, u)[..., 0]
-    by_state = reset[:, 2 : 2 + n]
+    jump = _reset(s, g, t, a, q)
+    time, state = np.array([t]), q[:n, None]
     if isinstance(transition.guard, Scheduled):
         late = t - float(transition.guard.nearest(time)[0])
-        findings = _off_schedule(transition, t, late)
-    else:
-        level, slope, rate = _guard(s, a, g, time, state)
-        findings = _off_guard(transition, t, level, rate, _noise(slope, scale[a, :n]))
-        before = kernels.field(s, a, time, state, u)[:, 0, 0]
-        after = kernels.field(s, b, time, reset[:, :1], u)[:, 0, 0]
-        slip = by_state @ before + reset[:, 1] - after
-        by_state = by_state - np.outer(slip, slope) / rate
-    out, full = np.zeros(s.d), np.zeros((s.d, s.d))
-    out[: s.dims[b]] = reset[:, 0]
-    full[: s.dims[b], :n] = by_state
-    return _Jump(b, out, full, findings)
+        return jump._replace(findings=_off_schedule(transition, t, late))
+    level, slope, rate = _guard(s, a, g, time, state)
+    findings = _off_guard(transition, t, level, rate, _noise(slope, scale[a, :n]))
+    delay = np.zeros(s.d)
+    delay[:n] = -slope / rate
+    return jump._replace(delay=delay, findings=findings)
+
+
+def _jump_at_once(s: Structure, g: int, t: float, a: int, q, scale) -> _Jump:
+    """Event g of a state of chart a, to which another event has just led: its guard is at zero, or
+    beyond."""
+    transition, n = s.transitions[g], s.dims[a]
+    jump = _reset(s, g, t, a, q)
+    if isinstance(transition.guard, Scheduled):
+        return jump
+    level, slope, _ = _guard(s, a, g, np.array([t]), q[:n, None])
+    if level <= 10 * _noise(slope, scale[a, :n]):
+        return jump
+    return jump._replace(findings=_off_guard(transition, t, level, -1.0, 0.0))
+
+
+def _reset(s: Structure, g: int, t: float, a: int, q) -> _Jump:
+    """The state after an event, without its delay."""
+    transition, n = s.transitions[g], s.dims[a]
+    b = s.chart_index(transition.target)
+    m = s.dims[b]
+    state, time, u = q[:n, None], np.array([t]), np.zeros((s.nu, 1))
+    reset = kernels.reset(s, s.member(g), time, state, u)[..., 0]
+    before = kernels.field(s, a, time, state, u)[:, 0, 0]
+    after = kernels.field(s, b, time, reset[:, :1], u)[:, 0, 0]
+    out, slip, by_state = np.zeros(s.d), np.zeros(s.d), np.zeros((s.d, s.d))
+    out[:m] = reset[:, 0]
+    by_state[:m, :n] = reset[:, 2 : 2 + n]
+    slip[:m] = reset[:, 2 : 2 + n] @ before + reset[:, 1] - after
+    return _Jump(b, out, by_state, slip, np.zeros(s.d), [])
 
 
 def _guard(s: Structure, a: int, g: int, time, state):
@@ -441,7 +483,8 @@ def _closes_sooner(cycle, path: _Path) -> float | None:
         return None
     times = path.t[0] + period / np.array(parts)
     moves = np.searchsorted(path.t, times) - 1
-    stretch = Stretch(path.t[moves], times, path.chart[moves], path.begin[:, moves])
+    begins = path.t[moves]
+    stretch = Stretch(begins, times - begins, path.chart[moves], path.begin[:, moves])
     reached = walk(s, stretch, np.asarray(map.scale)).q
     sizes = np.asarray(map.scale)[path.chart[0]][:, None]
     apart = np.max(np.abs(reached - path.begin[:, :1]) / sizes, axis=0)

@@ -41,11 +41,12 @@ _FRACTIONS = np.linspace(0.0, 1.0, 9)[1:]
 class Stretch(NamedTuple):
     """L pieces of flow without events, each in its chart."""
 
-    t0: Float[np.ndarray, " L"]
-    t1: Float[np.ndarray, " L"]
+    t: Float[np.ndarray, " L"]
+    """Times at which they begin."""
+    length: Float[np.ndarray, " L"]
     chart: Int[np.ndarray, " L"]
     q: Float[np.ndarray, "d L"]
-    """States at t0, padded to the largest chart."""
+    """States at the beginnings, padded to the largest chart."""
 
 
 class Walked(NamedTuple):
@@ -72,7 +73,7 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
     points: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for a in np.unique(stretch.chart).tolist():
         n, lanes = s.dims[a], np.flatnonzero(stretch.chart == a)
-        times = stretch.t0[lanes], stretch.t1[lanes]
+        times = stretch.t[lanes], stretch.length[lanes]
         x, error[lanes], path = _in_chart(
             s, a, *times, stretch.q[:n, lanes], scale[a, :n]
         )
@@ -97,7 +98,7 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
 # derivatives by the state at the beginning. So do the rates of x.
 
 
-def _in_chart(s: Structure, a: int, t0, t1, q, sizes):
+def _in_chart(s: Structure, a: int, begin, length, q, sizes):
     """The ends x of stretches in chart a, their errors, and the points on the way: lanes, times and
     states of each part of a step."""
     n, L = q.shape
@@ -106,38 +107,41 @@ def _in_chart(s: Structure, a: int, t0, t1, q, sizes):
     order = len(_EULER_STEPS) if implicit else 2 * len(_MIDPOINT_STEPS) - 1
 
     def field(t, x):
-        return np.moveaxis(
-            kernels.field(s, a, t, x[..., 0].T, np.zeros((s.nu, 1))), -1, 0
-        )
+        rows = kernels.field(s, a, t, x[..., 0].T, np.zeros((s.nu, 1)))
+        return np.moveaxis(rows, -1, 0)
 
     x = np.concatenate([q.T[..., None], np.tile(np.eye(n), (L, 1, 1))], axis=2)
-    t, h, error, path = t0.copy(), t1 - t0, np.zeros(L), []
+    past, h, error, path = np.zeros(L), length.copy(), np.zeros(L), []
     with np.errstate(all="ignore"):
-        by_field = field(t, x).copy()
+        by_field = field(begin, x).copy()
         for _ in range(_PATIENCE):
-            going = np.flatnonzero(t < t1)
+            going = np.flatnonzero(past < length)
             if not len(going):
                 break
-            begin = t[going], h[going], x[going]
-            end, change = extrapolated(field, by_field[going], *begin)
+            t = begin[going] + past[going]
+            end, change = extrapolated(field, by_field[going], t, h[going], x[going])
             off = np.max(np.abs(change) / sizes, axis=1, initial=0.0)
             off = np.where(np.isfinite(off), off, np.inf)
             longer = _SAFE * (_ACCURATE / np.maximum(off, 1e-300)) ** (1 / order)
             # (Steps as short as rounding of the time go on with the error that they have.)
-            shortest = h[going] <= 1e-13 * np.maximum(np.abs(t), t1 - t0)[going]
+            shortest = h[going] <= 1e-13 * np.maximum(np.abs(t), length[going])
             good = (off <= _ACCURATE) | shortest
             lanes = going[good]
             if len(lanes):
-                t_end = t[lanes] + h[lanes]
-                t_end = np.where(h[lanes] >= t1[lanes] - t[lanes], t1[lanes], t_end)
-                by_end = field(t_end, end[good])
-                step = t[lanes], h[lanes], x[lanes], end[good], by_field[lanes], by_end
-                path += [(lanes, time, state.T) for time, state in _between(*step)]
-                t[lanes], x[lanes], by_field[lanes] = t_end, end[good], by_end
+                left = length[lanes] - past[lanes]
+                ended = np.where(
+                    h[lanes] >= left, length[lanes], past[lanes] + h[lanes]
+                )
+                by_end = field(begin[lanes] + ended, end[good])
+                step = h[lanes], x[lanes], end[good], by_field[lanes], by_end
+                path += [
+                    (lanes, time, state.T) for time, state in _between(t[good], *step)
+                ]
+                past[lanes], x[lanes], by_field[lanes] = ended, end[good], by_end
                 error[lanes] += off[good]
             h[going] *= np.clip(longer, _SHORTER, _LONGER)
-            h = np.minimum(h, t1 - t)
-    return x, np.where(t < t1, np.inf, error), path
+            h = np.minimum(h, length - past)
+    return x, np.where(past < length, np.inf, error), path
 
 
 def _rates(by_field: np.ndarray, x: np.ndarray) -> np.ndarray:
