@@ -75,6 +75,11 @@ CASES = {
         6,
         "random systems with jumps and pulses, right or refused",
     ),
+    "missed-events": (
+        "missed_events.py",
+        15,
+        "random flows with known zeros: events missed and invented",
+    ),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
     "motion": ("motion.py", 1, "moves of sliders, first pictures of animations"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),

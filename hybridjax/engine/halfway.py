@@ -27,6 +27,9 @@ _VIOLATED = 2e-4
 # Conditions of lower orders weigh so much more. Higher: rounding errors. Lower: weights violate
 # them, too, and their error does not vanish with the step.
 _FIRST = 1e5
+# Weights of the state are no larger than this. Higher: errors of the stages are larger halfway than
+# those of the cubic (Kvaerno5). Lower: the order of weights is lower.
+_LARGEST = 1.0
 # Conditions are satisfied up to this error, and smaller weights are zero. Higher: weights that
 # count are zero. Lower: steps add numbers without a meaning.
 _ROUNDING = 1e-9
@@ -74,6 +77,8 @@ def _weights(
     weights = np.linalg.lstsq(first * sums, first * wanted, rcond=1e-12)[0]
     violated = np.abs(sums @ weights - wanted).max(axis=1)
     if np.any(violated > np.where(sizes < order, _ROUNDING, _VIOLATED)):
+        return None
+    if np.abs(weights[:, 0]).max() > _LARGEST:
         return None
     full = np.zeros((2, len(a)))
     full[:, usable] = np.where(np.abs(weights) < _ROUNDING, 0.0, weights).T

@@ -17,7 +17,7 @@ import hybridjax as hj
 
 from ..conftest import ISOCHRONS, KINEMATIC, OUTPUTS, no_compilation
 from ..orbits import hopper_scipy
-from ..toys import RESTING
+from ..toys import RESTING, Field
 
 
 FAMILIES = ("isochron", pytest.param("kinematic", marks=pytest.mark.slow))
@@ -249,3 +249,42 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
     np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
     true = central(lambda u: value(parameters, u)[0], u)
     np.testing.assert_allclose(by_u, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+
+
+class Restarted(hj.HybridSystem):
+    """x is a polynomial of degree 5 of the time since the last whole second, and falls through zero
+    three times in a second. A step may be as long as a second."""
+
+    zeros: tuple[float, ...] = (0.15, 0.3, 0.5, 0.7, 0.9)
+    inputs = ("u",)
+
+    def polynomial(self):
+        return np.poly1d(self.zeros, r=True) * -100
+
+    def start(self):
+        p = self.polynomial()
+        return (p(0.0), *(p.deriv(k)(0.0) for k in range(1, 6)))
+
+    def charts(self):
+        rates = lambda t, q, u: (q[1] + u[0], *q[2:], 0.0)  # noqa: E731
+        return {"run": Field(tuple("abcdef"), rates)}
+
+    def transitions(self):
+        (first, *others), last = self.start(), self.polynomial()(1.0)
+        back = lambda t, q, u: (first + 0.3 * (q[0] - last), *others)  # noqa: E731
+        return (
+            hj.Transition("fall", "run", "run", lambda t, q, u: q[0]),
+            hj.Transition("restart", "run", "run", hj.Scheduled(1.0), reset=back),
+        )
+
+    def period(self):
+        return 1.0
+
+
+def test_no_event_is_missed_between_sections_a_period_apart():
+    guess = hj.Guess("run", Restarted().start(), 0.0)
+    cycle = hj.find_limit_cycle(Restarted(), guess)
+    assert cycle.event_sequence == (0, 0, 0, 1)
+    u = 1e-3 * np.random.default_rng(0).normal(size=(10, 20, 1))
+    data = hj.run_experiments(cycle, hj.ClockPhase(1), u, ("a",), discard=0)
+    assert data.ok.all(), data.summary()

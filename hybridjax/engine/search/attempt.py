@@ -26,10 +26,14 @@ Present = Bool[Array, ""]
 # Higher: crossings whose times are right to five digits are called grazing. Lower: derivatives of
 # crossing times lose more digits before a grazing is reported.
 SLOW = 1e-5
-# A step is too long for a watched function if the cubic interpolant misses it by more than this part
-# of its size. Higher: functions that turn many times within a step are taken for their interpolant,
-# and events are missed. Lower: more steps.
-_BEND = 1e-2
+# A step is too long for a watched function if the cubic interpolant misses it by more than this
+# part of its size. Higher: functions that turn many times within a step are taken for their
+# interpolant, and events are missed. Lower: more steps (at 4e-3, twice as many of the hopper at a
+# tolerance of 1e-4).
+_BEND = 2e-2
+# The margin of an interpolant is this many times its error halfway. Higher: more steps. Lower: near
+# an extremum the error, which moves it, may be larger than the margin, and events are missed.
+_CAUTION = 2.0
 # The error of a derivative is estimated by a step from a state that is shifted by this part of its
 # size. Higher: second derivatives contribute. Lower: rounding errors do.
 _ASIDE = 1e-4
@@ -296,7 +300,7 @@ def _margin(
     slope = 1.5 * (after.value - before.value) - 0.25 * (d0 + d1)
     missing = xp.abs(true.value - value) + 0.5 * xp.abs(moved * true.rate - slope)
     fastest = xp.maximum(xp.abs(before.rate), xp.abs(after.rate))
-    return xp.maximum(missing - width(t, span, fastest), 0.0)
+    return _CAUTION * xp.maximum(missing - width(t, span, fastest), 0.0)
 
 
 def _bent(before: Watch, after: Watch, margin: Float[Array, "W L"]) -> Mask:
