@@ -52,8 +52,8 @@ _OFF = 4.0
 # from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
 # of a guess that is more than 1e18 times too large keep their errors.
 _SHRINKS = 3
-# A guess is far from the cycle if a state is so many times larger than on it. Larger: rough sizes of
-# states that move are kept. Smaller: sizes of states at rest are tried in vain.
+# A guess is far from the cycle if a state is so many times larger than on it. Larger: rough sizes
+# of states that move are kept. Smaller: sizes of states at rest are tried in vain.
 _DISTANT = 1e3
 # Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
 # Fewer: neurons have no cycle. More: vain searches last longer.
