@@ -56,6 +56,9 @@ _LATER = 8, 40
 # from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
 # of a guess that is more than 1e18 times too large keep their errors.
 _SHRINKS = 3
+# A guess is far from the cycle if a state is so many times larger than on it. Larger: rough sizes
+# of states that move are kept. Smaller: sizes of states at rest are tried in vain.
+_DISTANT = 1e3
 
 
 @checked
@@ -382,7 +385,7 @@ def _is_distant(map: ReturnMap, solution: Solution) -> bool:
     own = sizes_on(s, solution.turn.legs, float(solution.turn.period))
     guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
     return any(
-        SAME * x > own[str(name)]
+        x > _DISTANT * own[str(name)]
         for name, x in zip(s.charts[a].states, guess, strict=True)
     )
 

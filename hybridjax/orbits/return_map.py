@@ -368,7 +368,7 @@ class ReturnMap(eqx.Module):
             )
             farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
             still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
-            if self.event >= 0:
+            if self.event >= 0 and not self.expected.ndim:  # (not in sweeps)
                 ends_at_once = turn.closed & self._follows(turn.end)
                 code = xp.where(ends_at_once, Result.COINCIDENCE, code)
             extra = turn.meetings > self.multiplicity
