@@ -46,7 +46,8 @@ class Result(enum.IntEnum):
     )
     FIELD_NOT_FINITE = (
         15,
-        "NaN or infinity in a field, guard or reset: 1/0, or a matrix that is singular or not positive",
+        "NaN or infinity in a field, guard or reset: 1/0, or a matrix that is singular or not "
+        "positive",
     )
     GUARD_PASSED = (
         16,
