@@ -31,9 +31,9 @@ _FREQUENCIES = np.linspace(0.02, 1.98, 197)
 # The background of a picture that is not that of the sliders.
 _OLD = "0.88"
 # Sliders, and the picture that comes from Python. While one is on its way, only the last place of
-# the sliders is kept; once they rest, the gain is asked for. A picture of values that are not those
-# of the sliders fades after a third of a second (sooner: pictures flicker while a slider moves), and
-# a line below says so, until their own picture comes.
+# the sliders is kept; once they rest, the gain is asked for. A picture of values that are not
+# those of the sliders fades after a third of a second (sooner: pictures flicker while a slider
+# moves), and a line below says so, until their own picture comes.
 _PAGE = """
 function render({ model, el }) {
   const values = { ...model.get("asked").values };

@@ -160,7 +160,7 @@ def test_other_experiments_are_refused(made, arguments):
             dict(design=hj.multisine(8, 8, (0, 4.0), experiments=COUNT, seed=1)),
             "`design",
         ),
-        (dict(outputs=("x", velocity)), "`outputs"),
+        (dict(outputs=("x", velocity)), "`data.outputs"),
         (dict(sections=hj.ClockPhase(8, anchor=hj.Crossing("v", "rising"))), "`family"),
         (NOISE, "`process_noise"),
         (
