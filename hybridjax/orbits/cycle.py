@@ -21,7 +21,7 @@ from .._core.html import (
     picture,
     unit_circle,
 )
-from .._core.meaning import code_digest
+from .._core.meaning import changed_part
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.progress import whole_call
@@ -414,8 +414,9 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
 def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
     """A sentence on what of a system has changed since its cycle was found, if anything has."""
     now, name, changed = arrays_of(system), type(system).__name__, ""
-    if system.code_digest != code_digest(system):
-        changed = f"the functions of {name}, or values that they read, have"
+    part = changed_part(system)
+    if part is not None:
+        changed = f"{part} of {name} has"
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
             changed = f"`{key}` of {name} has"

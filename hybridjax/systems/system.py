@@ -3,7 +3,8 @@
 import abc
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import functools as ft
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition, is_tracer
-from .._core.meaning import code_digest, current
+from .._core.meaning import Part, code_digest, current, meaning, parts_of
 from .._core.pieces.description import digest_of
 from .._core.precision import real
 from .._core.text import columns, fields, value
@@ -23,7 +24,7 @@ from ..errors import DefinitionError
 from .chart import Chart, attribute_of
 from .drawing import Drawing
 from .solver import ByChart, Method, Solver, solvers
-from .transition import Transition
+from .transition import Scheduled, Transition
 
 
 @checked
@@ -64,7 +65,7 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
     `unit`, as text.
     """
-    metadata = {"doc": doc, "unit": unit}
+    metadata = {"doc": doc, "unit": unit, "is_number": True}
     options: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=_number, metadata=metadata, **options)
 
@@ -275,3 +276,51 @@ class Driven(Derived):
     """`system` with an input that is a function of time, added to the piecewise constant one."""
 
     drive: Callable[[Any], Any]
+
+
+@parts_of.register
+def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
+    charts = system.charts()
+    yield Part("the period", str(system.period() is None), system.period)
+    names = [tuple(x) for x in (system.inputs, system.input_units, charts)]
+    yield Part("the names of inputs and charts", repr((*names, system.time_unit)))
+    if system.solver is not None:
+        yield Part("the solver", meaning(system.solver))
+    if isinstance(system, Driven):
+        yield Part("the input", "", ft.partial(system.drive, t))
+    inputs = {}
+    for name, chart in charts.items():
+        used = system.inputs if chart.inputs is None else chart.inputs
+        columns = np.array([system.inputs.index(x) for x in used], int)
+        inputs[name] = t, q[: len(chart.states)], u[columns]
+        yield from _parts_of_chart(name, chart, inputs[name])
+    for x in system.transitions():
+        yield from _parts_of_transition(x, inputs[x.source])
+    for x in system.outputs():
+        for name in charts:
+            function = x.function if callable(x.function) else x.function.get(name)
+            if function is not None:
+                at = ft.partial(function, *inputs[name])
+                about = f"the output '{x.name}' in chart '{name}'"
+                yield Part(about, repr((x.name, x.unit)), at)
+
+
+def _parts_of_chart(name: str, chart: Chart, point: tuple) -> Iterator[Part]:
+    about = chart.states, chart.units, chart.inputs, sorted(chart.absent)
+    yield Part(f"the list of states of chart '{name}'", repr(about))
+    yield Part(f"`absent` of chart '{name}'", "", lambda: dict(chart.absent))
+    if chart.solver is not None:
+        yield Part(f"the solver of chart '{name}'", meaning(chart.solver))
+    yield Part(f"the field of chart '{name}'", "", ft.partial(chart.field, *point))
+
+
+def _parts_of_transition(x: Transition, point: tuple) -> Iterator[Part]:
+    yield Part(f"the transition '{x.name}'", f"{x.source}, {x.target}, {x.direction}")
+    if isinstance(x.guard, Scheduled):
+        times = x.guard.period, x.guard.offset
+        yield Part(f"the schedule of '{x.name}'", "", lambda: times)
+    else:
+        yield Part(f"the guard of '{x.name}'", "", ft.partial(x.guard, *point))
+    yield Part(f"the reset of '{x.name}'", "", ft.partial(x.reset, *point))
+    if x.enabled is not None:
+        yield Part(f"`enabled` of '{x.name}'", "", ft.partial(x.enabled, *point))
