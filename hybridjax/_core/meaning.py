@@ -11,7 +11,7 @@ import contextlib
 import contextvars
 import functools as ft
 import itertools
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -30,9 +30,9 @@ Thing = TypeVar("Thing")
 
 # Definitions whose digests are kept. Fewer: taking turns with many systems traces them again.
 _KEPT = 1024
-# Traces of a function that may draw random numbers, of which all must be the same. Fewer: one that
-# draws one of two numbers passes more often. More: time.
-_DRAWS = 4
+# Further traces of a function that may draw random numbers, all of which must be the same. Fewer:
+# one that draws one of two numbers passes more often. More: time.
+_DRAWS = 3
 
 
 class Part(NamedTuple):
@@ -118,16 +118,23 @@ def unchanged_code() -> Iterator[None]:
 def _digest_of(x: Definition) -> str:
     without = jax.tree_util.tree_map(lambda y: None if eqx.is_array(y) else y, x)
     if parts_of.dispatch(type(x)) is parts_of.dispatch(object):
-        return meaning(without)
+        reading = Reading(without)
+        _refuse((*reading.hidden, *reading.moving))
+        return reading.digest
     arrays = _single(x)
     reading = Reading(without, str(arrays), marks=True)
     known = _digests.get(reading.digest)
-    if known is not None and not reading.unread:
+    # (JAX may remember traces of a time between, when a function computed something else.)
+    remembered = not reading.retraced or reading.digest in _remembered
+    if known is not None and not reading.unread and remembered:
         return known
     programs = _traced(x, arrays, reading, anew=reading.retraced)
     digest = digest_of_words(*itertools.chain(*programs.items()))
-    if digest != known:
-        _require_the_same(x, arrays, reading, programs)
+    if digest != known or not remembered:
+        # (A function may change a value that it reads.)
+        after = Reading(without, str(arrays), marks=True)
+        moves = bool(reading.unread) or after.digest != reading.digest
+        _require_the_same(x, arrays, reading, programs, moves)
     _keep(_digests, reading.digest, digest)
     _keep(_programs, digest, programs)
     return digest
@@ -137,6 +144,8 @@ def _digest_of(x: Definition) -> str:
 # no object of a user.)
 _digests: collections.OrderedDict[str, str] = collections.OrderedDict()
 _programs: collections.OrderedDict[str, dict[str, str]] = collections.OrderedDict()
+# Digests of readings of what JAX traces now as it remembers it.
+_remembered: collections.OrderedDict[str, None] = collections.OrderedDict()
 
 
 def _keep(table: collections.OrderedDict[str, Any], key: str, value: Any) -> None:
@@ -179,13 +188,14 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         results: list[Any] = []
         try:
             for part in parts_of(eqx.combine(arrays, static), *point) or ():
-                values, failure = _values(part)
+                values, failure = _values(part, reading)
                 results += values
                 words.append((part.name, part.words + failure, len(values)))
         except (
             Exception
         ) as error:  # of the user's, which the call that follows raises, too
-            words.append(("the charts and transitions", type(error).__name__, 0))
+            failure = _failure(error, reading)
+            words.append(("the charts and transitions", failure, 0))
         return results
 
     with jax.enable_x64(True), _own_traces() if anew else contextlib.nullcontext():
@@ -196,7 +206,8 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         leaves = jax.tree_util.tree_leaves_with_path(arrays)
         names = [jax.tree_util.keystr(path) for path, _ in leaves]
         arguments = [
-            f"{name}:{y.dtype}{y.shape}" for name, (_, y) in zip(names, leaves)
+            f"{name}:{y.dtype}{y.shape}"
+            for name, (_, y) in zip(names, leaves, strict=True)
         ]
         digests = Digests(program, [*arguments, "t", "q", "u"])
         rule = ""
@@ -215,15 +226,20 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
     return parts | ({"a rule of a derivative, or a callback,": rule} if rule else {})
 
 
-def _values(part: Part) -> tuple[list[Any], str]:
-    """Numbers that a part returns, and the name of the error that it raises instead."""
+def _values(part: Part, reading: Reading) -> tuple[list[Any], str]:
+    """Numbers that a part returns, and words on the error that it raises instead."""
     if part.function is None:
         return [], ""
     try:
         leaves = jax.tree_util.tree_leaves(part.function())
         return [jnp.asarray(x) for x in leaves], ""
     except Exception as error:  # of the user's, which the call that follows raises, too
-        return [], f" {type(error).__name__}"
+        return [], _failure(error, reading)
+
+
+def _failure(error: Exception, reading: Reading) -> str:
+    """Words that stand for a program that cannot be traced: those of its code."""
+    return f" {type(error).__name__} {reading.digest}"
 
 
 def _own_traces() -> contextlib.AbstractContextManager:
@@ -233,19 +249,21 @@ def _own_traces() -> contextlib.AbstractContextManager:
 
 
 def _require_the_same(
-    x: Definition, arrays: Any, reading: Reading, programs: dict[str, str]
+    x: Definition,
+    arrays: Any,
+    reading: Reading,
+    programs: dict[str, str],
+    moves: bool,
 ) -> None:
-    """Compare programs with another trace, and with the one that JAX remembers.
+    """Compare programs with the one that JAX remembers, and with other traces if a value `moves`.
 
     **Raises:** `DefinitionError` for a part that computes another value each time.
     """
-    if reading.retraced:
-        remembered = _traced(x, arrays, reading, anew=False)
-        if remembered == programs and not reading.unread:
-            return
-        if remembered != programs:
-            jax.clear_caches()
-    for _ in range(_DRAWS - 1 if reading.moving else 1 if reading.unread else 0):
+    if reading.retraced and _traced(x, arrays, reading, anew=False) != programs:
+        jax.clear_caches()
+        _remembered.clear()
+    _keep(_remembered, reading.digest, None)
+    for _ in range(_DRAWS if moves else 0):
         again = _traced(x, arrays, reading, anew=reading.retraced)
         if again == programs:
             continue
@@ -289,6 +307,10 @@ def meaning(*things: Any) -> str:
     `import_module`, `sys.modules` or `getenv`, or if a function that is no method reads a file.
     """
     reading = Reading(*things)
-    for text in reading.hidden:
-        raise DefinitionError(f"{text}: read values before, by their names.")
+    _refuse(reading.hidden)
     return reading.digest
+
+
+def _refuse(reads: Iterable[str]) -> None:
+    for read in reads:
+        raise DefinitionError(f"{read}: read values before, by their names.")

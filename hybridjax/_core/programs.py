@@ -48,7 +48,8 @@ class Digests:
 
         def digest(x: Any) -> str:
             if isinstance(x, jex.Literal):
-                return digest_of_words(str(x.aval.dtype), repr(x.val))
+                # (Its text has eight digits.)
+                return _digest_of_constant(x.val)
             return known[x]
 
         for equation in jaxpr.eqns:
@@ -79,6 +80,9 @@ class Digests:
             return self._program(_program(x))
         if isinstance(x, tuple | list):
             return f"({','.join(map(self._option, x))})"
+        if hasattr(x, "dtype") and hasattr(x, "shape"):
+            if not isinstance(x, jax.ShapeDtypeStruct) and hasattr(x, "__array__"):
+                return _digest_of_constant(x)
         if callable(x) and not isinstance(x, type | np.dtype):
             return "function"  # (see `rules` and `hosted`)
         return _ADDRESS.sub("", repr(x))
@@ -124,6 +128,7 @@ def _digest_of_constant(x: Any) -> str:
 
 def _digest_of_values(x: Any) -> str:
     is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    values = np.ascontiguousarray(jax.random.key_data(x) if is_key else x)
-    digest = hashlib.blake2b(values.reshape(-1).view(np.uint8), digest_size=12)
+    values = np.asarray(jax.random.key_data(x) if is_key else x)
+    flat = np.ascontiguousarray(values).reshape(-1)
+    digest = hashlib.blake2b(flat.view(np.uint8), digest_size=12)
     return digest_of_words(str(values.dtype), str(values.shape), digest.hexdigest())

@@ -87,7 +87,7 @@ _DESCRIPTIONS = frozenset(
     "__orig_bases__ __parameters__ __abstractmethods__ __abstractclassvars__ __abstractvars__ "
     "__dataclass_fields__ __dataclass_params__ __match_args__ __slots__ __classcell__".split()
 )
-# Objects after which a reading for a mark ends as incomplete. More: what holds a whole library (a
+# Objects after which a reading ends as incomplete. More: what holds a whole library (a
 # figure, a session) is read for longer than tracing takes. Fewer: large systems are traced again
 # at each call.
 _MOST = 20_000
@@ -135,10 +135,13 @@ class Reading:
         self._alive: list[Any] = []  # an id belongs to an object while this lives
         self._attributes: set[tuple[int, Names]] = set()
         self._classes = 0  # around what is visited
+        self._function_name = ""
         try:
             self._visit_all(things)
         except _TooMany:
-            self.unread.append("too many objects")
+            text = f"`{self._function_name}` reads too many objects to compare them"
+            self.unread.append(text)
+            self.hidden.append(text)
         self.digest = self._hash.hexdigest()
         self._alive.clear()
 
@@ -162,7 +165,7 @@ class Reading:
             return self._note(self._number[id(x)])
         self._number[id(x)] = len(self._number)
         self._alive.append(x)
-        if self._marks and len(self._alive) > _MOST:
+        if len(self._alive) > _MOST:
             raise _TooMany
         self._note(kind.__qualname__)
         if is_tracer(x):
@@ -257,6 +260,7 @@ class Reading:
         if is_installed:
             self._packaged(x.__module__ or "", x.__qualname__)
         else:
+            self._function_name = x.__qualname__
             self._visit(x.__code__)
             self._globals(x)
         # The functions of one that dispatches by type.

@@ -20,8 +20,8 @@ from distributed.scheduler import KilledWorker
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..cache import enable_compilation_cache
 from ..meaning import meaning
-from ..reading import is_packaged
 from ..progress import counted, say
+from ..reading import is_packaged
 from .store import ArrayStore, ZarrStore
 
 
