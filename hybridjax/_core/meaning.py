@@ -281,9 +281,9 @@ def different(before: dict[str, str], after: dict[str, str]) -> list[str]:
     return [name for name in names if before.get(name) != after.get(name)]
 
 
-def changed_part(x: Definition) -> str | None:
-    """The name of a part of a definition that is not what it was when its digest was taken, None
-    if all are.
+def change_of(x: Definition) -> str | None:
+    """The name of a part of a definition that is not what it was when its digest was taken, as in
+    "the guard of 'touchdown' of Hopper"; None if all are.
 
     **Raises:** `DefinitionError`, as `code_digest`.
     """
@@ -291,9 +291,32 @@ def changed_part(x: Definition) -> str | None:
     if digest == x.code_digest:
         return None
     before, after = _programs.get(x.code_digest, {}), _programs.get(digest, {})
+    part = "a function, or a value that it reads,"
     if before and after:
-        return different(before, after)[0]
-    return "a function, or a value that it reads,"
+        part = different(before, after)[0]
+    name = getattr(x, "name", None)
+    title = (
+        f"{type(x).__name__} '{name}'" if isinstance(name, str) else type(x).__name__
+    )
+    return f"{part} of {title}"
+
+
+def require_as_made(things: Any, made: str) -> None:
+    """**Raises:** `DefinitionError` if a definition in a tree of things that were `made` at some
+    time, as in "this response function was made", computes something else now."""
+    is_definition = lambda x: isinstance(x, Definition)  # noqa: E731
+    for x in jax.tree_util.tree_leaves(things, is_leaf=is_definition):
+        if not is_definition(x) or not x.code_digest:
+            continue
+        change = change_of(x)
+        if change is not None:
+            raise DefinitionError(f"{change} has changed since {made}: make it again.")
+
+
+def parts_by_name(x: Definition) -> dict[str, str]:
+    """Digests of the parts of a definition, as they are now."""
+    digest = code_digest(x)
+    return dict(_programs.get(digest, {"code": digest}))
 
 
 def meaning(*things: Any) -> str:

@@ -13,7 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
-from .._core.meaning import current
+from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import folded, number, signal_values
@@ -99,6 +99,7 @@ class Trajectory(eqx.Module):
     @property
     def events(self) -> list[Event]:
         """The events in order of time."""
+        require_as_made(self.system, "this trajectory was computed")
         events, s = [], self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
@@ -163,6 +164,7 @@ class Trajectory(eqx.Module):
         Values are NaN in charts where they are not defined.
         """
         require_x64()
+        require_as_made(self.system, "this trajectory was computed")
         point = self.dense(per_step)
         return (point[0], *observed(self.structure, names, *point))
 

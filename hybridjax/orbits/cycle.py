@@ -21,10 +21,10 @@ from .._core.html import (
     picture,
     unit_circle,
 )
-from .._core.meaning import changed_part
+from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
-from .._core.progress import whole_call
+from .._core.progress import once_in_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -116,11 +116,14 @@ class LimitCycle(eqx.Module):
         )
 
     def require_current(self) -> None:
-        """**Raises:** `DefinitionError` if the system's code, or a parameter, has changed since the
-        cycle was found."""
-        if whole_call().compared is not self:
+        """**Raises:** `DefinitionError` if the system's code, its section's, or a parameter, has
+        changed since the cycle was found."""
+
+        def compare():
             require_unchanged(self.system, self.numbers)
-        whole_call().compared = self
+            require_as_made(self.base, "this limit cycle was found")
+
+        once_in_call(self, compare)
 
     def require_found(self) -> None:
         """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
@@ -156,7 +159,7 @@ class LimitCycle(eqx.Module):
         _require_values(self, "dims")
         return np.array(self.structure.dims)[np.asarray(self.legs.chart)]
 
-    @remembered
+    @property
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, by decreasing modulus (on the host).
 
@@ -169,6 +172,10 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "multipliers")
         self.require_found()
+        return self._multipliers
+
+    @remembered
+    def _multipliers(self) -> Complex[np.ndarray, " r"]:
         # The factors in sizes of the states, without padding.
         dims, scale = (
             self.dims,
@@ -197,7 +204,7 @@ class LimitCycle(eqx.Module):
         values.flags.writeable = False  # they are kept
         return values
 
-    @remembered
+    @property
     def log_multipliers(self) -> Float[np.ndarray, " r"]:
         """Natural logarithms of the moduli of `multipliers`.
 
@@ -414,9 +421,9 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
 def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
     """A sentence on what of a system has changed since its cycle was found, if anything has."""
     now, name, changed = arrays_of(system), type(system).__name__, ""
-    part = changed_part(system)
-    if part is not None:
-        changed = f"{part} of {name} has"
+    change = change_of(system)
+    if change is not None:
+        changed = f"{change} has"
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
             changed = f"`{key}` of {name} has"

@@ -105,7 +105,7 @@ class LimitCycles(eqx.Module):
         """Indices of the systems without a cycle."""
         return np.flatnonzero(~self.ok)
 
-    @remembered
+    @property
     def multipliers(self) -> Complex[np.ndarray, "S d"]:
         """Floquet multipliers, by decreasing modulus; NaN for systems without a cycle.
 
@@ -113,6 +113,10 @@ class LimitCycles(eqx.Module):
         are lost in rounding. `cycles[i].multipliers` has them.
         """
         require_unchanged(self.systems, self.numbers)
+        return self._multipliers
+
+    @remembered
+    def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
         values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
         order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)

@@ -16,8 +16,8 @@ from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import Scalar, Vector
 from .._core.executor import Definition, is_tracer
-from .._core.meaning import Part, code_digest, current, meaning, parts_of
-from .._core.pieces.description import digest_of
+from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
+from .._core.pieces.description import digest_of, marked
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from ..errors import DefinitionError
@@ -108,7 +108,7 @@ def describe(system: "HybridSystem") -> dict[str, Any]:
     return {
         "class": type(system).__qualname__,
         "numbers": numbers,
-        "code": code_digest(system),
+        "code": {name: marked(x) for name, x in parts_by_name(system).items()},
     }
 
 
