@@ -1,20 +1,15 @@
 """A hundred ways to change what a system computes: each is seen, or the system is refused."""
 
 import importlib
-import random
-import sqlite3
-import subprocess
 import sys
-import textwrap
 import types
 
-import h5py
-import numpy as np
 import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import code_digest
 
+from ..sessions import run_python
 from .test_meaning import WAYS
 
 
@@ -414,3 +409,77 @@ def test_a_change_of_what_code_reads_is_seen_by_systems(way, monkeypatch):
     exec(change, space)
     assert (digest_or_refusal(space) == first) == (way in SAME)
     sys.modules.pop("users_third", None)
+
+
+# Programs of a module in a package of a user that define f(x) and read `constants.K`.
+RELATIVE = {
+    "a name": "def f(x):\n    from .constants import K\n    return K * x",
+    "a module": "def f(x):\n    from . import constants\n    return constants.K * x",
+    "a module of the package around": (
+        "def f(x):\n    from ..users_package.constants import K as k\n    return k * x"
+    ),
+}
+
+
+@pytest.mark.parametrize("way", RELATIVE)
+def test_a_constant_of_a_relative_import_is_seen(way, monkeypatch, tmp_path):
+    package = tmp_path / "around" / "users_package"
+    package.mkdir(parents=True)
+    (package / "constants.py").write_text("K = 1.0")
+    (package / "system.py").write_text(SYSTEM + RELATIVE[way])
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("around.users_package.system")
+    first = digest_or_refusal(vars(module))
+    assert digest_or_refusal(vars(module)) == first
+    constants = importlib.import_module("around.users_package.constants")
+    constants.K = 2.0
+    assert digest_or_refusal(vars(module)) != first
+    for name in [x for x in sys.modules if x.partition(".")[0] == "around"]:
+        sys.modules.pop(name)
+
+
+# A script that changes what its system computes in three ways, and prints whether each was seen.
+SCRIPT = """
+import hybridjax as hj
+from hybridjax._core.meaning import code_digest
+{imports}
+hj.enable_x64()
+K = 1.0
+class Line(hj.Chart):
+    states = ("x",)
+    factor = 1.0
+    def field(self, t, q, u):
+        return (K * {helper}(q[0]) * self.factor,)
+class Uses(hj.HybridSystem):
+    def charts(self):
+        return {{"line": Line()}}
+digests = [code_digest(Uses())]
+K = 2.0
+digests.append(code_digest(Uses()))
+Line.factor = 2.0
+digests.append(code_digest(Uses()))
+{change}
+digests.append(code_digest(Uses()))
+print(len(set(digests)), "digests")
+"""
+
+
+@pytest.mark.parametrize("name", ["profile", "code", "calendar"])
+def test_a_module_of_a_user_may_have_the_name_of_one_of_python(name, tmp_path):
+    (tmp_path / f"{name}.py").write_text("C = 1.0\ndef h(x): return C * x")
+    text = SCRIPT.format(
+        imports=f"import {name}", helper=f"{name}.h", change=f"{name}.C = 2.0"
+    )
+    (tmp_path / "script.py").write_text(text)
+    assert run_python("script.py", cwd=tmp_path).strip() == "4 digests"
+
+
+@pytest.mark.parametrize("runner", ["cProfile", "profile", "pdb"])
+def test_what_a_script_changes_is_seen_under_a_runner(runner, tmp_path):
+    text = SCRIPT.format(imports="", helper="float.__abs__", change="K = 3.0")
+    text = text.replace("float.__abs__(q[0])", "q[0]")
+    (tmp_path / "script.py").write_text(text)
+    options = ["-c", "continue"] if runner == "pdb" else []
+    assert "4 digests" in run_python(
+        "-m", runner, *options, "script.py", cwd=tmp_path, input=""
+    )
