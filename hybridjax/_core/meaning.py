@@ -116,7 +116,7 @@ def unchanged_code() -> Iterator[None]:
 
 
 def _digest_of(x: Definition) -> str:
-    without = jax.tree_util.tree_map(lambda y: None if eqx.is_array(y) else y, x)
+    without = _without_arrays(x)
     if parts_of.dispatch(type(x)) is parts_of.dispatch(object):
         reading = Reading(without)
         _refuse((*reading.hidden, *reading.moving))
@@ -299,6 +299,16 @@ def change_of(x: Definition) -> str | None:
         f"{type(x).__name__} '{name}'" if isinstance(name, str) else type(x).__name__
     )
     return f"{part} of {title}"
+
+
+def code_of(x: Definition) -> str:
+    """Return a digest of all code of a definition, for functions that are no part of it (pictures).
+    It may change where they do not."""
+    return Reading(_without_arrays(x)).digest
+
+
+def _without_arrays(x: Definition) -> Any:
+    return jax.tree_util.tree_map(lambda y: None if eqx.is_array(y) else y, x)
 
 
 def require_as_made(things: Any, made: str) -> None:

@@ -79,7 +79,8 @@ CELLS = {
         "def first(x):\n    return K * x\n"
         "def helper(x):\n    return first(x) + users_helpers.gain(x) + pair.product()"
     ),
-    "a method that is not used": SYSTEM + "    def energy(self, q):\n        return q[0]",
+    "a method that is not used": SYSTEM
+    + "    def energy(self, q):\n        return q[0]",
     "an attribute that is not used": "Uses.note = 'first try'",
     "a guess": "Uses.guess = lambda self: hj.Guess('line', (0.2,))",
     "a picture": "Uses.draw = lambda self, chart, t, q: hj.systems.Drawing([])",
