@@ -302,7 +302,7 @@ def test_each_later_call_names_what_has_changed(name, swinging, monkeypatch):
 
 
 def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypatch):
-    level = hj.Crossing(lambda t, q: q[0] + 0.01 * GAIN, "rising")
+    level = hj.Crossing(lambda t, q: q[0] - 0.001 * GAIN, "rising")
     response = hj.response_function(swinging, PLACES, SPEED)
     chunks = hj.experiments.stream_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
     placed = hj.place_sections(swinging, hj.ClockPhase(2, anchor=level))
