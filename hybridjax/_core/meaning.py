@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.tree_util import keystr, tree_leaves_with_path
 
 from ..errors import DefinitionError
 from .executor import Definition
@@ -129,7 +130,8 @@ def _digest_of(x: Definition) -> str:
     if known is not None and not reading.unread and remembered:
         return known
     programs = _traced(x, arrays, reading, anew=reading.retraced)
-    digest = digest_of_words(*itertools.chain(*programs.items()))
+    names = [keystr(path) for path, _ in tree_leaves_with_path(arrays)]
+    digest = digest_of_words(*names, *itertools.chain(*programs.items()))
     if digest != known or not remembered:
         # (A function may change a value that it reads.)
         after = Reading(without, str(arrays), marks=True)
@@ -203,12 +205,8 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         numbers = jax.ShapeDtypeStruct((_NUMBERS,), jnp.float64)
         point = number, numbers, numbers
         program = jax.make_jaxpr(lambda *y: every(*y))(arrays, *point)
-        leaves = jax.tree_util.tree_leaves_with_path(arrays)
-        names = [jax.tree_util.keystr(path) for path, _ in leaves]
-        arguments = [
-            f"{name}:{y.dtype}{y.shape}"
-            for name, (_, y) in zip(names, leaves, strict=True)
-        ]
+        leaves = tree_leaves_with_path(arrays)
+        arguments = [f"{keystr(path)}:{y.dtype}{y.shape}" for path, y in leaves]
         digests = Digests(program, [*arguments, "t", "q", "u"])
         rule = ""
         if digests.rules:
@@ -299,6 +297,12 @@ def change_of(x: Definition) -> str | None:
         f"{type(x).__name__} '{name}'" if isinstance(name, str) else type(x).__name__
     )
     return f"{part} of {title}"
+
+
+def program_digest(x: Any) -> str:
+    """Return the digest of a definition that is known by its programs, "" for other things."""
+    is_traced = isinstance(x, Definition) and x.code_digest in _programs
+    return x.code_digest if is_traced else ""
 
 
 def code_of(x: Definition) -> str:

@@ -40,8 +40,8 @@ CHANGES = {
             "Pair.sum = lambda self: self.a - self.b",
         ),
         (
-            PAIR
-            + "    @staticmethod\n    def k(): return 1.0\np = Pair(1.0, 2.0)\ndef f(x): return p.k() * x",
+            PAIR + "    @staticmethod\n    def k(): return 1.0\np = Pair(1.0, 2.0)\n"
+            "def f(x): return p.k() * x",
             "Pair.k = staticmethod(lambda: 2.0)",
         ),
         (
@@ -242,7 +242,8 @@ CHANGES = {
     ],
     "a file that is opened": [
         (
-            "pathlib.Path('k').write_text('1')\ndef f(x):\n    with open('k') as g: return float(g.read()) * x",
+            "pathlib.Path('k').write_text('1')\n"
+            "def f(x):\n    with open('k') as g: return float(g.read()) * x",
             "pathlib.Path('k').write_text('2')",
         ),
         (

@@ -111,7 +111,9 @@ CELLS = {
     "garbage collected": "gc.collect()",
     "a variable of the environment": "os.environ['USERS_NOTE'] = '1'",
     "a timer around a call": "begin = time.time()\nhelper(1.0)\ntook = time.time() - begin",
-    "a thread": "thread = threading.Thread(target=helper, args=(1.0,))\nthread.start()\nthread.join()",
+    "a thread": (
+        "thread = threading.Thread(target=helper, args=(1.0,))\nthread.start()\nthread.join()"
+    ),
     "a table that is shown": "pd.DataFrame({'x': TABLE}).describe()",
     "a call of a helper by hand": "helper(jnp.ones(3))",
     "a derivative by hand": "jax.vmap(jax.grad(helper))(jnp.ones(3))",
