@@ -124,7 +124,10 @@ def _digest_of(x: Definition) -> str:
         return reading.digest
     arrays = _single(x)
     reading = Reading(without, str(arrays), marks=True)
-    known = _digests.get(reading.digest)
+    # (A class that has not been seen is traced, however much it is like another one.)
+    read: collections.OrderedDict[str, None]
+    read = _read.recall(type(x), None, collections.OrderedDict)
+    known = _digests.get(reading.digest) if reading.digest in read else None
     # (JAX may remember traces of a time between, when a function computed something else.)
     remembered = not reading.retraced or reading.digest in _remembered
     if known is not None and not reading.unread and remembered:
@@ -137,6 +140,7 @@ def _digest_of(x: Definition) -> str:
         after = Reading(without, str(arrays), marks=True)
         moves = bool(reading.unread) or after.digest != reading.digest
         _require_the_same(x, arrays, reading, programs, moves)
+    _keep(read, reading.digest, None)
     _keep(_digests, reading.digest, digest)
     _keep(_programs, digest, programs)
     return digest
@@ -146,6 +150,8 @@ def _digest_of(x: Definition) -> str:
 # no object of a user.)
 _digests: collections.OrderedDict[str, str] = collections.OrderedDict()
 _programs: collections.OrderedDict[str, dict[str, str]] = collections.OrderedDict()
+# By class, digests of readings of its objects.
+_read = Memory()
 # Digests of readings of what JAX traces now as it remembers it.
 _remembered: collections.OrderedDict[str, None] = collections.OrderedDict()
 

@@ -612,9 +612,18 @@ def is_packaged(module: str | None) -> bool:
 def is_packaged_class(x: type) -> bool:
     """Test whether a class belongs to Python or to a package, `hybridjax.models` excepted."""
     module = str(x.__module__)
-    # (A class of `exec` without a `__name__` has the module of Python's own.)
-    is_made = module == "builtins" and "__module__" in vars(x)
-    return is_packaged(module) and not is_made
+    if not is_packaged(module):
+        return False
+    # (A class of `exec` without a `__name__`, or of `type(...)`, may have the module of a package.)
+    found: Any = sys.modules.get(module)
+    for name in x.__qualname__.split("."):
+        found = getattr(found, name, None)
+    if found is x or not x.__flags__ & _HEAP:
+        return True
+    functions = [y for y in vars(x).values() if isinstance(y, types.FunctionType)]
+    return bool(functions) and all(
+        is_of_package(y.__code__.co_filename) for y in functions
+    )
 
 
 @ft.cache

@@ -4,12 +4,14 @@ import importlib
 import sys
 import types
 
+import numpy as np
 import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import code_digest
 
 from ..sessions import run_python
+from ..toys import Field
 from .test_meaning import WAYS
 
 
@@ -410,6 +412,21 @@ def test_a_change_of_what_code_reads_is_seen_by_systems(way, monkeypatch):
     exec(change, space)
     assert (digest_or_refusal(space) == first) == (way in SAME)
     sys.modules.pop("users_third", None)
+
+
+def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
+    """Classes that `type` makes have the module of a package; a number may be anywhere."""
+
+    def system(k):
+        field = lambda t, q, u: (k, 1.0)  # noqa: E731
+        charts = {"line": Field(("x", "y"), field)}
+        return type("Made", (hj.HybridSystem,), {"charts": lambda self, x=charts: x})()
+
+    for k in (1.0, 1.0 + 1e-15, 2.0):
+        way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
+        np.testing.assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
+    digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
+    assert digests[0] == digests[1] and len(set(digests)) == 3
 
 
 # Programs of a module in a package of a user that define f(x) and read `constants.K`.
