@@ -27,10 +27,10 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .executor import is_tracer
+from .programs import digest_of_array
 
 
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range, slice
@@ -225,18 +225,15 @@ class Reading:
         self.retraced = self.retraced or other.retraced
 
     def _array(self, x: Any) -> None:
-        is_key = isinstance(x, jax.Array) and jnp.issubdtype(
-            x.dtype, jax.dtypes.prng_key
-        )
-        values = np.asarray(jax.random.key_data(x) if is_key else x)
-        self._note(values.dtype.str, values.shape)
-        if values.dtype.hasobject:
-            return self._visit_all(values.ravel().tolist())
-        if self._marks and values.nbytes > _LARGE:
+        if isinstance(x, jax.Array):  # (whose digest is kept with it)
+            return self._note(digest_of_array(x))
+        if x.dtype.hasobject:
+            self._note(x.shape)
+            return self._visit_all(x.ravel().tolist())
+        if self._marks and x.nbytes > _LARGE:
             self.unread.append("a large array")
             return None
-        self._hash.update(values.tobytes())
-        return None
+        return self._note(digest_of_array(x))
 
     def _builtin(self, x: Any) -> None:
         self._note(x.__name__)

@@ -394,6 +394,53 @@ def test_a_change_is_seen_or_refused(kind, k, monkeypatch, tmp_path):
     assert digest_or_refusal(space) == second
 
 
+CLOCKED = """
+class Line(hj.Chart):
+    states = ("x",)
+    def field(self, t, q, u):
+        return (jnp.cos(2 * jnp.pi * t) - f(q[0]) + u[0],)
+
+class Uses(hj.HybridSystem):
+    def charts(self):
+        return {"line": Line()}
+    def period(self):
+        return 1.0
+"""
+FOLLOWED = (
+    "a method of a named tuple",
+    "a property of a named tuple",
+    "the order of the fields of a named tuple",
+    "a subclass of float",
+    "a subclass of str",
+    "a subclass of an array",
+    "the axes of jax.vmap",
+    "a class attribute with two underscores",
+    "a file of HDF5",
+    "a file of pathlib",
+    "another program",
+    "a database",
+)
+
+
+@pytest.mark.parametrize("kind", FOLLOWED)
+def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_path):
+    """The multiplier of x' = cos 2 pi t - k x is exp(-k), with k = f(1) as Python computes it."""
+    monkeypatch.chdir(tmp_path)
+    before, change = CHANGES[kind][0]
+    space = made(f"{before}\n{CLOCKED}")
+    sections, guess = hj.ClockPhase(2), hj.Guess("line", (0.0,))
+    cycles = []
+    for statement in ("", change):
+        exec(statement, space)
+        k = float(space["f"](1.0))
+        for cycle in cycles:
+            with pytest.raises(hj.DefinitionError, match="the field of chart 'line'"):
+                hj.linearize(cycle, sections)
+        cycles.append(hj.find_limit_cycle(space["Uses"](), guess))
+        model = hj.linearize(cycles[-1], sections)
+        np.testing.assert_allclose(model.multipliers, [np.exp(-k)], rtol=1e-9)
+
+
 # Changes that leave the numbers as they are, for an x that JAX traces.
 SAME = "True for 1", "a function by types"
 
