@@ -65,6 +65,16 @@ def current(x: Thing) -> Thing:
     return _marked.recall(x, digest, lambda: _mark(x, digest))
 
 
+def current_of_many(x: Thing) -> Thing:
+    """As `current`, of systems side by side, whose arrays have a leading axis."""
+    return cast(Thing, _mark(x, code_digest(first_of(x))))
+
+
+def first_of(x: Thing) -> Thing:
+    """The first of systems side by side."""
+    return jax.tree_util.tree_map(lambda y: y[0] if eqx.is_array(y) else y, x)
+
+
 def _mark(x: Any, digest: str) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
@@ -92,6 +102,10 @@ def code_digest(x: Definition) -> str:
         if digests is not None and key in digests:
             return digests[key]
     digest = _digest_of(x)
+    if x.code_digest not in ("", digest) and _are_many(x):
+        # (Systems side by side have the digest of each.)
+        single = _digest_of(first_of(x))
+        digest = single if single == x.code_digest else digest
     with contextlib.suppress(TypeError):
         if digests is not None:
             digests[key] = digest
@@ -122,7 +136,7 @@ def _digest_of(x: Definition) -> str:
         reading = Reading(without)
         _refuse((*reading.hidden, *reading.moving))
         return reading.digest
-    arrays = _single(x)
+    arrays = _shapes(x)
     reading = Reading(without, str(arrays), marks=True)
     # (A class that has not been seen is traced, however much it is like another one.)
     read: collections.OrderedDict[str, None]
@@ -162,19 +176,16 @@ def _keep(table: collections.OrderedDict[str, Any], key: str, value: Any) -> Non
         table.popitem(last=False)
 
 
-def _single(x: Definition) -> Any:
-    """Shapes of the arrays of a definition; of systems side by side, those of one of them."""
-    arrays = eqx.filter(x, eqx.is_array)
-    leaves = jax.tree_util.tree_leaves(arrays)
-    number = getattr(type(x), "__dataclass_fields__", {})
-    single = [y for y, field in number.items() if field.metadata.get("is_number")]
-    shapes = {
-        getattr(x, name).shape for name in single if eqx.is_array(getattr(x, name))
-    }
-    side_by_side = bool(shapes) and () not in shapes and all(y.ndim for y in leaves)
-    lanes = slice(1 if side_by_side else 0, None)
-    shape = lambda y: jax.ShapeDtypeStruct(y.shape[lanes], y.dtype)  # noqa: E731
-    return jax.tree_util.tree_map(shape, arrays)
+def _shapes(x: Definition) -> Any:
+    """Shapes of the arrays of a definition."""
+    shape = lambda y: jax.ShapeDtypeStruct(y.shape, y.dtype)  # noqa: E731
+    return jax.tree_util.tree_map(shape, eqx.filter(x, eqx.is_array))
+
+
+def _are_many(x: Definition) -> bool:
+    """Test for what may be systems side by side: all arrays have the same leading axis."""
+    leaves = jax.tree_util.tree_leaves(eqx.filter(x, eqx.is_array))
+    return len({y.shape[:1] for y in leaves}) == 1 and leaves[0].ndim > 0
 
 
 # States and inputs of a part are the first of so many numbers. Fewer: larger systems cannot be

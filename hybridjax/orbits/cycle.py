@@ -418,10 +418,15 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
         )
 
 
-def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
-    """A sentence on what of a system has changed since its cycle was found, if anything has."""
+def what_changed(
+    system: HybridSystem,
+    numbers: Mapping[str, Any],
+    single: HybridSystem | None = None,
+) -> str:
+    """A sentence on what of a system has changed since its cycle was found, if anything has; of
+    systems side by side, of which `single` is one."""
     now, name, changed = arrays_of(system), type(system).__name__, ""
-    change = change_of(system)
+    change = change_of(system if single is None else single)
     if change is not None:
         changed = f"{change} has"
     for key in now.keys() | numbers.keys():
@@ -439,9 +444,14 @@ def as_found(cycle: LimitCycle) -> LimitCycle:
     return eqx.tree_at(lambda x: x.system, cycle, eqx.combine(arrays, static))
 
 
-def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
-    """**Raises:** `DefinitionError` if something of the system has changed."""
-    if change := what_changed(system, numbers):
+def require_unchanged(
+    system: HybridSystem,
+    numbers: Mapping[str, Any],
+    single: HybridSystem | None = None,
+) -> None:
+    """**Raises:** `DefinitionError` if something of the system, or systems, has changed."""
+    change = what_changed(system, numbers, single)
+    if change:
         raise DefinitionError(f"{change}.")
 
 

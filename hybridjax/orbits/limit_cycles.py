@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
 from .._core.execution import Execution
 from .._core.executor import from_host
+from .._core.meaning import current_of_many, first_of
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
@@ -112,7 +113,7 @@ class LimitCycles(eqx.Module):
         Eigenvalues of the product of the factors, padded with zeros: those far below the largest
         are lost in rounding. `cycles[i].multipliers` has them.
         """
-        require_unchanged(self.systems, self.numbers)
+        require_unchanged(self.systems, self.numbers, first_of(self.systems))
         return self._multipliers
 
     @remembered
@@ -243,7 +244,7 @@ def _stacked(systems) -> HybridSystem:
                 "all arrays of `systems` need the same leading axis, one entry for each system: "
                 "make it by equinox.filter_vmap, or pass a list of systems."
             )
-        return systems
+        return current_of_many(systems)
     parts = [jax.tree_util.tree_flatten(x) for x in systems]
     kinds = {(structure, *map(eqx.is_array, leaves)) for leaves, structure in parts}
     if len(kinds) != 1:

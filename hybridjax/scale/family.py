@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed, Vector
-from .._core.meaning import current
+from .._core.meaning import current_of_many
 from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
@@ -139,7 +139,7 @@ class Family:
     def systems(self, values: Mapping[str, np.ndarray]) -> HybridSystem:
         """Return the systems at several points as one, whose arrays have a leading axis."""
         arrays = {name: jnp.asarray(x) for name, x in values.items()}
-        return current(eqx.filter_vmap(self.system)(arrays))
+        return current_of_many(eqx.filter_vmap(self.system)(arrays))
 
     def check(self, values: Mapping[str, float]) -> HybridSystem:
         """Return the system at one point.

@@ -65,7 +65,7 @@ def parameter(default: float | None = None, *, doc: str = "", unit: str = "") ->
     **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
     `unit`, as text.
     """
-    metadata = {"doc": doc, "unit": unit, "is_number": True}
+    metadata = {"doc": doc, "unit": unit}
     options: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=_number, metadata=metadata, **options)
 
