@@ -288,6 +288,9 @@ def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
         yield Part("the solver", meaning(system.solver))
     if isinstance(system, Driven):
         yield Part("the input", "", ft.partial(system.drive, t))
+    if isinstance(system, Derived):  # (of which a part may be left out)
+        for part in parts_of(system.system, t, q, u) or ():
+            yield part._replace(name=f"{part.name} of the original system")
     inputs = {}
     for name, chart in charts.items():
         used = system.inputs if chart.inputs is None else chart.inputs

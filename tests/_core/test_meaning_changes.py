@@ -476,6 +476,43 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
     assert digests[0] == digests[1] and len(set(digests)) == 3
 
 
+MIRRORED = """
+K, SIZE, PUSH = 1.0, 1.0, 1.0
+
+class Side(hj.Chart):
+    states = ("x",)
+    def field(self, t, q, u):
+        return (-K * q[0] + PUSH,)
+
+class Left(Side):
+    def field(self, t, q, u):
+        return (-K * q[0] + 1.0,)
+
+class Both(hj.HybridSystem):
+    def charts(self):
+        return {"left": Left(), "right": Side()}
+    def transitions(self):
+        level = lambda t, q, u: q[0] - SIZE
+        return [
+            hj.Transition("step", "left", "right", level),
+            hj.Transition("other step", "right", "left", level),
+        ]
+
+class Uses:
+    def __new__(cls):
+        return hj.Quotient(Both(), swap={"left": "right"})
+"""
+
+
+@pytest.mark.parametrize("change", ["K = 2.0", "SIZE = 2.0", "PUSH = 2.0"])
+def test_a_change_inside_of_a_quotient_is_seen(change):
+    """PUSH acts in the chart that is left out, whose symmetry is checked."""
+    space = made(MIRRORED)
+    first = digest_or_refusal(space)
+    exec(change, space)
+    assert digest_or_refusal(space) != first
+
+
 # Programs of a module in a package of a user that define f(x) and read `constants.K`.
 RELATIVE = {
     "a name": "def f(x):\n    from .constants import K\n    return K * x",
