@@ -164,7 +164,6 @@ class Trajectory(eqx.Module):
         Values are NaN in charts where they are not defined.
         """
         require_x64()
-        require_as_made(self.system, "this trajectory was computed")
         point = self.dense(per_step)
         return (point[0], *observed(self.structure, names, *point))
 
@@ -191,7 +190,11 @@ def observed(
     chart: Int[np.ndarray, " p"],
     q: Float[np.ndarray, "p d"],
 ) -> Float[np.ndarray, "n p"]:
-    """States or outputs at zero input; NaN in charts where they are not defined."""
+    """States or outputs at zero input; NaN in charts where they are not defined.
+
+    **Raises:** `DefinitionError` if the system's code has changed since.
+    """
+    require_as_made(s.system, "this trajectory was computed")
     items = tuple(s.resolve_outputs(names).items)
     values = np.full((len(names), len(t)), np.nan)
     for a in np.unique(chart):
