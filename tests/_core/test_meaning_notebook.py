@@ -4,10 +4,13 @@ import sys
 import types
 
 import matplotlib
+import numpy as np
 import pytest
 
 import hybridjax as hj
 from hybridjax._core.meaning import change_of, code_digest, current
+
+from ..conftest import no_compilation
 
 
 matplotlib.use("agg")
@@ -178,6 +181,29 @@ def test_an_ordinary_cell_changes_nothing(name, notebook):
     after = notebook.get("system", notebook["Uses"]())
     assert change_of(before) is None
     assert code_digest(after) == before.code_digest
+
+
+def test_a_cycle_of_a_class_whose_cell_runs_again_needs_no_compilation(notebook):
+    clocked = (
+        "class Uses(hj.HybridSystem):\n"
+        "    def charts(self):\n        return {'line': Driven()}\n"
+        "    def period(self):\n        return 1.0\n"
+        "class Driven(hj.Chart):\n    states = ('x',)\n"
+        "    def field(self, t, q, u):\n"
+        "        return (jnp.cos(2 * jnp.pi * t) - K * q[0] + u[0],)"
+    )
+    cycles = []
+
+    def find():
+        exec(clocked, notebook)
+        guess = hj.Guess("line", (0.0,))
+        cycles.append(hj.find_limit_cycle(notebook["Uses"](), guess))
+        return cycles[-1].multipliers
+
+    with no_compilation(find):
+        np.testing.assert_allclose(find(), [np.exp(-1.5)], rtol=1e-9)
+    first, second = cycles
+    assert type(first.system) is not type(second.system)
 
 
 def test_the_notebook_notices_what_is_changed(notebook):
