@@ -205,14 +205,13 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
     def every(arrays: Any, *point: Any) -> list[Any]:
         words.clear()
         results: list[Any] = []
+        # (An error of the user's functions is raised again by the call that follows.)
         try:
             for part in parts_of(eqx.combine(arrays, static), *point) or ():
                 values, failure = _values(part, reading)
                 results += values
                 words.append((part.name, part.words + failure, len(values)))
-        except (
-            Exception
-        ) as error:  # of the user's, which the call that follows raises, too
+        except Exception as error:
             failure = _failure(error, reading)
             words.append(("the charts and transitions", failure, 0))
         return results
@@ -234,11 +233,16 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
             )
     if digests.hosted:
         rule += reading.digest
-    results, parts = iter(digests.results), {}
+    results = iter(digests.results)
+    parts: dict[str, str] = {}
     for name, about, count in words:
         values = itertools.islice(results, count)
-        parts[name] = digest_of_words(about, *values)
-    return parts | ({"a rule of a derivative, or a callback,": rule} if rule else {})
+        # (Two transitions may have one name.)
+        before = parts.get(name, "")
+        parts[name] = digest_of_words(about, before, *values)
+    if rule:
+        parts["a rule of a derivative, or a callback,"] = rule
+    return parts
 
 
 def _values(part: Part, reading: Reading) -> tuple[list[Any], str]:

@@ -585,3 +585,19 @@ def test_what_a_script_changes_is_seen_under_a_runner(runner, tmp_path):
     assert "4 digests" in run_python(
         "-m", runner, *options, "script.py", cwd=tmp_path, input=""
     )
+
+
+def test_parts_of_one_name_are_all_compared():
+    def system(first, second):
+        levels = [
+            hj.Transition(
+                "hit", "line", "line", lambda t, q, u, k=k: q[0] - k, "rising"
+            )
+            for k in (first, second)
+        ]
+        charts = {"line": Field(("x",), lambda t, q, u: (1.0,))}
+        names = {"charts": lambda self: charts, "transitions": lambda self: levels}
+        return type("Made", (hj.HybridSystem,), names)()
+
+    pairs = [(1.0, 2.0), (3.0, 2.0), (1.0, 3.0), (2.0, 1.0)]
+    assert len({code_digest(system(*pair)) for pair in pairs}) == 4
