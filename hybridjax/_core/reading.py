@@ -138,8 +138,8 @@ class Reading:
         self._function_name = ""
         try:
             self._visit_all(things)
-        except _TooMany:
-            text = f"`{self._function_name}` reads too many objects to compare them"
+        except (_TooMany, RecursionError):
+            text = f"`{self._function_name}` reads too many objects to compare"
             self.unread.append(text)
             self.hidden.append(text)
         self.digest = self._hash.hexdigest()
@@ -205,6 +205,10 @@ class Reading:
                 self._note(x.format, x.shape, x.tobytes())
             case np.ufunc():
                 self._note(x.__name__)
+                if (
+                    getattr(np, x.__name__, None) is not x
+                ):  # (made of a user's function)
+                    self.unread.append(f"`{x.__name__}`")
             case _ if kind in _OF_C:
                 self._note(x.__name__, x.__objclass__.__qualname__)
             case np.dtype():

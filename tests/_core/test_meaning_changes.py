@@ -322,6 +322,20 @@ CHANGES = {
             "pathlib.Path('k').write_text('2')",
         ),
     ],
+    "a function of numpy that a user makes": [
+        (
+            "g = np.frompyfunc(lambda a: 2.0 * a, 1, 1)\ndef f(x): return float(g(1.0)) * x",
+            "g = np.frompyfunc(lambda a: 3.0 * a, 1, 1)",
+        ),
+        (
+            "g = np.vectorize(lambda a: 2.0 * a)\ndef f(x): return float(g(1.0)) * x",
+            "g = np.vectorize(lambda a: 3.0 * a)",
+        ),
+        (
+            "g = np.poly1d([1.0, 2.0])\ndef f(x): return g(1.0) * x",
+            "g.coeffs[0] = 3.0",
+        ),
+    ],
     "the rule of a derivative": [
         (
             "K = 1.0\n@jax.custom_jvp\ndef h(x): return x\nh.defjvps(lambda dx, _, x: K * dx)\n"
