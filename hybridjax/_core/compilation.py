@@ -29,6 +29,7 @@ from jax.core import eval_context
 from ..errors import ComputationError
 from . import executor
 from .executor import as_numpy, from_host, is_hidden, on_cpu, on_the_cpu, to_host
+from .meaning import program_digest
 from .progress import say_compiling
 
 
@@ -378,7 +379,8 @@ def kernel(
     and `form` belong to modules, so that they are the same objects in each call.
 
     One program serves everything of the same structure: the same classes, static fields, functions,
-    and shapes and types of arrays. The arrays themselves are arguments.
+    and shapes and types of arrays. The arrays themselves are arguments. It also serves systems of
+    other classes that compute the same (a class whose cell in a notebook has run again).
 
     The program is for this number of `lanes`: more are done in several calls, fewer are filled up.
     (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
@@ -428,23 +430,49 @@ def _bound(function, form, static, trees, lanes) -> tuple[Callable, list]:
         for x in leaves
         if _is_array(x)
     ]
-    # (1, 1.0 and True are equal, and not the same.)
-    static_leaves = tuple(None if _is_array(x) else (type(x), x) for x in leaves)
-    return _kernel_program(
-        function, form, static, structure, static_leaves, lanes
-    ), arrays
+    key = function, form, static, lanes, _identity(trees)
+    with _kernels_lock:
+        if key not in _kernels:
+            _kernels[key] = _kernel_program(function, form, static, structure, leaves)
+        _kernels.move_to_end(key)
+        while len(_kernels) > _KEPT:
+            _kernels.popitem(last=False)
+        return _kernels[key], arrays
 
 
-@ft.lru_cache(_KEPT)
-def _kernel_program(function, form, static, structure, static_leaves, lanes):
+_kernels: collections.OrderedDict[tuple, Callable] = collections.OrderedDict()
+_kernels_lock = threading.Lock()
+
+
+def _kernel_program(function, form, static, structure, leaves) -> Callable:
+    still = [None if _is_array(x) else x for x in leaves]
+    places = [k for k, x in enumerate(leaves) if _is_array(x)]
+
     def run(arrays, *arguments):
-        arrays = iter(arrays)
-        leaves = [next(arrays) if x is None else x[1] for x in static_leaves]
+        leaves = list(still)
+        for k, x in zip(places, arrays, strict=True):
+            leaves[k] = x
         trees = jax.tree_util.tree_unflatten(structure, leaves)
         return form(ft.partial(function, *static), *trees)(*arguments)
 
     # (One for each number of lanes, as it is for arrays of one shape.)
     return jax.jit(run, compiler_options=compiler_options(small=True))
+
+
+def _identity(trees: Any) -> tuple:
+    """All of trees but the values of arrays; of a system what it computes, not how it is done."""
+    parts, structure = jax.tree_util.tree_flatten(
+        trees, is_leaf=lambda x: bool(program_digest(x))
+    )
+    return structure, *map(_identity_of_part, parts)
+
+
+def _identity_of_part(x: Any) -> Hashable:
+    if digest := program_digest(x):
+        arrays = filter(_is_array, jax.tree_util.tree_leaves(x))
+        return digest, *((y.shape, y.dtype) for y in arrays)
+    # (1, 1.0 and True are equal, and not the same.)
+    return None if _is_array(x) else (type(x), x)
 
 
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:

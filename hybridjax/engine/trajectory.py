@@ -15,7 +15,7 @@ from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
 from .._core.findings import Finding, print_findings, warn_of
-from .._core.meaning import current
+from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.text import folded, number, signal_values
@@ -103,6 +103,7 @@ class Trajectory(eqx.Module):
     @property
     def events(self) -> list[Event]:
         """The events in order of time."""
+        require_as_made(self.system, "this trajectory was computed")
         events, s = [], self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
@@ -194,7 +195,11 @@ def observed(
     chart: Int[np.ndarray, " p"],
     q: Float[np.ndarray, "p d"],
 ) -> Float[np.ndarray, "n p"]:
-    """States or outputs at zero input; NaN in charts where they are not defined."""
+    """States or outputs at zero input; NaN in charts where they are not defined.
+
+    **Raises:** `DefinitionError` if the system's code has changed since.
+    """
+    require_as_made(s.system, "this trajectory was computed")
     items = tuple(s.resolve_outputs(names).items)
     values = np.full((len(names), len(t)), np.nan)
     for a in np.unique(chart):

@@ -12,7 +12,7 @@ from jax.extend import core as jex
 from jaxtyping import Float
 
 from .._core.compilation import kind
-from .._core.meaning import is_of_package
+from .._core.reading import is_of_package
 from ..systems.solver import Method
 from ..systems.structure import Structure
 from . import kernels

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
+from .._core.meaning import require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.text import folded, listed
@@ -216,7 +217,8 @@ class ResponseFunction(eqx.Module):
         u, placed = jnp.asarray(u, float), self.placed
         require_shape(u.shape, placed.n_sections, placed.cycle.structure.nu)
         if system is None:
-            placed.cycle.require_current()
+            placed.require_current()
+            require_as_made(self.outputs, "this response function was made")
         else:
             both = lambda x: (x.cycle.system, x.cycle.numbers)  # noqa: E731
             placed = eqx.tree_at(both, placed, (system, arrays_of(system)))

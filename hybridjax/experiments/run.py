@@ -15,6 +15,7 @@ from .._core.boundary.values import Reals
 from .._core.compilation import TwoTiers
 from .._core.execution import Execution, in_threads
 from .._core.executor import from_host, on_cpu, to_host
+from .._core.meaning import require_as_made
 from .._core.memo import Memory, remembered
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -191,7 +192,8 @@ class Campaign:
         **Raises:** `DefinitionError` for an output that is not defined where experiments go, and if
         the system's code has changed; `ComputationError` if a steady start is not found.
         """
-        self.placed.cycle.require_current()
+        self.placed.require_current()
+        require_as_made(self.outputs, "these experiments were planned")
         rows = slice(0, len(self.inputs)) if rows is None else rows
         workers = self.execution.workers if workers is None else workers
         execution = dataclasses.replace(self.execution, workers=workers)

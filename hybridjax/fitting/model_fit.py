@@ -217,6 +217,7 @@ class ModelFit(eqx.Module):
                 f"`true` must have a value of '{missing[0]}', which was fitted."
             )
         values = jnp.array([float(true[name]) for name in self.names])
+        self.cycle.require_current()
         r, *_ = evaluate(
             self.problem, self.problem.parameters.encode(values), self.cycle
         )

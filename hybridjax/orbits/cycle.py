@@ -22,10 +22,10 @@ from .._core.html import (
     picture,
     unit_circle,
 )
-from .._core.meaning import code_digest
+from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
-from .._core.progress import whole_call
+from .._core.progress import once_in_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -118,11 +118,14 @@ class LimitCycle(eqx.Module):
         )
 
     def require_current(self) -> None:
-        """**Raises:** `DefinitionError` if the system's code, or a parameter, has changed since the
-        cycle was found."""
-        if whole_call().compared is not self:
+        """**Raises:** `DefinitionError` if the system's code, its section's, or a parameter, has
+        changed since the cycle was found."""
+
+        def compare():
             require_unchanged(self.system, self.numbers)
-        whole_call().compared = self
+            require_as_made(self.base, "this limit cycle was found")
+
+        once_in_call(self, compare)
 
     def require_found(self) -> None:
         """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
@@ -158,7 +161,7 @@ class LimitCycle(eqx.Module):
         _require_values(self, "dims")
         return np.array(self.structure.dims)[np.asarray(self.legs.chart)]
 
-    @remembered
+    @property
     def multipliers(self) -> Complex[np.ndarray, " r"]:
         """The non-zero Floquet multipliers, by decreasing modulus (on the host).
 
@@ -171,6 +174,10 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "multipliers")
         self.require_found()
+        return self._multipliers
+
+    @remembered
+    def _multipliers(self) -> Complex[np.ndarray, " r"]:
         # The factors in sizes of the states, without padding.
         dims, scale = (
             self.dims,
@@ -199,7 +206,7 @@ class LimitCycle(eqx.Module):
         values.flags.writeable = False  # they are kept
         return values
 
-    @remembered
+    @property
     def log_multipliers(self) -> Float[np.ndarray, " r"]:
         """Natural logarithms of the moduli of `multipliers`.
 
@@ -449,11 +456,17 @@ def _require_values(cycle: LimitCycle, name: str) -> None:
         )
 
 
-def what_changed(system: HybridSystem, numbers: Mapping[str, Any]) -> str:
-    """A sentence on what of a system has changed since its cycle was found, if anything has."""
+def what_changed(
+    system: HybridSystem,
+    numbers: Mapping[str, Any],
+    single: HybridSystem | None = None,
+) -> str:
+    """A sentence on what of a system has changed since its cycle was found, if anything has; of
+    systems side by side, of which `single` is one."""
     now, name, changed = arrays_of(system), type(system).__name__, ""
-    if system.code_digest != code_digest(system):
-        changed = f"the functions of {name}, or values that they read, have"
+    change = change_of(system if single is None else single)
+    if change is not None:
+        changed = f"{change} has"
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
             changed = f"`{key}` of {name} has"
@@ -469,9 +482,14 @@ def as_found(cycle: LimitCycle) -> LimitCycle:
     return eqx.tree_at(lambda x: x.system, cycle, eqx.combine(arrays, static))
 
 
-def require_unchanged(system: HybridSystem, numbers: Mapping[str, Any]) -> None:
-    """**Raises:** `DefinitionError` if something of the system has changed."""
-    if change := what_changed(system, numbers):
+def require_unchanged(
+    system: HybridSystem,
+    numbers: Mapping[str, Any],
+    single: HybridSystem | None = None,
+) -> None:
+    """**Raises:** `DefinitionError` if something of the system, or systems, has changed."""
+    change = what_changed(system, numbers, single)
+    if change:
         raise DefinitionError(f"{change}.")
 
 

@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
 from .._core.execution import Execution
 from .._core.executor import from_host
+from .._core.meaning import current_of_many, first_of
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
@@ -106,14 +107,18 @@ class LimitCycles(eqx.Module):
         """Indices of the systems without a cycle."""
         return np.flatnonzero(~self.ok)
 
-    @remembered
+    @property
     def multipliers(self) -> Complex[np.ndarray, "S d"]:
         """Floquet multipliers, by decreasing modulus; NaN for systems without a cycle.
 
         Eigenvalues of the product of the factors, padded with zeros: those far below the largest
         are lost in rounding. `cycles[i].multipliers` has them.
         """
-        require_unchanged(self.systems, self.numbers)
+        require_unchanged(self.systems, self.numbers, first_of(self.systems))
+        return self._multipliers
+
+    @remembered
+    def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
         values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
         order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
@@ -251,7 +256,7 @@ def _stacked(systems) -> HybridSystem:
                 "all arrays of `systems` need the same leading axis, one entry for each system: "
                 "make it by equinox.filter_vmap, or pass a list of systems."
             )
-        return systems
+        return current_of_many(systems)
     parts = [jax.tree_util.tree_flatten(x) for x in systems]
     kinds = {(structure, *map(eqx.is_array, leaves)) for leaves, structure in parts}
     if len(kinds) != 1:

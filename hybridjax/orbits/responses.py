@@ -30,6 +30,7 @@ from .._core.executor import (
     svdvals,
     to_host,
 )
+from .._core.meaning import require_as_made
 from .._core.results import Result
 from .._core.signal import unit_of
 from .._core.text import number
@@ -143,6 +144,10 @@ class Coupling(eqx.Module):
         return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
 
 
+# When responses were made, for messages.
+_MADE = "these responses were computed"
+
+
 @checked_methods
 class Responses(eqx.Module):
     """Responses of a limit cycle to brief pushes, at every phase (see `LimitCycle.responses`).
@@ -190,6 +195,7 @@ class Responses(eqx.Module):
             "cycles": 1 / self.period,
             "radians": 2 * np.pi / self.period,
         }[unit]
+        require_as_made(self.structure.system, _MADE)
         return self._named(self._covector(None), phase, scale)
 
     def amplitude(self, mode: Index, phase: Phases) -> dict[str, Inexact[Array, " p"]]:
@@ -202,11 +208,13 @@ class Responses(eqx.Module):
 
         **Raises:** `DefinitionError` for a mode that does not exist.
         """
+        require_as_made(self.structure.system, _MADE)
         return self._named(self._covector(mode), phase)
 
     def impulses(self, mode: Index | None = None) -> tuple[Impulse, ...]:
         """The responses of the phase (in time), or of the amplitude of a mode, to inputs that act
         at events."""
+        require_as_made(self.structure.system, _MADE)
         xp, jumps, s = namespace(self.period), self.flow.jumps, self.structure
         after = xp.roll(self._covector(mode)[:, 0], -1, axis=0)
         weight = xp.einsum("pi,piu->pu", after, jumps.by_input)
@@ -304,6 +312,7 @@ class Responses(eqx.Module):
 
     def _pushed(self, name: str | None) -> tuple[str, Float[Array, "P K"]]:
         """An input (Default: the first), and the response of the phase to it at the nodes."""
+        require_as_made(self.structure.system, _MADE)
         (name, *_), columns = self.structure.inputs_among(
             name if name is None else [name]
         )

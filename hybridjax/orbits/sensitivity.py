@@ -14,6 +14,7 @@ from jaxtyping import Float
 from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host, svdvals
+from .._core.meaning import require_as_made
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
@@ -51,6 +52,7 @@ class Sensitivity(eqx.Module):
 
     def shape(self, phase: Phases) -> dict[str, Float[Array, " p"]]:
         """Derivatives of the states at equal phases, by name; NaN in charts that lack one."""
+        require_as_made(self.structure.system, "these derivatives were computed")
         chart, states = self.flow.at(phase, self.duration, self.change)
         return by_name(self.structure, chart, states)
 

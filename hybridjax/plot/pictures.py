@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._core.lanes import by_lane
+from .._core.meaning import code_of
 from ..engine.trajectory import Trajectory
 from ..systems.check import evaluating
 from ..systems.drawing import Drawing
@@ -78,10 +79,12 @@ def drawn(
 ) -> list[Drawing]:
     """The drawings of states, on the host."""
     drawings: list[Any] = [None] * len(t)
+    code = code_of(s.system)
     for a in np.unique(chart).tolist():
         rows = np.flatnonzero(chart == a)
         leaves, form = jax.tree_util.tree_flatten(drawing_of(s, a))
-        values = s.kernel(_flat, by_lane, a, lanes=4)(t[rows], q[rows, : s.dims[a]].T)
+        program = s.kernel(_flat, by_lane, a, code, lanes=4)
+        values = program(t[rows], q[rows, : s.dims[a]].T)
         parts = np.split(values.T, np.cumsum([x.size for x in leaves])[:-1], axis=1)
         for k, row in enumerate(rows):
             shapes = [
@@ -102,7 +105,7 @@ def drawing_of(s: Structure, a: int) -> Any:
         return s.once(("drawing", a), (), shapes)
 
 
-def _flat(a: int, s: Structure, t, q):
+def _flat(a: int, code: str, s: Structure, t, q):
     return jnp.concatenate(
         [jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))]
     )

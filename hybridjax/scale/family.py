@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import ExperimentCount, Seed, Vector
-from .._core.meaning import current
+from .._core.meaning import current_of_many
 from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
 from .._core.precision import require_x64
@@ -148,7 +148,7 @@ class Family:
         **Raises:** `DefinitionError` for a parameter that must be positive and is not.
         """
         arrays = {name: jnp.asarray(x) for name, x in values.items()}
-        systems = current(eqx.filter_vmap(self.system)(arrays))
+        systems = current_of_many(eqx.filter_vmap(self.system)(arrays))
         require_positive(systems)
         return systems
 

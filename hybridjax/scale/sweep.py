@@ -83,7 +83,9 @@ def sweep(
     - `chunk`: largest number of points in a piece. Default: 4000, with functions 250;
         more in sweeps of more than 64 such pieces without functions.
     - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
-        are not computed again: after an interruption, repeat the call.
+        are not computed again: after an interruption, repeat the call. It holds digests of the
+        programs of the model, and of the code of functions with the values, helpers and classes
+        that this code can reach (not of databases and files): with others, the call is refused.
     - `client`: a `distributed.Client`, whose workers compute the pieces.
 
     **Returns:** an `xarray.Dataset`, whose coordinates are the parameters with their units. With a

@@ -4,7 +4,8 @@ import abc
 import contextvars
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import functools as ft
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
@@ -16,15 +17,15 @@ from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
 from .._core.executor import Definition, is_tracer
-from .._core.meaning import code_digest, current
-from .._core.pieces.description import digest_of
+from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
+from .._core.pieces.description import digest_of, marked
 from .._core.precision import real
 from .._core.text import columns, fields, value
 from ..errors import DefinitionError
 from .chart import Chart, attribute_of
 from .drawing import Drawing
 from .solver import ByChart, Method, Solver, solvers
-from .transition import Transition
+from .transition import Scheduled, Transition
 
 
 @checked
@@ -116,7 +117,7 @@ def describe(system: "HybridSystem") -> dict[str, Any]:
     return {
         "class": type(system).__qualname__,
         "numbers": numbers,
-        "code": code_digest(system),
+        "code": {name: marked(x) for name, x in parts_by_name(system).items()},
     }
 
 
@@ -337,3 +338,54 @@ class Driven(Derived):
     """`system` with an input that is a function of time, added to the piecewise constant one."""
 
     drive: Callable[[Any], Any]
+
+
+@parts_of.register
+def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
+    charts = system.charts()
+    yield Part("the period", str(system.period() is None), system.period)
+    names = [tuple(x) for x in (system.inputs, system.input_units, charts)]
+    yield Part("the names of inputs and charts", repr((*names, system.time_unit)))
+    if system.solver is not None:
+        yield Part("the solver", meaning(system.solver))
+    if isinstance(system, Driven):
+        yield Part("the input", "", ft.partial(system.drive, t))
+    if isinstance(system, Derived):  # (of which a part may be left out)
+        for part in parts_of(system.system, t, q, u) or ():
+            yield part._replace(name=f"{part.name} of the original system")
+    inputs = {}
+    for name, chart in charts.items():
+        used = system.inputs if chart.inputs is None else chart.inputs
+        columns = np.array([system.inputs.index(x) for x in used], int)
+        inputs[name] = t, q[: len(chart.states)], u[columns]
+        yield from _parts_of_chart(name, chart, inputs[name])
+    for x in system.transitions():
+        yield from _parts_of_transition(x, inputs[x.source])
+    for x in system.outputs():
+        for name in charts:
+            function = x.function if callable(x.function) else x.function.get(name)
+            if function is not None:
+                at = ft.partial(function, *inputs[name])
+                about = f"the output '{x.name}' in chart '{name}'"
+                yield Part(about, repr((x.name, x.unit)), at)
+
+
+def _parts_of_chart(name: str, chart: Chart, point: tuple) -> Iterator[Part]:
+    about = chart.states, chart.units, chart.inputs, sorted(chart.absent)
+    yield Part(f"the list of states of chart '{name}'", repr(about))
+    yield Part(f"`absent` of chart '{name}'", "", lambda: dict(chart.absent))
+    if chart.solver is not None:
+        yield Part(f"the solver of chart '{name}'", meaning(chart.solver))
+    yield Part(f"the field of chart '{name}'", "", ft.partial(chart.field, *point))
+
+
+def _parts_of_transition(x: Transition, point: tuple) -> Iterator[Part]:
+    yield Part(f"the transition '{x.name}'", f"{x.source}, {x.target}, {x.direction}")
+    if isinstance(x.guard, Scheduled):
+        times = x.guard.period, x.guard.offset
+        yield Part(f"the schedule of '{x.name}'", "", lambda: times)
+    else:
+        yield Part(f"the guard of '{x.name}'", "", ft.partial(x.guard, *point))
+    yield Part(f"the reset of '{x.name}'", "", ft.partial(x.reset, *point))
+    if x.enabled is not None:
+        yield Part(f"`enabled` of '{x.name}'", "", ft.partial(x.enabled, *point))

@@ -121,11 +121,11 @@ def plain(function, *trees):
 @pytest.mark.parametrize("lanes", [1, 3, 4, 8])
 def test_a_kernel_of_any_number_of_lanes(lanes):
     x, y = np.linspace(0.0, 1.0, 4)[None], np.ones((1, 1))
-    before = compilation._kernel_program.cache_info().misses
+    before = len(compilation._kernels)
     for k in (1.0, 2.0):
         values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
         np.testing.assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
-    assert compilation._kernel_program.cache_info().misses == before + 1
+    assert len(compilation._kernels) == before + 1
     some = np.array([False, True, False, True])
     values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(
         x, y, some=some

@@ -7,7 +7,8 @@ import pytest
 
 import hybridjax as hj
 from hybridjax._core.boundary.containers import Instance, Items
-from hybridjax._core.meaning import current, is_of_package, meaning
+from hybridjax._core.meaning import current, meaning
+from hybridjax._core.reading import is_of_package
 from hybridjax.errors import DefinitionError
 
 

@@ -84,7 +84,7 @@ def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
         use(blown)
     monkeypatch.setitem(globals(), "DRAG", 1.3)
     with pytest.raises(
-        hj.DefinitionError, match="have changed since this limit cycle was found"
+        hj.DefinitionError, match="the field of chart 'air' of Slowed has changed since"
     ):
         use(cycle)
     assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
@@ -129,7 +129,10 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
         )
     np.testing.assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
     for use in (lambda: response(DESIGN.inputs(cycles=1)), lambda: next(chunks)):
-        with pytest.raises(hj.DefinitionError, match="have changed since"):
+        with pytest.raises(
+            hj.DefinitionError,
+            match="the field of chart 'air' of Slowed has changed since",
+        ):
             use()
 
 
@@ -182,3 +185,142 @@ def test_the_gain_of_an_input_has_the_clocks_period():
         hj.DefinitionError, match=r"does not have the period 1 that Pushed.period"
     ):
         hj.find_limit_cycle(Pushed())
+
+
+GAIN = 1.0
+SPEED = hj.Output("speed", lambda t, q, u: GAIN * q[0], "m/s")
+
+
+class Swings(hj.HybridSystem):
+    """A damped pendulum with a motor, whose gain is a constant of the notebook."""
+
+    torque: hj.Parameter = hj.parameter(0.3)
+
+    def charts(self):
+        def field(t, q, u):
+            torque = self.torque * jnp.cos(2 * jnp.pi * t) + u[0]
+            return q[1], -DRAG * q[1] - jnp.sin(q[0]) + torque
+
+        return {"free": Field(("x", "v"), field)}
+
+    def period(self):
+        return 1.0
+
+    def guess(self):
+        return hj.Guess("free", (0.0, 0.0))
+
+
+PUSHES = hj.multisine(2, periods=4).scaled(rms=0.01)
+PLACES = hj.ClockPhase(2)
+
+
+def campaign(cycle):
+    return hj.experiments.stream_experiments(cycle, PLACES, PUSHES, "x", chunk=1)
+
+
+# Objects that are made of a cycle, and a later call.
+LATER = {
+    "a cycle": (lambda cycle: cycle, lambda x: x.trajectory()),
+    "its multipliers": (
+        lambda cycle: (cycle.multipliers, cycle)[1],
+        lambda x: x.multipliers,
+    ),
+    "its stability": (lambda cycle: (cycle.stable, cycle)[1], lambda x: x.stable),
+    "its responses": (lambda cycle: cycle, lambda x: x.responses()),
+    "its transfer functions": (lambda cycle: cycle, lambda x: x.htf(0.3)),
+    "its sensitivity": (lambda cycle: cycle, lambda x: x.sensitivity("torque")),
+    "its fluctuations": (lambda cycle: cycle, lambda x: x.fluctuations({"v": 0.1})),
+    "responses": (
+        lambda cycle: cycle.responses(),
+        lambda x: x.amplitude(0, np.array([0.5])),
+    ),
+    "a sensitivity": (
+        lambda cycle: cycle.sensitivity("torque"),
+        lambda x: x.shape(np.array([0.5])),
+    ),
+    "a trajectory": (lambda cycle: cycle.trajectory(), lambda x: x("x")),
+    "its events": (lambda cycle: cycle.trajectory(), lambda x: x.events),
+    "placed sections": (
+        lambda cycle: hj.place_sections(cycle, PLACES),
+        lambda x: x.observe("x"),
+    ),
+    "sections for a model": (
+        lambda cycle: (cycle, hj.place_sections(cycle, PLACES)),
+        lambda x: hj.linearize(x[0], x[1], "x"),
+    ),
+    "a map of sections": (
+        lambda cycle: hj.section_map(cycle, PLACES, 0, 1),
+        lambda x: x(x.fixed_point),
+    ),
+    "a response function": (
+        lambda cycle: hj.response_function(cycle, PLACES, "x"),
+        lambda x: x(PUSHES.inputs(cycles=1)),
+    ),
+    "a campaign": (campaign, next),
+    "experiments": (
+        lambda cycle: cycle,
+        lambda x: hj.run_experiments(x, PLACES, PUSHES, "x"),
+    ),
+    "a branch": (
+        lambda cycle: hj.continuation(cycle, "torque", (0.29, 0.31)),
+        lambda x: x[1].trajectory(),
+    ),
+    "multipliers of a branch": (
+        lambda cycle: hj.continuation(cycle, "torque", (0.29, 0.31)),
+        lambda x: x.multipliers,
+    ),
+    "the start of a branch": (
+        lambda cycle: cycle,
+        lambda x: hj.continuation(x, "torque", (0.29, 0.31)),
+    ),
+    "cycles": (
+        lambda cycle: hj.find_limit_cycles([cycle.system] * 2, guess=cycle),
+        lambda x: x.multipliers,
+    ),
+    "one of several cycles": (
+        lambda cycle: hj.find_limit_cycles([cycle.system] * 2, guess=cycle),
+        lambda x: hj.linearize(x[1], PLACES, "x"),
+    ),
+    "sliders": (lambda cycle: cycle, lambda x: hj.explore(x, "torque")),
+    "a figure": (lambda cycle: cycle, lambda x: hj.plot.cycle(x)),
+}
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    return hj.find_limit_cycle(Swings())
+
+
+@pytest.mark.parametrize("name", LATER)
+def test_each_later_call_names_what_has_changed(name, swinging, monkeypatch):
+    make, use = LATER[name]
+    made = make(swinging)
+    monkeypatch.setitem(globals(), "DRAG", 0.9)
+    sentence = "the field of chart 'free' of Swings has changed since"
+    with pytest.raises(hj.DefinitionError, match=sentence):
+        use(made)
+
+
+def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypatch):
+    level = hj.Crossing(lambda t, q: q[0] - 0.001 * GAIN, "rising")
+    response = hj.response_function(swinging, PLACES, SPEED)
+    chunks = hj.experiments.stream_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
+    placed = hj.place_sections(swinging, hj.ClockPhase(2, anchor=level))
+    before = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    monkeypatch.setitem(globals(), "GAIN", 2.0)
+    uses = {
+        "Output 'speed' has changed since this response function was made": (
+            lambda: response(PUSHES.inputs(cycles=1))
+        ),
+        "Output 'speed' has changed since these experiments were planned": (
+            lambda: next(chunks)
+        ),
+        "ClockPhase has changed since it was placed on a cycle": (
+            lambda: placed.observe("x")
+        ),
+    }
+    for sentence, use in uses.items():
+        with pytest.raises(hj.DefinitionError, match=sentence):
+            use()
+    after = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    np.testing.assert_allclose(after, 2 * before, rtol=1e-12)

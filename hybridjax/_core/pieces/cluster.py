@@ -19,8 +19,9 @@ from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
 from ..cache import enable_compilation_cache
-from ..meaning import is_packaged, meaning
+from ..meaning import meaning
 from ..progress import counted, say
+from ..reading import is_packaged
 from .store import ArrayStore, ZarrStore
 
 

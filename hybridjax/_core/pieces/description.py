@@ -39,9 +39,13 @@ def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
 def digest_of(*things: Any) -> str:
     """Return a digest of functions, definitions and values: see `meaning`. Arrays of JAX have the
     digests of NumPy's."""
-    return _DIGEST + meaning(
-        *(np.asarray(x) if isinstance(x, jax.Array) else x for x in things)
-    )
+    arrays = (np.asarray(x) if isinstance(x, jax.Array) else x for x in things)
+    return marked(meaning(*arrays))
+
+
+def marked(digest: str) -> str:
+    """A digest in the form in which descriptions hold it, so that messages do not show it."""
+    return _DIGEST + digest
 
 
 _DIGEST = "digest:"

@@ -1,0 +1,649 @@
+"""What functions and objects read: their code, and the values that this code can reach.
+
+A reading has a digest, which says what was read, and lists what it could not read. It is a mark:
+if nothing was left unread and the digest is the same as before, then nothing has changed. If the
+digest differs, what is computed may still be the same (see `meaning.py`, which compares that).
+"""
+
+import builtins
+import contextlib
+import contextvars
+import dis
+import functools as ft
+import hashlib
+import importlib.metadata
+import importlib.util
+import inspect
+import itertools
+import os
+import pathlib
+import random
+import re
+import sys
+import sysconfig
+import types
+import weakref
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .executor import is_tracer
+from .programs import digest_of_array
+
+
+_PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range, slice
+# Objects of these types that are no more than their values, if a class is made of them.
+_VALUES = bool, int, float, complex, str, bytes
+_JITTED: Any = type(jax.jit(len))
+
+# What classes of C are made of.
+_OF_C = frozenset(
+    (
+        types.MethodDescriptorType,
+        types.ClassMethodDescriptorType,
+        types.WrapperDescriptorType,
+        types.GetSetDescriptorType,
+        types.MemberDescriptorType,
+    )
+)
+
+# Functions that read files, the names of values, or the system.
+_HIDDEN = re.compile(
+    "eval|exec|globals|__import__|import_module|getenv|check_output|urlopen|popen"
+)
+_FILES = re.compile(
+    "open|(read|open|load)_.+|load|loadtxt|loadmat|genfromtxt|fromfile|memmap|fromregex"
+)
+_FRAMES = frozenset(("__globals__", "f_globals", "f_locals"))
+_FILE_METHODS = frozenset(("read_text", "read_bytes"))
+# Built-in functions whose result depends on more than the values that are read here.
+_UNSURE = frozenset(
+    "open eval exec globals locals vars dir getattr hasattr __import__ input compile id hash "
+    "breakpoint memoryview".split()
+)
+# Packages and modules whose functions compute from their arguments only, but for those above and
+# the ones with these names.
+_PURE = frozenset(
+    "builtins math cmath operator _operator functools _functools itertools dataclasses typing "
+    "collections abc enum numbers fractions decimal string re copy types contextlib numpy jax "
+    "jaxlib equinox jaxtyping hybridjax _thread".split()
+)
+_DRAWN = frozenset(
+    "random default_rng pure_callback io_callback now config devices ctypeslib".split()
+)
+_CLOCKS = frozenset("now today utcnow".split())
+_MOVING = frozenset("time random secrets uuid".split())
+# Functions of JAX that remember the trace of a function by its identity.
+_RETRACED = frozenset(
+    "jit filter_jit scan cond switch while_loop fori_loop map associative_scan checkpoint remat "
+    "filter_checkpoint custom_jvp custom_vjp filter_custom_jvp filter_custom_vjp".split()
+)
+# What Python and its tools write into classes.
+_DESCRIPTIONS = frozenset(
+    "_abc_impl __doc__ __module__ __dict__ __weakref__ __annotations__ __annotate__ "
+    "__annotate_func__ __annotations_cache__ __firstlineno__ __static_attributes__ __qualname__ "
+    "__orig_bases__ __parameters__ __abstractmethods__ __abstractclassvars__ __abstractvars__ "
+    "__dataclass_fields__ __dataclass_params__ __match_args__ __slots__ __classcell__".split()
+)
+# Objects after which a reading ends as incomplete. More: what holds a whole library (a
+# figure, a session) is read for longer than tracing takes. Fewer: large systems are traced again
+# at each call.
+_MOST = 20_000
+# Bytes of an array that a mark digests. More: calls take longer than tracing does. Fewer: systems
+# with tables are traced again at each call.
+_LARGE = 1_000_000
+
+_PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
+_MODELS = os.path.join(_PACKAGE, "models")
+_FOLDERS = _PACKAGE, *(sysconfig.get_paths()[x] for x in ("stdlib", "platstdlib"))
+# Packages of a user and of a distribution lie elsewhere than those of Python.
+_INSTALLED = re.compile(
+    "|".join([*map(re.escape, _FOLDERS), r".*[\\/](site|dist)-packages[\\/]"])
+)
+
+Names = tuple[str, ...]
+"""Also a global name with the attributes that code reads of it: `("np", "linalg", "norm")`."""
+
+
+class _TooMany(Exception):
+    """A mark would read too many objects."""
+
+
+class Reading:
+    """What some things read.
+
+    - `digest`: of all that was read, the same in every process.
+    - `unread`: what could not be read, so that a change of it would not be seen.
+    - `hidden`: of these, what reads files, or values by computed names, as sentences.
+    - `moving`: of these, what draws random numbers or reads the clock, as sentences.
+    - `retraced`: whether JAX may remember the trace of a function that was read.
+
+    **Arguments:** `marks`: do not read what takes longer than tracing (large arrays, objects of
+    other libraries); it counts as unread.
+    """
+
+    def __init__(self, *things: Any, marks: bool = False):
+        self.unread: list[str] = []
+        self.hidden: list[str] = []
+        self.moving: list[str] = []
+        self.retraced = False
+        self._marks = marks
+        self._hash = hashlib.blake2b(digest_size=16)
+        self._number: dict[int, int] = {}
+        self._alive: list[Any] = []  # an id belongs to an object while this lives
+        self._attributes: set[tuple[int, Names]] = set()
+        self._classes = 0  # around what is visited
+        self._function_name = ""
+        try:
+            self._visit_all(things)
+        except (_TooMany, RecursionError):
+            text = f"`{self._function_name}` reads too many objects to compare"
+            self.unread.append(text)
+            self.hidden.append(text)
+        self.digest = self._hash.hexdigest()
+        self._alive.clear()
+
+    def _note(self, *words: Any) -> None:
+        self._hash.update(repr(words).encode())
+
+    def _visit_all(self, things: Iterable[Any]) -> None:
+        things = list(things)
+        self._note(len(things))
+        for x in things:
+            self._visit(x)
+
+    def _visit_items(self, items: Iterable[tuple[Any, Any]]) -> None:
+        self._visit_all(part for item in items for part in item)
+
+    def _visit(self, x: Any) -> None:
+        kind = type(x)
+        if kind in _PLAIN:
+            return self._note(kind.__name__, x)
+        if id(x) in self._number:
+            return self._note(self._number[id(x)])
+        self._number[id(x)] = len(self._number)
+        self._alive.append(x)
+        if len(self._alive) > _MOST:
+            raise _TooMany
+        self._note(kind.__qualname__)
+        if is_tracer(x):
+            return self._note(str(x.aval))
+        if kind in (list, tuple):
+            return self._visit_all(x)
+        if kind is dict:
+            return self._visit_items(x.items())
+        if kind in (set, frozenset):
+            return self._set(x)
+        if kind is np.ndarray or isinstance(x, np.generic | jax.Array):
+            return self._array(x)
+        match x:
+            case types.FunctionType():
+                self._function(x)
+            case types.CodeType():
+                self._note(_code(x))
+            case types.CellType():
+                with contextlib.suppress(ValueError):  # an empty cell
+                    self._visit(x.cell_contents)
+            case type():
+                self._class(x)
+            case property():
+                self._visit_all((x.fget, x.fset))
+            case types.MethodType():
+                self._visit_all((x.__func__, x.__self__))
+            case types.ModuleType():  # read by other means than the names of its attributes
+                self._module(x)
+            case types.BuiltinFunctionType():
+                self._builtin(x)
+            case weakref.ref():
+                self._visit(x())
+            case contextvars.ContextVar():
+                with contextlib.suppress(LookupError):  # of one that is not set
+                    self._visit(x.get())
+            case memoryview():
+                self._note(x.format, x.shape, x.tobytes())
+            case np.ufunc():
+                self._note(x.__name__)
+                if (
+                    getattr(np, x.__name__, None) is not x
+                ):  # (made of a user's function)
+                    self.unread.append(f"`{x.__name__}`")
+            case _ if kind in _OF_C:
+                self._note(x.__name__, x.__objclass__.__qualname__)
+            case np.dtype():
+                self._note(str(x))
+            case _:
+                self._object(x)
+
+    def _set(self, x: Any) -> None:
+        parts = [Reading(y, marks=self._marks) for y in x]
+        self._note(sorted(part.digest for part in parts))
+        for part in parts:
+            self._join(part)
+
+    def _join(self, other: "Reading") -> None:
+        self.unread += other.unread
+        self.hidden += other.hidden
+        self.moving += other.moving
+        self.retraced = self.retraced or other.retraced
+
+    def _array(self, x: Any) -> None:
+        if isinstance(x, jax.Array):  # (whose digest is kept with it)
+            return self._note(digest_of_array(x))
+        if x.dtype.hasobject:
+            self._note(x.shape)
+            return self._visit_all(x.ravel().tolist())
+        if self._marks and x.nbytes > _LARGE:
+            self.unread.append("a large array")
+            return None
+        return self._note(digest_of_array(x))
+
+    def _builtin(self, x: Any) -> None:
+        self._note(x.__name__)
+        owner = x.__self__
+        if owner is not None and not isinstance(owner, types.ModuleType):
+            return self._visit(owner)
+        self._packaged(x.__module__ or "builtins", x.__name__)
+        return None
+
+    def _packaged(self, module: str, name: str) -> None:
+        """Note a function or a class of a package, which is known by the version of this."""
+        root = module.partition(".")[0]
+        self._note(module, name, _version(root))
+        if root not in _PURE or (root == "builtins" and name in _UNSURE):
+            self.unread.append(f"`{module}.{name}`")
+        if name in _RETRACED and root in ("jax", "equinox"):
+            self.retraced = True
+
+    def _function(self, x: types.FunctionType) -> None:
+        is_installed = is_of_package(x.__code__.co_filename)
+        if is_installed:
+            self._packaged(x.__module__ or "", x.__qualname__)
+        else:
+            self._function_name = x.__qualname__
+            self._visit(x.__code__)
+            self._globals(x)
+        # The functions of one that dispatches by type.
+        registered = vars(x).get("registry")
+        self._visit_all((getattr(x, "__wrapped__", None), registered))
+        self._visit_all((x.__defaults__, x.__kwdefaults__))
+        cells = x.__closure__ or ()
+        if is_installed:
+            # (Wrappers of a package may remember there what they have been called with.)
+            cells = tuple(filter(_is_option, cells))
+        self._visit_all(cells)
+        if not is_installed:
+            self._visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
+
+    def _globals(self, x: types.FunctionType) -> None:
+        """Visit what a function, and the functions written in it, read of their module."""
+        read = _names(x.__code__)
+        space = x.__globals__
+        self._suspect(x, frozenset(read.names), frozenset(read.attributes))
+        for path in read.paths:
+            name = path[0]
+            if name in space:
+                self._global(x, path, space[name], read.names)
+            elif hasattr(builtins, name):
+                self._global(x, path, getattr(builtins, name), read.names)
+        for name, level in read.imports:
+            module = _imported(name, level, space)
+            if module is None:
+                self.unread.append(f"the module `{name}`, which is not imported yet")
+            else:
+                self._global(x, (name, ""), module, read.names)
+
+    def _suspect(
+        self, x: types.FunctionType, names: frozenset[str], attributes: frozenset[str]
+    ) -> None:
+        """List reads that names show."""
+        if names & _FRAMES:
+            self._hide(x, "globals")
+        if not self._classes and names & _FILE_METHODS:
+            self._hide(x, "read_text")
+        if attributes & _RETRACED or "getattr" in names:
+            self.retraced = True
+        for name in attributes:
+            if name in _DRAWN or _FILES.fullmatch(name):
+                self.unread.append(f"`{name}` in `{x.__qualname__}`")
+
+    def _hide(self, x: types.FunctionType, name: str) -> None:
+        text = f"`{x.__qualname__}` uses `{name}`, whose changes cannot be noticed"
+        self.hidden.append(text)
+        self.unread.append(text)
+
+    def _global(
+        self, x: types.FunctionType, path: Names, value: Any, names: Names
+    ) -> None:
+        self._note(path[0])
+        if self._is_hidden(x, path, value):
+            return None
+        if not isinstance(value, types.ModuleType):
+            return self._visit(value)
+        self._module_names(value, names)
+        if path[1:] == () or path[1][:2] == "__":
+            self._visit(value)
+        return None
+
+    def _is_hidden(self, x: types.FunctionType, path: Names, value: Any) -> bool:
+        """Test for values that cannot be read here, and list them."""
+        for name in path[1:]:
+            if isinstance(value, types.ModuleType | type):
+                value = getattr(value, name, None)
+        if value is sys.modules:
+            self._hide(x, "sys.modules")
+            return True
+        if _moves(value):
+            text = (
+                f"`{x.__qualname__}` uses `{value.__name__}`, which changes by itself"
+            )
+            self.moving.append(text)
+            self.unread.append(text)
+        if not callable(value) or not is_packaged(getattr(value, "__module__", None)):
+            return False
+        name = str(getattr(value, "__name__", ""))
+        reads_file = _FILES.fullmatch(name) and not self._classes
+        if _HIDDEN.fullmatch(name) or reads_file:
+            self._hide(x, name)
+        return False
+
+    def _module_names(self, module: types.ModuleType, names: Names) -> None:
+        """Visit the attributes of a module that a function names."""
+        if (id(module), names) in self._attributes:
+            return
+        self._attributes.add((id(module), names))
+        self._alive.append(module)
+        name = module.__name__
+        root = name.partition(".")[0]
+        is_installed = is_packaged(name)
+        self._note(name, _version(root))
+        if is_installed and root not in _PURE:
+            self.unread.append(f"the module `{name}`")
+        if type(module) is not types.ModuleType:
+            self._visit(type(module))
+        if not is_installed and hasattr(module, "__getattr__"):
+            self._visit(module)
+        for key in names:
+            if key not in vars(module) and key not in _lazy_names(module):
+                continue
+            value = getattr(module, key)
+            if is_installed and callable(value):
+                continue
+            self._note(key)
+            if isinstance(value, types.ModuleType):
+                self._module_names(value, names)
+            else:
+                self._visit(value)
+
+    def _module(self, x: types.ModuleType) -> None:
+        self._note(x.__name__, _version(x.__name__.partition(".")[0]))
+        self.unread.append(f"the module `{x.__name__}` as a value")
+        if not is_packaged(x.__name__):
+            items = vars(x).items()
+            self._visit({k: v for k, v in items if not _is_description(k, v)})
+
+    def _class(self, x: type) -> None:
+        self._classes += 1
+        for base in inspect.getmro(x):
+            module = str(base.__module__)  # (of a metaclass it may be a descriptor)
+            if is_packaged_class(base):
+                self._packaged(module, base.__qualname__)
+                continue
+            self._note(module, base.__qualname__)
+            items = vars(base).items()
+            self._visit({k: v for k, v in items if not _is_description(k, v)})
+        if type(x) is not type:
+            self._visit(type(x))
+        self._classes -= 1
+
+    def _object(self, x: Any) -> None:
+        kind = type(x)
+        if isinstance(x, _JITTED | jax.custom_jvp | jax.custom_vjp):
+            return self._wrapper_of_jax(x)
+        self._visit(kind)
+        self._value(x)
+        state = _state_of(x)
+        root = str(kind.__module__).partition(".")[0]
+        is_foreign = is_packaged_class(kind) and root not in _PURE
+        if is_foreign and self._marks:
+            self.unread.append(f"an object of `{kind.__module__}.{kind.__qualname__}`")
+            return None
+        if is_packaged_class(kind) and (is_foreign or not state):
+            return self._pickled(x, state)
+        self._visit(state)
+        if not state and not is_packaged_class(kind):
+            # (A user's class is made of a type of C whose values are not known here.)
+            known = (object, *_VALUES, list, tuple, dict, set, frozenset, np.ndarray)
+            made_of = {b for b in kind.__mro__ if b.__flags__ & _HEAP == 0}
+            if not made_of <= set(known):
+                self.unread.append(f"an object of `{kind.__qualname__}`")
+        return None
+
+    def _wrapper_of_jax(self, x: Any) -> None:
+        function = x.__wrapped__
+        code = getattr(function, "__code__", None)
+        is_own = code is not None and is_of_package(code.co_filename)
+        if not is_own or function.__closure__:
+            self.retraced = True
+        self._visit(function)
+        self._visit({k: v for k, v in vars(x).items() if callable(v)})
+
+    def _value(self, x: Any) -> None:
+        """Visit the value of an object whose class is made of a type of Python or NumPy."""
+        for base in _VALUES:
+            if isinstance(x, base):
+                self._note(base.__name__, base.__repr__(x))
+        if isinstance(x, list | tuple):
+            base = list if isinstance(x, list) else tuple
+            self._visit_all(base.__iter__(x))
+        elif isinstance(x, set | frozenset):
+            base = set if isinstance(x, set) else frozenset
+            self._set(list(base.__iter__(x)))
+        elif isinstance(x, dict):
+            self._visit_items(dict.items(x))
+        elif isinstance(x, types.MappingProxyType):
+            self._visit_items(x.items())
+        elif isinstance(x, np.ndarray):
+            self._array(x.view(np.ndarray))
+
+    def _pickled(self, x: Any, state: Any) -> None:
+        """Visit the parts from which `pickle` makes an object, or what its attributes hold."""
+        try:
+            parts = [_listed(y) for y in x.__reduce_ex__(4)[1:]]
+        except Exception:  # whatever an object raises that cannot be pickled
+            self.unread.append(f"an object of `{type(x).__qualname__}`")
+            return self._visit(state)
+        return self._visit_all(parts)
+
+
+def _moves(x: Any) -> bool:
+    """Test for functions of packages that draw random numbers or read the clock."""
+    if not callable(x):
+        return False
+    owner = getattr(x, "__self__", None)
+    if isinstance(owner, np.random.RandomState | random.Random):
+        return True
+    if isinstance(owner, type) and getattr(x, "__name__", "") in _CLOCKS:
+        return True
+    module = str(getattr(x, "__module__", None))
+    is_function = isinstance(x, types.FunctionType | types.BuiltinFunctionType)
+    return is_function and module.partition(".")[0] in _MOVING
+
+
+_HEAP = 1 << 9  # Python's flag of classes that are made while it runs
+
+
+def _listed(x: Any) -> Any:
+    return list(x) if hasattr(x, "__next__") else x
+
+
+def _state_of(x: Any) -> dict[str, Any]:
+    """The attributes of an object, in its dictionary and in slots."""
+    state = dict(sorted(getattr(x, "__dict__", {}).items(), key=lambda item: str(item)))
+    state.pop("code_digest", None)
+    for base in type(x).__mro__:
+        slots = vars(base).get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else slots:
+            if name in ("__dict__", "__weakref__"):
+                continue
+            hides = name.startswith("__") and not name.endswith("__")
+            inner = f"_{base.__name__.lstrip('_')}{name}" if hides else name
+            with contextlib.suppress(AttributeError):  # of a slot that is not filled
+                state[inner] = getattr(x, inner)
+    if hasattr(x, "__wrapped__") and "__wrapped__" not in state:
+        state["__wrapped__"] = x.__wrapped__
+    return state
+
+
+def _is_option(cell: types.CellType) -> bool:
+    """Test for a cell of a package's wrapper that holds a function, a number, a name or several."""
+    try:
+        x = cell.cell_contents
+    except ValueError:
+        return False
+    kinds = (*_PLAIN, tuple, list, dict, set, frozenset, types.FunctionType)
+    return type(x) in kinds or isinstance(x, types.MethodType | _JITTED | ft.partial)
+
+
+def _imported(name: str, level: int, space: dict[str, Any]) -> types.ModuleType | None:
+    """The module that code imports, from the package of its own module if there are dots."""
+    if level:
+        package = space.get("__package__") or ""
+        with contextlib.suppress(ImportError):
+            return sys.modules.get(
+                importlib.util.resolve_name("." * level + name, package)
+            )
+        return None
+    return sys.modules.get(name)
+
+
+@ft.lru_cache(4096)
+def _code(code: types.CodeType) -> str:
+    names = (code.co_names, code.co_varnames, code.co_freevars)
+    counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
+    return Reading(code.co_code, *names, *counts, *code.co_consts).digest
+
+
+class _Names(NamedTuple):
+    """What code, and the functions that are written in it, name."""
+
+    paths: tuple[Names, ...]
+    """Global names, each with the attributes that are read of it."""
+    imports: tuple[tuple[str, int], ...]
+    """Modules that are imported, and the numbers of dots before their names."""
+    names: Names
+    """All names and words."""
+    attributes: Names
+    """Names of attributes."""
+
+
+_READING_ATTRIBUTES = frozenset(
+    "LOAD_ATTR LOAD_METHOD LOAD_SUPER_ATTR LOAD_SUPER_METHOD IMPORT_FROM".split()
+)
+
+
+@ft.lru_cache(4096)
+def _names(code: types.CodeType) -> _Names:
+    paths: list[Names] = []
+    imports: list[tuple[str, int]] = []
+    attributes: list[str] = []
+    steps = list(dis.get_instructions(code))
+    is_open = False  # whether the next step may read an attribute of the last name
+    for k, step in enumerate(steps):
+        if step.opname in _READING_ATTRIBUTES:
+            attributes.append(step.argval)
+        if step.opname == "IMPORT_NAME":
+            dots = steps[k - 2].argval if k > 1 else 0
+            imports.append((step.argval, dots if isinstance(dots, int) else 0))
+        if step.opname == "LOAD_NAME" or step.opname.startswith("LOAD_GLOBAL"):
+            paths.append((step.argval,))
+        elif is_open and step.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            paths[-1] += (step.argval,)
+        elif step.opname != "CACHE":
+            is_open = False
+            continue
+        is_open = True
+    words = [x for x in code.co_consts if isinstance(x, str) and x.isidentifier()]
+    inner = [_names(x) for x in code.co_consts if isinstance(x, types.CodeType)]
+    own = paths, imports, [*code.co_names, *words], attributes
+    every: Any = zip(own, *inner, strict=True)
+    return _Names(*(tuple(dict.fromkeys(itertools.chain(*x))) for x in every))
+
+
+@ft.cache
+def _version(package: str) -> str:
+    """Return the version of an installed package, "" for others and Python's own."""
+    try:
+        return (
+            ""
+            if package in sys.stdlib_module_names
+            else importlib.metadata.version(package)
+        )
+    except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
+        return str(getattr(sys.modules.get(package), "__version__", ""))
+
+
+def _is_description(name: str, value: Any) -> bool:
+    """Test for attributes that Python and its tools add to modules and classes."""
+    if name in _DESCRIPTIONS:
+        return True
+    is_special = name.startswith("__") and name.endswith("__")
+    plain = (*_PLAIN, list, tuple, dict, set, frozenset, np.ndarray)
+    return is_special and not callable(value) and type(value) not in plain
+
+
+@ft.cache
+def _lazy_names(module: types.ModuleType) -> frozenset[str]:
+    """Names that a package imports when they are used."""
+    return frozenset(dir(module)) if hasattr(module, "__getattr__") else frozenset()
+
+
+def is_packaged(module: str | None) -> bool:
+    """Test whether a module belongs to Python or to a package, `hybridjax.models` excepted."""
+    name = module or "builtins"
+    root = name.partition(".")[0]
+    if name.startswith("hybridjax.models") or root == "__main__":
+        return False
+    # (A user's file may have the name of one of Python's modules.)
+    path = getattr(sys.modules.get(root), "__file__", None)
+    return root in sys.stdlib_module_names if path is None else is_of_package(path)
+
+
+def is_packaged_class(x: type) -> bool:
+    """Test whether a class belongs to Python or to a package, `hybridjax.models` excepted."""
+    module = str(x.__module__)
+    if not is_packaged(module):
+        return False
+    # (A class of `exec` without a `__name__`, or of `type(...)`, may have the module of a package.)
+    found: Any = sys.modules.get(module)
+    for name in x.__qualname__.split("."):
+        found = getattr(found, name, None)
+    if found is x or not x.__flags__ & _HEAP:
+        return True
+    functions = [y for y in vars(x).values() if isinstance(y, types.FunctionType)]
+    return bool(functions) and all(
+        is_of_package(y.__code__.co_filename) for y in functions
+    )
+
+
+@ft.cache
+def is_of_package(path: str) -> bool:
+    """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
+    file = pathlib.Path(path)
+    recorded = (file.parts[-k] in _recorded(x) for k, x in enumerate(file.parents, 1))
+    return not path.startswith(_MODELS) and (
+        _INSTALLED.match(path) is not None or any(recorded)
+    )
+
+
+@ft.cache
+def _recorded(folder: pathlib.Path) -> frozenset[str]:
+    """Names of what pip has put into a folder (with `--target`)."""
+    records = [
+        x.read_text("RECORD")
+        for x in importlib.metadata.distributions(path=[str(folder)])
+    ]
+    return frozenset(
+        re.split("[/,]", y)[0] for x in records for y in (x or "").splitlines()
+    )
