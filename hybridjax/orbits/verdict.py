@@ -88,10 +88,13 @@ class Verdict(NamedTuple):
     def __str__(self) -> str:
         if np.isnan(self.distance):
             return "guards and events (a second integration did not reach its accuracy)"
-        text = f"second integration: closes to {self.distance:.1g}, events, shortest period"
-        if np.isnan(self.multipliers):
+        # (Smaller numbers are only rounding.)
+        distance = np.maximum(self.distance, 1e-15)
+        multipliers = np.maximum(self.multipliers, 1e-15)
+        text = f"second integration: closes to {distance:.1g}, events, shortest period"
+        if np.isnan(multipliers):
             return text
-        return f"{text}, multipliers to {self.multipliers:.1g}"
+        return f"{text}, multipliers to {multipliers:.1g}"
 
 
 class _Path(NamedTuple):
