@@ -67,7 +67,8 @@ def current(x: Thing) -> Thing:
 
 def current_of_many(x: Thing) -> Thing:
     """As `current`, of systems side by side, whose arrays have a leading axis."""
-    return cast(Thing, _mark(x, code_digest(first_of(x))))
+    single: Any = first_of(x)
+    return cast(Thing, _mark(x, code_digest(single)))
 
 
 def first_of(x: Thing) -> Thing:

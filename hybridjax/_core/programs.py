@@ -131,5 +131,6 @@ def _digest_of_values(x: Any) -> str:
     values = np.asarray(jax.random.key_data(x) if is_key else x)
     flat = np.ascontiguousarray(values).reshape(-1)
     # (Where processors have instructions for it, SHA-1 takes a third of the time of BLAKE2.)
-    digest = hashlib.sha1(flat.view(np.uint8), usedforsecurity=False)
+    numbers: Any = flat.view(np.uint8)  # (mypy knows no array as a buffer)
+    digest = hashlib.sha1(numbers, usedforsecurity=False)
     return digest_of_words(str(values.dtype), str(values.shape), digest.hexdigest())

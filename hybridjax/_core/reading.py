@@ -335,9 +335,8 @@ class Reading:
             self._hide(x, "sys.modules")
             return True
         if _moves(value):
-            text = (
-                f"`{x.__qualname__}` uses `{value.__name__}`, which changes by itself"
-            )
+            name = str(getattr(value, "__name__", ""))
+            text = f"`{x.__qualname__}` uses `{name}`, which changes by itself"
             self.moving.append(text)
             self.unread.append(text)
         if not callable(value) or not is_packaged(getattr(value, "__module__", None)):
@@ -434,12 +433,14 @@ class Reading:
         for base in _VALUES:
             if isinstance(x, base):
                 self._note(base.__name__, base.__repr__(x))
-        if isinstance(x, list | tuple):
-            base = list if isinstance(x, list) else tuple
-            self._visit_all(base.__iter__(x))
-        elif isinstance(x, set | frozenset):
-            base = set if isinstance(x, set) else frozenset
-            self._set(list(base.__iter__(x)))
+        if isinstance(x, list):
+            self._visit_all(list.__iter__(x))
+        elif isinstance(x, tuple):
+            self._visit_all(tuple.__iter__(x))
+        elif isinstance(x, set):
+            self._set(list(set.__iter__(x)))
+        elif isinstance(x, frozenset):
+            self._set(list(frozenset.__iter__(x)))
         elif isinstance(x, dict):
             self._visit_items(dict.items(x))
         elif isinstance(x, types.MappingProxyType):
