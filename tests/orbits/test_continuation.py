@@ -215,3 +215,72 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
         ("f", 2),
     ]
     np.testing.assert_allclose([x.value for x in points], [1.99, 2.0, 3.0], atol=1e-8)
+
+
+def test_a_cycle_that_shrinks_to_an_equilibrium():
+    """The circle of Hopf's normal form has the radius sqrt(mu) and the multiplier exp(-2 mu)."""
+    cycle = hj.find_limit_cycle(m.HopfOscillator())
+    branch = hj.continuation(cycle, "mu", (-0.05, 0.12), step=0.2)
+    begin, _ = branch.ends
+    assert begin.result == hj.Result.EQUILIBRIUM
+    assert "shrinks to an equilibrium" in begin.message
+    assert 0 < begin.value < 1e-4
+    wide = branch.values > 1e-3
+    exact = np.exp(-2 * branch.values[wide])
+    np.testing.assert_allclose(branch.multipliers[wide, 0], exact, rtol=1e-8)
+
+
+class IntegrateAndFire(hj.HybridSystem):
+    """v' = 1.5 - v + a sin(2 pi t / T), reset to 0 at v = 1: one spike in each period."""
+
+    a: hj.Parameter = hj.parameter(0.6)
+    T: hj.Parameter = hj.parameter(1.2)
+
+    def charts(self):
+        def leak(t, q, u):
+            return 1.5 - q + self.a * jnp.sin(2 * jnp.pi * t / self.T)
+
+        return {"leak": Field(("v",), leak)}
+
+    def transitions(self):
+        def below(t, q, u):
+            return 1 - q[0]
+
+        def to_rest(t, q, u):
+            return (0.0,)
+
+        return [hj.Transition("spike", "leak", "leak", below, reset=to_rest)]
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return hj.Guess("leak", (0.3,), 0.0)
+
+
+def test_a_spike_that_an_earlier_maximum_reaches_first():
+    """Spikes lock to the sine from a fold on, where it just makes up for the mean. On the unstable
+    side the potential has a maximum before each spike, which reaches the threshold, too."""
+    cycle = hj.find_limit_cycle(IntegrateAndFire())
+    branch = hj.continuation(cycle, "a", (0.3, 0.8), step=0.1)
+    (fold,) = branch.points
+    mean = 1 / (1 - np.exp(-1.2)) - 1.5
+    margin = abs(mean) * np.hypot(1, 2 * np.pi / 1.2)
+    np.testing.assert_allclose(fold.value, margin, rtol=1e-9)
+    begin, end = branch.ends
+    assert end.message == "end of the parameter range"
+    assert begin.result == hj.Result.GRAZING
+    assert "'spike' is touched tangentially" in begin.message
+    last = branch[0]
+    spike = float(last.trajectory().events[0].time)
+    rate = 2 * np.pi / 1.2
+    t = spike - np.linspace(1e-9, 1.2 - 1e-9, 20001)
+    drive = np.sin(rate * t) - rate * np.cos(rate * t)
+    v = 1.5 + begin.value * drive / (1 + rate**2)
+    start = spike - 1.2
+    off = 1.5 + begin.value * (np.sin(rate * start) - rate * np.cos(rate * start)) / (
+        1 + rate**2
+    )
+    v -= off * np.exp(-(t - start))
+    peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
+    np.testing.assert_allclose(peaks, 1.0, atol=1e-4)
