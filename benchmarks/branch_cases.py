@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
 
 import hybridjax as hj
 from hybridjax.systems.chart import FieldChart
@@ -237,7 +238,7 @@ class IntegrateAndFire(hj.HybridSystem):
 class SchmittTrigger(hj.HybridSystem):
     """v' = 1 - v or -1 - v, switched at thresholds that move with a clock."""
 
-    width: hj.Parameter = hj.parameter(0.3)
+    width: hj.Parameter = hj.parameter(0.31)
     T: hj.Parameter = hj.parameter(1.3)
 
     def charts(self):
@@ -289,6 +290,17 @@ def _spike_margin() -> float:
     T = 1.2
     gain = 1 / np.hypot(1, 2 * np.pi / T)
     return abs(1 / (1 - np.exp(-T)) - 1.5) / gain
+
+
+def _widest() -> float:
+    """The largest width of `SchmittTrigger` that its clock locks: at the lowest threshold, the ways
+    up and down last a period together."""
+
+    def late(w):
+        high = w - 0.05
+        return np.log((1 + w) / (1 - high)) + np.log((1 + high) / (1 - w)) - 1.3
+
+    return brentq(late, 0.3, 0.4)
 
 
 _VDP = (0.05, 1.0, 5.0, 10.0)
@@ -451,6 +463,11 @@ CASES: dict[str, Callable[[], Case]] = {
         marks=[("fold", _spike_margin())],
     ),
     "Schmitt trigger": lambda: Case(
-        SchmittTrigger(), "width", (0.28, 0.6), marks=[("fold", np.nan)]
+        SchmittTrigger(),
+        "width",
+        (0.3, 0.4),
+        ends=(OVER, OVER),
+        marks=[("fold", _widest())],
+        border=(0.3, 0.3),
     ),
 }

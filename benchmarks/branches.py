@@ -39,6 +39,8 @@ SAMPLES, STEPS = 8, 60
 LEFT = 1e-9
 # Comparisons of a branch at least.
 LEAST = 5
+# Cycles of a branch each way at most: beyond them it takes minutes.
+MOST = 200
 
 
 class Loop:
@@ -306,7 +308,7 @@ def run(name: str, every: int) -> tuple[int, int]:
     begin = time.process_time()
     first = hj.find_limit_cycle(case.system, **case.find)
     middle = time.process_time()
-    branch = hj.continuation(first, case.parameter, case.values)
+    branch = hj.continuation(first, case.parameter, case.values, max_points=MOST)
     seconds = time.process_time() - middle
     print(f"== {name}: {len(branch)} cycles, {seconds:.1f} s", end=" ")
     print(f"(the first {middle - begin:.1f} s)")

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings, strategies as st
+from scipy.linalg import expm
+from scipy.optimize import brentq
 
 import hybridjax as hj
 from hybridjax.orbits.curve import Curve
@@ -284,3 +286,73 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
     v -= off * np.exp(-(t - start))
     peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
     np.testing.assert_allclose(peaks, 1.0, atol=1e-4)
+
+
+class Boost(hj.HybridSystem):
+    """A boost converter: 10 V, 100 uH, 100 uF, a clock of 20 us, the switch closed for one half."""
+
+    R: hj.Parameter = hj.parameter(70.0)
+
+    def charts(self):
+        def on(t, q, u):
+            return -q[0] / (self.R * 1e-4), 1e5
+
+        def off(t, q, u):
+            return (q[1] - q[0] / self.R) / 1e-4, (10.0 - q[0]) / 1e-4
+
+        def idle(t, q, u):
+            return (-q[0] / (self.R * 1e-4),)
+
+        return {
+            "on": Field(("v", "i"), on),
+            "off": Field(("v", "i"), off),
+            "idle": Field(("v",), idle),
+        }
+
+    def transitions(self):
+        def current(t, q, u):
+            return q[1]
+
+        def without(t, q, u):
+            return (q[0],)
+
+        def begins(t, q, u):
+            return q[0], 0.0
+
+        tick = hj.Scheduled(20e-6)
+        return [
+            hj.Transition("opens", "on", "off", hj.Scheduled(20e-6, 10e-6)),
+            hj.Transition("closes", "off", "on", tick),
+            hj.Transition("is empty", "off", "idle", current, reset=without),
+            hj.Transition("closes again", "idle", "on", tick, reset=begins),
+        ]
+
+    def period(self):
+        return 20e-6
+
+    def guess(self):
+        return hj.Guess("on", (20.0, 0.3), 5e-6)
+
+
+def _least_current(R):
+    """Of the cycle in continuous conduction, by exponentials of matrices beside a constant 1."""
+    load = 1 / (R * 1e-4)
+    on = np.array([[-load, 0, 0], [0, 0, 1e5], [0, 0, 0]])
+    off = np.array([[-load, 1e4, 0], [-1e4, 0, 1e5], [0, 0, 0]])
+    turn = expm(off * 10e-6) @ expm(on * 10e-6)
+    return np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 2])[1]
+
+
+def test_the_border_of_continuous_conduction():
+    """There the coil's current vanishes just when the clock closes the switch: on one side it does
+    not vanish, on the other side two events come to the same time."""
+    border = brentq(_least_current, 50.0, 110.0)
+    for R, values, side, words in (
+        (70.0, (70.0, 90.0), 1, "'is empty' begins to happen"),
+        (90.0, (70.0, 90.0), 0, "'is empty' and 'closes again' come to the same time"),
+    ):
+        cycle = hj.find_limit_cycle(Boost(R=R))
+        end = hj.continuation(cycle, "R", values, step=0.5).ends[side]
+        assert end.result == hj.Result.EVENT_ORDER
+        assert words in end.message
+        np.testing.assert_allclose(end.value, border, rtol=1e-4)
