@@ -284,6 +284,19 @@ def _largest_multiplier(cycle: hj.LimitCycle) -> float:
     return float(cycle.multipliers[0].real)
 
 
+# Sections that contain the equilibrium at every value of the parameter.
+
+
+def _potassium_rate(t, q):
+    v, w = q
+    return 0.5 * (1 + jnp.tanh((v - 2) / 30)) - w
+
+
+def _recovery_rate(t, q):
+    v, w = q
+    return v + 0.7 - 0.8 * w
+
+
 def _spike_margin() -> float:
     """The least amplitude of `IntegrateAndFire` with a spike in each period: the sine, passed
     through the leak, makes up for the mean."""
@@ -322,7 +335,7 @@ CASES: dict[str, Callable[[], Case]] = {
         m.FitzHughNagumo(eps=0.08),
         "current",
         (0.2, 1.6),
-        {"section": hj.Crossing("v", "rising")},
+        {"section": hj.Crossing(_recovery_rate, "rising")},
         ends=(_REST, _REST),
         border=tuple(_HOPF),
         within=1e-3,
@@ -350,6 +363,7 @@ CASES: dict[str, Callable[[], Case]] = {
         Brusselator(),
         "b",
         (1.8, 6.0),
+        {"section": hj.Crossing("x", "rising", 1.0)},
         ends=(_REST, OVER),
         marks=[],
         border=(2.0, 6.0),
@@ -369,6 +383,7 @@ CASES: dict[str, Callable[[], Case]] = {
         Predators(),
         "K",
         (2.0, 8.0),
+        {"section": hj.Crossing("x", "rising", 2 / 3)},
         ends=(_REST, OVER),
         marks=[],
         border=(7 / 3, 8.0),
@@ -378,6 +393,7 @@ CASES: dict[str, Callable[[], Case]] = {
         MorrisLecar(),
         "current",
         (80.0, 230.0),
+        {"section": hj.Crossing(_potassium_rate, "falling")},
         ends=(_REST, _REST),
         border=(93.86, 212.0),
         within=2e-3,
