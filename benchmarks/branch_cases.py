@@ -467,8 +467,9 @@ CASES: dict[str, Callable[[], Case]] = {
         ImpactOscillator(),
         "rate",
         (0.9, 1.8),
-        ends=(OVER, "grazing"),
-        border=(0.9, np.sqrt(1.99)),
+        ends=("grazing", "grazing"),
+        marks=[("fold", np.nan)],
+        border=(np.nan, np.sqrt(1.99)),
         within=1e-3,
     ),
     "integrate and fire": lambda: Case(
