@@ -461,7 +461,9 @@ CASES: dict[str, Callable[[], Case]] = {
         within=5e-3,
     ),
     "two hoppers": lambda: Case(m.HopperPair(), "coupling", (0.3, 3.0)),
-    "hopper, damping": lambda: Case(m.VerticalHopper(), "b", (2.0, 12.0)),
+    "hopper, damping": lambda: Case(
+        m.VerticalHopper(), "b", (2.0, 12.0), ends=("come to the same time", OVER)
+    ),
     "hopper, stiffness": lambda: Case(m.VerticalHopper(), "k", (5.0, 20.0)),
     "impact oscillator": lambda: Case(
         ImpactOscillator(),
