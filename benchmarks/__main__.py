@@ -80,6 +80,11 @@ CASES = {
         15,
         "random flows with known zeros: events missed and invented",
     ),
+    "branches": (
+        "branches.py",
+        20,
+        "branches against single searches, scipy and closed forms",
+    ),
     "scale": ("scale.py", 30, "sweeps and experiments on several processes"),
     "motion": ("motion.py", 1, "moves of sliders, first pictures of animations"),
     "boundary": ("boundary.py", 1, "the cost of checking arguments"),

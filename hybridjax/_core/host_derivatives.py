@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import eval_context
 from jax.flatten_util import ravel_pytree
 
+from ..errors import DefinitionError
 from .compilation import at_ease, uncollected
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
@@ -72,7 +73,7 @@ def by_columns(
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= most
         if is_hidden(arguments) or not is_small:
-            return eqx.filter_jvp(compiled, arguments, tangents)
+            return _compiled_derivatives(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
         directions = jax.tree_util.tree_unflatten(structure, parts)
@@ -81,12 +82,28 @@ def by_columns(
                 result, columns = along(to_host(arguments), directions)
         except NotOnHostError:
             require_program()
-            return eqx.filter_jvp(compiled, arguments, tangents)
+            return _compiled_derivatives(compiled, arguments, tangents)
         return from_host(result), _combined(
             from_host(columns), jax.tree_util.tree_leaves(moved)
         )
 
     return derived
+
+
+def _compiled_derivatives(compiled: Callable, arguments: tuple, tangents: tuple):
+    """**Raises:** `DefinitionError` where JAX would transpose the flow, whose loops end by
+    themselves: in a derivative of a derivative in reverse mode."""
+    try:
+        return eqx.filter_jvp(compiled, arguments, tangents)
+    except (AssertionError, ValueError) as error:
+        # (JAX raises the first without a text, the second for operations without a transpose.)
+        if isinstance(error, ValueError) and "reverse-mode" not in str(error):
+            raise
+        raise DefinitionError(
+            "second derivatives are available with forward mode inside: instead of `jax.hessian` "
+            "or `jax.jacrev(jax.jacrev(f))`, take `jax.jacrev(jax.jacfwd(f))` or "
+            "`jax.jacfwd(jax.jacfwd(f))`."
+        ) from error
 
 
 @jax.jit

@@ -23,6 +23,10 @@ _SLOW = 0.02
 # of the guard, is between them. Larger and smaller: as above.
 _CLOSE = 0.02
 
+# A cycle has shrunk to a point if its states move less than this, in sizes of the states on the
+# first cycle. Larger: small cycles are called equilibria. Smaller: a branch whose section does not
+# contain the equilibrium ends before.
+_SMALL = 0.02
 # The cycle passes an equilibrium if nothing moves by more than this, in sizes of the states, in a
 # time of one period. Larger: slow cycles count. Smaller: a branch ends before.
 _REST = 0.1
@@ -47,7 +51,8 @@ def explained(cycle: LimitCycle, result: Result) -> End:
         return End(result, result.message)
     visits = visits_of(cycle)
     return (
-        _touched_section(cycle)
+        _shrunk(cycle)
+        or _touched_section(cycle)
         or _touched_guard(cycle, visits)
         or _change_of_order(cycle, visits)
         or _near_guard(cycle, visits)
@@ -55,6 +60,20 @@ def explained(cycle: LimitCycle, result: Result) -> End:
         or _missed_section(cycle, result)
         or End(result, result.message)
     )
+
+
+def _shrunk(cycle: LimitCycle) -> End | None:
+    """An end at which an autonomous cycle without events becomes an equilibrium."""
+    if cycle.clocked or cycle.event_sequence:
+        return None
+    path, scale = cycle.trajectory(), np.asarray(cycle.settings.scale)
+    a = int(path.chart[0])
+    n = cycle.structure.dims[a]
+    ranges = np.ptp(path.after[:, :n], axis=0) / scale[a, :n]
+    if ranges.max() > _SMALL:
+        return None
+    text = "the cycle shrinks to an equilibrium, as it does at a Hopf point"
+    return End(Result.EQUILIBRIUM, text)
 
 
 def _touched_section(cycle: LimitCycle) -> End | None:
@@ -121,7 +140,7 @@ def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 
 
 def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
-    """An end at which the cycle reaches a guard that led to no event before."""
+    """An end at which the cycle reaches a guard where there was no event before."""
     s = cycle.structure
     for visit in visits:
         guards = s.guards(visit.chart)
@@ -130,20 +149,25 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
         u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
         rows = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)[:, 0]
         for g, level in zip(guards, rows, strict=True):
-            inside = level[1:-1]
-            if g == visit.event or not len(inside):
+            near = _CLOSE * np.ptp(level)
+            if len(level) < 3 or near == 0:
                 continue
             name = s.transitions[g].name
-            low = int(np.argmin(inside))
-            if inside[low] > _CLOSE * np.ptp(level) or np.ptp(level) == 0:
-                continue
-            if 0 < low < len(inside) - 1:
+            if _has_minimum(level, near):
                 text = f"the guard of '{name}' is touched tangentially (grazing)"
                 return End(Result.GRAZING, text)
-            if low == len(inside) - 1:
-                text = f"the event '{name}' begins to happen at the end of a stay"
-                return End(Result.EVENT_ORDER, text)
+            if g != visit.event and np.argmin(level[1:]) == len(level) - 2:
+                if level[-2] <= near:
+                    text = f"the event '{name}' begins to happen at the end of a stay"
+                    return End(Result.EVENT_ORDER, text)
     return None
+
+
+def _has_minimum(level: np.ndarray, near: float) -> bool:
+    """True if a guard has a minimum close to zero within a stay, after which it grows again."""
+    inside = level[1:-1]
+    lowest = (inside < level[:-2]) & (inside <= level[2:])
+    return bool(np.any(lowest & (np.abs(inside) <= near)))
 
 
 def _near_rest(cycle: LimitCycle, visits: list[Visit], result: Result) -> End | None:

@@ -1,5 +1,6 @@
 """The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
 
+import dataclasses
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
@@ -21,6 +22,11 @@ from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike
+
+
+# Periods after which a state is given up that has not reached the section. Fewer: states far from
+# the cycle do not arrive. More: those that never arrive cost more.
+_PATIENCE = 100
 
 
 class Arrival(NamedTuple):
@@ -100,9 +106,9 @@ def section_map(
     For i = j it is the Poincaré return map. Call it with `q` (n_i,), a state near section i of the
     cycle; `u` (nu,), a constant input, Default: 0; `t`, the time at section i, Default: that of the
     cycle. The result has the time `t` and the state `q` (n_j,) at section j, can be differentiated,
-    jitted and vmapped, and raises `ComputationError` if section j is not reached, or is reached in
-    another chart than the cycle's. `fixed_point` is the cycle's state at section i, `dims` are
-    n_i and n_j.
+    jitted and vmapped, and raises `ComputationError` if section j is not reached within 100
+    periods, or is reached in another chart than the cycle's. `fixed_point` is the cycle's state at
+    section i, `dims` are n_i and n_j.
 
     **Raises:** `DefinitionError` for an index out of range; `ComputationError` as `place_sections`.
     """
@@ -129,6 +135,9 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
     )
     u = xp.broadcast_to(u, s.nu)[:, None]
     target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
+    if np.isinf(np.asarray(placed.bound.time)[j]):  # (not a time of the clock)
+        patience = target.limit + _PATIENCE * placed.cycle.period
+        target = dataclasses.replace(target, limit=patience)
     moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
     result = update_result(

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings, strategies as st
+from scipy.linalg import expm
+from scipy.optimize import brentq
 
 import hybridjax as hj
 from hybridjax.orbits.curve import Curve
@@ -215,3 +217,142 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
         ("f", 2),
     ]
     np.testing.assert_allclose([x.value for x in points], [1.99, 2.0, 3.0], atol=1e-8)
+
+
+def test_a_cycle_that_shrinks_to_an_equilibrium():
+    """The circle of Hopf's normal form has the radius sqrt(mu) and the multiplier exp(-2 mu)."""
+    cycle = hj.find_limit_cycle(m.HopfOscillator())
+    branch = hj.continuation(cycle, "mu", (-0.05, 0.12), step=0.2)
+    begin, _ = branch.ends
+    assert begin.result == hj.Result.EQUILIBRIUM
+    assert "shrinks to an equilibrium" in begin.message
+    assert 0 < begin.value < 1e-4
+    wide = branch.values > 1e-3
+    exact = np.exp(-2 * branch.values[wide])
+    np.testing.assert_allclose(branch.multipliers[wide, 0], exact, rtol=1e-8)
+
+
+class IntegrateAndFire(hj.HybridSystem):
+    """v' = 1.5 - v + a sin(2 pi t / T), reset to 0 at v = 1: one spike in each period."""
+
+    a: hj.Parameter = hj.parameter(0.6)
+    T: hj.Parameter = hj.parameter(1.2)
+
+    def charts(self):
+        def leak(t, q, u):
+            return 1.5 - q + self.a * jnp.sin(2 * jnp.pi * t / self.T)
+
+        return {"leak": Field(("v",), leak)}
+
+    def transitions(self):
+        def below(t, q, u):
+            return 1 - q[0]
+
+        def to_rest(t, q, u):
+            return (0.0,)
+
+        return [hj.Transition("spike", "leak", "leak", below, reset=to_rest)]
+
+    def period(self):
+        return self.T
+
+    def guess(self):
+        return hj.Guess("leak", (0.3,), 0.0)
+
+
+def test_a_spike_that_an_earlier_maximum_reaches_first():
+    """Spikes lock to the sine from a fold on, where it just makes up for the mean. On the unstable
+    side the potential has a maximum before each spike, which reaches the threshold, too."""
+    cycle = hj.find_limit_cycle(IntegrateAndFire())
+    branch = hj.continuation(cycle, "a", (0.3, 0.8), step=0.1)
+    (fold,) = branch.points
+    mean = 1 / (1 - np.exp(-1.2)) - 1.5
+    margin = abs(mean) * np.hypot(1, 2 * np.pi / 1.2)
+    np.testing.assert_allclose(fold.value, margin, rtol=1e-9)
+    begin, end = branch.ends
+    assert end.message == "end of the parameter range"
+    assert begin.result == hj.Result.GRAZING
+    assert "'spike' is touched tangentially" in begin.message
+    last = branch[0]
+    spike = float(last.trajectory().events[0].time)
+    rate = 2 * np.pi / 1.2
+    t = spike - np.linspace(1e-9, 1.2 - 1e-9, 20001)
+    drive = np.sin(rate * t) - rate * np.cos(rate * t)
+    v = 1.5 + begin.value * drive / (1 + rate**2)
+    start = spike - 1.2
+    off = 1.5 + begin.value * (np.sin(rate * start) - rate * np.cos(rate * start)) / (
+        1 + rate**2
+    )
+    v -= off * np.exp(-(t - start))
+    peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
+    np.testing.assert_allclose(peaks, 1.0, atol=1e-4)
+
+
+class Boost(hj.HybridSystem):
+    """A boost converter: 10 V, 100 uH, 100 uF, a clock of 20 us, the switch closed for one half."""
+
+    R: hj.Parameter = hj.parameter(70.0)
+
+    def charts(self):
+        def on(t, q, u):
+            return -q[0] / (self.R * 1e-4), 1e5
+
+        def off(t, q, u):
+            return (q[1] - q[0] / self.R) / 1e-4, (10.0 - q[0]) / 1e-4
+
+        def idle(t, q, u):
+            return (-q[0] / (self.R * 1e-4),)
+
+        return {
+            "on": Field(("v", "i"), on),
+            "off": Field(("v", "i"), off),
+            "idle": Field(("v",), idle),
+        }
+
+    def transitions(self):
+        def current(t, q, u):
+            return q[1]
+
+        def without(t, q, u):
+            return (q[0],)
+
+        def begins(t, q, u):
+            return q[0], 0.0
+
+        tick = hj.Scheduled(20e-6)
+        return [
+            hj.Transition("opens", "on", "off", hj.Scheduled(20e-6, 10e-6)),
+            hj.Transition("closes", "off", "on", tick),
+            hj.Transition("is empty", "off", "idle", current, reset=without),
+            hj.Transition("closes again", "idle", "on", tick, reset=begins),
+        ]
+
+    def period(self):
+        return 20e-6
+
+    def guess(self):
+        return hj.Guess("on", (20.0, 0.3), 5e-6)
+
+
+def _least_current(R):
+    """Of the cycle in continuous conduction, by exponentials of matrices beside a constant 1."""
+    load = 1 / (R * 1e-4)
+    on = np.array([[-load, 0, 0], [0, 0, 1e5], [0, 0, 0]])
+    off = np.array([[-load, 1e4, 0], [-1e4, 0, 1e5], [0, 0, 0]])
+    turn = expm(off * 10e-6) @ expm(on * 10e-6)
+    return np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 2])[1]
+
+
+def test_the_border_of_continuous_conduction():
+    """There the coil's current vanishes just when the clock closes the switch: on one side it does
+    not vanish, on the other side two events come to the same time."""
+    border = brentq(_least_current, 50.0, 110.0)
+    for R, values, side, words in (
+        (70.0, (70.0, 90.0), 1, "'is empty' begins to happen"),
+        (90.0, (70.0, 90.0), 0, "'is empty' and 'closes again' come to the same time"),
+    ):
+        cycle = hj.find_limit_cycle(Boost(R=R))
+        end = hj.continuation(cycle, "R", values, step=0.5).ends[side]
+        assert end.result == hj.Result.EVENT_ORDER
+        assert words in end.message
+        np.testing.assert_allclose(end.value, border, rtol=1e-4)
