@@ -288,7 +288,7 @@ class Tiles(NamedTuple):
                 out, going, part._replace(steps=part.steps + out.steps[going])
             )
         anchor, period, result = self._in_tiles(
-            _verdict, rows, out.anchor, out.period, out.turn
+            _verdict, rows, out.anchor, out.period, out.turn._replace(codes=out.codes)
         )
         return out._replace(anchor=anchor, period=period, result=result)
 

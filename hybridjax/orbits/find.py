@@ -222,7 +222,6 @@ def find_limit_cycle(
     code = Result(int(cycle.result))
     checks.check_found(cycle)
     if code in (Result.OK, Result.SINGULAR):
-        check_begin(cycle.return_map)
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
@@ -261,6 +260,7 @@ def _judged(
     cycle = _kept(map, solution)
     if not solution.is_fixed_point:
         return cycle, solution.turn
+    check_begin(cycle.return_map)
     if coincident(map, solution.turn) and not commutes(cycle):
         return _with_result(cycle, Result.COINCIDENCE), solution.turn
     checked = verdict(cycle)

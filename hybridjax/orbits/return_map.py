@@ -406,13 +406,16 @@ class ReturnMap(eqx.Module):
             source = lanes.chart == s.chart_index(transition.source)
             which = xp.where(source, np.int32(g), np.int32(-1))
             holds.append(enabled(self._structure_of(lanes), lanes.t, lanes.q, u, which))
+        codes = turn.codes.reshape(*shape, -1)
+        fired = [xp.any(codes == g, axis=-1) for g in range(len(s.transitions))]
         passed = here & ~lanes.armed & (value < -error)
         fine = here & (lanes.armed | (value > error))
         passed, fine = (
             x.reshape(len(x), LEGS, *shape).any(axis=1)
             for x in (passed & xp.stack(holds), fine)
         )
-        return (passed & ~fine).any(axis=0)
+        # (An event that happens may leave the state beyond its guard.)
+        return (passed & ~fine & ~xp.stack(fired)).any(axis=0)
 
     def _follows(self, end: Lanes) -> Bool[Array, ""]:
         """Test whether another event follows at once on the one with which a turn ends, so that the

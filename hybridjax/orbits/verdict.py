@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.findings import Finding
 from .._core.memo import Memory
@@ -151,10 +151,12 @@ def _verdict(cycle) -> Verdict:
     path = _walk_along(cycle)
     visits = _visits(s, path)
     findings = [*path.findings]
-    for visit in visits:
-        if visit.t[-1] - visit.t[0] > _SHORT * period:
-            findings += _passed_guards(s, visit, scale)
-            findings += _skipped_schedules(s, visit)
+    long = [visit for visit in visits if visit.t[-1] - visit.t[0] > _SHORT * period]
+    never = set(range(len(s.transitions))) - set(cycle.event_sequence)
+    findings += _beyond_guards(s, long, never, scale)
+    for visit in long:
+        findings += _passed_guards(s, visit, scale)
+        findings += _skipped_schedules(s, visit)
     sooner, apart = None, np.nan
     accurate = path.error <= ROUGH
     if accurate:
@@ -355,35 +357,56 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
     return visits
 
 
-def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
-    """Guards that a visit passes, or beyond which it lies all along, without an event."""
+def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
+    """Guards at the points of a visit, with zero for what may be an error of the walk."""
     a, n = visit.chart, len(visit.q)
-    guards = s.guards(a)
-    if not guards:
-        return
+    if not s.guards(a):
+        return np.zeros((0, len(visit.t)))
     u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
     noise = _noise(np.moveaxis(rows[:, 2 : 2 + n], 0, 1), scale[a, :n])
-    for k, g in enumerate(guards):
-        level, transition = rows[k, 0], s.transitions[g]
-        over, under = level > noise[k], level < -noise[k]
-        if under.any() and not over.any() and g != visit.event:
-            if _may_happen(s, g, visit, np.flatnonzero(under)):
-                yield _beyond(s, transition, visit, level)
-            continue
+    return np.where(np.abs(rows[:, 0]) > noise, rows[:, 0], 0.0)
+
+
+def _beyond_guards(
+    s: Structure, visits: list[Visit], never: set[int], scale
+) -> Iterable[Finding]:
+    """Guards of events that never happen, and beyond which the cycle lies in all of its visits.
+
+    An event that happens may leave the state beyond its guard.
+    """
+    for a in {visit.chart for visit in visits}:
+        here = [visit for visit in visits if visit.chart == a]
+        levels = [_levels(s, visit, scale) for visit in here]
+        for k, g in enumerate(s.guards(a)):
+            values = np.concatenate([level[k] for level in levels])
+            if g not in never or values.max() > 0 or values.min() == 0:
+                continue
+            pairs = zip(here, levels, strict=True)
+            if any(
+                _may_happen(s, g, visit, np.flatnonzero(level[k] < 0))
+                for visit, level in pairs
+                if (level[k] < 0).any()
+            ):
+                yield _beyond(s, s.transitions[g], a, values)
+
+
+def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
+    """Guards that a visit passes without an event."""
+    levels = _levels(s, visit, scale)
+    for k, g in enumerate(s.guards(visit.chart)):
         # (At the end of a visit the guard of its own event is zero up to errors.)
-        points = slice(None, -1) if g == visit.event else slice(None)
-        for point in _crossings(over[points], under[points]):
+        level = levels[k, :-1] if g == visit.event else levels[k]
+        for point in _crossings(level):
             if _may_happen(s, g, visit, np.array([point])):
-                yield _passed(transition, visit.t[point])
+                yield _passed(s.transitions[g], visit.t[point])
                 break
 
 
-def _crossings(over: Bool[np.ndarray, " P"], under: Bool[np.ndarray, " P"]):
+def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
     """Points at which a guard is below zero for the first time after it was above."""
-    side = np.where(over, 1, np.where(under, -1, 0))
-    points = np.flatnonzero(side)
-    falls = (side[points][1:] < 0) & (side[points][:-1] > 0)
+    points = np.flatnonzero(level)
+    falls = (level[points][1:] < 0) & (level[points][:-1] > 0)
     return points[1:][falls]
 
 
@@ -396,11 +419,11 @@ def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
     return bool(kernels.enabled(s, s.member(g), *at, u).any())
 
 
-def _beyond(s: Structure, transition, visit: Visit, level) -> Finding:
+def _beyond(s: Structure, transition, a: int, level) -> Finding:
     low, high = sorted(transition.sign * np.array([level.min(), level.max()]))
     text = (
         f"the cycle lies beyond the guard of '{transition.name}' all along its stay in chart "
-        f"'{s.names[visit.chart]}' (values from {low:.3g} to {high:.3g}; the guard should be "
+        f"'{s.names[a]}' (values from {low:.3g} to {high:.3g}; the guard should be "
         f"{transition.direction}), so that this event can never happen. Begin with a guess on the "
         "other side of the guard, or let the transition that leads there end in another chart."
     )

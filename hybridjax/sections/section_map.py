@@ -135,9 +135,10 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
     )
     u = xp.broadcast_to(u, s.nu)[:, None]
     target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
-    if np.isinf(np.asarray(placed.bound.time)[j]):  # (not a time of the clock)
-        patience = target.limit + _PATIENCE * placed.cycle.period
-        target = dataclasses.replace(target, limit=patience)
+    patience = target.limit + _PATIENCE * placed.cycle.period
+    # (The time of a clock section is the limit.)
+    limit = xp.where(xp.isfinite(target.time), target.limit, patience)
+    target = dataclasses.replace(target, limit=limit)
     moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
     result = update_result(

@@ -219,7 +219,7 @@ def test_systems_that_are_alike_or_undefined(wheel):
         np.isnan(found.multipliers[9]).all()
         and np.isfinite(found.multipliers[:9]).all()
     )
-    assert found.summary().startswith("10/11 found; #9: ")
+    assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
     assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
 
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
@@ -227,3 +229,32 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
         design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
         data = hj.run_experiments(cycle, sections, design, current, start="periodic")
         np.testing.assert_allclose(data.y, 2 * data.u, rtol=1e-9)
+
+
+def test_a_section_map_waits_for_late_arrivals():
+    """A ball 3 m/s faster than on the cycle flies for two periods: alone and inside of programs."""
+    cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
+    paddle = hj.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
+    state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
+    begin = float(hj.place_sections(cycle, [hj.AtEvent("impact")]).lanes.t[0])
+    path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
+    alone, inside = paddle(state), eqx.filter_jit(paddle)(state)
+    both = jax.vmap(paddle)(np.stack([state, state]))
+    assert float(alone.t) - begin > 1.5 * float(cycle.period)
+    for t in (alone.t, inside.t, both.t[1]):
+        np.testing.assert_allclose(t, path.events[0].time, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_a_period():
+    cycle = hj.find_limit_cycle(hj.models.VanDerPol())
+
+    def period(mu):
+        return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), cycle).period
+
+    h = 1e-3
+    second = (period(1 + h) - 2 * period(1.0) + period(1 - h)) / h**2
+    exact = jax.jacrev(jax.jacfwd(period))(1.0)
+    np.testing.assert_allclose(exact, second, rtol=1e-5)
+    with pytest.raises(hj.errors.DefinitionError, match="jacrev.*jacfwd"):
+        jax.hessian(period)(1.0)
