@@ -89,6 +89,7 @@ def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
     assert explorer.figure.axes[0].get_facecolor() == to_rgba("white")
 
 
+@pytest.mark.slow  # (It waits for a browser, which other tests delay.)
 def test_a_picture_of_other_values_than_the_sliders_is_marked(tmp_path):
     """The page without a kernel: an answer comes a second after a slider has moved."""
     names = ("chromium", "chromium-browser", "google-chrome")
