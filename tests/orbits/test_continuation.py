@@ -343,6 +343,7 @@ def _least_current(R):
     return np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 2])[1]
 
 
+@pytest.mark.slow
 def test_the_border_of_continuous_conduction():
     """There the coil's current vanishes just when the clock closes the switch: on one side it does
     not vanish, on the other side two events come to the same time."""
