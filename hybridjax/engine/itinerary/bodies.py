@@ -1,0 +1,272 @@
+r"""What the rows of an itinerary do: steps in charts, jumps at events, the section at the end.
+
+Beside the state $q$ run columns $v$, its derivatives in some directions at a fixed time. Between
+events they obey $\dot v = f_q v$. An event of the guard h takes place later by
+$\delta = -h_q v / \dot h$, and leaves $v^+ = R_q (v + f^- \delta) + R_t \delta - f^+ \delta$ with the
+reset R: the saltation formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and
+Applied Mathematics 11, 1958).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...systems.structure import Member, Structure
+from ...systems.transition import Scheduled
+from ..settings import Settings
+from ..target import AbstractLevels
+from . import steps
+from .rows import JUMP, NOTHING, PIECE, SCHEDULE, SECTION, STEP, Body, Rows
+
+
+class Course(NamedTuple):
+    """A trajectory on its way, with C columns; the state is padded to d numbers."""
+
+    t: Float[Array, ""]
+    y: Float[Array, "1+C d"]
+    """The state, then its columns."""
+    begin: Float[Array, ""]
+    """Time at which the present leg began."""
+    delay: Float[Array, " C"]
+    """Columns of the time of the last event."""
+    ends: Float[Array, " E"]
+    """Ends of legs: as guessed, and as found once they are past."""
+    before: "Watched"
+    """Watched functions where the last row began, and since then."""
+    error: Float[Array, ""]
+    """Largest estimated error of a step so far, relative to what is allowed."""
+    last: Float[Array, ""]
+    """Largest last correction of the time of an event."""
+    left: Bool[Array, ""]
+    """Whether the itinerary was left: a watched function has passed zero where it should not."""
+
+
+class Watched(NamedTuple):
+    """The watched functions of a chart, and their rates along the flow, at a time."""
+
+    t: Float[Array, ""]
+    value: Float[Array, " G"]
+    rate: Float[Array, " G"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Functions of a row and a course for every kind of row.
+
+    **Fields:** `levels`: of the section at the end, if there is one; `width`: largest number of
+    watched functions of a chart; `pairs`: a solver for each chart.
+    """
+
+    s: Structure
+    levels: AbstractLevels | None
+    settings: Settings
+    width: int
+    pairs: Callable[[int], steps.Solver]
+
+    def of(self, body: Body) -> Callable[[Rows, Course], Course]:
+        """The function of rows with this body."""
+        work: Any = {
+            NOTHING: lambda body, row, course: course,
+            PIECE: self._piece,
+            SCHEDULE: self._schedule,
+            STEP: self._step,
+            JUMP: self._jump,
+            SECTION: self._section,
+        }[body.does]
+        return lambda row, course: work(body, row, course)
+
+    def _piece(self, _: Body, row: Rows, course: Course) -> Course:
+        """A piece begins: columns begin anew. (`follow` keeps those of the last one.)"""
+        d, C = course.y.shape[1], course.y.shape[0] - 1
+        unit = jnp.where(jnp.arange(d) < row.states, jnp.eye(C, d), 0.0)
+        return course._replace(y=course.y.at[1:].set(unit))
+
+    def _schedule(self, body: Body, row: Rows, course: Course) -> Course:
+        """A leg begins whose end is known: the tick nearest to the guess."""
+        guard = self.s.transitions[body.transition].guard
+        assert isinstance(guard, Scheduled)
+        tick = guard.nearest(course.ends[row.leg])
+        return course._replace(ends=course.ends.at[row.leg].set(tick))
+
+    def _step(self, body: Body, row: Rows, course: Course) -> Course:
+        """A part of the leg, or a Newton step on a watched function."""
+        a = body.chart
+        q = self._state(a, course)
+        field = self._field(a, course.t, q)
+        now = self._watched(a, course.t, q, field)
+        begin = jnp.where(row.first, course.t, course.begin)
+        h = row.fraction * (course.ends[row.leg] - begin)
+        if self._functions(a):
+            is_correction = row.target >= 0
+            h = jnp.where(is_correction, _newton(now, row.target), h)
+        y, error = self._advanced(a, course, h)
+        error = jnp.where(row.target >= 0, course.error, jnp.maximum(course.error, error))
+        return course._replace(
+            t=course.t + h,
+            y=y,
+            begin=begin,
+            before=now,
+            error=error,
+            left=course.left | self._has_left(a, row, course, now, q),
+        )
+
+    def _jump(self, body: Body, row: Rows, course: Course) -> Course:
+        """An event, and the reset."""
+        s, a, member = self.s, body.chart, Member(body.kind, row.place)
+        b = s.chart_index(s.transitions[body.kind[0]].target)
+        q, u = self._state(a, course), self._no_input
+        field = self._field(a, course.t, q)
+        now = self._watched(a, course.t, q, field)
+        delay, late = course.delay, jnp.zeros(())
+        if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
+            delay = jnp.zeros_like(delay)
+        elif not body.at_once:
+            late = _newton(now, row.target)
+            delay = self._delay(a, course, q, now, row.target)
+        t, q = course.t + late, q + field * late
+        after = s.reset(member, t, q, u)
+        onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
+
+        def column(v, delay):
+            along = delay, v + field * delay
+            reset = lambda t, q: s.reset(member, t, q, u)  # noqa: E731
+            return jax.jvp(reset, (t, q), along)[1] - onward * delay
+
+        columns = jax.vmap(column)(course.y[1:, : s.dims[a]], delay)
+        moved = jnp.concatenate([after[None], columns])
+        y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
+        left = course.left | self._has_left(a, row, course, now, q)
+        return course._replace(
+            t=t,
+            y=y,
+            begin=t,
+            delay=delay,
+            ends=course.ends.at[row.leg].set(t),
+            before=self._unknown(t),
+            last=jnp.maximum(course.last, jnp.abs(late)),
+            left=left | (t < course.begin),
+        )
+
+    def _section(self, body: Body, row: Rows, course: Course) -> Course:
+        """The end, at a level of the section or at the time that is known."""
+        a = body.chart
+        n, q = self.s.dims[a], self._state(a, course)
+        field = self._field(a, course.t, q)
+        now = self._watched(a, course.t, q, field)
+        late, y = jnp.zeros(()), course.y
+        if self._has_level(a):
+            late = _newton(now, row.target)
+            delay = self._delay(a, course, q, now, row.target)
+            arrived = jnp.outer(jnp.append(late, delay), field)
+            y = y.at[:, :n].add(arrived)
+        t = course.t + late
+        return course._replace(
+            t=t,
+            y=y,
+            ends=course.ends.at[row.leg].set(t),
+            last=jnp.maximum(course.last, jnp.abs(late)),
+            left=course.left | self._has_left(a, row, course, now, q),
+        )
+
+    # Functions of a chart.
+
+    @property
+    def _no_input(self) -> Float[Array, " nu"]:
+        return jnp.zeros(self.s.nu)
+
+    def _state(self, a: int, course: Course) -> Float[Array, " n"]:
+        return course.y[0, : self.s.dims[a]]
+
+    def _field(self, a: int, t, q) -> Float[Array, " n"]:
+        return steps.field(self.s, a, t, q)
+
+    def _advanced(self, a: int, course: Course, h):
+        """The state and its columns after a step, and the error relative to what is allowed."""
+        n = self.s.dims[a]
+        y, error = steps.step(self.s, a, self.pairs(a), course.t, course.y[:, :n], h)
+        scale = self.settings.scale[a, :n]
+        allowed = self.settings.rtol * jnp.maximum(
+            jnp.abs(course.y[0, :n]), jnp.abs(y[0])
+        )
+        allowed = allowed + self.settings.atol * scale
+        error = jax.lax.stop_gradient(jnp.max(jnp.abs(error) / allowed, initial=0.0))
+        return course.y.at[:, :n].set(y), error
+
+    def _has_level(self, a: int) -> bool:
+        return self.levels is not None and self.levels.present(self.s, a)
+
+    def _functions(self, a: int) -> int:
+        """Number of watched functions."""
+        return len(self.s.guards(a)) + self._has_level(a)
+
+    def _values(self, a: int, t, q) -> Float[Array, " g"]:
+        """The watched functions."""
+        from ..kernels import watched_at
+
+        kinds = self.s.guard_kinds(a)
+        index = jnp.zeros((), jnp.int32)
+        return watched_at(a, kinds, self.s, self.levels, t, q, self._no_input, index)
+
+    def _watched(self, a: int, t, q, field) -> Watched:
+        if not self._functions(a):
+            return self._unknown(t)
+        values = lambda t, q: self._values(a, t, q)  # noqa: E731
+        value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
+        more = self.width - len(value)
+        # (Rates of what is not watched are 1: nothing divides by zero.)
+        value = jnp.pad(value, (0, more), constant_values=jnp.inf)
+        return Watched(t, value, jnp.pad(rate, (0, more), constant_values=1.0))
+
+    def _unknown(self, t) -> Watched:
+        """Watched functions of which nothing is known."""
+        return Watched(t, jnp.full(self.width, jnp.inf), jnp.ones(self.width))
+
+    def _delay(self, a: int, course: Course, q, now: Watched, target):
+        """Columns of the time at which a watched function is zero."""
+        n = self.s.dims[a]
+
+        def along(v):
+            value = lambda q: self._values(a, course.t, q)  # noqa: E731
+            return jax.jvp(value, (q,), (v,))[1][target]
+
+        return -jax.vmap(along)(course.y[1:, :n]) / now.rate[target]
+
+    def _has_left(self, a: int, row: Rows, course: Course, now: Watched, q):
+        """Test whether a watched function has another sign than on the recorded trajectory, or has
+        passed zero and come back since the row before."""
+        if not self._functions(a):
+            return jnp.asarray(False)
+        held = now.value
+        for place, g in enumerate(self.s.guards(a)):
+            if self.s.transitions[g].enabled is not None:
+                enabled = self.s.enabled(g, now.t, q, self._no_input)
+                value = jnp.where(enabled, now.value[place], jnp.abs(now.value[place]))
+                held = held.at[place].set(value)
+        other = (jnp.sign(held) * row.signs < 0).any()
+        dips = _dips(course.before, now) & (row.signs > 0)
+        return other | dips.any()
+
+
+def _newton(now: Watched, target) -> Float[Array, ""]:
+    """The time to the zero of a watched function."""
+    return -now.value[target] / now.rate[target]
+
+
+def _dips(before: Watched, now: Watched) -> Bool[Array, " G"]:
+    """Test whether a function that is positive at two times has been negative in between: whether
+    the cubic polynomial with its values and rates is."""
+    h = now.t - before.t
+    first, last = before.value, now.value
+    rise, slope0, slope1 = last - first, h * before.rate, h * now.rate
+    third = slope0 + slope1 - 2 * rise
+    second = 3 * rise - 2 * slope0 - slope1
+    # The minimum is at the larger root of the derivative if the polynomial is of order 3.
+    root = jnp.sqrt(jnp.maximum(second**2 - 3 * third * slope0, 0.0))
+    place = -slope0 / (second + root)
+    lowest = first + place * (slope0 + place * (second + place * third))
+    within = (place > 0) & (place < 1)
+    return jax.lax.stop_gradient((first > 0) & (last > 0) & within & (lowest < 0))

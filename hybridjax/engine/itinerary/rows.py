@@ -1,0 +1,333 @@
+"""The itinerary of a trajectory: its steps and events, as the rows of a table.
+
+A *leg* lies between two events. A leg ends at a time that is not known exactly, so that each of
+its steps is a fraction of the leg; corrections, which are Newton steps on the guard, follow the
+last one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..._core.lanes import shared
+from ...systems.structure import Kind, Structure
+from ...systems.transition import Scheduled
+from .. import kernels
+from ..lanes import ARRIVE_LEVEL, IDLE, Lanes, Tape
+from ..replay import Moves, recorded_moves
+from ..target import AbstractLevels
+
+
+# Newton steps on the guard after the last step of a leg, by the method of the chart. A last one, of
+# Euler, follows. Fewer: lanes far from the recorded one miss their event. More: turns last longer.
+CORRECTIONS = 2
+# Pieces of a turn: columns begin anew in each. (See `orbits.return_map`.)
+LEGS = 16
+# Rows of a table are a multiple of this. More: empty rows take time. Fewer: itineraries of other
+# lengths compile again.
+_ROUND = 32
+# A guard whose value is below this part of its largest one in the chart may have either sign.
+# Larger: a guard that is passed is not noticed. Smaller: rounding at events is taken for a passage.
+_NEAR_ZERO = 1e-7
+
+# What a row does.
+NOTHING, PIECE, SCHEDULE, STEP, JUMP, SECTION = range(6)
+
+
+class Rows(NamedTuple):
+    """R rows; those of other kinds do not use a column."""
+
+    body: Int[np.ndarray, " R"]
+    """Index among the `bodies` of the program."""
+    leg: Int[np.ndarray, " R"]
+    first: Bool[np.ndarray, " R"]
+    """Whether the leg begins here."""
+    fraction: Float[np.ndarray, " R"]
+    """Length of a step, as a part of the leg."""
+    target: Int[np.ndarray, " R"]
+    """Of a correction: the row of the watched function of the chart that it brings to zero. -1 for
+    a step."""
+    place: Int[np.ndarray, " R"]
+    """Of a jump: index of the transition among those of its kind. Of a piece: its number."""
+    states: Int[np.ndarray, " R"]
+    """Of a piece: number of states."""
+    onward: Bool[np.ndarray, " R"]
+    """Of a jump: whether the trajectory goes on after it."""
+    signs: Int[np.ndarray, "R G"]
+    """Signs of the watched functions of the chart where a row begins, on the recorded
+    trajectory; 0 where they may have either."""
+
+
+class Body(NamedTuple):
+    """What rows of one kind do, for the compiler."""
+
+    does: int
+    chart: int = -1
+    """Of steps and sections."""
+    kind: Kind = ()
+    """Of jumps."""
+    at_once: bool = False
+    """Whether the jump happens at the time of the event before."""
+
+    @property
+    def transition(self) -> int:
+        """Of a scheduled jump, which is the only one of its kind: its index."""
+        return self.kind[0]
+
+
+class Form(NamedTuple):
+    """All of an itinerary that a program is compiled for. (Hashable.)"""
+
+    bodies: tuple[Body, ...]
+    legs: int
+    rows: int
+    watched: int
+    """Largest number of watched functions of a chart."""
+
+
+class Itinerary(NamedTuple):
+    """The steps and events of a recorded trajectory, one row for each."""
+
+    form: Form
+    rows: Rows
+    pieces: Int[np.ndarray, " K"]
+    """Rows at which pieces begin."""
+    ends: Float[np.ndarray, " E"]
+    """Ends of the legs, from the beginning of the trajectory."""
+    charts: Int[np.ndarray, " K"]
+    """Charts in which the pieces begin."""
+    events: tuple[int, ...]
+    """Indices of transitions, in order."""
+
+
+def levels_in(s: Structure, a: int, levels: AbstractLevels | None) -> bool:
+    """Test whether a level of the section is watched in chart a."""
+    return levels is not None and shared(levels).present(s, a)
+
+
+class _Table:
+    """Rows that are written one after the other."""
+
+    def __init__(self):
+        self.rows: list[tuple] = []
+        self.bodies: list[Body] = [Body(NOTHING), Body(PIECE)]
+
+    def add(
+        self,
+        body: Body,
+        leg: int,
+        signs: np.ndarray,
+        *,
+        first: bool = False,
+        fraction: float = 0.0,
+        target: int = -1,
+        place: int = 0,
+        states: int = 0,
+        onward: bool = True,
+    ) -> None:
+        if body not in self.bodies:
+            self.bodies.append(body)
+        number = self.bodies.index(body)
+        row = number, leg, first, fraction, target, place, states, onward, signs
+        self.rows.append(row)
+
+
+class _Leg(NamedTuple):
+    """Recorded moves between two events, in one chart."""
+
+    chart: int
+    times: Float[np.ndarray, " 1+m"]
+    """Beginnings of the moves, and the end."""
+    begins: Int[np.ndarray, "m G"]
+    """Signs of watched functions at the beginnings of the moves (see `_signs`)."""
+    ends: Int[np.ndarray, "m G"]
+    code: int
+    """With which it ends: of an event, of a level, or negative."""
+    at_once: bool
+
+    def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
+        """Beginnings of steps, and the end, with so many steps for each recorded one."""
+        if self.at_once:
+            return self.times[-1:]
+        moves = len(self.times) - 1
+        count = max(1, int(np.ceil(moves * density - 1e-9)))
+        place = np.linspace(0, moves, count + 1)
+        return np.interp(place, np.arange(moves + 1), self.times)
+
+    def signs(self, t: float) -> Int[np.ndarray, " G"]:
+        """Signs at a time; 0 for what changes its sign in the recorded move there."""
+        move = int(np.searchsorted(self.times, t, side="right")) - 1
+        if t == self.times[move]:
+            return self.begins[move]
+        return np.where(self.begins[move] == self.ends[move], self.begins[move], 0)
+
+
+def recorded(
+    s: Structure,
+    turn: tuple[Lanes, Tape],
+    levels: AbstractLevels | None,
+    density: float = 1.0,
+) -> Itinerary:
+    """The itinerary of a turn that was recorded piece by piece, side by side.
+
+    **Arguments:** `levels`: of the section on which the turn ends, if it does. `density`: number of
+    steps for each recorded one, up to rounding in each leg.
+    """
+    legs = _legs(s, levels, turn)
+    nodes = [leg.nodes(density) for leg in legs]
+    while sum(len(x) - 1 for x in nodes) < LEGS:
+        density *= 1.25
+        nodes = [leg.nodes(density) for leg in legs]
+    pieces = _pieces(nodes)
+    table = _Table()
+    unknown = np.zeros(legs[0].begins.shape[1], int)
+    charts: list[int] = []
+    for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
+        a = leg.chart
+        if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
+            table.add(Body(SCHEDULE, a, (leg.code,)), k, unknown)
+        for j, (t, fraction) in enumerate(zip(times, _fractions(times), strict=False)):
+            if (k, j) in pieces:
+                table.add(Body(PIECE), k, unknown, states=s.dims[a])
+                charts.append(a)
+            step = dict(first=j == 0, fraction=fraction)
+            table.add(Body(STEP, a), k, leg.signs(t), **step)
+        _end(s, table, k, leg, goes_on=k < len(legs) - 1)
+    events = tuple(leg.code for leg in legs if leg.code >= 0)
+    ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
+    return _finished(table, ends, np.array(charts, np.int32), events, legs[0].chart)
+
+
+def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
+    return np.diff(times) / (times[-1] - times[0]) if len(times) > 1 else np.zeros(0)
+
+
+def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
+    """The nodes at which pieces begin, by leg and number: nearly equal parts of the turn."""
+    places = [(k, j) for k, x in enumerate(nodes) for j in range(len(x) - 1)]
+    times = np.array([nodes[k][j] for k, j in places])
+    whole = nodes[-1][-1] - nodes[0][0]
+    chosen = [0]
+    for piece in range(1, LEGS):
+        first, last = chosen[-1] + 1, len(places) - (LEGS - piece)
+        goal = nodes[0][0] + piece * whole / LEGS
+        nearest = first + int(np.argmin(np.abs(times[first : last + 1] - goal)))
+        chosen.append(nearest)
+    return {places[k] for k in chosen}
+
+
+def _end(s: Structure, table: _Table, k: int, leg: _Leg, goes_on: bool) -> None:
+    """Add the rows with which leg k ends."""
+    a, signs = leg.chart, leg.ends[-1]
+    step = Body(STEP, a)
+    if leg.code == ARRIVE_LEVEL:
+        level = len(s.guards(a))
+        for _ in range(CORRECTIONS):
+            table.add(step, k, 0 * signs, target=level)
+        table.add(Body(SECTION, a), k, _but(signs, level), target=level)
+    elif leg.code < 0:
+        table.add(Body(SECTION, a), k, signs)
+    else:
+        jump, place = _jump(s, leg.code, leg.at_once)
+        target = -1
+        if leg.at_once:
+            signs = 0 * signs
+        elif not _is_scheduled(s, leg.code):
+            target = s.guards(a).index(leg.code)
+            signs = _but(signs, target)
+            for _ in range(CORRECTIONS):
+                table.add(step, k, 0 * signs, target=target)
+        # (A turn that ends with an event ends at a time that is free.)
+        table.add(jump, k, signs, target=target, place=place, onward=goes_on)
+
+
+def _legs(s: Structure, levels, turn: tuple[Lanes, Tape]) -> list[_Leg]:
+    """The legs of a recorded turn."""
+    moves = recorded_moves(*turn)
+    h = np.where(moves.at_once, 0.0, moves.h)
+    before = _before_events(turn[1])
+    begins = _signs(s, levels, moves.t, moves.chart, moves.q)
+    ends = _signs(s, levels, moves.t + h, moves.chart, before)
+    last = np.flatnonzero(moves.code >= 0)
+    if not len(last) or last[-1] != len(h) - 1:
+        last = np.append(last, len(h) - 1)
+    legs, first = [], 0
+    for end in last:
+        own = slice(first, end + 1)
+        times = np.append(moves.t[own], moves.t[end] + h[end])
+        code, at_once = int(moves.code[end]), bool(moves.at_once[end])
+        a = int(moves.chart[first])
+        legs.append(_Leg(a, times, begins[own], ends[own], code, at_once))
+        first = end + 1
+    return legs
+
+
+def _but(signs: np.ndarray, target: int) -> np.ndarray:
+    """Signs without that of the function that is zero here."""
+    signs = signs.copy()
+    signs[target] = 0
+    return signs
+
+
+def _before_events(tape: Tape) -> Float[np.ndarray, "d M"]:
+    """States at the ends of the moves of a tape, before events, lane by lane."""
+    lane, row = np.nonzero(tape.code.T != IDLE)
+    return np.asarray(tape.before)[row, :, lane].T
+
+
+def _signs(s: Structure, levels, t, chart, q) -> Int[np.ndarray, "M G"]:
+    """Signs of the watched functions of charts at points; 0 where they are zero but for errors.
+
+    A guard whose event is not enabled counts as positive: nothing happens there.
+    """
+    width = max(len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims)))
+    signs = np.zeros((len(t), width), int)
+    for a in np.unique(chart).tolist():
+        here = np.flatnonzero(chart == a)
+        point = t[here], q[: s.dims[a], here], np.zeros((s.nu, 1))
+        count = len(s.guards(a)) + levels_in(s, a, levels)
+        if not count:
+            continue
+        index = np.zeros(1, np.int32)
+        value = kernels.watched(s, a, levels, *point, index)[:, 0]
+        for row, g in enumerate(s.guards(a)):
+            if s.transitions[g].enabled is not None:
+                enabled = kernels.enabled(s, s.member(g), *point)
+                value[row] = np.where(enabled, value[row], np.abs(value[row]))
+        largest = np.abs(value).max(axis=1, keepdims=True)
+        known = np.abs(value) > _NEAR_ZERO * largest
+        signs[here, :count] = np.where(known, np.sign(value), 0).T
+    return signs
+
+
+def _is_scheduled(s: Structure, g: int) -> bool:
+    return isinstance(s.transitions[g].guard, Scheduled)
+
+
+def _jump(s: Structure, g: int, at_once: bool) -> tuple[Body, int]:
+    """The body of a transition, and its index among those of its kind."""
+    kind = next(kind for kind in s.kinds if g in kind)
+    a = s.chart_index(s.transitions[g].source)
+    return Body(JUMP, a, kind, at_once), kind.index(g)
+
+
+def _finished(
+    table: _Table, ends, charts, events: tuple[int, ...], begin: int
+) -> Itinerary:
+    """The itinerary of a table, filled up with empty rows."""
+    used = len(table.rows)
+    width = len(table.rows[0][-1])
+    for _ in range(-used % _ROUND):
+        table.add(Body(NOTHING), 0, np.zeros(width, int))
+    columns = [np.array(x) for x in zip(*table.rows, strict=True)]
+    number = np.int32
+    types = number, number, bool, float, number, number, number, bool, number
+    rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
+    # (Bodies in one order, so that itineraries with the same ones share a program.)
+    bodies = tuple(sorted(table.bodies))
+    place = np.array([bodies.index(body) for body in table.bodies], number)
+    rows = rows._replace(body=place[rows.body])
+    pieces = np.flatnonzero(rows.body == bodies.index(Body(PIECE)))
+    form = Form(bodies, len(ends), len(rows.body), width)
+    return Itinerary(form, rows, pieces.astype(number), ends, charts, events)

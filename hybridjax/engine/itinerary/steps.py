@@ -1,0 +1,86 @@
+"""A step of a chart, with its derivative columns beside the state.
+
+The step is that of a solver of diffrax. Of an implicit one, the stages are solved for by this
+package, whose iterations carry derivatives.
+"""
+
+import functools as ft
+from typing import Any, ClassVar, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...systems.solver import Method
+from ...systems.structure import Structure
+from ..runge_kutta import take_step
+
+
+Solver: TypeAlias = Any
+"""A solver of diffrax, or an implicit `Method`."""
+
+
+@ft.lru_cache
+def solver_of(method: Method) -> Solver:
+    """The solver of diffrax with the coefficients of an explicit method; an implicit one itself."""
+    if method.implicit:
+        return method
+    import diffrax
+
+    a, c = np.array(method.a), np.array(method.c)
+    coefficients = diffrax.ButcherTableau(
+        a_lower=tuple(a[i, :i] for i in range(1, len(c))),
+        b_sol=np.array(method.b),
+        b_error=np.array(method.error),
+        c=c[1:],
+    )
+
+    class Explicit(diffrax.AbstractERK):
+        tableau: ClassVar = coefficients
+        term_structure: ClassVar = diffrax.AbstractTerm
+        interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+        def order(self, terms):
+            return round(method.order) - 1
+
+    return Explicit(scan_kind="lax")
+
+
+def field(s: Structure, a: int, t, q) -> Float[Array, " n"]:
+    """The field of chart a, without inputs."""
+    return s.field(a, t, q, jnp.zeros(s.nu))
+
+
+def _rates(s: Structure, a: int, t, y: Float[Array, "1+C n"]) -> Float[Array, "1+C n"]:
+    """Rates of a state and of its columns."""
+    rate, linear = jax.linearize(lambda q: field(s, a, t, q), y[0])
+    if len(y) == 1:
+        return rate[None]
+    return jnp.concatenate([rate[None], jax.vmap(linear)(y[1:])])
+
+
+def step(
+    s: Structure, a: int, solver: Solver, t, y: Float[Array, "1+C n"], h
+) -> tuple[Float[Array, "1+C n"], Float[Array, " n"]]:
+    """A state and its columns after a step from t to t + h, and the estimated error of the state."""
+    if isinstance(solver, Method):
+        return _implicit(s, a, solver, t, y, h)
+    import diffrax
+
+    term = diffrax.ODETerm(lambda t, y, _: _rates(s, a, t, y))
+    begun = solver.init(term, t, t + h, y, None)
+    end, error, _, _, _ = solver.step(term, t, t + h, y, None, begun, False)
+    return end, error[0]
+
+
+def _implicit(s: Structure, a: int, method: Method, t, y, h):
+    """A step of an implicit method, and its columns as derivatives of the whole step."""
+    lanes = lambda t, q: jax.vmap(lambda q: field(s, a, t[0], q), -1, -1)(q)  # noqa: E731
+
+    def whole(q):
+        end = take_step(method, lanes, t[None], q[:, None], h[None], still=lanes)
+        return end.q[:, 0], end.estimate[:, 0]
+
+    end, linear, error = jax.linearize(whole, y[0], has_aux=True)
+    return jnp.concatenate([end[None], jax.vmap(linear)(y[1:])]), error

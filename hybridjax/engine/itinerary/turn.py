@@ -1,0 +1,122 @@
+"""A trajectory that follows an itinerary."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...systems.structure import Structure
+from ..settings import Settings
+from ..target import AbstractLevels
+from .bodies import Bodies, Course, Watched
+from .rows import Body, Form, Rows
+from .steps import Solver, solver_of
+
+
+class Passage(NamedTuple):
+    """A trajectory that has followed an itinerary."""
+
+    t: Float[Array, ""]
+    q: Float[Array, " d"]
+    """The time and the state at the end."""
+    ends: Float[Array, " E"]
+    """Ends of legs."""
+    legs_t: Float[Array, " K"]
+    legs_q: Float[Array, "K d"]
+    """Times and states at the beginnings of pieces."""
+    factors: Float[Array, "K d d"]
+    """Derivatives of the states at the ends of pieces by those at their beginnings."""
+    error: Float[Array, ""]
+    """Largest estimated error of a step, relative to what is allowed."""
+    last: Float[Array, ""]
+    """Largest last correction of the time of an event."""
+    left: Bool[Array, ""]
+    """Whether the itinerary was left."""
+
+
+class Travelers(NamedTuple):
+    """Whose trajectories follow an itinerary: one system, or many in lanes.
+
+    Lanes stand on the first axis of arrays. Only what a row does is vectorized over them: JAX takes
+    many times as long to vectorize the loop over the rows.
+    """
+
+    of: Callable[[Any], Structure]
+    """The structure by its numbers."""
+    numbers: Any
+    """Of one system, or of all lanes."""
+    many: bool
+
+    def each(self, function: Callable) -> Callable:
+        """A function of the numbers and further arrays of one lane, for all."""
+        return jax.vmap(function) if self.many else function
+
+
+def follow(
+    travelers: Travelers,
+    levels: AbstractLevels | None,
+    settings: Settings,
+    form: Form,
+    rows: Rows,
+    pieces: Int[Array, " K"],
+    begin: tuple[Float[Array, ""], Float[Array, " d"]],
+    ends: Float[Array, " E"],
+    *,
+    solver: Solver | None = None,
+    columns: bool = True,
+) -> Passage:
+    """Follow an itinerary from a time and a state.
+
+    **Arguments:** `levels`: of the section at the end; None for a turn that ends at `ends[-1]`.
+    `begin`, `ends` (guessed ends of legs), and the result: of each lane. `solver`: for all charts;
+    None for that of each chart. `columns`: whether derivatives are computed; otherwise factors are
+    meaningless.
+    """
+    d = begin[1].shape[-1]
+    C = d if columns else 0
+
+    def depart(t, q, ends):
+        zero = jnp.zeros_like(t)
+        unknown = jnp.full(form.watched, jnp.inf), jnp.ones(form.watched)
+        y = jnp.concatenate([q[None], jnp.eye(C, d)])
+        before, inside = Watched(t, *unknown), jnp.asarray(False)
+        return Course(t, y, t, jnp.zeros(C), ends, before, zero, zero, inside)
+
+    def branch(body: Body) -> Callable[[Rows, Course], Course]:
+        def of_lane(numbers, course, row):
+            s = travelers.of(numbers)
+            pairs = lambda a: solver_of(s.method(a)) if solver is None else solver  # noqa: E731
+            bodies = Bodies(s, levels, settings, form.watched, pairs)
+            return bodies.of(body)(row, course)
+
+        def of_all(row, course):
+            one = travelers.each(lambda *lane: of_lane(*lane, row))
+            return one(travelers.numbers, course)
+
+        return of_all
+
+    branches = [branch(body) for body in form.bodies]
+
+    def one(course: Course, row: Rows):
+        after = jax.lax.switch(row.body, branches, row, course)
+        return after, (course.t, course.y)
+
+    along = jax.vmap if travelers.many else lambda function: function
+    course = along(depart)(*begin, ends)
+    course, (times, states) = jax.lax.scan(one, course, rows)
+    # (Columns begin anew at the rows of pieces: those before are the factors.)
+    kept = jnp.concatenate([states[pieces[1:]], course.y[None]])
+    last = lambda x: jnp.moveaxis(x, 0, 1) if travelers.many else x  # noqa: E731
+    return Passage(
+        course.t,
+        course.y[..., 0, :],
+        course.ends,
+        last(times[pieces]),
+        last(states[pieces][..., 0, :]),
+        jnp.swapaxes(last(kept)[..., 1:, :], -1, -2),
+        course.error,
+        course.last,
+        course.left,
+    )

@@ -1,0 +1,223 @@
+"""Cycles near one that is known: Newton's method on its itinerary, without a search.
+
+The charts, events and steps of a turn are an `Itinerary` (`engine/itinerary`). `correct` repeats it
+from the states that Newton's method takes, and says whether all stayed as recorded. It is one
+program for all systems of a class, and is differentiable.
+"""
+
+import dataclasses
+import functools as ft
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.vector_math import factorizations
+from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded
+from ..engine.itinerary.turn import Passage, Travelers, follow
+from ..linear.time_response import monodromy
+from .crossing import Crossing, ListLevels
+from .return_map import ReturnMap
+from .shooting import ATOL, RTOL
+
+
+# Turns before a lane is given up. Fewer: distant cycles are left to the search. More: lanes that
+# will not converge keep the others of their call waiting.
+MOST_TURNS = 10
+
+
+class Plan(NamedTuple):
+    """What a turn repeats: the arrays of an itinerary."""
+
+    rows: Rows
+    pieces: Int[Array, " K"]
+
+    @classmethod
+    def of(cls, itinerary: Itinerary) -> "Plan":
+        return cls(itinerary.rows, itinerary.pieces)
+
+
+class Corrected(NamedTuple):
+    """The end of Newton's method on an itinerary."""
+
+    q: Float[Array, " d"]
+    """The state at the beginning of the last turn."""
+    passage: Passage
+    """The last turn."""
+    jacobian: Float[Array, "d d"]
+    """Of P(q) - q, less the steps back to values of conserved quantities."""
+    distance: Float[Array, ""]
+    """Largest part of P(q) - q in sizes of the states."""
+    excess: Float[Array, ""]
+    """Size of the Newton step that would follow, relative to the tolerance."""
+    turns: Int[Array, ""]
+
+
+def levels_of(map: ReturnMap) -> ListLevels | None:
+    """The level on which a turn ends; None for one that ends at a time, or with an event."""
+    return ListLevels((map.base,)) if isinstance(map.base, Crossing) else None
+
+
+class Maps(NamedTuple):
+    """Return maps of one system, or of many in lanes on the first axis of arrays."""
+
+    map: ReturnMap
+    """With the numbers that all share; in place of the others, those of some lane."""
+    numbers_of_system: tuple[Array, ...]
+    """The arrays of the systems, as leaves."""
+    t: Float[Array, "*L"]
+    """Times of anchors."""
+    expected: Float[Array, "*L"]
+
+    @property
+    def many(self) -> bool:
+        return self.t.ndim > 0
+
+    def of(self, numbers: Any) -> ReturnMap:
+        """The map of one lane."""
+        leaves, t, expected = numbers
+        arrays, static = eqx.partition(self.map.system, eqx.is_array)
+        arrays = jax.tree_util.tree_structure(arrays).unflatten(leaves)
+        system = eqx.combine(arrays, static)
+        anchor = self.map.anchor._replace(t=t[None])
+        return dataclasses.replace(
+            self.map, system=system, anchor=anchor, expected=expected
+        )
+
+    @property
+    def numbers(self) -> Any:
+        return self.numbers_of_system, self.t, self.expected
+
+    def each(self, function: Callable, *arrays: Array) -> Any:
+        """`function(map, *arrays)` of each lane."""
+        one = lambda numbers, *lane: function(self.of(numbers), *lane)  # noqa: E731
+        return (jax.vmap(one) if self.many else one)(self.numbers, *arrays)
+
+
+def maps_of(map: ReturnMap) -> Maps:
+    """The return map of one system."""
+    return Maps(map, leaves_of(map.system), map.anchor.t[0], map.expected)
+
+
+def leaves_of(system: Any) -> tuple[Array, ...]:
+    """The arrays of a system, or of many."""
+    return tuple(jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_array)))
+
+
+def _turn(maps: Maps, form: Form, plan: Plan, q, ends, columns: bool = True):
+    """One turn: its passage, and P(q) - q less the step back to conserved values."""
+    if maps.map.base is None:
+        ends = ends.at[..., -1].set(maps.t + maps.expected)
+    travelers = Travelers(
+        lambda numbers: maps.of(numbers).structure, maps.numbers, maps.many
+    )
+    passage = follow(
+        travelers,
+        levels_of(maps.map),
+        maps.map.settings,
+        form,
+        *plan,
+        (maps.t, q),
+        ends,
+        columns=columns,
+    )
+
+    def residual(map: ReturnMap, end, q):
+        return jnp.where(map.valid, end, 0.0) - q - map.held(q)[0]
+
+    return passage, maps.each(residual, passage.q, q)
+
+
+def _newton(map: ReturnMap, factors, residual, q):
+    """The Jacobian of the residual, the Newton step, its size relative to the tolerance, and that
+    of the residual in sizes of the states."""
+    product = jnp.where(map.valid[:, None], monodromy(factors), 0.0)
+    jacobian = product - jnp.eye(len(q)) - map.held(q)[1]
+    sizes = map.sizes
+    step = -_solve(jacobian * sizes / sizes[:, None], residual / sizes)
+    excess = jnp.max(jnp.abs(step) / (ATOL + RTOL * jnp.abs(q / sizes)))
+    return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
+
+
+def _solve(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
+    if len(right) <= factorizations.MOST_ROWS:
+        return factorizations.solve(matrix, right)
+    return jnp.linalg.solve(matrix, right)
+
+
+def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+    def turn(carry):
+        before, q = carry
+        passage, residual = _turn(maps, form, plan, q, before.passage.ends)
+        steps = maps.each(_newton, passage.factors, residual, q)
+        jacobian, step, excess, distance = steps
+        found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
+        done = before.excess <= 1
+        found = jax.tree_util.tree_map(ft.partial(_where, done), before, found)
+        return found, _where(done, q, q + step)
+
+    def going(carry):
+        found, _ = carry
+        return ((found.excess > 1) & (found.turns < MOST_TURNS)).any()
+
+    # (A first turn before the loop would be compiled twice.)
+    begin = _nothing_yet(plan, q, ends), q
+    return jax.lax.while_loop(going, turn, begin)[0]
+
+
+def _nothing_yet(plan: Plan, q: Float[Array, "*L d"], ends) -> Corrected:
+    """The beginning of Newton's method."""
+    lanes, d, K = q.shape[:-1], q.shape[-1], len(plan.pieces)
+    zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
+    legs = zeros(K), zeros(K, d), zeros(K, d, d)
+    inside = jnp.zeros(lanes, bool)
+    passage = Passage(zeros(), q, ends, *legs, zeros(), zeros(), inside)
+    unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
+    return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
+
+
+def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
+    return jnp.where(mask.reshape(mask.shape + (1,) * (yes.ndim - mask.ndim)), yes, no)
+
+
+@eqx.filter_custom_jvp
+def _root(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+    return _corrected(maps, form, plan, q, ends)
+
+
+@_root.def_jvp
+def _root_jvp(primals, tangents):
+    """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp; nothing else of the result has derivatives."""
+    maps, form, plan, *_ = primals
+    found = _root(*primals)
+    q, ends = found.q, found.passage.ends
+    fixed = jax.tree_util.tree_map(lambda _: None, maps.map.settings)
+    t_maps = eqx.tree_at(
+        lambda x: x.map.settings, tangents[0], fixed, is_leaf=lambda x: x is None
+    )
+    residual = lambda maps: _turn(maps, form, plan, q, ends, columns=False)[1]  # noqa: E731
+    _, moved = eqx.filter_jvp(residual, (maps,), (t_maps,))
+    passage, _ = _turn(maps, form, plan, q, ends)
+    _, step, *_ = maps.each(_newton, passage.factors, moved, q)
+    nothing = jax.tree_util.tree_map(lambda _: None, found)
+    return found, nothing._replace(q=step)
+
+
+def correct(
+    maps: Maps, form: Form, plan: Plan, q, ends, *, derivatives: bool = False
+) -> Corrected:
+    """Newton's method on an itinerary.
+
+    **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: whether
+    the result has those of the cycles, for which the last turn is repeated.
+    """
+    if not derivatives:
+        return _corrected(maps, form, plan, q, ends)
+    still = jax.lax.stop_gradient
+    found = _root(maps, form, plan, still(q), still(ends))
+    passage, _ = _turn(maps, form, plan, found.q, still(found.passage.ends))
+    return found._replace(passage=passage)
