@@ -12,22 +12,28 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
 from .._core.execution import Execution
-from .._core.executor import from_host
+from .._core.executor import from_host, to_host
 from .._core.meaning import current_of_many, first_of
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
 from .._core.results import Result
 from .._core.text import folded
-from ..engine.lanes import Lanes
+from ..engine.events import arm
+from ..engine.lanes import Lanes, start_lanes
 from ..engine.settings import SWEEP, Settings
+from ..engine.target import until
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
-from .batches import Rounds, Tiles, tiles_of
+from .batches import Known, Rounds, Tiles, tiles_of
 from .checks import check_found, check_periodic
-from .coincidence import commutes
+from .coincidence import commutes, together
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
+from .guess import require_similar
+from .many import Found, Many, Solver
+from .newton import search as newton
+from .repeat import leaves_of
 from .return_map import ReturnMap, turn_product
 from .verdict import verdict
 
@@ -35,6 +41,15 @@ from .verdict import verdict
 # Cycles that are tested for whether events that coincide commute; all are, if one of these fails.
 # More: the test takes longer. Fewer: exceptions are missed.
 _LOOKED_AT = 50
+# Systems from which programs of itineraries are worth their compilation. Fewer: a sweep waits for
+# the compiler. More: turns side by side take longer.
+WORTH_COMPILING = 250
+# Turns after which a search begins in the chart where they end. More: hopeless searches last longer.
+# Fewer: cycles that begin in another chart are lost.
+_TURNS = 3
+# Cycles from which systems begin that no route suits. More: neighbors take longer to find. Fewer:
+# guesses are worse.
+_GUESSES = 500
 # Cycles that are tested for jumps and pulses of fields, and checked in full, which takes longer.
 _TESTED = 8
 
@@ -177,12 +192,11 @@ def find_limit_cycles(
     require_x64(systems)
     settings = Settings() if settings is None else settings
     systems = settings.system(systems)
-    arrays, static = eqx.partition(systems, eqx.is_array)
-    S = len(jax.tree_util.tree_leaves(arrays)[0])
-    check_periodic(eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static))
+    first = first_of(systems)
+    check_periodic(first)
     map = map_for_sweep(guess, settings)
-    tiles = tiles_of(systems, map, execution.batch, execution.threads, S)
-    return as_cycles(tiles, tiles.solve(S))
+    require_similar(map, first)
+    return solved(systems, map, execution.batch, execution.threads)
 
 
 def map_for_sweep(guess: LimitCycle, settings: Settings) -> ReturnMap:
@@ -193,10 +207,196 @@ def map_for_sweep(guess: LimitCycle, settings: Settings) -> ReturnMap:
     return dataclasses.replace(guess.return_map, settings=settings)
 
 
+def solved(
+    systems: HybridSystem,
+    map: ReturnMap,
+    size: int | None = None,
+    workers: int = 1,
+    total: int | None = None,
+    known: Known | None = None,
+) -> LimitCycles:
+    """The cycles of systems near that of a return map.
+
+    **Arguments:** `size`, `total`, `known`: see `tiles_of` and `Tiles`.
+    """
+    S = len(leaves_of(systems)[0])
+    tiles = tiles_of(systems, map, size, workers, total or S)._replace(known=known)
+    if S < WORTH_COMPILING or map.multiplicity > 1:
+        return as_cycles(tiles, tiles.solve(S))
+    expected = np.full(S, float(map.expected))
+    expected = expected if tiles.periods is None else tiles.periods
+    times = np.full(S, float(tiles.map.anchor.t[0]))
+    if map.base is None:
+        times = times * expected / float(map.expected)
+    leaves = tuple(np.asarray(x) for x in leaves_of(systems))
+
+    def search(row: int, near: int, solver: Solver) -> ReturnMap | None:
+        system = from_host(first_of(_some(systems, np.array([row]))))
+        begin = _on_routes(systems, solver, tiles.map)[near].return_map
+        at_phase = dict(system=system, expected=expected[row])
+        anchor = to_host(begin.anchor)._replace(t=times[row : row + 1])
+        return _search(dataclasses.replace(tiles.map, anchor=anchor, **at_phase))
+
+    solver = Solver(Many(leaves, times, expected, workers), tiles.map, search)
+    solver.run()
+    cycles = _on_routes(systems, solver, tiles.map)
+    coincide = _coincide(cycles, solver)
+    if len(left := solver.pending):
+        near = _some_known(cycles) if known is None else known
+        part = tiles_of(_some(systems, left), map, size, workers, total or S)
+        rounds = part._replace(known=near).solve(len(left))
+        cycles = _with_rows(cycles, left, _cycles(part, rounds))
+        coincide[left] = rounds.together
+    return examined(cycles, coincide, solver.found.route >= 0)
+
+
+def _search(map: ReturnMap) -> ReturnMap | None:
+    """The return map of a cycle that is found from the state of a map's anchor; None if there is
+    none. (Newton's method does not lead to a cycle that begins in another chart: turns do.)"""
+    for _ in range(_TURNS):
+        end = map.turn(map.anchor.q[:, 0]).end
+        if end.chart == map.anchor.chart:
+            break
+        anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
+        map = dataclasses.replace(map, anchor=anchor)
+    solution = newton(map)
+    if not solution.is_fixed_point:
+        return None
+    return dataclasses.replace(map, anchor=to_host(solution.anchor))
+
+
+def _some(systems: HybridSystem, rows) -> HybridSystem:
+    """Some of many systems."""
+    pick = lambda x: jax.device_put(np.asarray(x)[rows])  # noqa: E731
+    return jax.tree_util.tree_map(lambda x: pick(x) if eqx.is_array(x) else x, systems)
+
+
+def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
+    """The cycles that were found on routes; NaN for the others."""
+    found, s, S = solver.found, map.structure, len(solver.found.route)
+    G, K = len(s.transitions), found.legs_t.shape[1]
+    chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
+    armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
+    for number, route in enumerate(solver.routes):
+        rows = np.flatnonzero(found.route == number)
+        if not len(rows):
+            continue
+        itinerary = route.first
+        chart[rows], events[rows] = itinerary.charts, itinerary.begins
+        one = found.legs_t[rows[0]], itinerary.charts, found.legs_q[rows[0]].T
+        system = from_host(first_of(_some(systems, rows[:1])))
+        own = dataclasses.replace(map, system=system)
+        lanes = start_lanes(own.structure, *one)
+        watched = own.watch(lanes, until(lanes.t))
+        armed[rows] = arm(own.structure, lanes, watched, map.expected).armed
+        more = np.full((S, len(itinerary.events)), -1)
+        more[rows] = itinerary.events
+        codes = _wider(codes, more)
+    pace = np.array([0.0, np.inf, 0.0, 0.0])
+    legs = Lanes(
+        found.legs_t,
+        chart,
+        np.swapaxes(found.legs_q, 1, 2),
+        armed,
+        events,
+        np.tile(pace[:, None], (S, 1, K)),
+    )
+    anchor = jax.tree_util.tree_map(lambda x: x[..., :1], legs)
+    if map.event >= 0:
+        anchor.armed[:, map.event] = False
+    period = found.period if map.base is not None else solver.many.expected
+    missing = found.route < 0
+    return LimitCycles(
+        systems,
+        map.base,
+        np.where(missing, np.nan, period),
+        anchor._replace(q=found.q[..., None]),
+        legs,
+        found.factors,
+        found.distance,
+        found.turns,
+        np.where(missing, Result.NOT_CONVERGED, _singular(found, map)),
+        codes,
+        map.settings,
+        map.conserved,
+        map.multiplicity,
+        copies_of(systems),
+    )
+
+
+def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
+    """Codes of events with those of other rows."""
+    width = max(codes.shape[1], more.shape[1])
+    fill = lambda x: np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)  # noqa: E731
+    return np.maximum(fill(codes), fill(more))
+
+
+def _singular(found: Found, map: ReturnMap) -> Int[np.ndarray, " S"]:
+    """OK, or `SINGULAR` for cycles that are not isolated."""
+    return np.full(len(found.route), int(Result.OK))
+
+
+def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
+    """Whether events coincide, on cycles that were found on routes."""
+    found, out = solver.found, np.zeros(len(cycles), bool)
+    at_event = isinstance(cycles.base, AtEvent)
+    begin = cycles.anchor.t[:, 0] if at_event else np.full(len(out), -np.inf)
+    for number, route in enumerate(solver.routes):
+        rows = np.flatnonzero(found.route == number)
+        events = route.first.events
+        if len(rows) and events:
+            times = solver.ends(number)[rows][:, : len(events)]
+            codes = np.tile(np.array(events), (len(rows), 1))
+            out[rows] = together(codes, times, begin[rows], cycles.period[rows])
+    return out
+
+
+def known_from(cycles: LimitCycles) -> Known:
+    """Cycles as guesses for others."""
+    unit = np.eye(cycles.factors.shape[-1])
+    jacobian = turn_product(np.asarray(cycles.factors)) - unit
+    return Known(None, cycles.anchor, cycles.period, jacobian, cycles.result)
+
+
+def _some_known(cycles: LimitCycles) -> Known | None:
+    """Some of the cycles that were found, as guesses for others."""
+    rows = np.flatnonzero(cycles.ok)
+    if not len(rows):
+        return None
+    rows = rows[:: -(-len(rows) // _GUESSES)]
+    known = known_from(cycles)._replace(systems=None)
+    some = jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], known)
+    return some._replace(systems=_some(cycles.systems, rows))
+
+
+def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:
+    """Cycles, with others in some rows."""
+
+    def put(x, y):
+        x = np.array(x)
+        x[rows] = y
+        return x
+
+    codes = cycles.codes.copy()
+    codes[rows] = -1
+    more = np.full((len(cycles), others.codes.shape[1]), -1)
+    more[rows] = others.codes
+    names = "period", "anchor", "legs", "factors", "residual", "iterations", "result"
+    changed: Any = {
+        name: jax.tree_util.tree_map(put, getattr(cycles, name), getattr(others, name))
+        for name in names
+    }
+    return dataclasses.replace(cycles, codes=_wider(codes, more), **changed)
+
+
 def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     """The last rounds of Newton's method as cycles."""
+    return examined(_cycles(tiles, rounds), rounds.together, rounds.together & False)
+
+
+def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     turn, map = rounds.turn, tiles.map
-    cycles = LimitCycles(
+    return LimitCycles(
         tiles.systems,
         map.base,
         rounds.period,
@@ -212,22 +412,26 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         map.multiplicity,
         copies_of(tiles.systems),
     )
-    return examined(cycles, rounds.together)
 
 
-def examined(cycles: LimitCycles, together: Bool[np.ndarray, " S"]) -> LimitCycles:
-    """The cycles, with the result `COINCIDENCE` if events coincide (`together`) that do not
-    commute, and with those of their verdicts: of eight cycles and, if one of these has a fault, of
-    all.
+def examined(
+    cycles: LimitCycles,
+    coincide: Bool[np.ndarray, " S"],
+    walked: Bool[np.ndarray, " S"],
+) -> LimitCycles:
+    """The cycles, with the result `COINCIDENCE` if events `coincide` that do not commute, and with
+    those of their verdicts: of eight cycles and, if one of these has a fault, of all.
+
+    **Arguments:** `walked`: cycles that a second integration has checked already.
 
     **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
     result = cycles.result.copy()
-    rows = np.flatnonzero(together & cycles.ok)
+    rows = np.flatnonzero(coincide & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if not all(commutes(cycles[i]) for i in few):
         result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
-    good = np.flatnonzero(result == Result.OK)
+    good = np.flatnonzero((result == Result.OK) & ~walked)
     places = np.linspace(0, len(good) - 1, min(len(good), _TESTED))
     tested = good[np.unique(places.astype(int))]
     for i in tested:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core.vector_math import factorizations
-from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded
+from ..engine.itinerary.rows import LEGS, Form, Rows
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..linear.time_response import monodromy
 from .crossing import Crossing, ListLevels
@@ -34,11 +34,10 @@ class Plan(NamedTuple):
     """What a turn repeats: the arrays of an itinerary."""
 
     rows: Rows
-    pieces: Int[Array, " K"]
-
-    @classmethod
-    def of(cls, itinerary: Itinerary) -> "Plan":
-        return cls(itinerary.rows, itinerary.pieces)
+    count: Int[Array, ""] | None
+    """Of rows; None for all of them (see `follow`)."""
+    last: Int[Array, ""]
+    """Number of the last leg."""
 
 
 class Corrected(NamedTuple):
@@ -108,10 +107,14 @@ def leaves_of(system: Any) -> tuple[Array, ...]:
     return tuple(jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_array)))
 
 
-def _turn(maps: Maps, form: Form, plan: Plan, q, ends, columns: bool = True):
-    """One turn: its passage, and P(q) - q less the step back to conserved values."""
+def turn(maps: Maps, form: Form, plan: Plan, q, ends, **options: Any):
+    """One turn: its passage, and P(q) - q less the step back to conserved values.
+
+    **Arguments:** `options`: of `follow`.
+    """
     if maps.map.base is None:
-        ends = ends.at[..., -1].set(maps.t + maps.expected)
+        end = (maps.t + maps.expected)[..., None]
+        ends = jnp.where(jnp.arange(ends.shape[-1]) >= plan.last, end, ends)
     travelers = Travelers(
         lambda numbers: maps.of(numbers).structure, maps.numbers, maps.many
     )
@@ -120,10 +123,11 @@ def _turn(maps: Maps, form: Form, plan: Plan, q, ends, columns: bool = True):
         levels_of(maps.map),
         maps.map.settings,
         form,
-        *plan,
+        plan.rows,
+        plan.count,
         (maps.t, q),
         ends,
-        columns=columns,
+        **options,
     )
 
     def residual(map: ReturnMap, end, q):
@@ -143,16 +147,18 @@ def _newton(map: ReturnMap, factors, residual, q):
     return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
 
 
-def _solve(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
+def _solve(
+    matrix: Float[Array, "d d"], right: Float[Array, " d"]
+) -> Float[Array, " d"]:
     if len(right) <= factorizations.MOST_ROWS:
         return factorizations.solve(matrix, right)
     return jnp.linalg.solve(matrix, right)
 
 
 def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
-    def turn(carry):
+    def again(carry):
         before, q = carry
-        passage, residual = _turn(maps, form, plan, q, before.passage.ends)
+        passage, residual = turn(maps, form, plan, q, before.passage.ends)
         steps = maps.each(_newton, passage.factors, residual, q)
         jacobian, step, excess, distance = steps
         found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
@@ -165,13 +171,13 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
         return ((found.excess > 1) & (found.turns < MOST_TURNS)).any()
 
     # (A first turn before the loop would be compiled twice.)
-    begin = _nothing_yet(plan, q, ends), q
-    return jax.lax.while_loop(going, turn, begin)[0]
+    begin = _nothing_yet(q, ends), q
+    return jax.lax.while_loop(going, again, begin)[0]
 
 
-def _nothing_yet(plan: Plan, q: Float[Array, "*L d"], ends) -> Corrected:
+def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     """The beginning of Newton's method."""
-    lanes, d, K = q.shape[:-1], q.shape[-1], len(plan.pieces)
+    lanes, d, K = q.shape[:-1], q.shape[-1], LEGS
     zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
     legs = zeros(K), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
@@ -199,9 +205,9 @@ def _root_jvp(primals, tangents):
     t_maps = eqx.tree_at(
         lambda x: x.map.settings, tangents[0], fixed, is_leaf=lambda x: x is None
     )
-    residual = lambda maps: _turn(maps, form, plan, q, ends, columns=False)[1]  # noqa: E731
+    residual = lambda maps: turn(maps, form, plan, q, ends, columns=False)[1]  # noqa: E731
     _, moved = eqx.filter_jvp(residual, (maps,), (t_maps,))
-    passage, _ = _turn(maps, form, plan, q, ends)
+    passage, _ = turn(maps, form, plan, q, ends)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
     return found, nothing._replace(q=step)
@@ -219,5 +225,5 @@ def correct(
         return _corrected(maps, form, plan, q, ends)
     still = jax.lax.stop_gradient
     found = _root(maps, form, plan, still(q), still(ends))
-    passage, _ = _turn(maps, form, plan, found.q, still(found.passage.ends))
+    passage, _ = turn(maps, form, plan, found.q, still(found.passage.ends))
     return found._replace(passage=passage)

@@ -20,10 +20,16 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import BATCH, SMALL, Known, Tiles, tiles_of
+from ..orbits.batches import BATCH, SMALL, Known
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..orbits.limit_cycles import LimitCycles, as_cycles, map_for_sweep, rough
+from ..orbits.limit_cycles import (
+    LimitCycles,
+    known_from,
+    map_for_sweep,
+    rough,
+    solved,
+)
 from ..orbits.return_map import ReturnMap
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space
@@ -199,10 +205,9 @@ class SweepJob:
         if len(self.blocks) == 1:
             cycles = self.cycles or self.coarse()[1]
         else:
-            tiles = self._tiles(index := self._points(k), workers)
             coarse = self.family.systems(self.space.at(self.begun.index))
-            tiles = tiles._replace(known=self.begun.coarse._replace(systems=coarse))
-            cycles = as_cycles(tiles, tiles.solve(len(index[0])))
+            known = self.begun.coarse._replace(systems=coarse)
+            cycles = self._solved(self._points(k), workers, known)
         shape = [x.stop - x.start for x in self.blocks.slices(k)]
         values = self.wanted.values(cycles, self.variables)
         return {name: x.reshape(*shape, *x.shape[1:]) for name, x in values.items()}
@@ -215,24 +220,22 @@ class SweepJob:
 
     def coarse(self) -> tuple[Known, LimitCycles]:
         """Return the cycles of the coarse pass."""
-        index = self.begun.index
-        tiles = self._tiles(index, None)
-        rounds = tiles.solve(len(index[0]))
-        jacobian, result = np.asarray(rounds.turn.jacobian), np.asarray(rounds.result)
-        return Known(None, rounds.anchor, rounds.period, jacobian, result), as_cycles(
-            tiles, rounds
-        )
+        cycles = self._solved(self.begun.index, None)
+        return known_from(cycles), cycles
 
-    def _tiles(self, index: tuple[np.ndarray, ...], workers: int | None) -> Tiles:
-        systems, total = (
-            self.family.systems(self.space.at(index)),
-            math.prod(self.blocks.shape),
-        )
+    def _solved(
+        self,
+        index: tuple[np.ndarray, ...],
+        workers: int | None,
+        known: Known | None = None,
+    ) -> LimitCycles:
+        """Return the cycles at some points."""
+        systems = self.family.systems(self.space.at(index))
+        total = math.prod(self.blocks.shape)
         # (One size for all, also for the smaller blocks at the edges: there is one program.)
         size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
-        return tiles_of(
-            systems, self.begun.map, size, Execution(workers=workers).threads, total
-        )
+        threads = Execution(workers=workers).threads
+        return solved(systems, self.begun.map, size, threads, total, known)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""

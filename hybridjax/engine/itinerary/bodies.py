@@ -104,7 +104,9 @@ class Bodies:
             is_correction = row.target >= 0
             h = jnp.where(is_correction, _newton(now, row.target), h)
         y, error = self._advanced(a, course, h)
-        error = jnp.where(row.target >= 0, course.error, jnp.maximum(course.error, error))
+        error = jnp.where(
+            row.target >= 0, course.error, jnp.maximum(course.error, error)
+        )
         return course._replace(
             t=course.t + h,
             y=y,

@@ -5,6 +5,7 @@ its steps is a fraction of the leg; corrections, which are Newton steps on the g
 last one.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,9 @@ CORRECTIONS = 2
 LEGS = 16
 # Rows of a table are a multiple of this. More: empty rows take time. Fewer: itineraries of other
 # lengths compile again.
-_ROUND = 32
+_ROUND = 128
+# The same of legs.
+_LEGS = 4
 # A guard whose value is below this part of its largest one in the chart may have either sign.
 # Larger: a guard that is passed is not noticed. Smaller: rounding at events is taken for a passage.
 _NEAR_ZERO = 1e-7
@@ -49,7 +52,9 @@ class Rows(NamedTuple):
     """Of a correction: the row of the watched function of the chart that it brings to zero. -1 for
     a step."""
     place: Int[np.ndarray, " R"]
-    """Of a jump: index of the transition among those of its kind. Of a piece: its number."""
+    """Of a jump: index of the transition among those of its kind."""
+    piece: Int[np.ndarray, " R"]
+    """Number of the piece that begins; `LEGS` for none."""
     states: Int[np.ndarray, " R"]
     """Of a piece: number of states."""
     onward: Bool[np.ndarray, " R"]
@@ -91,12 +96,16 @@ class Itinerary(NamedTuple):
 
     form: Form
     rows: Rows
-    pieces: Int[np.ndarray, " K"]
-    """Rows at which pieces begin."""
+    count: int
+    """Rows that do something; the others follow."""
     ends: Float[np.ndarray, " E"]
-    """Ends of the legs, from the beginning of the trajectory."""
+    """Ends of the legs, from the beginning of the trajectory; that of the last one is repeated."""
+    last: int
+    """Number of the last leg."""
     charts: Int[np.ndarray, " K"]
     """Charts in which the pieces begin."""
+    begins: Int[np.ndarray, " K"]
+    """Numbers of events before them."""
     events: tuple[int, ...]
     """Indices of transitions, in order."""
 
@@ -113,6 +122,10 @@ class _Table:
         self.rows: list[tuple] = []
         self.bodies: list[Body] = [Body(NOTHING), Body(PIECE)]
 
+    def include(self, bodies: Iterable[Body]) -> None:
+        """Have bodies compiled, whether rows use them or not."""
+        self.bodies += [x for x in dict.fromkeys(bodies) if x not in self.bodies]
+
     def add(
         self,
         body: Body,
@@ -123,14 +136,14 @@ class _Table:
         fraction: float = 0.0,
         target: int = -1,
         place: int = 0,
+        piece: int = LEGS,
         states: int = 0,
         onward: bool = True,
     ) -> None:
-        if body not in self.bodies:
-            self.bodies.append(body)
+        self.include([body])
         number = self.bodies.index(body)
-        row = number, leg, first, fraction, target, place, states, onward, signs
-        self.rows.append(row)
+        places = target, place, piece, states
+        self.rows.append((number, leg, first, fraction, *places, onward, signs))
 
 
 class _Leg(NamedTuple):
@@ -189,14 +202,18 @@ def recorded(
             table.add(Body(SCHEDULE, a, (leg.code,)), k, unknown)
         for j, (t, fraction) in enumerate(zip(times, _fractions(times), strict=False)):
             if (k, j) in pieces:
-                table.add(Body(PIECE), k, unknown, states=s.dims[a])
+                new = dict(piece=len(charts), states=s.dims[a])
+                table.add(Body(PIECE), k, unknown, **new)
                 charts.append(a)
             step = dict(first=j == 0, fraction=fraction)
             table.add(Body(STEP, a), k, leg.signs(t), **step)
         _end(s, table, k, leg, goes_on=k < len(legs) - 1)
     events = tuple(leg.code for leg in legs if leg.code >= 0)
+    if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
+        # (The end at a time may lie in any chart: all of these itineraries share a program.)
+        table.include(Body(SECTION, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
-    return _finished(table, ends, np.array(charts, np.int32), events, legs[0].chart)
+    return _finished(table, ends, np.array(charts, np.int32), events)
 
 
 def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
@@ -312,9 +329,7 @@ def _jump(s: Structure, g: int, at_once: bool) -> tuple[Body, int]:
     return Body(JUMP, a, kind, at_once), kind.index(g)
 
 
-def _finished(
-    table: _Table, ends, charts, events: tuple[int, ...], begin: int
-) -> Itinerary:
+def _finished(table: _Table, ends, charts, events: tuple[int, ...]) -> Itinerary:
     """The itinerary of a table, filled up with empty rows."""
     used = len(table.rows)
     width = len(table.rows[0][-1])
@@ -322,12 +337,14 @@ def _finished(
         table.add(Body(NOTHING), 0, np.zeros(width, int))
     columns = [np.array(x) for x in zip(*table.rows, strict=True)]
     number = np.int32
-    types = number, number, bool, float, number, number, number, bool, number
+    types = number, number, bool, float, *[number] * 4, bool, number
     rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))
     place = np.array([bodies.index(body) for body in table.bodies], number)
     rows = rows._replace(body=place[rows.body])
-    pieces = np.flatnonzero(rows.body == bodies.index(Body(PIECE)))
+    last = len(ends) - 1
+    ends = np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS))
     form = Form(bodies, len(ends), len(rows.body), width)
-    return Itinerary(form, rows, pieces.astype(number), ends, charts, events)
+    before = rows.leg[rows.piece < LEGS]
+    return Itinerary(form, rows, used, ends, last, charts, before, events)

@@ -11,7 +11,7 @@ from ...systems.structure import Structure
 from ..settings import Settings
 from ..target import AbstractLevels
 from .bodies import Bodies, Course, Watched
-from .rows import Body, Form, Rows
+from .rows import LEGS, Body, Form, Rows
 from .steps import Solver, solver_of
 
 
@@ -60,7 +60,7 @@ def follow(
     settings: Settings,
     form: Form,
     rows: Rows,
-    pieces: Int[Array, " K"],
+    count: Int[Array, ""] | None,
     begin: tuple[Float[Array, ""], Float[Array, " d"]],
     ends: Float[Array, " E"],
     *,
@@ -69,7 +69,8 @@ def follow(
 ) -> Passage:
     """Follow an itinerary from a time and a state.
 
-    **Arguments:** `levels`: of the section at the end; None for a turn that ends at `ends[-1]`.
+    **Arguments:** `count`: of the rows that do something; None for a loop over all of them, which
+    reverse mode needs. `levels`: of the section at the end; None for a turn that ends at `ends[-1]`.
     `begin`, `ends` (guessed ends of legs), and the result: of each lane. `solver`: for all charts;
     None for that of each chart. `columns`: whether derivatives are computed; otherwise factors are
     meaningless.
@@ -99,23 +100,35 @@ def follow(
 
     branches = [branch(body) for body in form.bodies]
 
-    def one(course: Course, row: Rows):
-        after = jax.lax.switch(row.body, branches, row, course)
-        return after, (course.t, course.y)
+    def one(carry, row: Rows):
+        course, times, states = carry
+        times = times.at[row.piece].set(course.t)
+        states = states.at[row.piece].set(course.y)
+        return (jax.lax.switch(row.body, branches, row, course), times, states), None
+
+    def numbered(k, carry):
+        return one(carry, jax.tree_util.tree_map(lambda x: x[k], rows))[0]
 
     along = jax.vmap if travelers.many else lambda function: function
     course = along(depart)(*begin, ends)
-    course, (times, states) = jax.lax.scan(one, course, rows)
-    # (Columns begin anew at the rows of pieces: those before are the factors.)
-    kept = jnp.concatenate([states[pieces[1:]], course.y[None]])
+    # (Rows at which no piece begins write into one more place.)
+    kept = lambda x: jnp.zeros((LEGS + 1, *x.shape))  # noqa: E731
+    carry = course, kept(course.t), kept(course.y)
+    if count is None:
+        (course, times, states), _ = jax.lax.scan(one, carry, rows)
+    else:
+        rows = jax.tree_util.tree_map(jnp.asarray, rows)
+        course, times, states = jax.lax.fori_loop(0, count, numbered, carry)
+    # (Columns begin anew with each piece: those before are the factors.)
+    factors = jnp.concatenate([states[1:LEGS], course.y[None]])[..., 1:, :]
     last = lambda x: jnp.moveaxis(x, 0, 1) if travelers.many else x  # noqa: E731
     return Passage(
         course.t,
         course.y[..., 0, :],
         course.ends,
-        last(times[pieces]),
-        last(states[pieces][..., 0, :]),
-        jnp.swapaxes(last(kept)[..., 1:, :], -1, -2),
+        last(times[:LEGS]),
+        last(states[:LEGS, ..., 0, :]),
+        jnp.swapaxes(last(factors), -1, -2),
         course.error,
         course.last,
         course.left,

@@ -1,0 +1,303 @@
+"""Cycles of many systems near known ones, on the itineraries of these.
+
+A `Route` is the itinerary of a known cycle. All systems first take that of the guess. What leaves
+it, or does not converge, begins again from a neighbor that did, or from a cycle that a search has
+found there, on that one's route.
+"""
+
+import collections
+import hashlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._core.compilation import identity, whole
+from .._core.execution import in_threads
+from .._core.executor import on_the_cpu, to_host
+from ..engine.itinerary.rows import LEGS, Form, Itinerary, recorded
+from ..engine.itinerary.turn import Passage
+from ..engine.lanes import side_by_side
+from .repeat import Corrected, Maps, Plan, correct, levels_of, turn
+from .return_map import CLOSED, ReturnMap
+from .scale import ROUNDING, has_implicit
+
+
+# Lanes of a call. More: their arrays leave the cache. Fewer: calls cost more.
+TILE = 250
+# Steps of an itinerary for each one that the search took, first for all systems, then for those
+# whose errors are too large. More: turns last longer. Fewer: more systems need the second.
+_DENSITY, _FINER = 0.9, 1.6
+# Steps of the second integration, which shares no node with the first.
+_OTHER_DENSITY = 0.75
+# Largest distance, in sizes of the states, of the end of the second integration from its beginning,
+# and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
+# Smaller: errors of the second integration refuse cycles.
+_APART, _ROUGH = 1e-6, 1e3
+# Largest last correction of an event's time, as a part of the period. Larger: an event that the
+# corrections have not reached passes. Smaller: rounding errors of times do not.
+_LAST = 1e-10
+# Rounds in which systems begin from neighbors, and routes that searches find for systems that no
+# route suits. More: hopeless systems cost more. Fewer: more are left to the search.
+_ROUNDS, _SEARCHES = 4, 6
+
+
+class Route(NamedTuple):
+    """The itinerary of a known cycle."""
+
+    map: ReturnMap
+    """Of the known cycle."""
+    first: Itinerary
+    finer: Itinerary
+    other: Itinerary
+    """Of the second integration."""
+
+
+class Found(NamedTuple):
+    """The cycles of S systems, some of them found; S is the leading axis of every array."""
+
+    route: Int[np.ndarray, " S"]
+    """Number of the route; negative for systems without a cycle."""
+    q: Float[np.ndarray, "S d"]
+    period: Float[np.ndarray, " S"]
+    legs_t: Float[np.ndarray, "S K"]
+    legs_q: Float[np.ndarray, "S K d"]
+    factors: Float[np.ndarray, "S K d d"]
+    distance: Float[np.ndarray, " S"]
+    turns: Int[np.ndarray, " S"]
+
+
+def route_of(map: ReturnMap) -> Route:
+    """The route of a cycle, the fixed point of a return map."""
+    map = to_host(map)
+    pieces = side_by_side(to_host(map.pieces()))
+    densities = _DENSITY, _DENSITY * _FINER, _OTHER_DENSITY
+    s, levels = map.structure, levels_of(map)
+    return Route(map, *(recorded(s, pieces, levels, density) for density in densities))
+
+
+class Many(NamedTuple):
+    """Systems whose cycles are wanted.
+
+    **Fields:** `leaves`: arrays of the systems, with S on the first axis; `t`, `expected` (S,):
+    times of anchors and periods.
+    """
+
+    leaves: tuple[np.ndarray, ...]
+    t: Float[np.ndarray, " S"]
+    expected: Float[np.ndarray, " S"]
+    workers: int
+
+    def attempt(self, route: Route, rows, q, ends, finer: bool = False) -> "_Attempt":
+        """Newton's method for some systems on a route, from states and ends of legs."""
+        itinerary = route.finer if finer else route.first
+        found: Corrected = self._in_tiles(_correct, route, itinerary, rows, q, ends)
+        passage = found.passage
+        sizes = np.asarray(route.map.sizes)
+        durations = np.diff(passage.ends, axis=1, prepend=self.t[rows, None])
+        converged = np.isfinite(found.excess) & (found.excess <= 1)
+        converged &= found.distance <= CLOSED
+        # (Rounding makes the last legs, which last no time, negative.)
+        forwards = durations >= -ROUNDING * self.expected[rows, None]
+        kept = ~passage.left & forwards.all(axis=1)
+        kept &= passage.last <= _LAST * self.expected[rows]
+        fine = passage.error <= 1
+        good = np.flatnonzero(converged & kept & fine)
+        if len(good):
+            start = found.q[good], passage.ends[good]
+            other: Passage = self._in_tiles(
+                _travel, route, route.other, rows[good], *start
+            )
+            apart = np.max(np.abs(other.q - found.q[good]) / sizes, axis=1)
+            same = np.isfinite(apart) & (apart <= _APART) & (other.error <= _ROUGH)
+            kept[good] &= (
+                same
+                & ~other.left
+                & _moves(route.first.events, found.q[good], passage, good, sizes)
+            )
+        return _Attempt(rows, found, converged, kept, fine)
+
+    def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
+        """A function of all lanes, in calls of one size."""
+        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
+        plan = Plan(itinerary.rows, *counts)
+        map = jax.tree_util.tree_map(jnp.asarray, route.map)
+        program = whole(function, (itinerary.form,), (map,), loops=True)
+
+        def run(k):
+            own = np.arange(k, k + TILE) % len(rows)
+            lanes = rows[own]
+            leaves = tuple(x[lanes] for x in self.leaves)
+            numbers = leaves, self.t[lanes], self.expected[lanes]
+            with on_the_cpu():
+                result = program(numbers, plan, q[own], ends[own])
+            left = min(TILE, len(rows) - k)
+            return jax.tree_util.tree_map(lambda x: x[:left], result)
+
+        tiles = range(0, len(rows), TILE)
+        parts = in_threads(run, tiles, min(self.workers, len(tiles)))
+        return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
+
+
+class _Attempt(NamedTuple):
+    """What Newton's method has found for some systems."""
+
+    rows: Int[np.ndarray, " n"]
+    found: Corrected
+    converged: Bool[np.ndarray, " n"]
+    kept: Bool[np.ndarray, " n"]
+    """Whether the route was kept, and the second integration agrees."""
+    fine: Bool[np.ndarray, " n"]
+    """Whether the steps are fine enough."""
+
+    @property
+    def ok(self) -> Bool[np.ndarray, " n"]:
+        return self.converged & self.kept & self.fine
+
+
+def _moves(events, q, passage: Passage, good, sizes) -> Bool[np.ndarray, " n"]:
+    """Test whether cycles are no equilibria: whether some state moves, or an event happens."""
+    if events:
+        return np.ones(len(q), bool)
+    apart = np.abs(passage.legs_q[good] - q[:, None]) / sizes
+    return apart.max(axis=(1, 2)) > _APART
+
+
+def _correct(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
+    return correct(Maps(map, *numbers), form, plan, q, ends)
+
+
+def _travel(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
+    """The turn by another method, with other steps."""
+    import diffrax
+
+    maps = Maps(map, *numbers)
+    # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
+    solver = None if has_implicit(map.structure) else diffrax.Dopri8(scan_kind="lax")
+    return turn(maps, form, plan, q, ends, solver=solver, columns=False)[0]
+
+
+class Solver:
+    """The search for the cycles of many systems, route after route."""
+
+    def __init__(self, many: Many, map: ReturnMap, search: Callable):
+        """**Arguments:** `map`: that of a known cycle. `search`: a function of the number of a
+        system, of that of one near it whose cycle is known, and of this solver, that returns the
+        return map of a cycle that it finds, or None."""
+        S, d = len(many.t), map.anchor.q.shape[0]
+        self.many, self._search = many, search
+        key = _key(map, many.leaves)
+        if key not in _routes:
+            _routes[key] = [route_of(map)]
+            while len(_routes) > _KEPT:
+                _routes.popitem(last=False)
+        self.routes = _routes[key]
+        self.pending = np.arange(S)
+        self._ends: dict[int, np.ndarray] = {}
+        blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
+        legs = blank(LEGS), blank(LEGS, d), blank(LEGS, d, d)
+        none = np.full(S, -1)
+        self.found = Found(none, blank(d), blank(), *legs, blank(), none + 1)
+
+    def run(self) -> None:
+        """Find cycles on the known routes, then on new ones."""
+        for number in range(len(self.routes)):
+            self._take(number)
+        for _ in range(_SEARCHES):
+            known = np.flatnonzero(self.found.route >= 0)
+            if not len(self.pending) or not len(known):
+                return
+            distance, near = self.nearest(self.pending, known)
+            first = np.argmin(distance)
+            map = self._search(int(self.pending[first]), int(near[first]), self)
+            if map is None:
+                return
+            before = len(self.pending)
+            self.routes.append(route_of(map))
+            self._take(len(self.routes) - 1)
+            if len(self.pending) == before:
+                self.routes.pop()
+                return
+
+    def nearest(self, rows, known) -> tuple[np.ndarray, np.ndarray]:
+        """Distances of systems to the nearest ones with known cycles, and the numbers of these."""
+        from scipy.spatial import KDTree  # (a third of a second)
+
+        numbers = _parameters(self.many.leaves)
+        distance, place = KDTree(numbers[known]).query(numbers[rows])
+        return distance, known[place]
+
+    def _take(self, number: int) -> None:
+        """Find the cycles of the systems without one on a route."""
+        route, rows = self.routes[number], self.pending
+        if not len(rows):
+            return
+        many, expected = self.many, float(route.map.expected)
+        q = np.repeat(route.map.anchor.q.T, len(rows), axis=0)
+        grown = many.expected[rows] / expected
+        ends = many.t[rows, None] + route.first.ends * grown[:, None]
+        for _ in range(_ROUNDS):
+            attempt = many.attempt(route, rows, q, ends)
+            self._keep(number, attempt)
+            coarse = attempt.converged & attempt.kept & ~attempt.fine
+            if coarse.any():
+                start = attempt.found.q[coarse], attempt.found.passage.ends[coarse]
+                self._keep(
+                    number, many.attempt(route, rows[coarse], *start, finer=True)
+                )
+            # (What has converged, and left the route, needs another one.)
+            rows = rows[~attempt.converged]
+            known = np.flatnonzero(self.found.route == number)
+            if not len(rows) or not attempt.ok.any():
+                break
+            _, near = self.nearest(rows, known)
+            q, ends = self.found.q[near], self._ends[number][near]
+        self.pending = np.flatnonzero(self.found.route < 0)
+
+    def _keep(self, number: int, attempt: _Attempt) -> None:
+        """Keep the cycles that an attempt has found."""
+        ok = np.flatnonzero(attempt.ok)
+        rows, found = attempt.rows[ok], attempt.found
+        passage, out = found.passage, self.found
+        out.route[rows] = number
+        out.q[rows] = found.q[ok]
+        out.period[rows] = (passage.t - self.many.t[attempt.rows])[ok]
+        out.legs_t[rows] = passage.legs_t[ok]
+        out.legs_q[rows] = passage.legs_q[ok]
+        out.factors[rows] = passage.factors[ok]
+        out.distance[rows] = found.distance[ok]
+        out.turns[rows] = found.turns[ok]
+        S, E = len(self.many.t), passage.ends.shape[1]
+        ends = self._ends.setdefault(number, np.full((S, E), np.nan))
+        ends[rows] = passage.ends[ok]
+
+    def ends(self, number: int) -> Float[np.ndarray, "S E"]:
+        """Ends of legs of the systems on a route; NaN for others."""
+        return self._ends[number]
+
+
+# The routes of the last calls: the same call again searches nothing. More: memory. Fewer: calls that
+# take turns search again.
+_KEPT = 16
+_routes: collections.OrderedDict[Any, list[Route]] = collections.OrderedDict()
+
+
+def _key(map: ReturnMap, leaves: tuple[np.ndarray, ...]) -> tuple:
+    """All on which the routes of a call depend."""
+    arrays = [*jax.tree_util.tree_leaves(eqx.filter(map, eqx.is_array)), *leaves]
+    digest = hashlib.sha1(usedforsecurity=False)
+    for x in arrays:
+        digest.update(np.ascontiguousarray(x).view(np.uint8))
+    return identity(map), digest.digest()
+
+
+def _parameters(leaves: tuple[np.ndarray, ...]) -> Float[np.ndarray, "S p"]:
+    """The numbers in which systems differ, in units of their spread."""
+    flat = np.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
+    flat = flat - flat.mean(axis=0)
+    spread = np.sqrt(np.mean(flat**2, axis=0))
+    return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]
