@@ -217,6 +217,44 @@ def lane_jvp(
     return end, jax.tree_util.tree_map(contract, columns)
 
 
+def by_jacobian(function: Callable) -> Callable:
+    """A function of a tree with few numbers and of further arguments, with derivatives by the
+    numbers that are computed forwards, all at once.
+
+    Reverse mode then transposes a product with the Jacobian, and stores nothing of the function.
+    """
+
+    @eqx.filter_custom_jvp
+    def derived(tree, *others):
+        return function(tree, *others)
+
+    @derived.def_jvp
+    def rule(arguments, tangents):
+        tree, *others = arguments
+        has = jax.tree_util.tree_map(
+            lambda x, t: t is not None, tree, tangents[0], is_leaf=lambda x: x is None
+        )
+        moving, still = eqx.partition(tree, has)
+        along, _ = ravel_pytree(eqx.filter(tangents[0], has))
+        numbers, back = ravel_pytree(moving)
+
+        def of(moving):
+            value = function(eqx.combine(moving, still), *others)
+            smooth, rest = eqx.partition(value, eqx.is_inexact_array)
+            return smooth, rest
+
+        def push(direction):
+            return jax.jvp(of, (moving,), (back(direction),), has_aux=True)
+
+        units = jnp.eye(len(numbers), dtype=numbers.dtype)
+        smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(units)
+        contract = lambda column: jnp.tensordot(along, column, 1)  # noqa: E731
+        tangent = jax.tree_util.tree_map(contract, columns)
+        return eqx.combine(smooth, rest), tangent
+
+    return derived
+
+
 # Up to so many rows are selected one by one. Twice as many: programs of eight contacts compile for
 # longer, and run a little faster.
 _FEW = 8

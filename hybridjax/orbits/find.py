@@ -13,7 +13,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation import uncollected
-from .._core.executor import is_traced, is_tracer, to_host
+from .._core.executor import is_inside_program, is_traced, is_tracer, to_host
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result, update_result
@@ -32,6 +32,7 @@ from .curve import away_from_events
 from .cycle import LimitCycle
 from .guess import require_similar, return_map_near
 from .linear_flow import keep_turn, last_turn, remembering
+from .near import repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
 from .scale import (
@@ -190,6 +191,10 @@ def find_limit_cycle(
         map, conserved={k: real(v) for k, v in (conserved or {}).items()}
     )
     near = last_turn(guess) if isinstance(guess, LimitCycle) else None
+    if isinstance(guess, LimitCycle) and is_inside_program():
+        route = route_near(guess)
+        if route is not None:
+            return traced_cycle(route, map)
     if isinstance(guess, LimitCycle) and traced:
         solution = solve(map, True, True, near)
         # (Of events that coincide on the guess, too, its search has compared the orders.)
@@ -205,6 +210,10 @@ def find_limit_cycle(
     )
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
+    if isinstance(guess, LimitCycle):
+        cycle = repeated_cycle(guess, map)
+        if cycle is not None and _sizes_hold(map, cycle):
+            return cycle
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)
     ends_elsewhere = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
@@ -227,6 +236,13 @@ def find_limit_cycle(
     if throw and code != Result.OK:
         raise ComputationError(checks.explain(cycle, turn, float(map.expected), settle))
     return cycle
+
+
+def _sizes_hold(map: ReturnMap, cycle: LimitCycle) -> bool:
+    """Test whether the sizes of states are those of a cycle, nearly."""
+    rough = sizes_of(map.structure, map.scale)
+    own = sizes_on(map.structure, to_host(cycle.legs), float(cycle.period))
+    return all(rough[name] <= _OFF * max(own[name], SAME * rough[name]) for name in own)
 
 
 def _solution(

@@ -19,10 +19,8 @@ from .._core.precision import require_x64
 from .._core.progress import working
 from .._core.results import Result
 from .._core.text import folded
-from ..engine.events import arm
-from ..engine.lanes import Lanes, start_lanes
+from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
-from ..engine.target import until
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
 from .batches import Known, Rounds, Tiles, tiles_of
@@ -283,12 +281,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
             continue
         itinerary = route.first
         chart[rows], events[rows] = itinerary.charts, itinerary.begins
-        one = found.legs_t[rows[0]], itinerary.charts, found.legs_q[rows[0]].T
-        system = from_host(first_of(_some(systems, rows[:1])))
-        own = dataclasses.replace(map, system=system)
-        lanes = start_lanes(own.structure, *one)
-        watched = own.watch(lanes, until(lanes.t))
-        armed[rows] = arm(own.structure, lanes, watched, map.expected).armed
+        armed[rows] = itinerary.armed
         more = np.full((S, len(itinerary.events)), -1)
         more[rows] = itinerary.events
         codes = _wider(codes, more)

@@ -18,43 +18,28 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import identity, whole
 from .._core.execution import in_threads
-from .._core.executor import on_the_cpu, to_host
-from ..engine.itinerary.rows import LEGS, Form, Itinerary, recorded
+from .._core.executor import on_the_cpu
+from ..engine.itinerary.rows import LEGS, Form, Itinerary
 from ..engine.itinerary.turn import Passage
-from ..engine.lanes import side_by_side
-from .repeat import Corrected, Maps, Plan, correct, levels_of, turn
-from .return_map import CLOSED, ReturnMap
-from .scale import ROUNDING, has_implicit
+from .repeat import (
+    Corrected,
+    Maps,
+    Plan,
+    Route,
+    agrees,
+    correct,
+    judge,
+    route_of,
+    travel,
+)
+from .return_map import ReturnMap
 
 
 # Lanes of a call. More: their arrays leave the cache. Fewer: calls cost more.
 TILE = 250
-# Steps of an itinerary for each one that the search took, first for all systems, then for those
-# whose errors are too large. More: turns last longer. Fewer: more systems need the second.
-_DENSITY, _FINER = 0.9, 1.6
-# Steps of the second integration, which shares no node with the first.
-_OTHER_DENSITY = 0.75
-# Largest distance, in sizes of the states, of the end of the second integration from its beginning,
-# and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
-# Smaller: errors of the second integration refuse cycles.
-_APART, _ROUGH = 1e-6, 1e3
-# Largest last correction of an event's time, as a part of the period. Larger: an event that the
-# corrections have not reached passes. Smaller: rounding errors of times do not.
-_LAST = 1e-10
 # Rounds in which systems begin from neighbors, and routes that searches find for systems that no
 # route suits. More: hopeless systems cost more. Fewer: more are left to the search.
 _ROUNDS, _SEARCHES = 4, 6
-
-
-class Route(NamedTuple):
-    """The itinerary of a known cycle."""
-
-    map: ReturnMap
-    """Of the known cycle."""
-    first: Itinerary
-    finer: Itinerary
-    other: Itinerary
-    """Of the second integration."""
 
 
 class Found(NamedTuple):
@@ -69,15 +54,6 @@ class Found(NamedTuple):
     factors: Float[np.ndarray, "S K d d"]
     distance: Float[np.ndarray, " S"]
     turns: Int[np.ndarray, " S"]
-
-
-def route_of(map: ReturnMap) -> Route:
-    """The route of a cycle, the fixed point of a return map."""
-    map = to_host(map)
-    pieces = side_by_side(to_host(map.pieces()))
-    densities = _DENSITY, _DENSITY * _FINER, _OTHER_DENSITY
-    s, levels = map.structure, levels_of(map)
-    return Route(map, *(recorded(s, pieces, levels, density) for density in densities))
 
 
 class Many(NamedTuple):
@@ -96,35 +72,18 @@ class Many(NamedTuple):
         """Newton's method for some systems on a route, from states and ends of legs."""
         itinerary = route.finer if finer else route.first
         found: Corrected = self._in_tiles(_correct, route, itinerary, rows, q, ends)
-        passage = found.passage
-        sizes = np.asarray(route.map.sizes)
-        durations = np.diff(passage.ends, axis=1, prepend=self.t[rows, None])
-        converged = np.isfinite(found.excess) & (found.excess <= 1)
-        converged &= found.distance <= CLOSED
-        # (Rounding makes the last legs, which last no time, negative.)
-        forwards = durations >= -ROUNDING * self.expected[rows, None]
-        kept = ~passage.left & forwards.all(axis=1)
-        kept &= passage.last <= _LAST * self.expected[rows]
-        fine = passage.error <= 1
+        judged = judge(route, found, self.t[rows], self.expected[rows])
+        converged, kept, fine = judged
         good = np.flatnonzero(converged & kept & fine)
         if len(good):
-            start = found.q[good], passage.ends[good]
-            other: Passage = self._in_tiles(
-                _travel, route, route.other, rows[good], *start
-            )
-            apart = np.max(np.abs(other.q - found.q[good]) / sizes, axis=1)
-            same = np.isfinite(apart) & (apart <= _APART) & (other.error <= _ROUGH)
-            kept[good] &= (
-                same
-                & ~other.left
-                & _moves(route.first.events, found.q[good], passage, good, sizes)
-            )
+            start = found.q[good], found.passage.ends[good]
+            other = self._in_tiles(_travel, route, route.other, rows[good], *start)
+            kept[good] &= agrees(route, found.q[good], other)
         return _Attempt(rows, found, converged, kept, fine)
 
     def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
         """A function of all lanes, in calls of one size."""
-        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
-        plan = Plan(itinerary.rows, *counts)
+        plan = Plan.of(itinerary)
         map = jax.tree_util.tree_map(jnp.asarray, route.map)
         program = whole(function, (itinerary.form,), (map,), loops=True)
 
@@ -159,26 +118,12 @@ class _Attempt(NamedTuple):
         return self.converged & self.kept & self.fine
 
 
-def _moves(events, q, passage: Passage, good, sizes) -> Bool[np.ndarray, " n"]:
-    """Test whether cycles are no equilibria: whether some state moves, or an event happens."""
-    if events:
-        return np.ones(len(q), bool)
-    apart = np.abs(passage.legs_q[good] - q[:, None]) / sizes
-    return apart.max(axis=(1, 2)) > _APART
-
-
 def _correct(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
     return correct(Maps(map, *numbers), form, plan, q, ends)
 
 
 def _travel(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
-    """The turn by another method, with other steps."""
-    import diffrax
-
-    maps = Maps(map, *numbers)
-    # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
-    solver = None if has_implicit(map.structure) else diffrax.Dopri8(scan_kind="lax")
-    return turn(maps, form, plan, q, ends, solver=solver, columns=False)[0]
+    return travel(Maps(map, *numbers), form, plan, q, ends)
 
 
 class Solver:

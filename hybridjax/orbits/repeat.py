@@ -16,18 +16,38 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.executor import namespace, to_host
 from .._core.vector_math import factorizations
-from ..engine.itinerary.rows import LEGS, Form, Rows
+from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
+from ..engine.lanes import Lanes, Tape, side_by_side
 from ..linear.time_response import monodromy
 from .crossing import Crossing, ListLevels
-from .return_map import ReturnMap
+from .return_map import CLOSED, ReturnMap
+from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
 
 
 # Turns before a lane is given up. Fewer: distant cycles are left to the search. More: lanes that
 # will not converge keep the others of their call waiting.
 MOST_TURNS = 10
+
+
+# Size of a Newton step, relative to the tolerance, at which no further turn is taken. Larger:
+# residuals stay near the tolerance. Smaller: one turn more for most lanes.
+_SMALL = 0.05
+# Steps of an itinerary for each one that the search took, first for all systems, then for those
+# whose errors are too large. More: turns last longer. Fewer: more systems need the second.
+_DENSITY, _FINER = 0.9, 1.6
+# Steps of the second integration, which shares no node with the first.
+_OTHER_DENSITY = 0.75
+# Largest distance, in sizes of the states, of the end of the second integration from its beginning,
+# and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
+# Smaller: errors of the second integration refuse cycles.
+_APART, _ROUGH = 1e-6, 1e3
+# Largest last correction of an event's time, as a part of the period. Larger: an event that the
+# corrections have not reached passes. Smaller: rounding errors of times do not.
+_LAST = 1e-10
 
 
 class Plan(NamedTuple):
@@ -38,6 +58,35 @@ class Plan(NamedTuple):
     """Of rows; None for all of them (see `follow`)."""
     last: Int[Array, ""]
     """Number of the last leg."""
+
+    @classmethod
+    def of(cls, itinerary: Itinerary) -> "Plan":
+        """That of a loop that ends with the last row."""
+        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
+        return cls(itinerary.rows, *counts)
+
+
+class Route(NamedTuple):
+    """The itinerary of a known cycle."""
+
+    map: ReturnMap
+    """Of the known cycle."""
+    first: Itinerary
+    finer: Itinerary
+    other: Itinerary
+    """Of the second integration."""
+
+
+def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
+    """The route of a cycle, the fixed point of a return map.
+
+    **Arguments:** `turn`: the recorded pieces, side by side. Default: those of another turn.
+    """
+    map = to_host(map)
+    turn = side_by_side(to_host(map.pieces())) if turn is None else turn
+    densities = _DENSITY, _DENSITY * _FINER, _OTHER_DENSITY
+    s, levels = map.structure, levels_of(map)
+    return Route(map, *(recorded(s, turn, levels, density) for density in densities))
 
 
 class Corrected(NamedTuple):
@@ -157,21 +206,22 @@ def _solve(
 
 def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
     def again(carry):
-        before, q = carry
+        before, q, settled = carry
         passage, residual = turn(maps, form, plan, q, before.passage.ends)
         steps = maps.each(_newton, passage.factors, residual, q)
         jacobian, step, excess, distance = steps
         found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
-        done = before.excess <= 1
-        found = jax.tree_util.tree_map(ft.partial(_where, done), before, found)
-        return found, _where(done, q, q + step)
+        found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
+        # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
+        closed = (excess <= _SMALL) | ((excess <= 1) & (before.excess <= 1))
+        return found, _where(settled, q, q + step), settled | closed
 
     def going(carry):
-        found, _ = carry
-        return ((found.excess > 1) & (found.turns < MOST_TURNS)).any()
+        found, _, settled = carry
+        return (~settled & (found.turns < MOST_TURNS)).any()
 
     # (A first turn before the loop would be compiled twice.)
-    begin = _nothing_yet(q, ends), q
+    begin = _nothing_yet(q, ends), q, jnp.zeros(q.shape[:-1], bool)
     return jax.lax.while_loop(going, again, begin)[0]
 
 
@@ -191,21 +241,22 @@ def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def _root(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+def _root(maps: Maps, form: Form, plan: Plan, q, ends, reverse: bool) -> Corrected:
     return _corrected(maps, form, plan, q, ends)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
     """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp; nothing else of the result has derivatives."""
-    maps, form, plan, *_ = primals
+    maps, form, plan, *_, reverse = primals
     found = _root(*primals)
     q, ends = found.q, found.passage.ends
     fixed = jax.tree_util.tree_map(lambda _: None, maps.map.settings)
     t_maps = eqx.tree_at(
         lambda x: x.map.settings, tangents[0], fixed, is_leaf=lambda x: x is None
     )
-    residual = lambda maps: turn(maps, form, plan, q, ends, columns=False)[1]  # noqa: E731
+    options: Any = dict(columns=False, reverse=reverse)
+    residual = lambda maps: turn(maps, form, plan, q, ends, **options)[1]  # noqa: E731
     _, moved = eqx.filter_jvp(residual, (maps,), (t_maps,))
     passage, _ = turn(maps, form, plan, q, ends)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
@@ -214,16 +265,60 @@ def _root_jvp(primals, tangents):
 
 
 def correct(
-    maps: Maps, form: Form, plan: Plan, q, ends, *, derivatives: bool = False
+    maps: Maps,
+    form: Form,
+    plan: Plan,
+    q,
+    ends,
+    *,
+    derivatives: bool = False,
+    reverse: bool = False,
 ) -> Corrected:
     """Newton's method on an itinerary.
 
     **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: whether
-    the result has those of the cycles, for which the last turn is repeated.
+    the result has those of the cycles, for which the last turn is repeated; in `reverse` mode, too.
     """
     if not derivatives:
         return _corrected(maps, form, plan, q, ends)
     still = jax.lax.stop_gradient
-    found = _root(maps, form, plan, still(q), still(ends))
-    passage, _ = turn(maps, form, plan, found.q, still(found.passage.ends))
+    found = _root(maps, form, plan, still(q), still(ends), reverse)
+    passage, _ = turn(
+        maps, form, plan, found.q, still(found.passage.ends), reverse=reverse
+    )
     return found._replace(passage=passage)
+
+
+def travel(maps: Maps, form: Form, plan: Plan, q, ends) -> Passage:
+    """The second integration of turns: by another method, with other steps."""
+    import diffrax
+
+    # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
+    implicit = has_implicit(maps.map.structure)
+    solver = None if implicit else diffrax.Dopri8(scan_kind="lax")
+    return turn(maps, form, plan, q, ends, solver=solver, columns=False)[0]
+
+
+def judge(route: Route, found: Corrected, t, expected) -> tuple:
+    """Whether Newton's method converged, whether the route was kept, and whether its steps were
+    fine enough, of lanes with these times of the anchor and expected periods."""
+    passage, xp = found.passage, namespace(found.q)
+    converged = xp.isfinite(found.excess) & (found.excess <= 1)
+    converged = converged & (found.distance <= CLOSED)
+    begins = xp.concatenate([t[..., None], passage.ends[..., :-1]], axis=-1)
+    # (Rounding makes the last legs, which last no time, negative.)
+    forwards = passage.ends - begins >= -ROUNDING * expected[..., None]
+    kept = ~passage.left & forwards.all(axis=-1)
+    kept = kept & (passage.last <= _LAST * expected)
+    if not route.first.events:
+        apart = xp.abs(passage.legs_q - found.q[..., None, :]) / route.map.sizes
+        kept = kept & (apart.max(axis=(-2, -1)) > _APART)  # (it is no equilibrium)
+    return converged, kept, passage.error <= 1
+
+
+def agrees(route: Route, q, other: Passage) -> Bool[Array, "*L"]:
+    """Whether a second integration from states q closes, and keeps the route."""
+    xp = namespace(q)
+    apart = xp.max(xp.abs(other.q - q) / route.map.sizes, axis=-1)
+    same = xp.isfinite(apart) & (apart <= _APART)
+    return same & (other.error <= _ROUGH) & ~other.left

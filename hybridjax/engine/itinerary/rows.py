@@ -15,8 +15,9 @@ from ..._core.lanes import shared
 from ...systems.structure import Kind, Structure
 from ...systems.transition import Scheduled
 from .. import kernels
+from ..events import await_schedules, with_schedules
 from ..lanes import ARRIVE_LEVEL, IDLE, Lanes, Tape
-from ..replay import Moves, recorded_moves
+from ..replay import recorded_moves
 from ..target import AbstractLevels
 
 
@@ -106,6 +107,8 @@ class Itinerary(NamedTuple):
     """Charts in which the pieces begin."""
     begins: Int[np.ndarray, " K"]
     """Numbers of events before them."""
+    armed: Bool[np.ndarray, "G K"]
+    """Transitions that are armed there."""
     events: tuple[int, ...]
     """Indices of transitions, in order."""
 
@@ -196,6 +199,7 @@ def recorded(
     table = _Table()
     unknown = np.zeros(legs[0].begins.shape[1], int)
     charts: list[int] = []
+    armed: list[np.ndarray] = []
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
         a = leg.chart
         if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
@@ -205,6 +209,7 @@ def recorded(
                 new = dict(piece=len(charts), states=s.dims[a])
                 table.add(Body(PIECE), k, unknown, **new)
                 charts.append(a)
+                armed.append(_armed(s, a, t, leg.signs(t)))
             step = dict(first=j == 0, fraction=fraction)
             table.add(Body(STEP, a), k, leg.signs(t), **step)
         _end(s, table, k, leg, goes_on=k < len(legs) - 1)
@@ -213,7 +218,17 @@ def recorded(
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
         table.include(Body(SECTION, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
-    return _finished(table, ends, np.array(charts, np.int32), events)
+    begins = np.array(charts, np.int32), np.stack(armed, axis=1)
+    return _finished(table, ends, *begins, events)
+
+
+def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
+    """Transitions that are armed in chart a, where watched functions have these signs."""
+    armed = np.zeros((len(s.transitions), 1), bool)
+    for place, g in enumerate(s.guards(a)):
+        armed[g] = signs[place] > 0
+    time = np.array([t])
+    return with_schedules(s, armed, await_schedules(s, armed, time, time))[:, 0]
 
 
 def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
@@ -329,7 +344,7 @@ def _jump(s: Structure, g: int, at_once: bool) -> tuple[Body, int]:
     return Body(JUMP, a, kind, at_once), kind.index(g)
 
 
-def _finished(table: _Table, ends, charts, events: tuple[int, ...]) -> Itinerary:
+def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> Itinerary:
     """The itinerary of a table, filled up with empty rows."""
     used = len(table.rows)
     width = len(table.rows[0][-1])
@@ -347,4 +362,4 @@ def _finished(table: _Table, ends, charts, events: tuple[int, ...]) -> Itinerary
     ends = np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS))
     form = Form(bodies, len(ends), len(rows.body), width)
     before = rows.leg[rows.piece < LEGS]
-    return Itinerary(form, rows, used, ends, last, charts, before, events)
+    return Itinerary(form, rows, used, ends, last, charts, before, armed, events)

@@ -22,8 +22,11 @@ Solver: TypeAlias = Any
 
 
 @ft.lru_cache
-def solver_of(method: Method) -> Solver:
-    """The solver of diffrax with the coefficients of an explicit method; an implicit one itself."""
+def solver_of(method: Method, reverse: bool = False) -> Solver:
+    """The solver of diffrax with the coefficients of an explicit method; an implicit one itself.
+
+    **Arguments:** `reverse`: whether reverse mode will differentiate its steps.
+    """
     if method.implicit:
         return method
     import diffrax
@@ -44,7 +47,8 @@ def solver_of(method: Method) -> Solver:
         def order(self, terms):
             return round(method.order) - 1
 
-    return Explicit(scan_kind="lax")
+    # (The stages are a loop: unrolled, they compile for twice as long and run 5 to 20 % faster.)
+    return Explicit(scan_kind="bounded" if reverse else "lax")
 
 
 def field(s: Structure, a: int, t, q) -> Float[Array, " n"]:

@@ -66,6 +66,7 @@ def follow(
     *,
     solver: Solver | None = None,
     columns: bool = True,
+    reverse: bool = False,
 ) -> Passage:
     """Follow an itinerary from a time and a state.
 
@@ -73,7 +74,7 @@ def follow(
     reverse mode needs. `levels`: of the section at the end; None for a turn that ends at `ends[-1]`.
     `begin`, `ends` (guessed ends of legs), and the result: of each lane. `solver`: for all charts;
     None for that of each chart. `columns`: whether derivatives are computed; otherwise factors are
-    meaningless.
+    meaningless. `reverse`: whether reverse mode will differentiate it.
     """
     d = begin[1].shape[-1]
     C = d if columns else 0
@@ -88,7 +89,10 @@ def follow(
     def branch(body: Body) -> Callable[[Rows, Course], Course]:
         def of_lane(numbers, course, row):
             s = travelers.of(numbers)
-            pairs = lambda a: solver_of(s.method(a)) if solver is None else solver  # noqa: E731
+
+            def pairs(a):
+                return solver_of(s.method(a), reverse) if solver is None else solver
+
             bodies = Bodies(s, levels, settings, form.watched, pairs)
             return bodies.of(body)(row, course)
 

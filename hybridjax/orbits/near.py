@@ -1,0 +1,180 @@
+"""A cycle near one that is known: a call that repeats another with other numbers.
+
+It follows the route of the known cycle, as one program, also inside of programs of users and with
+derivatives. Outside of these, what leaves the route goes to the search.
+"""
+
+import collections
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import eval_context
+
+from .._core.compilation import at_ease, identity, whole
+from .._core.executor import from_host, is_traced, is_tracer, on_the_cpu
+from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
+from .._core.memo import Memory
+from .._core.results import Result, update_result
+from ..engine.itinerary.rows import Form
+from ..engine.lanes import Lanes
+from ..systems.system import copies_of
+from ..systems.transition import TOGETHER
+from .cycle import LimitCycle
+from .linear_flow import hosted, last_turn
+from .repeat import (
+    Corrected,
+    Plan,
+    Route,
+    agrees,
+    correct,
+    judge,
+    leaves_of,
+    maps_of,
+    route_of,
+    travel,
+)
+from .return_map import ReturnMap
+
+
+# Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
+# not used again. More: repeated calls stay slow for longer.
+_WORTH_COMPILING = 3
+_routes = Memory()
+_calls: collections.Counter = collections.Counter()
+
+
+def route_near(guess: LimitCycle) -> Route | None:
+    """The route of a cycle; None for one that is traced, or closes after several turns."""
+    if is_traced(guess) or guess.multiplicity > 1 or int(guess.result) != Result.OK:
+        return None
+    with eval_context(), on_the_cpu(), at_ease():  # (also while a program is traced)
+        guess = hosted(guess)
+        make = lambda: route_of(guess.return_map, last_turn(guess))  # noqa: E731
+        return _routes.recall(guess, None, make)
+
+
+def _beginning(route: Route, map: ReturnMap) -> tuple:
+    """The state and the ends of legs from which Newton's method begins."""
+    grown = map.expected / float(route.map.expected)
+    ends = map.anchor.t + route.first.ends * grown
+    return jnp.asarray(route.map.anchor.q[:, 0]), ends
+
+
+def traced_cycle(route: Route, map: ReturnMap) -> LimitCycle:
+    """The cycle of a return map whose system is traced, with derivatives.
+
+    A cycle that leaves the route has a result code.
+    """
+    traced = [x.size for x in leaves_of(map) if is_tracer(x)]
+    few = sum(traced) <= JACOBIAN_COLUMNS
+    found = (by_jacobian(_found) if few else _found)(map, route, not few)
+    return _cycle(route, map, found, _result(route, map, found))
+
+
+def _found(map: ReturnMap, route: Route, reverse: bool) -> Corrected:
+    itinerary = route.first
+    plan = Plan(itinerary.rows, None, jnp.asarray(itinerary.last))
+    options: Any = dict(derivatives=True, reverse=reverse)
+    begin = _beginning(route, map)
+    return correct(maps_of(map), itinerary.form, plan, *begin, **options)
+
+
+def _result(route: Route, map: ReturnMap, found: Corrected):
+    """The code of a cycle."""
+    still = jax.lax.stop_gradient
+    t, expected = still(map.anchor.t[0]), still(map.expected)
+    converged, kept, fine = judge(route, still(found), t, expected)
+    result = jnp.zeros_like(found.turns, dtype=jnp.int32)
+    result = update_result(result, ~converged, Result.NOT_CONVERGED)
+    result = update_result(result, ~kept, Result.EVENT_ORDER)
+    result = update_result(result, ~fine, Result.STEP_LIMIT)
+    together = _coincide(route, found, expected)
+    return update_result(result, together, Result.COINCIDENCE)
+
+
+def _coincide(route: Route, found: Corrected, expected):
+    """Whether two events come together that do not on the known cycle."""
+    count = len(route.first.events)
+    pairs = [k for k in range(1, count) if _apart(route, k)]
+    between = [found.passage.ends[k] - found.passage.ends[k - 1] for k in pairs]
+    if not between:
+        return jnp.asarray(False)
+    return (jnp.stack(between) <= TOGETHER * expected).any()
+
+
+def _apart(route: Route, k: int) -> bool:
+    ends, period = route.first.ends, float(route.map.expected)
+    return bool(ends[k] - ends[k - 1] > TOGETHER * period)
+
+
+def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
+    """The cycle of a return map near a known one; None if a search is needed: where the route is
+    left, does not lead to a cycle, or is not compiled yet."""
+    route = route_near(guess)
+    if route is None:
+        return None
+    form = route.first.form
+    arrays = jax.tree_util.tree_map(jnp.asarray, map)
+    key = form, identity((arrays,))
+    _calls[key] += 1
+    if _calls[key] < _WORTH_COMPILING:
+        return None
+    begin = [np.asarray(x) for x in _beginning(route, map)]
+    t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
+    with on_the_cpu():
+        for itinerary in (route.first, route.finer):
+            program = whole(_correct, (form,), (arrays,), loops=True)
+            found = program(Plan.of(itinerary), *begin)
+            converged, kept, fine = judge(route, found, t, expected)
+            if fine or not (converged and kept):
+                break
+            begin = [found.q, found.passage.ends]
+        if not (converged and kept and fine):
+            return None
+        program = whole(_travel, (route.other.form,), (arrays,), loops=True)
+        other = program(Plan.of(route.other), found.q, found.passage.ends)
+    if not agrees(route, found.q, other) or _coincide(route, found, expected):
+        return None
+    return from_host(_cycle(route, map, found, np.int32(Result.OK)))
+
+
+def _correct(form: Form, map: ReturnMap, plan: Plan, q, ends) -> Corrected:
+    return correct(maps_of(map), form, plan, q, ends)
+
+
+def _travel(form: Form, map: ReturnMap, plan: Plan, q, ends):
+    return travel(maps_of(map), form, plan, q, ends)
+
+
+def _cycle(route: Route, map: ReturnMap, found: Corrected, result) -> LimitCycle:
+    """The cycle that Newton's method has found."""
+    itinerary, passage = route.first, found.passage
+    K = len(itinerary.charts)
+    pace = np.tile([[0.0], [np.inf], [0.0], [0.0]], K)
+    legs = Lanes(
+        passage.legs_t,
+        itinerary.charts,
+        passage.legs_q.T,
+        itinerary.armed,
+        itinerary.begins,
+        pace,
+    )
+    anchor = map.anchor._replace(q=found.q[:, None])
+    return LimitCycle(
+        map.system,
+        map.base,
+        map.expected if map.base is None else passage.t - map.anchor.t[0],
+        anchor,
+        legs,
+        passage.factors,
+        found.distance,
+        found.turns,
+        result,
+        itinerary.events,
+        map.settings,
+        map.conserved,
+        map.multiplicity,
+        copies_of(map.system),
+    )
