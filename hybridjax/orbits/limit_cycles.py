@@ -245,7 +245,7 @@ def solved(
         rounds = part._replace(known=near).solve(len(left))
         cycles = _with_rows(cycles, left, _cycles(part, rounds))
         coincide[left] = rounds.together
-    return examined(cycles, coincide, solver.found.route >= 0)
+    return examined(cycles, coincide, solver.found.path >= 0)
 
 
 def _search(map: ReturnMap) -> ReturnMap | None:
@@ -271,15 +271,14 @@ def _some(systems: HybridSystem, rows) -> HybridSystem:
 
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
     """The cycles that were found on routes; NaN for the others."""
-    found, s, S = solver.found, map.structure, len(solver.found.route)
+    found, s, S = solver.found, map.structure, len(solver.found.path)
     G, K = len(s.transitions), found.legs_t.shape[1]
     chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
     armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
-    for number, route in enumerate(solver.routes):
-        rows = np.flatnonzero(found.route == number)
+    for path, itinerary in enumerate(solver.itineraries):
+        rows = np.flatnonzero(found.path == path)
         if not len(rows):
             continue
-        itinerary = route.first
         chart[rows], events[rows] = itinerary.charts, itinerary.begins
         armed[rows] = itinerary.armed
         more = np.full((S, len(itinerary.events)), -1)
@@ -298,7 +297,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
     if map.event >= 0:
         anchor.armed[:, map.event] = False
     period = found.period if map.base is not None else solver.many.expected
-    missing = found.route < 0
+    missing = found.path < 0
     return LimitCycles(
         systems,
         map.base,
@@ -326,7 +325,7 @@ def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
 
 def _singular(found: Found, map: ReturnMap) -> Int[np.ndarray, " S"]:
     """OK, or `SINGULAR` for cycles that are not isolated."""
-    return np.full(len(found.route), int(Result.OK))
+    return np.full(len(found.path), int(Result.OK))
 
 
 def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
@@ -334,11 +333,11 @@ def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
     found, out = solver.found, np.zeros(len(cycles), bool)
     at_event = isinstance(cycles.base, AtEvent)
     begin = cycles.anchor.t[:, 0] if at_event else np.full(len(out), -np.inf)
-    for number, route in enumerate(solver.routes):
-        rows = np.flatnonzero(found.route == number)
-        events = route.first.events
+    for path, itinerary in enumerate(solver.itineraries):
+        rows = np.flatnonzero(found.path == path)
+        events = itinerary.events
         if len(rows) and events:
-            times = solver.ends(number)[rows][:, : len(events)]
+            times = solver.ends(path)[rows][:, : len(events)]
             codes = np.tile(np.array(events), (len(rows), 1))
             out[rows] = together(codes, times, begin[rows], cycles.period[rows])
     return out

@@ -28,6 +28,7 @@ from .repeat import (
     Route,
     agrees,
     correct,
+    factors_across,
     judge,
     route_of,
     travel,
@@ -45,8 +46,8 @@ _ROUNDS, _SEARCHES = 4, 6
 class Found(NamedTuple):
     """The cycles of S systems, some of them found; S is the leading axis of every array."""
 
-    route: Int[np.ndarray, " S"]
-    """Number of the route; negative for systems without a cycle."""
+    path: Int[np.ndarray, " S"]
+    """Number of the itinerary; negative for systems without a cycle."""
     q: Float[np.ndarray, "S d"]
     period: Float[np.ndarray, " S"]
     legs_t: Float[np.ndarray, "S K"]
@@ -153,7 +154,7 @@ class Solver:
         for number in range(len(self.routes)):
             self._take(number)
         for _ in range(_SEARCHES):
-            known = np.flatnonzero(self.found.route >= 0)
+            known = np.flatnonzero(self.found.path >= 0)
             if not len(self.pending) or not len(known):
                 return
             distance, near = self.nearest(self.pending, known)
@@ -191,38 +192,44 @@ class Solver:
             coarse = attempt.converged & attempt.kept & ~attempt.fine
             if coarse.any():
                 start = attempt.found.q[coarse], attempt.found.passage.ends[coarse]
-                self._keep(
-                    number, many.attempt(route, rows[coarse], *start, finer=True)
-                )
+                again = many.attempt(route, rows[coarse], *start, finer=True)
+                self._keep(number, again, finer=True)
             # (What has converged, and left the route, needs another one.)
             rows = rows[~attempt.converged]
-            known = np.flatnonzero(self.found.route == number)
+            known = np.flatnonzero(self.found.path // 2 == number)
             if not len(rows) or not attempt.ok.any():
                 break
             _, near = self.nearest(rows, known)
             q, ends = self.found.q[near], self._ends[number][near]
-        self.pending = np.flatnonzero(self.found.route < 0)
+        self.pending = np.flatnonzero(self.found.path < 0)
 
-    def _keep(self, number: int, attempt: _Attempt) -> None:
+    def _keep(self, number: int, attempt: _Attempt, finer: bool = False) -> None:
         """Keep the cycles that an attempt has found."""
-        ok = np.flatnonzero(attempt.ok)
+        ok, route = np.flatnonzero(attempt.ok), self.routes[number]
+        itinerary = route.finer if finer else route.first
         rows, found = attempt.rows[ok], attempt.found
         passage, out = found.passage, self.found
-        out.route[rows] = number
+        out.path[rows] = 2 * number + finer
         out.q[rows] = found.q[ok]
         out.period[rows] = (passage.t - self.many.t[attempt.rows])[ok]
         out.legs_t[rows] = passage.legs_t[ok]
         out.legs_q[rows] = passage.legs_q[ok]
-        out.factors[rows] = passage.factors[ok]
+        factors = factors_across(route.map, itinerary, passage)
+        out.factors[rows] = factors[ok]
         out.distance[rows] = found.distance[ok]
         out.turns[rows] = found.turns[ok]
         S, E = len(self.many.t), passage.ends.shape[1]
         ends = self._ends.setdefault(number, np.full((S, E), np.nan))
         ends[rows] = passage.ends[ok]
 
-    def ends(self, number: int) -> Float[np.ndarray, "S E"]:
-        """Ends of legs of the systems on a route; NaN for others."""
-        return self._ends[number]
+    @property
+    def itineraries(self) -> list[Itinerary]:
+        """Those of all routes, two of each."""
+        return [x for route in self.routes for x in (route.first, route.finer)]
+
+    def ends(self, path: int) -> Float[np.ndarray, "S E"]:
+        """Ends of legs of the systems on an itinerary; NaN for others."""
+        return self._ends[path // 2]
 
 
 # The routes of the last calls: the same call again searches nothing. More: memory. Fewer: calls that

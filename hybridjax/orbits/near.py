@@ -5,6 +5,7 @@ derivatives. Outside of these, what leaves the route goes to the search.
 """
 
 import collections
+import functools as ft
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from .._core.executor import from_host, is_traced, is_tracer, on_the_cpu
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
-from ..engine.itinerary.rows import Form
+from ..engine.itinerary.rows import Form, Itinerary
 from ..engine.lanes import Lanes
 from ..systems.system import copies_of
 from ..systems.transition import TOGETHER
@@ -29,6 +30,7 @@ from .repeat import (
     Route,
     agrees,
     correct,
+    factors_across,
     judge,
     leaves_of,
     maps_of,
@@ -69,12 +71,13 @@ def traced_cycle(route: Route, map: ReturnMap) -> LimitCycle:
     """
     traced = [x.size for x in leaves_of(map) if is_tracer(x)]
     few = sum(traced) <= JACOBIAN_COLUMNS
-    found = (by_jacobian(_found) if few else _found)(map, route, not few)
-    return _cycle(route, map, found, _result(route, map, found))
+    find = ft.partial(_found, route, not few)
+    found = (by_jacobian(find) if few else find)(map)
+    return _cycle(route.finer, route, map, found, _result(route, map, found))
 
 
-def _found(map: ReturnMap, route: Route, reverse: bool) -> Corrected:
-    itinerary = route.first
+def _found(route: Route, reverse: bool, map: ReturnMap) -> Corrected:
+    itinerary = route.finer  # (steps cannot be divided later)
     plan = Plan(itinerary.rows, None, jnp.asarray(itinerary.last))
     options: Any = dict(derivatives=True, reverse=reverse)
     begin = _beginning(route, map)
@@ -137,7 +140,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
         other = program(Plan.of(route.other), found.q, found.passage.ends)
     if not agrees(route, found.q, other) or _coincide(route, found, expected):
         return None
-    return from_host(_cycle(route, map, found, np.int32(Result.OK)))
+    return from_host(_cycle(itinerary, route, map, found, np.int32(Result.OK)))
 
 
 def _correct(form: Form, map: ReturnMap, plan: Plan, q, ends) -> Corrected:
@@ -148,9 +151,11 @@ def _travel(form: Form, map: ReturnMap, plan: Plan, q, ends):
     return travel(maps_of(map), form, plan, q, ends)
 
 
-def _cycle(route: Route, map: ReturnMap, found: Corrected, result) -> LimitCycle:
-    """The cycle that Newton's method has found."""
-    itinerary, passage = route.first, found.passage
+def _cycle(
+    itinerary: Itinerary, route: Route, map: ReturnMap, found: Corrected, result
+) -> LimitCycle:
+    """The cycle that Newton's method has found on an itinerary of a route."""
+    passage = found.passage
     K = len(itinerary.charts)
     pace = np.tile([[0.0], [np.inf], [0.0], [0.0]], K)
     legs = Lanes(
@@ -168,7 +173,7 @@ def _cycle(route: Route, map: ReturnMap, found: Corrected, result) -> LimitCycle
         map.expected if map.base is None else passage.t - map.anchor.t[0],
         anchor,
         legs,
-        passage.factors,
+        factors_across(route.map, itinerary, passage),
         found.distance,
         found.turns,
         result,

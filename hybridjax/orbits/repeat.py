@@ -23,7 +23,7 @@ from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..linear.time_response import monodromy
 from .crossing import Crossing, ListLevels
-from .return_map import CLOSED, ReturnMap
+from .return_map import CLOSED, ReturnMap, across
 from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
 
@@ -38,7 +38,7 @@ MOST_TURNS = 10
 _SMALL = 0.05
 # Steps of an itinerary for each one that the search took, first for all systems, then for those
 # whose errors are too large. More: turns last longer. Fewer: more systems need the second.
-_DENSITY, _FINER = 0.9, 1.6
+_DENSITY, _FINER = 0.9, 2.0
 # Steps of the second integration, which shares no node with the first.
 _OTHER_DENSITY = 0.75
 # Largest distance, in sizes of the states, of the end of the second integration from its beginning,
@@ -229,7 +229,7 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     """The beginning of Newton's method."""
     lanes, d, K = q.shape[:-1], q.shape[-1], LEGS
     zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
-    legs = zeros(K), zeros(K, d), zeros(K, d, d)
+    legs = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
     passage = Passage(zeros(), q, ends, *legs, zeros(), zeros(), inside)
     unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
@@ -289,6 +289,21 @@ def correct(
     return found._replace(passage=passage)
 
 
+def factors_across(
+    map: ReturnMap, itinerary: Itinerary, passage: Passage
+) -> Float[Array, "*L K d d"]:
+    """The factors of the monodromy matrix; of an autonomous system, on the states modulo the
+    direction of the flow."""
+    if map.base is None:
+        return passage.factors
+    xp, lanes = namespace(passage.q), passage.q.ndim - 1
+    sizes = xp.asarray(map.scale)[itinerary.charts]
+    sizes = xp.broadcast_to(sizes, passage.rates.shape)
+    first = lambda x: xp.moveaxis(x, lanes, 0)  # noqa: E731
+    factors = across(first(passage.rates), first(sizes), first(passage.factors))
+    return xp.moveaxis(factors, 0, lanes)
+
+
 def travel(maps: Maps, form: Form, plan: Plan, q, ends) -> Passage:
     """The second integration of turns: by another method, with other steps."""
     import diffrax
@@ -305,12 +320,13 @@ def judge(route: Route, found: Corrected, t, expected) -> tuple:
     passage, xp = found.passage, namespace(found.q)
     converged = xp.isfinite(found.excess) & (found.excess <= 1)
     converged = converged & (found.distance <= CLOSED)
-    begins = xp.concatenate([t[..., None], passage.ends[..., :-1]], axis=-1)
-    # (Rounding makes the last legs, which last no time, negative.)
-    forwards = passage.ends - begins >= -ROUNDING * expected[..., None]
+    ends = passage.ends[..., : route.first.last + 1]
+    durations = ends - xp.concatenate([t[..., None], ends[..., :-1]], axis=-1)
+    # (Rounding makes legs that last no time negative.)
+    forwards = durations >= -ROUNDING * expected[..., None]
     kept = ~passage.left & forwards.all(axis=-1)
     kept = kept & (passage.last <= _LAST * expected)
-    if not route.first.events:
+    if route.map.base is not None and not route.first.events:
         apart = xp.abs(passage.legs_q - found.q[..., None, :]) / route.map.sizes
         kept = kept & (apart.max(axis=(-2, -1)) > _APART)  # (it is no equilibrium)
     return converged, kept, passage.error <= 1

@@ -29,6 +29,8 @@ class Course(NamedTuple):
     t: Float[Array, ""]
     y: Float[Array, "1+C d"]
     """The state, then its columns."""
+    rate: Float[Array, " d"]
+    """The field where the present piece began."""
     begin: Float[Array, ""]
     """Time at which the present leg began."""
     delay: Float[Array, " C"]
@@ -79,11 +81,14 @@ class Bodies:
         }[body.does]
         return lambda row, course: work(body, row, course)
 
-    def _piece(self, _: Body, row: Rows, course: Course) -> Course:
+    def _piece(self, body: Body, row: Rows, course: Course) -> Course:
         """A piece begins: columns begin anew. (`follow` keeps those of the last one.)"""
-        d, C = course.y.shape[1], course.y.shape[0] - 1
-        unit = jnp.where(jnp.arange(d) < row.states, jnp.eye(C, d), 0.0)
-        return course._replace(y=course.y.at[1:].set(unit))
+        n, d, C = self.s.dims[body.chart], course.y.shape[1], course.y.shape[0] - 1
+        unit = jnp.where(jnp.arange(d) < n, jnp.eye(C, d), 0.0)
+        rate = self._field(body.chart, course.t, self._state(body.chart, course))
+        return course._replace(
+            y=course.y.at[1:].set(unit), rate=jnp.pad(rate, (0, d - n))
+        )
 
     def _schedule(self, body: Body, row: Rows, course: Course) -> Course:
         """A leg begins whose end is known: the tick nearest to the guess."""

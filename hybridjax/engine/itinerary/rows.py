@@ -56,8 +56,6 @@ class Rows(NamedTuple):
     """Of a jump: index of the transition among those of its kind."""
     piece: Int[np.ndarray, " R"]
     """Number of the piece that begins; `LEGS` for none."""
-    states: Int[np.ndarray, " R"]
-    """Of a piece: number of states."""
     onward: Bool[np.ndarray, " R"]
     """Of a jump: whether the trajectory goes on after it."""
     signs: Int[np.ndarray, "R G"]
@@ -70,7 +68,7 @@ class Body(NamedTuple):
 
     does: int
     chart: int = -1
-    """Of steps and sections."""
+    """In which it begins."""
     kind: Kind = ()
     """Of jumps."""
     at_once: bool = False
@@ -123,7 +121,7 @@ class _Table:
 
     def __init__(self):
         self.rows: list[tuple] = []
-        self.bodies: list[Body] = [Body(NOTHING), Body(PIECE)]
+        self.bodies: list[Body] = [Body(NOTHING)]
 
     def include(self, bodies: Iterable[Body]) -> None:
         """Have bodies compiled, whether rows use them or not."""
@@ -140,12 +138,11 @@ class _Table:
         target: int = -1,
         place: int = 0,
         piece: int = LEGS,
-        states: int = 0,
         onward: bool = True,
     ) -> None:
         self.include([body])
         number = self.bodies.index(body)
-        places = target, place, piece, states
+        places = target, place, piece
         self.rows.append((number, leg, first, fraction, *places, onward, signs))
 
 
@@ -164,7 +161,7 @@ class _Leg(NamedTuple):
 
     def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
         """Beginnings of steps, and the end, with so many steps for each recorded one."""
-        if self.at_once:
+        if self.at_once or self.times[-1] == self.times[0]:
             return self.times[-1:]
         moves = len(self.times) - 1
         count = max(1, int(np.ceil(moves * density - 1e-9)))
@@ -174,6 +171,7 @@ class _Leg(NamedTuple):
     def signs(self, t: float) -> Int[np.ndarray, " G"]:
         """Signs at a time; 0 for what changes its sign in the recorded move there."""
         move = int(np.searchsorted(self.times, t, side="right")) - 1
+        move = min(move, len(self.begins) - 1)
         if t == self.times[move]:
             return self.begins[move]
         return np.where(self.begins[move] == self.ends[move], self.begins[move], 0)
@@ -206,8 +204,7 @@ def recorded(
             table.add(Body(SCHEDULE, a, (leg.code,)), k, unknown)
         for j, (t, fraction) in enumerate(zip(times, _fractions(times), strict=False)):
             if (k, j) in pieces:
-                new = dict(piece=len(charts), states=s.dims[a])
-                table.add(Body(PIECE), k, unknown, **new)
+                table.add(Body(PIECE, a), k, unknown, piece=len(charts))
                 charts.append(a)
                 armed.append(_armed(s, a, t, leg.signs(t)))
             step = dict(first=j == 0, fraction=fraction)
@@ -217,6 +214,7 @@ def recorded(
     if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
         table.include(Body(SECTION, leg.chart) for leg in legs)
+    table.include(Body(PIECE, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
     begins = np.array(charts, np.int32), np.stack(armed, axis=1)
     return _finished(table, ends, *begins, events)
@@ -352,7 +350,7 @@ def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> It
         table.add(Body(NOTHING), 0, np.zeros(width, int))
     columns = [np.array(x) for x in zip(*table.rows, strict=True)]
     number = np.int32
-    types = number, number, bool, float, *[number] * 4, bool, number
+    types = number, number, bool, float, *[number] * 3, bool, number
     rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))

@@ -26,6 +26,8 @@ class Passage(NamedTuple):
     legs_t: Float[Array, " K"]
     legs_q: Float[Array, "K d"]
     """Times and states at the beginnings of pieces."""
+    rates: Float[Array, "K d"]
+    """The field there."""
     factors: Float[Array, "K d d"]
     """Derivatives of the states at the ends of pieces by those at their beginnings."""
     error: Float[Array, ""]
@@ -83,8 +85,18 @@ def follow(
         zero = jnp.zeros_like(t)
         unknown = jnp.full(form.watched, jnp.inf), jnp.ones(form.watched)
         y = jnp.concatenate([q[None], jnp.eye(C, d)])
-        before, inside = Watched(t, *unknown), jnp.asarray(False)
-        return Course(t, y, t, jnp.zeros(C), ends, before, zero, zero, inside)
+        return Course(
+            t=t,
+            y=y,
+            rate=jnp.zeros(d),
+            begin=t,
+            delay=jnp.zeros(C),
+            ends=ends,
+            before=Watched(t, *unknown),
+            error=zero,
+            last=zero,
+            left=jnp.asarray(False),
+        )
 
     def branch(body: Body) -> Callable[[Rows, Course], Course]:
         def of_lane(numbers, course, row):
@@ -105,10 +117,11 @@ def follow(
     branches = [branch(body) for body in form.bodies]
 
     def one(carry, row: Rows):
-        course, times, states = carry
+        course, times, states, rates = carry
         times = times.at[row.piece].set(course.t)
         states = states.at[row.piece].set(course.y)
-        return (jax.lax.switch(row.body, branches, row, course), times, states), None
+        course = jax.lax.switch(row.body, branches, row, course)
+        return (course, times, states, rates.at[row.piece].set(course.rate)), None
 
     def numbered(k, carry):
         return one(carry, jax.tree_util.tree_map(lambda x: x[k], rows))[0]
@@ -117,12 +130,12 @@ def follow(
     course = along(depart)(*begin, ends)
     # (Rows at which no piece begins write into one more place.)
     kept = lambda x: jnp.zeros((LEGS + 1, *x.shape))  # noqa: E731
-    carry = course, kept(course.t), kept(course.y)
+    carry = course, kept(course.t), kept(course.y), kept(course.rate)
     if count is None:
-        (course, times, states), _ = jax.lax.scan(one, carry, rows)
+        (course, times, states, rates), _ = jax.lax.scan(one, carry, rows)
     else:
         rows = jax.tree_util.tree_map(jnp.asarray, rows)
-        course, times, states = jax.lax.fori_loop(0, count, numbered, carry)
+        course, times, states, rates = jax.lax.fori_loop(0, count, numbered, carry)
     # (Columns begin anew with each piece: those before are the factors.)
     factors = jnp.concatenate([states[1:LEGS], course.y[None]])[..., 1:, :]
     last = lambda x: jnp.moveaxis(x, 0, 1) if travelers.many else x  # noqa: E731
@@ -132,6 +145,7 @@ def follow(
         course.ends,
         last(times[:LEGS]),
         last(states[:LEGS, ..., 0, :]),
+        last(rates[:LEGS]),
         jnp.swapaxes(last(factors), -1, -2),
         course.error,
         course.last,

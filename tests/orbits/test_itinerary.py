@@ -1,0 +1,128 @@
+"""Cycles that follow the itinerary of a known one: as the search finds them, or not at all."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybridjax as hj
+from hybridjax.orbits import limit_cycles, near
+
+
+class Free(hj.Chart):
+    states = ("x", "v")
+    system: hj.HybridSystem
+
+    def field(self, t, q, u):
+        x, v = q
+        s = self.system
+        return v, -x - s.damping * v + s.drive * jnp.cos(1.3 * t) + u[0]
+
+
+class Rebound(hj.HybridSystem):
+    """A mass on a spring, driven by a clock, beside a stop at x = 1."""
+
+    drive: hj.Parameter = hj.parameter(0.3)
+    damping: hj.Parameter = hj.parameter(0.4)
+    restitution: hj.Parameter = hj.parameter(0.6)
+
+    def charts(self):
+        return {"free": Free(self)}
+
+    def transitions(self):
+        def bounce(t, q, u):
+            return q[0], -self.restitution * q[1]
+
+        def stop(t, q, u):
+            return q[0] - 1
+
+        return [hj.Transition("bounce", "free", "free", stop, "rising", bounce)]
+
+    def period(self):
+        return 2 * jnp.pi / 1.3
+
+    def guess(self):
+        return hj.Guess("free", (0.3, 0.0))
+
+
+@pytest.fixture(scope="module")
+def free():
+    return hj.find_limit_cycle(Rebound())
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """Calls follow itineraries from the first one on."""
+    monkeypatch.setattr(near, "_WORTH_COMPILING", 1)
+
+
+def amplitude(drive):
+    """Of the free motion, in closed form."""
+    return drive / np.hypot(1 - 1.3**2, 0.4 * 1.3)
+
+
+def test_a_repeated_cycle_is_that_of_the_closed_form(free, compiled):
+    cycle = hj.find_limit_cycle(Rebound(drive=0.5), free)
+    x = np.max(np.abs(np.asarray(cycle.legs.q[0])))
+    largest = np.max(cycle.trajectory().dense(64)[2][:, 0])
+    assert abs(largest - amplitude(0.5)) < 1e-3 * x
+    # A turn damps by exp(-damping T) in two directions.
+    product = np.prod(cycle.multipliers).real
+    assert abs(product - np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-11
+
+
+def test_an_event_that_is_new_goes_to_the_search(free, compiled):
+    assert amplitude(2.0) > 1
+    cycle = hj.find_limit_cycle(Rebound(drive=2.0), free)
+    assert [cycle.structure.transitions[g].name for g in cycle.event_sequence] == [
+        "bounce"
+    ]
+    # The rebound keeps the product of the multipliers, less the squared restitution.
+    product = np.prod(cycle.multipliers).real
+    assert abs(product - 0.6**2 * np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-9
+
+
+def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
+    @jax.jit
+    def result(drive):
+        return hj.find_limit_cycle(Rebound(drive=drive), free).result
+
+    assert result(0.5) == hj.Result.OK
+    assert result(2.0) == hj.Result.EVENT_ORDER
+
+
+def test_gradients_inside_of_programs_are_differences(free):
+    def state(drive, damping):
+        system = Rebound(drive=drive, damping=damping)
+        cycle = hj.find_limit_cycle(system, free)
+        monodromy = jnp.linalg.multi_dot(cycle.factors[::-1])
+        return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
+
+    value = jax.jit(state)
+    by_drive, by_damping = jax.jit(jax.grad(state, argnums=(0, 1)))(0.5, 0.4)
+    h = 1e-4
+    differences = (
+        (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h),
+        (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h),
+    )
+    assert np.allclose((by_drive, by_damping), differences, rtol=1e-6)
+    forward = jax.jit(jax.jacfwd(state, argnums=(0, 1)))(0.5, 0.4)
+    assert np.allclose(forward, (by_drive, by_damping), rtol=1e-10)
+
+
+def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
+    """Where the clock's phase of the anchor lies in stance for some, in flight for others."""
+    monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
+    k, b = np.meshgrid(np.linspace(8, 13, 8), np.linspace(3, 7, 8))
+    make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
+    systems = make(jnp.asarray(k.ravel()), jnp.asarray(b.ravel()))
+    guess = hj.find_limit_cycle(hj.models.VerticalHopper())
+    cycles = hj.find_limit_cycles(systems, guess)
+    assert cycles.ok.all()
+    charts = np.asarray(cycles.anchor.chart)[:, 0]
+    assert len(np.unique(charts)) == 2
+    for i in (0, 7, 20, 63, int(np.argmin(charts))):
+        alone = hj.find_limit_cycle(cycles[i].system)
+        found = cycles.multipliers[i][: len(alone.multipliers)]
+        assert np.allclose(np.sort(found), np.sort(alone.multipliers), atol=1e-8)
