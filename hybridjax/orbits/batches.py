@@ -1,5 +1,4 @@
-"""Cycles of many systems side by side, each from a guess of its own: in lanes of the host, or in
-compiled calls if there are many."""
+"""Cycles of systems side by side, each from a guess of its own, in lanes of the host."""
 
 import dataclasses
 import functools as ft
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.compilation import TwoTiers, at_ease, uncollected
+from .._core.compilation import at_ease, uncollected
 from .._core.execution import in_threads
 from .._core.executor import on_the_cpu, to_host
 from .._core.lanes import PerLane
@@ -86,18 +85,6 @@ def _settle(map: ReturnMap, periods: int):
     return _apart(map, anchor._replace(chart=moved.lanes.chart, q=q)), expected
 
 
-def _turns(systems, map: ReturnMap, anchor: Lanes, period, wanted):
-    """`_turn` of every system from its anchor, in JAX."""
-
-    def of_one(system, anchor, expected):
-        other = dataclasses.replace(
-            map, system=system, anchor=anchor, expected=expected
-        )
-        return _turn(other, wanted)
-
-    return eqx.filter_vmap(of_one)(systems, anchor, period)
-
-
 class Rounds(NamedTuple):
     """The last Newton step of S systems; S is the leading axis of every array."""
 
@@ -140,8 +127,6 @@ class Tiles(NamedTuple):
     size: int
     """Systems in one call."""
     workers: int
-    program: Callable | None
-    """`_turn` of systems with a leading axis, compiled; `None` for turns on the host."""
     known: Known | None = None
 
     @property
@@ -351,11 +336,11 @@ class Tiles(NamedTuple):
         """`function` of the return maps of some systems, and of further arguments, in calls of few
         sizes. (JAX compiles operations on numbers of systems for each size.)"""
         arrays, static = eqx.partition(self.systems, eqx.is_array)
-        program, map = self.program if function is _turn else None, self.map
+        map = self.map
 
         def run(k):
             left = len(rows) - k
-            size = self.size if program else min(self.size, -(-left // WIDE) * WIDE)
+            size = min(self.size, -(-left // WIDE) * WIDE)
             tile = np.arange(k, k + size) % len(rows)
             systems = _pick(arrays, rows[tile])
             begin, expected, *further = _pick((anchor, period, *others), tile)
@@ -363,21 +348,17 @@ class Tiles(NamedTuple):
                 expected = self.periods[rows[tile]]
             grown = expected / map.expected if map.base is None else np.ones(size)
             begin = begin._replace(t=map.anchor.t * grown[:, None])
-            if program:
-                systems = eqx.combine(systems, static)
-                results = program(systems, map, begin, expected, *further, *options)
-            else:
-                last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
-                split = (True,) * len(jax.tree_util.tree_leaves(last))
-                side = PerLane(eqx.combine(jax.device_put(last), static), split)
-                begin = jax.tree_util.tree_map(
-                    lambda x: np.moveaxis(x[..., 0], 0, -1), begin
+            last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
+            split = (True,) * len(jax.tree_util.tree_leaves(last))
+            side = PerLane(eqx.combine(jax.device_put(last), static), split)
+            begin = jax.tree_util.tree_map(
+                lambda x: np.moveaxis(x[..., 0], 0, -1), begin
+            )
+            replaced: Any = dict(system=side, anchor=begin, expected=expected)
+            with on_the_cpu(), at_ease():
+                results = function(
+                    dataclasses.replace(map, **replaced), *further, *options
                 )
-                replaced: Any = dict(system=side, anchor=begin, expected=expected)
-                with on_the_cpu(), at_ease():
-                    results = function(
-                        dataclasses.replace(map, **replaced), *further, *options
-                    )
             return _pick(then(results), slice(left))
 
         tiles = range(0, len(rows), self.size)
@@ -392,13 +373,12 @@ def tiles_of(
     require_similar(
         map, eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static)
     )
-    large, periods = total > SMALL, None
+    periods = None
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
-    size = min(size or (BATCH if large else 4 * WIDE), total)
-    program = TwoTiers(_turns, large=True) if large else None
-    return Tiles(systems, to_host(map), periods, size, workers, program)
+    size = min(size or 4 * WIDE, total)
+    return Tiles(systems, to_host(map), periods, size, workers)
 
 
 def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:

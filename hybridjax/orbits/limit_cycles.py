@@ -31,7 +31,7 @@ from .cycle import LimitCycle, require_unchanged
 from .guess import require_similar
 from .many import Found, Many, Solver
 from .newton import search as newton
-from .repeat import leaves_of
+from .repeat import has_route, leaves_of
 from .return_map import ReturnMap, turn_product
 from .verdict import verdict
 
@@ -219,7 +219,7 @@ def solved(
     """
     S = len(leaves_of(systems)[0])
     tiles = tiles_of(systems, map, size, workers, total or S)._replace(known=known)
-    if S < WORTH_COMPILING or map.multiplicity > 1:
+    if S < WORTH_COMPILING or not has_route(map):
         return as_cycles(tiles, tiles.solve(S))
     expected = np.full(S, float(map.expected))
     expected = expected if tiles.periods is None else tiles.periods

@@ -31,6 +31,7 @@ from .repeat import (
     agrees,
     correct,
     factors_across,
+    has_route,
     judge,
     leaves_of,
     maps_of,
@@ -48,8 +49,10 @@ _calls: collections.Counter = collections.Counter()
 
 
 def route_near(guess: LimitCycle) -> Route | None:
-    """The route of a cycle; None for one that is traced, or closes after several turns."""
-    if is_traced(guess) or guess.multiplicity > 1 or int(guess.result) != Result.OK:
+    """The route of a cycle; None for one that has none (see `has_route`), or is traced."""
+    if is_traced(guess) or int(guess.result) != Result.OK:
+        return None
+    if not has_route(guess.return_map):
         return None
     with eval_context(), on_the_cpu(), at_ease():  # (also while a program is traced)
         guess = hosted(guess)

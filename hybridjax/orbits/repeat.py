@@ -22,6 +22,7 @@ from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..linear.time_response import monodromy
+from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
 from .return_map import CLOSED, ReturnMap, across
 from .scale import ROUNDING, has_implicit
@@ -39,8 +40,8 @@ _SMALL = 0.05
 # Steps of an itinerary for each one that the search took, first for all systems, then for those
 # whose errors are too large. More: turns last longer. Fewer: more systems need the second.
 _DENSITY, _FINER = 0.9, 2.0
-# Steps of the second integration, which shares no node with the first.
-_OTHER_DENSITY = 0.75
+# Steps of the second integration for each one of the first: they share no node.
+_OTHER = 0.83
 # Largest distance, in sizes of the states, of the end of the second integration from its beginning,
 # and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
 # Smaller: errors of the second integration refuse cycles.
@@ -77,6 +78,13 @@ class Route(NamedTuple):
     """Of the second integration."""
 
 
+def has_route(map: ReturnMap) -> bool:
+    """Test whether the flags of a route tell all that may happen beside it: not whether a cycle of
+    several turns closes sooner, nor whether a scheduled event has become enabled."""
+    scheduled = [x for x in map.structure.transitions if isinstance(x.guard, Scheduled)]
+    return map.multiplicity == 1 and all(x.enabled is None for x in scheduled)
+
+
 def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     """The route of a cycle, the fixed point of a return map.
 
@@ -84,8 +92,10 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     """
     map = to_host(map)
     turn = side_by_side(to_host(map.pieces())) if turn is None else turn
-    densities = _DENSITY, _DENSITY * _FINER, _OTHER_DENSITY
     s, levels = map.structure, levels_of(map)
+    # (Steps of implicit methods differ much in length: joined ones have large errors.)
+    density = _FINER if has_implicit(s) else _DENSITY
+    densities = density, density * _FINER, density * _OTHER
     return Route(map, *(recorded(s, turn, levels, density) for density in densities))
 
 

@@ -6,7 +6,6 @@ Cycles of many systems and the command line are tested here too, since one progr
 import shutil
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -221,27 +220,6 @@ def test_systems_that_are_alike_or_undefined(wheel):
     )
     assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
     assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
-
-
-@pytest.mark.slow
-def test_many_systems_are_compiled_and_factorize_nothing(wheel, monkeypatch):
-    """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
-    systems = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(
-        wheel.system.slope * np.linspace(1.0, 1.1, 4)
-    )
-    few = hj.find_limit_cycles(systems, wheel, execution=FOUR)
-    monkeypatch.setattr(batches, "SMALL", 0)
-    many = hj.find_limit_cycles(systems, wheel, execution=FOUR)
-    np.testing.assert_allclose(many.period, few.period, rtol=1e-10)
-    np.testing.assert_allclose(many.factors, few.factors, atol=1e-8)
-    assert many.ok.all() and many[3].event_sequence == few[3].event_sequence == (0,)
-    repeat = lambda x: np.repeat(np.asarray(x)[None], 4, 0)  # noqa: E731
-    start, period = jax.tree_util.tree_map(repeat, (wheel.anchor, wheel.period))
-    arguments = systems, wheel.return_map, start, period, jnp.array(True)
-    assert (
-        "@lapack_"
-        not in eqx.filter_jit(batches._turns).lower(*arguments).lowered.as_text()
-    )
 
 
 def test_a_guess_with_too_long_a_period(wheel):

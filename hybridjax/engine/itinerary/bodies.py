@@ -16,11 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...systems.structure import Member, Structure
-from ...systems.transition import Scheduled
+from ...systems.transition import SAME_TIME, Scheduled
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
 from .rows import JUMP, NOTHING, PIECE, SCHEDULE, SECTION, STEP, Body, Rows
+
+
+# Times of a schedule are equal if they differ by less than this part of its period. Larger: an event
+# that is due shortly before another one is left out. Smaller: rounding separates the beginning of
+# a leg from the tick with which it begins.
+_SAME_TICK = 10 * SAME_TIME
 
 
 class Course(NamedTuple):
@@ -147,6 +153,7 @@ class Bodies:
         moved = jnp.concatenate([after[None], columns])
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
         left = course.left | self._has_left(a, row, course, now, q)
+        left = left | self._has_tick(a, course, t)
         return course._replace(
             t=t,
             y=y,
@@ -171,12 +178,13 @@ class Bodies:
             arrived = jnp.outer(jnp.append(late, delay), field)
             y = y.at[:, :n].add(arrived)
         t = course.t + late
+        left = course.left | self._has_left(a, row, course, now, q)
         return course._replace(
             t=t,
             y=y,
             ends=course.ends.at[row.leg].set(t),
             last=jnp.maximum(course.last, jnp.abs(late)),
-            left=course.left | self._has_left(a, row, course, now, q),
+            left=left | self._has_tick(a, course, t),
         )
 
     # Functions of a chart.
@@ -256,6 +264,18 @@ class Bodies:
         other = (jnp.sign(held) * row.signs < 0).any()
         dips = _dips(course.before, now) & (row.signs > 0)
         return other | dips.any()
+
+    def _has_tick(self, a: int, course: Course, t) -> Bool[Array, ""]:
+        """Test whether a scheduled event was due in a leg that ends at t, before its end."""
+        due = jnp.asarray(False)
+        for g in self.s.schedules(a):
+            guard = self.s.transitions[g].guard
+            assert isinstance(guard, Scheduled)
+            offset, period = guard.numbers(t)
+            before = jnp.floor((course.begin - offset) / period + _SAME_TICK)
+            last = jnp.ceil((t - offset) / period - _SAME_TICK) - 1
+            due = due | (last > before)
+        return jax.lax.stop_gradient(due)
 
 
 def _newton(now: Watched, target) -> Float[Array, ""]:

@@ -84,7 +84,7 @@ def _implicit(s: Structure, a: int, method: Method, t, y, h):
 
     def whole(q):
         end = take_step(method, lanes, t[None], q[:, None], h[None], still=lanes)
-        return end.q[:, 0], end.local[:, 0]
+        return end.q[:, 0], end.error[:, 0]
 
     end, linear, error = jax.linearize(whole, y[0], has_aux=True)
     return jnp.concatenate([end[None], jax.vmap(linear)(y[1:])]), error
