@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.executor import namespace, to_host
+from .._core.executor import namespace, svdvals, to_host
 from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
+from ..engine.unresolved import may_have_pulses
 from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
-from .return_map import CLOSED, ReturnMap, across
+from .return_map import CLOSED, SINGULAR, ReturnMap, across
 from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
 
@@ -80,9 +81,13 @@ class Route(NamedTuple):
 
 def has_route(map: ReturnMap) -> bool:
     """Test whether the flags of a route tell all that may happen beside it: not whether a cycle of
-    several turns closes sooner, nor whether a scheduled event has become enabled."""
-    scheduled = [x for x in map.structure.transitions if isinstance(x.guard, Scheduled)]
-    return map.multiplicity == 1 and all(x.enabled is None for x in scheduled)
+    several turns closes sooner, a scheduled event has become enabled, or a field has a pulse that
+    is shorter than a step."""
+    s = map.structure
+    scheduled = [x for x in s.transitions if isinstance(x.guard, Scheduled)]
+    if map.multiplicity > 1 or any(x.enabled is not None for x in scheduled):
+        return False
+    return not any(may_have_pulses(s, a) for a in range(len(s.charts)))
 
 
 def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
@@ -336,6 +341,10 @@ def judge(route: Route, found: Corrected, t, expected) -> tuple:
     forwards = durations >= -ROUNDING * expected[..., None]
     kept = ~passage.left & forwards.all(axis=-1)
     kept = kept & (passage.last <= _LAST * expected)
+    # (On a cycle that is not isolated, Newton's method ends anywhere.)
+    sizes = route.map.sizes
+    defect = found.jacobian * sizes / sizes[:, None]
+    kept = kept & (xp.min(svdvals(defect), axis=-1) >= SINGULAR)
     if route.map.base is not None and not route.first.events:
         apart = xp.abs(passage.legs_q - found.q[..., None, :]) / route.map.sizes
         kept = kept & (apart.max(axis=(-2, -1)) > _APART)  # (it is no equilibrium)
