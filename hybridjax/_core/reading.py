@@ -91,6 +91,9 @@ _DESCRIPTIONS = frozenset(
 # figure, a session) is read for longer than tracing takes. Fewer: large systems are traced again
 # at each call.
 _MOST = 20_000
+# Notes of which a hash is taken at once. Fewer: readings take longer. More: long lists of numbers
+# fill the memory.
+_AT_ONCE = 1000
 # Bytes of an array that a mark digests. More: calls take longer than tracing does. Fewer: systems
 # with tables are traced again at each call.
 _LARGE = 1_000_000
@@ -131,6 +134,7 @@ class Reading:
         self.retraced = False
         self._marks = marks
         self._hash = hashlib.blake2b(digest_size=16)
+        self._words: list[tuple] = []  # of which the hash is not yet taken
         self._number: dict[int, int] = {}
         self._alive: list[Any] = []  # an id belongs to an object while this lives
         self._attributes: set[tuple[int, Names]] = set()
@@ -142,11 +146,18 @@ class Reading:
             text = f"`{self._function_name}` reads too many objects to compare"
             self.unread.append(text)
             self.hidden.append(text)
+        self._take_hash()
         self.digest = self._hash.hexdigest()
         self._alive.clear()
 
     def _note(self, *words: Any) -> None:
-        self._hash.update(repr(words).encode())
+        self._words.append(words)
+        if len(self._words) == _AT_ONCE:
+            self._take_hash()
+
+    def _take_hash(self) -> None:
+        self._hash.update(repr(self._words).encode())
+        self._words.clear()
 
     def _visit_all(self, things: Iterable[Any]) -> None:
         things = list(things)

@@ -25,7 +25,7 @@ from .._core.html import (
 from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
-from .._core.progress import once_in_call
+from .._core.call import once_in_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -125,7 +125,7 @@ class LimitCycle(eqx.Module):
             require_unchanged(self.system, self.numbers)
             require_as_made(self.base, "this limit cycle was found")
 
-        once_in_call(self, compare)
+        once_in_call(("compared", id(self)), self, compare)
 
     def require_found(self) -> None:
         """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
