@@ -8,6 +8,7 @@ traced again, and the programs are compared. This is left out if a reading of th
 
 import collections
 import contextlib
+import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -120,8 +121,9 @@ def _identity(x: Any) -> Hashable:
     if kind is dict:
         return kind, *((_identity(k), _identity(y)) for k, y in x.items())
     if isinstance(x, eqx.Module):
-        items = vars(x).items()
-        return kind, *((k, _identity(y)) for k, y in items if k != "code_digest")
+        names = (field.name for field in dataclasses.fields(x))
+        values = (getattr(x, name, None) for name in names if name != "code_digest")
+        return kind, *map(_identity, values)
     return id(x)
 
 
