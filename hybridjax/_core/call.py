@@ -1,4 +1,4 @@
-"""A public call: a function of this package that a user calls, with all that it calls.
+"""A public call: a function of this package that a user's line calls, with all that it calls.
 
 Whether the user's code has changed is looked at once in a public call, and functions of the user
 that are no part of a program (`charts`, `transitions`) are called once.
@@ -6,61 +6,61 @@ that are no part of a program (`charts`, `transitions`) are called once.
 
 import contextlib
 import contextvars
-import os
-import pathlib
+import sys
 import types
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
+
+from .reading import is_of_package
 
 
 Value = TypeVar("Value")
 
-_PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
-_MODELS = os.path.join(_PACKAGE, "models")
 
-# What was computed in the public call that is running, with the objects to which it belongs.
-_of_call: contextvars.ContextVar[dict[Hashable, tuple[Any, Any]] | None]
-_of_call = contextvars.ContextVar("of_call", default=None)
+class _Call(NamedTuple):
+    """The frame of the user's line, and what was computed in the call by key, each value with the
+    object to which it belongs."""
+
+    frame: types.FrameType | None
+    values: dict[Hashable, tuple[Any, Any]]
+
+
+_running: contextvars.ContextVar[_Call | None]
+_running = contextvars.ContextVar("public call", default=None)
+
+
+def _frame_of_user() -> types.FrameType | None:
+    """The innermost frame of code that belongs to no package."""
+    frame: types.FrameType | None = sys._getframe(1)
+    while frame is not None and is_of_package(frame.f_code.co_filename):
+        frame = frame.f_back
+    return frame
 
 
 @contextlib.contextmanager
-def public_call(caller: types.FrameType | None) -> Iterator[None]:
-    """A context of a call: a public call of its own, or a part of that which is running if this
-    package is the caller. (A user's function that this package calls may change a value, and then
-    call this package.)"""
-    if _of_call.get() is not None and _is_own(caller):
+def public_call() -> Iterator[None]:
+    """A context of a call: a public call of its own, or a part of the one that is running if no
+    code of the user stands between them."""
+    frame, call = _frame_of_user(), _running.get()
+    if call is not None and call.frame is frame:
         yield
         return
-    token = _of_call.set({})
+    token = _running.set(_Call(frame, {}))
     try:
         yield
     finally:
-        _of_call.reset(token)
-
-
-def _is_own(caller: types.FrameType | None) -> bool:
-    """Test for code of this package. (Equinox stands between a class and its caller.)"""
-    while caller is not None and _root(caller) == "equinox":
-        caller = caller.f_back
-    if caller is None or _root(caller) != "hybridjax":
-        return False
-    path = caller.f_code.co_filename
-    return path.startswith(_PACKAGE) and not path.startswith(_MODELS)
-
-
-def _root(frame: types.FrameType) -> str:
-    return str(frame.f_globals.get("__name__")).partition(".")[0]
+        _running.reset(token)
 
 
 def once_in_call(key: Hashable, owner: Any, make: Callable[[], Value]) -> Value:
-    """Return what `make` returned in this public call for the same key; outside of all calls, what
-    it returns.
+    """Return what `make` returned for the same key in this public call; what it returns, outside of
+    all, or in a function of the user that a public call calls (and that may change a value).
 
     **Arguments:** `owner`: the object whose `id` is part of the key, which lives as long.
     """
-    values = _of_call.get()
-    if values is None:
+    call = _running.get()
+    if call is None or call.frame is not _frame_of_user():
         return make()
-    if key not in values:
-        values[key] = make(), owner
-    return values[key][0]
+    if key not in call.values:
+        call.values[key] = make(), owner
+    return call.values[key][0]

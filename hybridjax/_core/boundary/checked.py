@@ -110,7 +110,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     @functools.wraps(function)
     def call(*args, **kwargs):
         try:
-            with public_call(sys._getframe(1)), as_numpy():
+            with public_call(), as_numpy():
                 args, kwargs = kinds.take(args, kwargs)
                 return function(*args, **kwargs)
         except Misfit as misfit:
