@@ -21,6 +21,7 @@ import random
 import re
 import sys
 import sysconfig
+import threading
 import types
 import weakref
 from collections.abc import Iterable
@@ -49,6 +50,9 @@ _OF_C = frozenset(
     )
 )
 
+# Objects without a value, which `functools.cached_property` holds.
+_LOCKS = type(threading.Lock()), type(threading.RLock())
+
 # Functions that read files, the names of values, or the system.
 _HIDDEN = re.compile(
     "eval|exec|globals|__import__|import_module|getenv|check_output|urlopen|popen"
@@ -67,8 +71,9 @@ _UNSURE = frozenset(
 # the ones with these names.
 _PURE = frozenset(
     "builtins math cmath operator _operator functools _functools itertools dataclasses typing "
-    "collections abc enum numbers fractions decimal string re copy types contextlib numpy jax "
-    "jaxlib equinox jaxtyping hybridjax _thread".split()
+    "collections _collections abc enum numbers fractions decimal string re reprlib copy types "
+    "contextlib numpy jax jaxlib equinox jaxtyping lineax optimistix diffrax hybridjax "
+    "_thread".split()
 )
 _DRAWN = frozenset(
     "random default_rng pure_callback io_callback now config devices ctypeslib".split()
@@ -224,6 +229,8 @@ class Reading:
                 self._note(x.__name__, x.__objclass__.__qualname__)
             case np.dtype():
                 self._note(str(x))
+            case _ if kind in _LOCKS:
+                pass
             case _:
                 self._object(x)
 
@@ -270,7 +277,8 @@ class Reading:
     def _function(self, x: types.FunctionType) -> None:
         is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
-            self._packaged(x.__module__ or "", x.__qualname__)
+            # (A wrapper of a package may bear the name of the user's module.)
+            self._packaged(str(x.__globals__.get("__name__")), x.__qualname__)
         else:
             self._function_name = x.__qualname__
             self._visit(x.__code__)
