@@ -189,7 +189,7 @@ class Structure:
 
     @ft.cached_property
     def _charts(self) -> dict[str, Chart]:
-        return self._once_in_call("charts", self.system.charts)
+        return self._once_in_call("charts", lambda: self.system.charts())
 
     @ft.cached_property
     def charts(self) -> list[Chart]:
@@ -255,10 +255,17 @@ class Structure:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation.py`)."""
         name = function, form, static, lanes
-        every = self, *trees
-        return self.once(
-            name, trees, lambda: kernel(function, form, static, every, lanes)
-        )
+
+        def make():
+            return kernel(function, form, static, (self, *trees), lanes)
+
+        def make_once():
+            if type(self) is not Structure:  # (it has more than its source)
+                return make()
+            key = name, *map(id, (self.source, *trees))
+            return once_in_call(key, (self.source, trees), make)
+
+        return self.once(name, trees, make_once)
 
     # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
     by_system = False
