@@ -138,18 +138,19 @@ def _digest_of(x: Definition) -> str:
     read = _read.recall(type(x), None, collections.OrderedDict)
     known = _digests.get(reading.digest) if reading.digest in read else None
     # (JAX may remember traces of a time between, when a function computed something else.)
-    remembered = not reading.retraced or reading.digest in _remembered
+    remembered = reading.digest in _remembered
     if known is not None and not reading.unread and remembered:
         return known
     arrays = _shapes(x)
-    programs = _traced(x, arrays, reading, anew=reading.retraced)
+    anew = reading.retraced or not remembered
+    programs = _traced(x, arrays, reading, anew)
     names = [keystr(path) for path, _ in tree_leaves_with_path(arrays)]
     digest = digest_of_words(*names, *itertools.chain(*programs.items()))
     if digest != known or not remembered:
         # (A function may change a value that it reads.)
         after = Reading(_with_forms(x), marks=True)
         moves = bool(reading.unread) or after.digest != reading.digest
-        _require_the_same(x, arrays, reading, programs, moves)
+        _require_the_same(x, arrays, reading, programs, anew, moves)
     _keep(read, reading.digest, None)
     _keep(_digests, reading.digest, digest)
     _keep(_programs, digest, programs)
@@ -268,18 +269,20 @@ def _require_the_same(
     arrays: Any,
     reading: Reading,
     programs: dict[str, str],
+    anew: bool,
     moves: bool,
 ) -> None:
-    """Compare programs with the one that JAX remembers, and with other traces if a value `moves`.
+    """Compare programs, if they were traced `anew`, with those that JAX remembers, and with other
+    traces if a value `moves`.
 
     **Raises:** `DefinitionError` for a part that computes another value each time.
     """
-    if reading.retraced and _traced(x, arrays, reading, anew=False) != programs:
+    if anew and _traced(x, arrays, reading, anew=False) != programs:
         jax.clear_caches()
         _remembered.clear()
     _keep(_remembered, reading.digest, None)
     for _ in range(_DRAWS if moves else 0):
-        again = _traced(x, arrays, reading, anew=reading.retraced)
+        again = _traced(x, arrays, reading, anew)
         if again == programs:
             continue
         (name, *_) = different(programs, again)

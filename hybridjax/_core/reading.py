@@ -271,14 +271,15 @@ class Reading:
         self._note(module, name, _version(root))
         if root not in _PURE or (root == "builtins" and name in _UNSURE):
             self.unread.append(f"`{module}.{name}`")
-        if name in _RETRACED and root in ("jax", "equinox"):
+        if name.partition(".")[0] in _RETRACED and root in ("jax", "equinox"):
             self.retraced = True
 
     def _function(self, x: types.FunctionType) -> None:
         is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
-            # (A wrapper of a package may bear the name of the user's module.)
-            self._packaged(str(x.__globals__.get("__name__")), x.__qualname__)
+            # (A wrapper of a package may bear the names of a user's function.)
+            module = str(x.__globals__.get("__name__"))
+            self._packaged(module, x.__code__.co_qualname)
         else:
             self._function_name = x.__qualname__
             self._visit(x.__code__)
