@@ -80,10 +80,12 @@ _DRAWN = frozenset(
 )
 _CLOCKS = frozenset("now today utcnow".split())
 _MOVING = frozenset("time random secrets uuid".split())
-# Functions of JAX that remember the trace of a function by its identity.
+# Functions of JAX and its libraries that remember the trace of a function by its identity.
 _RETRACED = frozenset(
     "jit filter_jit scan cond switch while_loop fori_loop map associative_scan checkpoint remat "
-    "filter_checkpoint custom_jvp custom_vjp filter_custom_jvp filter_custom_vjp".split()
+    "filter_checkpoint custom_jvp custom_vjp filter_custom_jvp filter_custom_vjp piecewise reduce "
+    "closure_convert filter_closure_convert odeint diffeqsolve root_find fixed_point minimise "
+    "least_squares linear_solve FunctionLinearOperator".split()
 )
 # What Python and its tools write into classes.
 _DESCRIPTIONS = frozenset(
