@@ -4,6 +4,7 @@ Whether the user's code has changed is looked at once in a public call, and func
 that are no part of a program (`charts`, `transitions`) are called once.
 """
 
+import collections
 import contextlib
 import contextvars
 import sys
@@ -16,13 +17,17 @@ from .reading import is_of_package
 
 Value = TypeVar("Value")
 
+# Values that are kept in a call, some 30 for each system. Fewer: systems that take turns are looked
+# at again. More: a branch of thousands of points fills the memory.
+_KEPT = 1024
+
 
 class _Call(NamedTuple):
     """The frame of the user's line, and what was computed in the call by key, each value with the
     object to which it belongs."""
 
     frame: types.FrameType | None
-    values: dict[Hashable, tuple[Any, Any]]
+    values: collections.OrderedDict[Hashable, tuple[Any, Any]]
 
 
 _running: contextvars.ContextVar[_Call | None]
@@ -45,7 +50,7 @@ def public_call() -> Iterator[None]:
     if call is not None and call.frame is frame:
         yield
         return
-    token = _running.set(_Call(frame, {}))
+    token = _running.set(_Call(frame, collections.OrderedDict()))
     try:
         yield
     finally:
@@ -58,9 +63,14 @@ def once_in_call(key: Hashable, owner: Any, make: Callable[[], Value]) -> Value:
 
     **Arguments:** `owner`: the object whose `id` is part of the key, which lives as long.
     """
-    call = _running.get()
-    if call is None or call.frame is not _frame_of_user():
+    frame, call = _frame_of_user(), _running.get()
+    # (A thread has no frame of the user: several would share the values.)
+    if frame is None or call is None or call.frame is not frame:
         return make()
     if key not in call.values:
         call.values[key] = make(), owner
-    return call.values[key][0]
+    call.values.move_to_end(key)
+    value, _ = call.values[key]
+    while len(call.values) > _KEPT:
+        call.values.popitem(last=False)
+    return value
