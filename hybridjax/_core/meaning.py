@@ -8,7 +8,7 @@ traced again, and the programs are compared. This is left out if a reading of th
 
 import collections
 import contextlib
-import contextvars
+import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -21,6 +21,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.tree_util import keystr, tree_leaves_with_path
 
 from ..errors import DefinitionError
+from .call import once_in_call
 from .executor import Definition
 from .memo import Memory
 from .programs import Digests, digest_of_words
@@ -96,65 +97,60 @@ def code_digest(x: Definition) -> str:
     for another definition whose code reads files, the clock, random numbers, or values by names
     that are computed (`eval`, `globals`, `sys.modules`, ...).
     """
-    digests: dict[tuple, str] | None = _of_call.get(None)
-    leaves, structure = jax.tree_util.tree_flatten(x)
-    key = structure, *(_kind_of_leaf(y) for y in leaves)
-    with contextlib.suppress(TypeError):  # (something in it has no hash)
-        if digests is not None and key in digests:
-            return digests[key]
-    digest = _digest_of(x)
+    digest = once_in_call(("digest", _identity(x)), x, lambda: _digest_of(x))
     if x.code_digest not in ("", digest) and _are_many(x):
         # (Systems side by side have the digest of each.)
         single = _digest_of(first_of(x))
         digest = single if single == x.code_digest else digest
-    with contextlib.suppress(TypeError):
-        if digests is not None:
-            digests[key] = digest
     return digest
 
 
-def _kind_of_leaf(x: Any) -> Hashable:
-    return (x.shape, x.dtype) if eqx.is_array(x) else (type(x), x)
+_NUMBERS_AND_WORDS = bool, int, float, complex, str, bytes, type(None)
 
 
-_of_call: contextvars.ContextVar[dict[tuple, str]] = contextvars.ContextVar("of_call")
-
-
-@contextlib.contextmanager
-def unchanged_code() -> Iterator[None]:
-    """A context of a single call, in which definitions that differ in arrays only have one digest.
-    (Thousands of systems of a sweep are given at once.)"""
-    token = _of_call.set({})
-    try:
-        yield
-    finally:
-        _of_call.reset(token)
+def _identity(x: Any) -> Hashable:
+    """Which object a definition is, but for the values of its arrays: what thousands of systems of
+    a sweep, which are given at once, have in common. (Objects that are equal may differ.)"""
+    kind = type(x)
+    if kind in _NUMBERS_AND_WORDS:
+        return kind, repr(x)
+    if eqx.is_array(x):
+        return x.shape, x.dtype
+    if kind in (tuple, list):
+        return kind, *map(_identity, x)
+    if kind is dict:
+        return kind, *((_identity(k), _identity(y)) for k, y in x.items())
+    if isinstance(x, eqx.Module):
+        names = (field.name for field in dataclasses.fields(x))
+        values = (getattr(x, name, None) for name in names if name != "code_digest")
+        return kind, *map(_identity, values)
+    return id(x)
 
 
 def _digest_of(x: Definition) -> str:
-    without = _without_arrays(x)
     if parts_of.dispatch(type(x)) is parts_of.dispatch(object):
-        reading = Reading(without)
+        reading = Reading(_without_arrays(x))
         _refuse((*reading.hidden, *reading.moving))
         return reading.digest
-    arrays = _shapes(x)
-    reading = Reading(without, str(arrays), marks=True)
+    reading = Reading(_with_forms(x), marks=True)
     # (A class that has not been seen is traced, however much it is like another one.)
     read: collections.OrderedDict[str, None]
     read = _read.recall(type(x), None, collections.OrderedDict)
     known = _digests.get(reading.digest) if reading.digest in read else None
     # (JAX may remember traces of a time between, when a function computed something else.)
-    remembered = not reading.retraced or reading.digest in _remembered
+    remembered = reading.digest in _remembered
     if known is not None and not reading.unread and remembered:
         return known
-    programs = _traced(x, arrays, reading, anew=reading.retraced)
+    arrays = _shapes(x)
+    anew = reading.retraced or not remembered
+    programs = _traced(x, arrays, reading, anew)
     names = [keystr(path) for path, _ in tree_leaves_with_path(arrays)]
     digest = digest_of_words(*names, *itertools.chain(*programs.items()))
     if digest != known or not remembered:
         # (A function may change a value that it reads.)
-        after = Reading(without, str(arrays), marks=True)
+        after = Reading(_with_forms(x), marks=True)
         moves = bool(reading.unread) or after.digest != reading.digest
-        _require_the_same(x, arrays, reading, programs, moves)
+        _require_the_same(x, arrays, reading, programs, anew, moves)
     _keep(read, reading.digest, None)
     _keep(_digests, reading.digest, digest)
     _keep(_programs, digest, programs)
@@ -273,18 +269,20 @@ def _require_the_same(
     arrays: Any,
     reading: Reading,
     programs: dict[str, str],
+    anew: bool,
     moves: bool,
 ) -> None:
-    """Compare programs with the one that JAX remembers, and with other traces if a value `moves`.
+    """Compare programs, if they were traced `anew`, with those that JAX remembers, and with other
+    traces if a value `moves`.
 
     **Raises:** `DefinitionError` for a part that computes another value each time.
     """
-    if reading.retraced and _traced(x, arrays, reading, anew=False) != programs:
+    if anew and _traced(x, arrays, reading, anew=False) != programs:
         jax.clear_caches()
         _remembered.clear()
     _keep(_remembered, reading.digest, None)
     for _ in range(_DRAWS if moves else 0):
-        again = _traced(x, arrays, reading, anew=reading.retraced)
+        again = _traced(x, arrays, reading, anew)
         if again == programs:
             continue
         (name, *_) = different(programs, again)
@@ -335,6 +333,12 @@ def code_of(x: Definition) -> str:
 
 def _without_arrays(x: Definition) -> Any:
     return jax.tree_util.tree_map(lambda y: None if eqx.is_array(y) else y, x)
+
+
+def _with_forms(x: Definition) -> Any:
+    """A definition with types and shapes in place of its arrays."""
+    form = lambda y: f"{y.dtype}{y.shape}" if eqx.is_array(y) else y  # noqa: E731
+    return jax.tree_util.tree_map(form, x)
 
 
 def require_as_made(things: Any, made: str) -> None:

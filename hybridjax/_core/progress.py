@@ -37,8 +37,6 @@ class Call:
     done: int = 0
     step: str = ""
     compiling: bool = False
-    compared: dict[int, Any] = dataclasses.field(default_factory=dict)
-    """Objects whose code has been compared with what it was, once for the whole call."""
 
     def __str__(self) -> str:
         """The current step."""
@@ -53,19 +51,6 @@ class Call:
 # The calls that are running, each inside of the one before.
 _running: list[Call] = []
 _enabled: bool | None = None
-
-
-def whole_call() -> Call:
-    """The call that a user made; a new one outside of all."""
-    return _running[0] if _running else Call("")
-
-
-def once_in_call(owner: Any, compare: Callable[[], None]) -> None:
-    """Compare the code of an object with what it was, if this has not been done in this call."""
-    call = whole_call()
-    if id(owner) not in call.compared:
-        compare()
-        call.compared[id(owner)] = owner
 
 
 @checked

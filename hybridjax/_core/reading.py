@@ -21,6 +21,7 @@ import random
 import re
 import sys
 import sysconfig
+import threading
 import types
 import weakref
 from collections.abc import Iterable
@@ -49,6 +50,9 @@ _OF_C = frozenset(
     )
 )
 
+# Objects without a value, which `functools.cached_property` holds.
+_LOCKS = type(threading.Lock()), type(threading.RLock())
+
 # Functions that read files, the names of values, or the system.
 _HIDDEN = re.compile(
     "eval|exec|globals|__import__|import_module|getenv|check_output|urlopen|popen"
@@ -67,18 +71,21 @@ _UNSURE = frozenset(
 # the ones with these names.
 _PURE = frozenset(
     "builtins math cmath operator _operator functools _functools itertools dataclasses typing "
-    "collections abc enum numbers fractions decimal string re copy types contextlib numpy jax "
-    "jaxlib equinox jaxtyping hybridjax _thread".split()
+    "collections _collections abc enum numbers fractions decimal string re reprlib copy types "
+    "contextlib numpy jax jaxlib equinox jaxtyping lineax optimistix diffrax hybridjax "
+    "_thread".split()
 )
 _DRAWN = frozenset(
     "random default_rng pure_callback io_callback now config devices ctypeslib".split()
 )
 _CLOCKS = frozenset("now today utcnow".split())
 _MOVING = frozenset("time random secrets uuid".split())
-# Functions of JAX that remember the trace of a function by its identity.
+# Functions of JAX and its libraries that remember the trace of a function by its identity.
 _RETRACED = frozenset(
     "jit filter_jit scan cond switch while_loop fori_loop map associative_scan checkpoint remat "
-    "filter_checkpoint custom_jvp custom_vjp filter_custom_jvp filter_custom_vjp".split()
+    "filter_checkpoint custom_jvp custom_vjp filter_custom_jvp filter_custom_vjp piecewise reduce "
+    "closure_convert filter_closure_convert odeint diffeqsolve root_find fixed_point minimise "
+    "least_squares linear_solve FunctionLinearOperator".split()
 )
 # What Python and its tools write into classes.
 _DESCRIPTIONS = frozenset(
@@ -91,6 +98,9 @@ _DESCRIPTIONS = frozenset(
 # figure, a session) is read for longer than tracing takes. Fewer: large systems are traced again
 # at each call.
 _MOST = 20_000
+# Notes of which a hash is taken at once. Fewer: readings take longer. More: long lists of numbers
+# fill the memory.
+_AT_ONCE = 1000
 # Bytes of an array that a mark digests. More: calls take longer than tracing does. Fewer: systems
 # with tables are traced again at each call.
 _LARGE = 1_000_000
@@ -131,6 +141,7 @@ class Reading:
         self.retraced = False
         self._marks = marks
         self._hash = hashlib.blake2b(digest_size=16)
+        self._words: list[tuple] = []  # of which the hash is not yet taken
         self._number: dict[int, int] = {}
         self._alive: list[Any] = []  # an id belongs to an object while this lives
         self._attributes: set[tuple[int, Names]] = set()
@@ -142,11 +153,18 @@ class Reading:
             text = f"`{self._function_name}` reads too many objects to compare"
             self.unread.append(text)
             self.hidden.append(text)
+        self._take_hash()
         self.digest = self._hash.hexdigest()
         self._alive.clear()
 
     def _note(self, *words: Any) -> None:
-        self._hash.update(repr(words).encode())
+        self._words.append(words)
+        if len(self._words) == _AT_ONCE:
+            self._take_hash()
+
+    def _take_hash(self) -> None:
+        self._hash.update(repr(self._words).encode())
+        self._words.clear()
 
     def _visit_all(self, things: Iterable[Any]) -> None:
         things = list(things)
@@ -213,6 +231,8 @@ class Reading:
                 self._note(x.__name__, x.__objclass__.__qualname__)
             case np.dtype():
                 self._note(str(x))
+            case _ if kind in _LOCKS:
+                pass
             case _:
                 self._object(x)
 
@@ -253,13 +273,15 @@ class Reading:
         self._note(module, name, _version(root))
         if root not in _PURE or (root == "builtins" and name in _UNSURE):
             self.unread.append(f"`{module}.{name}`")
-        if name in _RETRACED and root in ("jax", "equinox"):
+        if name.partition(".")[0] in _RETRACED and root in ("jax", "equinox"):
             self.retraced = True
 
     def _function(self, x: types.FunctionType) -> None:
         is_installed = is_of_package(x.__code__.co_filename)
         if is_installed:
-            self._packaged(x.__module__ or "", x.__qualname__)
+            # (A wrapper of a package may bear the names of a user's function.)
+            module = str(x.__globals__.get("__name__"))
+            self._packaged(module, x.__code__.co_qualname)
         else:
             self._function_name = x.__qualname__
             self._visit(x.__code__)

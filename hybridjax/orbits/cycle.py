@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._core.boundary.checked import NeedsValues, checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers, Positive, SignalNames
 from .._core.boundary.values import Reals
+from .._core.call import once_in_call
 from .._core.executor import is_traced, is_tracer, to_host
 from .._core.findings import Finding
 from .._core.html import (
@@ -25,7 +26,6 @@ from .._core.html import (
 from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
-from .._core.progress import once_in_call
 from .._core.results import Result
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
@@ -125,7 +125,7 @@ class LimitCycle(eqx.Module):
             require_unchanged(self.system, self.numbers)
             require_as_made(self.base, "this limit cycle was found")
 
-        once_in_call(self, compare)
+        once_in_call(("compared", id(self)), self, compare)
 
     def require_found(self) -> None:
         """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""

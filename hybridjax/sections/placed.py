@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked_methods
+from .._core.call import once_in_call
 from .._core.compilation import at_ease, host_first
 from .._core.executor import Array, is_hidden, is_traced, namespace, on_host, to_host
 from .._core.html import card, facts
 from .._core.meaning import require_as_made
 from .._core.precision import require_x64
-from .._core.progress import once_in_call
 from .._core.results import Result
 from .._core.text import folded, number
 from ..engine import kernels
@@ -115,7 +115,7 @@ class PlacedSections(eqx.Module):
         or that of the sections since they were placed."""
         self.cycle.require_current()
         compare = lambda: require_as_made(self.family, "it was placed on a cycle")  # noqa: E731
-        once_in_call(self, compare)
+        once_in_call(("compared", id(self)), self, compare)
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
         """Outputs of the cycle at the sections, without input; NaN where a chart does not define

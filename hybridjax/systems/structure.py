@@ -26,8 +26,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Int
 
 from .._core.arguments import require_among
+from .._core.call import once_in_call
 from .._core.compilation import kernel
-from .._core.executor import Array
+from .._core.executor import Array, is_hidden
 from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
@@ -178,9 +179,17 @@ class Structure:
     def system(self) -> HybridSystem:
         return shared(self.source)
 
+    def _once_in_call(self, name: str, make: Callable[[], Any]) -> Any:
+        """Return what other structures of the system have made in this public call. (A trace of JAX
+        makes its own: constants belong to it.)"""
+        system = self.system
+        if is_hidden(system):
+            return make()
+        return once_in_call((name, id(system)), system, make)
+
     @ft.cached_property
     def _charts(self) -> dict[str, Chart]:
-        return self.system.charts()
+        return self._once_in_call("charts", lambda: self.system.charts())
 
     @ft.cached_property
     def charts(self) -> list[Chart]:
@@ -192,7 +201,9 @@ class Structure:
 
     @ft.cached_property
     def transitions(self) -> list[Transition]:
-        return list(self.system.transitions())
+        return self._once_in_call(
+            "transitions", lambda: list(self.system.transitions())
+        )
 
     @ft.cached_property
     def dims(self) -> tuple[int, ...]:
@@ -205,7 +216,8 @@ class Structure:
 
     @ft.cached_property
     def inputs(self) -> tuple[Signal, ...]:
-        return signals(self.system.inputs, self.system.input_units)
+        named = lambda: signals(self.system.inputs, self.system.input_units)  # noqa: E731
+        return self._once_in_call("inputs", named)
 
     def inputs_among(
         self, names: Sequence[str] | None
@@ -243,10 +255,17 @@ class Structure:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation.py`)."""
         name = function, form, static, lanes
-        every = self, *trees
-        return self.once(
-            name, trees, lambda: kernel(function, form, static, every, lanes)
-        )
+
+        def make():
+            return kernel(function, form, static, (self, *trees), lanes)
+
+        def make_once():
+            if type(self) is not Structure:  # (it has more than its source)
+                return make()
+            key = name, *map(id, (self.source, *trees))
+            return once_in_call(key, (self.source, trees), make)
+
+        return self.once(name, trees, make_once)
 
     # Whether lanes of the host have systems of their own (see `engine.kernels.Systems`).
     by_system = False

@@ -16,8 +16,9 @@ from .test_meaning import WAYS
 
 
 SYSTEM = """
-import functools, io, os, pathlib, random, sqlite3, subprocess, time, typing, datetime
-import h5py, jax, jax.numpy as jnp, numpy as np
+import dataclasses, datetime, functools, io, os, pathlib, random, sqlite3, subprocess, threading
+import time, typing
+import equinox as eqx, h5py, jax, jax.numpy as jnp, numpy as np
 import hybridjax as hj
 
 class Line(hj.Chart):
@@ -320,6 +321,72 @@ CHANGES = {
             "    with open('k') as file: return float(file.read()) * x\n"
             "def f(x): return h(x)",
             "pathlib.Path('k').write_text('2')",
+        ),
+    ],
+    "a trace that a function of JAX remembers": [
+        (
+            "K = 1.0\ndef h(x): return K * x\n"
+            "def f(x): return jnp.piecewise(x, [x < 0], [h, h])",
+            "K = 2.0",
+        ),
+        (
+            "K = 1.0\ndef h(x, y): return x + K * y\n"
+            "def f(x): return jax.lax.reduce(jnp.stack([x, x]), np.float64(0.0), h, (0,))",
+            "K = 2.0",
+        ),
+        (
+            "K = 1.0\ndef h(x): return K * x\ndef f(x):\n"
+            "    g, constants = jax.closure_convert(h, x)\n    return g(x, *constants)",
+            "K = 2.0",
+        ),
+    ],
+    "a trace that a wrapper remembers": [
+        (
+            "K = 1.0\ng = jax.checkpoint(lambda x: K * jnp.sin(x))\ndef f(x): return g(x)",
+            "K = 2.0",
+        ),
+        (
+            "K = 1.0\ng = eqx.filter_jit(lambda x: K * x)\ndef f(x): return g(x)",
+            "K = 2.0",
+        ),
+        (
+            "K = [1.0]\nG = {'g': jax.vmap(jax.jit(lambda x: K[0] * x))}\n"
+            "def f(x): return G['g'](jnp.stack([x]))[0]",
+            "K[0] = 2.0",
+        ),
+    ],
+    "an object of a data class": [
+        (
+            "@dataclasses.dataclass\nclass A:\n    k: float = 1.0\na = A()\n"
+            "def f(x): return a.k * x",
+            "a.k = 2.0",
+        ),
+        (
+            "@dataclasses.dataclass(frozen=True)\nclass A:\n    k: float = 1.0\na = A()\n"
+            "def f(x): return a.k * x",
+            "A.k = property(lambda self: 2.0)",
+        ),
+        (
+            "@dataclasses.dataclass\nclass A:\n    k: float = 1.0\n"
+            "    def twice(self): return 2 * self.k\na = A()\ndef f(x): return a.twice() * x",
+            "A.twice = lambda self: 3 * self.k",
+        ),
+    ],
+    "a cached property": [
+        (
+            "class A:\n    @functools.cached_property\n    def k(self): return 1.0\na = A()\n"
+            "def f(x): return a.k * x",
+            "vars(a)['k'] = 2.0",
+        ),
+        (
+            "class A:\n    c = 1.0\n    @functools.cached_property\n"
+            "    def k(self): return self.c\na = A()\ndef f(x): return a.k * x",
+            "A.c = 2.0\na = A()",
+        ),
+        (
+            "class A:\n    def __init__(self): self.lock, self.k = threading.RLock(), 1.0\n"
+            "a = A()\ndef f(x):\n    with a.lock: return a.k * x",
+            "a.k = 2.0",
         ),
     ],
     "a function of numpy that a user makes": [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core import meaning
 from hybridjax._core.meaning import change_of, code_digest, current
 
 from ..conftest import no_compilation
@@ -181,6 +182,44 @@ def test_an_ordinary_cell_changes_nothing(name, notebook):
     after = notebook.get("system", notebook["Uses"]())
     assert change_of(before) is None
     assert code_digest(after) == before.code_digest
+
+
+# Helpers that a second call reads in full, so that it needs no trace.
+READ = {
+    "constants": HELPER,
+    "an object of a dataclass": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Spring:\n    k: float = 1.5\n"
+        "spring = Spring()\ndef helper(x):\n    return spring.k * x"
+    ),
+    "a named tuple": (
+        "import collections\nnames = collections.namedtuple('names', 'a b')(1.0, 2.0)\n"
+        "def helper(x):\n    return names.a * x"
+    ),
+    "a cached property": (
+        "class Spring:\n    @functools.cached_property\n    def k(self):\n        return 1.5\n"
+        "spring = Spring()\nspring.k\ndef helper(x):\n    return spring.k * x"
+    ),
+    "a function for each entry": (
+        "doubled = jnp.vectorize(lambda x: 2 * x)\ndef helper(x):\n    return doubled(x)"
+    ),
+    "a function that is compiled": "@jax.jit\ndef helper(x):\n    return K * x",
+    "a branch": (
+        "def helper(x):\n"
+        "    return jax.lax.cond(x > 0, lambda y: K * y, lambda y: y, x)"
+    ),
+    "a network": (
+        "network = eqx.nn.MLP(1, 1, 4, 1, key=jax.random.key(0))\n"
+        "def helper(x):\n    return network(jnp.stack([x]))[0]"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_second_call_traces_nothing(name, notebook, monkeypatch):
+    exec(READ[name], notebook)
+    first = code_digest(notebook["Uses"]())
+    monkeypatch.setattr(meaning, "_traced", None)
+    assert code_digest(notebook["Uses"]()) == first
 
 
 def test_a_cycle_of_a_class_whose_cell_runs_again_needs_no_compilation(notebook):

@@ -11,6 +11,7 @@ import jax
 
 from ...errors import DefinitionError
 from ..arguments import require_among
+from ..call import public_call
 from ..executor import as_numpy, is_hidden
 from ..memo import Memory
 from .kinds import kind_of
@@ -20,7 +21,14 @@ from .values import Kind, Misfit
 Thing = TypeVar("Thing", bound=Callable)
 Class = TypeVar("Class", bound=type)
 
-_OPERATORS = "__call__", "__getitem__", "__matmul__", "__add__"
+_OPERATORS = (
+    "__call__",
+    "__getitem__",
+    "__matmul__",
+    "__add__",
+    "__repr__",
+    "_repr_html_",
+)
 _JAX_ERRORS = jax.errors.JAXTypeError, jax.errors.JAXIndexError
 
 
@@ -102,8 +110,8 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     @functools.wraps(function)
     def call(*args, **kwargs):
         try:
-            args, kwargs = kinds.take(args, kwargs)
-            with as_numpy():
+            with public_call(), as_numpy():
+                args, kwargs = kinds.take(args, kwargs)
                 return function(*args, **kwargs)
         except Misfit as misfit:
             raise DefinitionError(

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..executor import is_tracer
-from ..meaning import current, unchanged_code
+from ..meaning import current
 from ..signal import Signal
 from .values import Kind, Misfit, listed, refuse_traced, show, with_article
 
@@ -84,8 +84,7 @@ class Items(Kind):
             value = tuple(value)
         if self.item is not None:
             form = list if isinstance(value, list) else tuple
-            with unchanged_code():
-                value = form(_taken(self.item, i, x) for i, x in enumerate(value))
+            value = form(_taken(self.item, i, x) for i, x in enumerate(value))
         return (
             value
             if self.form is None or isinstance(value, self.form)

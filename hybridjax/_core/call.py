@@ -1,0 +1,76 @@
+"""A public call: a function of this package that a user's line calls, with all that it calls.
+
+Whether the user's code has changed is looked at once in a public call, and functions of the user
+that are no part of a program (`charts`, `transitions`) are called once.
+"""
+
+import collections
+import contextlib
+import contextvars
+import sys
+import types
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any, NamedTuple, TypeVar
+
+from .reading import is_of_package
+
+
+Value = TypeVar("Value")
+
+# Values that are kept in a call, some 30 for each system. Fewer: systems that take turns are looked
+# at again. More: a branch of thousands of points fills the memory.
+_KEPT = 1024
+
+
+class _Call(NamedTuple):
+    """The frame of the user's line, and what was computed in the call by key, each value with the
+    object to which it belongs."""
+
+    frame: types.FrameType | None
+    values: collections.OrderedDict[Hashable, tuple[Any, Any]]
+
+
+_running: contextvars.ContextVar[_Call | None]
+_running = contextvars.ContextVar("public call", default=None)
+
+
+def _frame_of_user() -> types.FrameType | None:
+    """The innermost frame of code that belongs to no package."""
+    frame: types.FrameType | None = sys._getframe(1)
+    while frame is not None and is_of_package(frame.f_code.co_filename):
+        frame = frame.f_back
+    return frame
+
+
+@contextlib.contextmanager
+def public_call() -> Iterator[None]:
+    """A context of a call: a public call of its own, or a part of the one that is running if no
+    code of the user stands between them."""
+    frame, call = _frame_of_user(), _running.get()
+    if call is not None and call.frame is frame:
+        yield
+        return
+    token = _running.set(_Call(frame, collections.OrderedDict()))
+    try:
+        yield
+    finally:
+        _running.reset(token)
+
+
+def once_in_call(key: Hashable, owner: Any, make: Callable[[], Value]) -> Value:
+    """Return what `make` returned for the same key in this public call; what it returns, outside of
+    all, or in a function of the user that a public call calls (and that may change a value).
+
+    **Arguments:** `owner`: the object whose `id` is part of the key, which lives as long.
+    """
+    frame, call = _frame_of_user(), _running.get()
+    # (A thread has no frame of the user: several would share the values.)
+    if frame is None or call is None or call.frame is not frame:
+        return make()
+    if key not in call.values:
+        call.values[key] = make(), owner
+    call.values.move_to_end(key)
+    value, _ = call.values[key]
+    while len(call.values) > _KEPT:
+        call.values.popitem(last=False)
+    return value
