@@ -32,11 +32,6 @@ from .scale import ROUNDING
 from .shooting import excess, newton_steps, one_by_one
 
 
-# Largest number of systems whose turns are computed on the host. Larger: that takes longer than
-# compiling them. Smaller: compiling takes longer than they run.
-SMALL = 8000
-# Systems per compiled call. More: their arrays leave the cache. Fewer: calls cost more.
-BATCH = 250
 # Periods for which a system is simulated before each further attempt of Newton's method. (0: for
 # unstable cycles.) Fewer: slow transients remain. More: each failure takes longer.
 _SETTLE = 8, 0, 40
@@ -366,9 +361,9 @@ class Tiles(NamedTuple):
 
 
 def tiles_of(
-    systems: HybridSystem, map: ReturnMap, size: int | None, workers: int, total: int
+    systems: HybridSystem, map: ReturnMap, size: int | None, workers: int
 ) -> Tiles:
-    """Systems, of so many in `total`, and how they are solved."""
+    """Systems, and how they are solved."""
     arrays, static = eqx.partition(systems, eqx.is_array)
     require_similar(
         map, eqx.combine(jax.tree_util.tree_map(lambda x: x[0], arrays), static)
@@ -377,8 +372,7 @@ def tiles_of(
     if map.base is None:
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
-    size = min(size or 4 * WIDE, total)
-    return Tiles(systems, to_host(map), periods, size, workers)
+    return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
 
 
 def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:

@@ -29,7 +29,7 @@ from .coincidence import commutes, together
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .guess import require_similar
-from .many import Found, Many, Solver
+from .many import TILE, Found, Many, Solver
 from .newton import search as newton
 from .repeat import has_route, leaves_of
 from .return_map import ReturnMap, turn_product
@@ -42,8 +42,8 @@ _LOOKED_AT = 50
 # Systems from which programs of itineraries are worth their compilation. Fewer: a sweep waits for
 # the compiler. More: turns side by side take longer.
 WORTH_COMPILING = 250
-# Turns after which a search begins in the chart where they end. More: hopeless searches last longer.
-# Fewer: cycles that begin in another chart are lost.
+# Turns after which a search begins in the chart where they end. More: hopeless searches last
+# longer. Fewer: cycles that begin in another chart are lost.
 _TURNS = 3
 # Cycles from which systems begin that no route suits. More: neighbors take longer to find. Fewer:
 # guesses are worse.
@@ -164,10 +164,15 @@ def find_limit_cycles(
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    Newton's method first finds the cycles of a few systems in parallel, from the guess. Each
-    further round solves four times as many systems, with the cycles of neighboring systems as
-    guesses. If Newton's method fails for a system, the system is simulated for 8 or 40 periods, and
-    Newton's method starts again from the final state.
+    From 250 systems on, all of them first follow the itinerary of the guess: its charts and events
+    in order, and its steps. Newton's method on this itinerary is one compiled program. A system
+    that leaves it takes that of a neighbor, for which a search has found another. Each cycle is
+    integrated again, by another method with other steps.
+
+    Fewer systems, and those that no itinerary suits, are searched side by side: first a few, from
+    the guess, then four times as many in each round, from cycles of neighbors. If Newton's method
+    fails for a system, the system is simulated for 8 or 40 periods, and Newton's method starts
+    again from the final state.
 
     **Arguments:**
 
@@ -176,8 +181,8 @@ def find_limit_cycles(
         `eqx.filter_vmap(lambda k: VerticalHopper(k=k))(jnp.linspace(8, 13, 100))`.
     - `guess`: a limit cycle of a similar system.
     - `settings`: accuracy of the flow (Default: 1e-9 per step) and its `solver`.
-    - `execution`: systems per call (`batch`, Default: 1024, and 250 in the compiled calls of more
-        than 8000 systems) and threads (`workers`).
+    - `execution`: systems per call (`batch`, Default: 250 on itineraries, otherwise 1024) and
+        threads (`workers`).
 
     **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
     for those.
@@ -210,15 +215,14 @@ def solved(
     map: ReturnMap,
     size: int | None = None,
     workers: int = 1,
-    total: int | None = None,
     known: Known | None = None,
 ) -> LimitCycles:
     """The cycles of systems near that of a return map.
 
-    **Arguments:** `size`, `total`, `known`: see `tiles_of` and `Tiles`.
+    **Arguments:** `size`: systems per call. `known`: see `Tiles`.
     """
     S = len(leaves_of(systems)[0])
-    tiles = tiles_of(systems, map, size, workers, total or S)._replace(known=known)
+    tiles = tiles_of(systems, map, size, workers)._replace(known=known)
     if S < WORTH_COMPILING or not has_route(map):
         return as_cycles(tiles, tiles.solve(S))
     expected = np.full(S, float(map.expected))
@@ -235,13 +239,14 @@ def solved(
         anchor = to_host(begin.anchor)._replace(t=times[row : row + 1])
         return _search(dataclasses.replace(tiles.map, anchor=anchor, **at_phase))
 
-    solver = Solver(Many(leaves, times, expected, workers), tiles.map, search)
+    many = Many(leaves, times, expected, workers, size or TILE)
+    solver = Solver(many, tiles.map, search)
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
     coincide = _coincide(cycles, solver)
     if len(left := solver.pending):
         near = _some_known(cycles) if known is None else known
-        part = tiles_of(_some(systems, left), map, size, workers, total or S)
+        part = tiles_of(_some(systems, left), map, size, workers)
         rounds = part._replace(known=near).solve(len(left))
         cycles = _with_rows(cycles, left, _cycles(part, rounds))
         coincide[left] = rounds.together
@@ -383,7 +388,7 @@ def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:
 
 def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
     """The last rounds of Newton's method as cycles."""
-    return examined(_cycles(tiles, rounds), rounds.together, rounds.together & False)
+    return examined(_cycles(tiles, rounds), rounds.together)
 
 
 def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
@@ -409,12 +414,12 @@ def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 def examined(
     cycles: LimitCycles,
     coincide: Bool[np.ndarray, " S"],
-    walked: Bool[np.ndarray, " S"],
+    walked: Bool[np.ndarray, " S"] | None = None,
 ) -> LimitCycles:
     """The cycles, with the result `COINCIDENCE` if events `coincide` that do not commute, and with
     those of their verdicts: of eight cycles and, if one of these has a fault, of all.
 
-    **Arguments:** `walked`: cycles that a second integration has checked already.
+    **Arguments:** `walked`: cycles that a second integration has checked already. Default: none.
 
     **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
@@ -423,7 +428,9 @@ def examined(
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if not all(commutes(cycles[i]) for i in few):
         result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
-    good = np.flatnonzero((result == Result.OK) & ~walked)
+    good = np.flatnonzero(result == Result.OK)
+    if walked is not None:
+        good = good[~walked[good]]
     places = np.linspace(0, len(good) - 1, min(len(good), _TESTED))
     tested = good[np.unique(places.astype(int))]
     for i in tested:

@@ -68,6 +68,8 @@ class Many(NamedTuple):
     t: Float[np.ndarray, " S"]
     expected: Float[np.ndarray, " S"]
     workers: int
+    size: int
+    """Lanes of a call."""
 
     def attempt(self, route: Route, rows, q, ends, finer: bool = False) -> "_Attempt":
         """Newton's method for some systems on a route, from states and ends of legs."""
@@ -89,16 +91,16 @@ class Many(NamedTuple):
         program = whole(function, (itinerary.form,), (map,), loops=True)
 
         def run(k):
-            own = np.arange(k, k + TILE) % len(rows)
+            own = np.arange(k, k + self.size) % len(rows)
             lanes = rows[own]
             leaves = tuple(x[lanes] for x in self.leaves)
             numbers = leaves, self.t[lanes], self.expected[lanes]
             with on_the_cpu():
                 result = program(numbers, plan, q[own], ends[own])
-            left = min(TILE, len(rows) - k)
+            left = min(self.size, len(rows) - k)
             return jax.tree_util.tree_map(lambda x: x[:left], result)
 
-        tiles = range(0, len(rows), TILE)
+        tiles = range(0, len(rows), self.size)
         parts = in_threads(run, tiles, min(self.workers, len(tiles)))
         return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
 
@@ -232,8 +234,8 @@ class Solver:
         return self._ends[path // 2]
 
 
-# The routes of the last calls: the same call again searches nothing. More: memory. Fewer: calls that
-# take turns search again.
+# The routes of the last calls: the same call again searches nothing. More: memory. Fewer: calls
+# that take turns search again.
 _KEPT = 16
 _routes: collections.OrderedDict[Any, list[Route]] = collections.OrderedDict()
 

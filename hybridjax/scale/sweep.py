@@ -20,7 +20,7 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import BATCH, SMALL, Known
+from ..orbits.batches import Known
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..orbits.limit_cycles import (
@@ -39,6 +39,9 @@ from .wanted import Measure, Want, Wanted
 # Pieces of a large sweep. More: many small files, and worse first guesses. Fewer: more is lost with
 # a worker.
 _PIECES = 64
+# Points of a piece, at least, and of one for which users' functions of cycles are evaluated. More:
+# more is lost with a worker. Fewer: many small files.
+_SMALLEST, _MEASURED = 4000, 250
 # Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
 # they save.
 _COARSE = 250
@@ -114,7 +117,7 @@ def sweep(
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
     wanted, total = Wanted(want, system), math.prod(space.shape)
-    most = chunk or (BATCH if wanted.measures else max(total // _PIECES, SMALL // 2))
+    most = chunk or (_MEASURED if wanted.measures else max(total // _PIECES, _SMALLEST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
         "kind": "sweep",
@@ -231,11 +234,8 @@ class SweepJob:
     ) -> LimitCycles:
         """Return the cycles at some points."""
         systems = self.family.systems(self.space.at(index))
-        total = math.prod(self.blocks.shape)
-        # (One size for all, also for the smaller blocks at the edges: there is one program.)
-        size = min(BATCH, math.prod(self.blocks.block)) if total > SMALL else None
         threads = Execution(workers=workers).threads
-        return solved(systems, self.begun.map, size, threads, total, known)
+        return solved(systems, self.begun.map, None, threads, known)
 
     def _blank(self) -> Begun:
         """Return the beginning before the cycles of the coarse pass are known."""

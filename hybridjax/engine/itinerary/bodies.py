@@ -2,8 +2,8 @@ r"""What the rows of an itinerary do: steps in charts, jumps at events, the sect
 
 Beside the state $q$ run columns $v$, its derivatives in some directions at a fixed time. Between
 events they obey $\dot v = f_q v$. An event of the guard h takes place later by
-$\delta = -h_q v / \dot h$, and leaves $v^+ = R_q (v + f^- \delta) + R_t \delta - f^+ \delta$ with the
-reset R: the saltation formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and
+$\delta = -h_q v / \dot h$, and leaves $v^+ = R_q (v + f^- \delta) + R_t \delta - f^+ \delta$ with
+the reset R: the saltation formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and
 Applied Mathematics 11, 1958).
 """
 
@@ -23,9 +23,9 @@ from . import steps
 from .rows import JUMP, NOTHING, PIECE, SCHEDULE, SECTION, STEP, Body, Rows
 
 
-# Times of a schedule are equal if they differ by less than this part of its period. Larger: an event
-# that is due shortly before another one is left out. Smaller: rounding separates the beginning of
-# a leg from the tick with which it begins.
+# Times of a schedule are equal if they differ by less than this part of its period. Larger: an
+# event that is due shortly before another one is left out. Smaller: rounding separates the
+# beginning of a leg from the tick with which it begins.
 _SAME_TICK = 10 * SAME_TIME
 
 

@@ -67,7 +67,7 @@ def _rates(s: Structure, a: int, t, y: Float[Array, "1+C n"]) -> Float[Array, "1
 def step(
     s: Structure, a: int, solver: Solver, t, y: Float[Array, "1+C n"], h
 ) -> tuple[Float[Array, "1+C n"], Float[Array, " n"]]:
-    """A state and its columns after a step from t to t + h, and the estimated error of the state."""
+    """A state and its columns after a step from t to t + h, and the state's estimated error."""
     if isinstance(solver, Method):
         return _implicit(s, a, solver, t, y, h)
     import diffrax

@@ -73,7 +73,7 @@ def follow(
     """Follow an itinerary from a time and a state.
 
     **Arguments:** `count`: of the rows that do something; None for a loop over all of them, which
-    reverse mode needs. `levels`: of the section at the end; None for a turn that ends at `ends[-1]`.
+    reverse mode needs. `levels`: of the section at the end; None for a turn that ends at a time.
     `begin`, `ends` (guessed ends of legs), and the result: of each lane. `solver`: for all charts;
     None for that of each chart. `columns`: whether derivatives are computed; otherwise factors are
     meaningless. `reverse`: whether reverse mode will differentiate it.
