@@ -70,6 +70,7 @@ def test_errors_that_no_residual_shows_are_unknown():
         )
 
 
+@pytest.mark.slow
 def test_times_of_autonomous_cycles_count_from_any_moment():
     where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
     cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
@@ -220,6 +221,7 @@ def fitted(hopper_cycle):
     return lambda near: hj.fit_model(near.system, data, free, guess=near)
 
 
+@pytest.mark.slow
 def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
     fit = fitted(hj.find_limit_cycle(hj.models.VerticalHopper(k=10.3)))
     np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)

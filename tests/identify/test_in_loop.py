@@ -130,6 +130,7 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     assert np.mean(regions) > 0.8
 
 
+@pytest.mark.slow
 def test_regions_of_series_hold_in_the_loop(plant):
     fits = (
         hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20)
@@ -183,6 +184,7 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     assert not hj.fit_series(data, 3, reference="r").doubt
 
 
+@pytest.mark.slow
 def test_fits_without_a_reference_tell_of_the_controller(plant):
     held = []
     for seed in range(8):

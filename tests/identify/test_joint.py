@@ -159,6 +159,7 @@ def test_undetermined_responses_have_infinite_variance():
     assert fit.contains(small.multipliers[:2], 0.999).all()
 
 
+@pytest.mark.slow
 def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
     rng, draws = np.random.default_rng(3), 40

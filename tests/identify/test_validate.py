@@ -11,6 +11,7 @@ from .test_series import record
 from .test_uncertainty import covered
 
 
+@pytest.mark.slow
 def test_the_true_model_leaves_white_noise(small):
     """P-values are uniform, for unknown starts and missing samples, and for fits to other data,
     and correlations have variance one."""

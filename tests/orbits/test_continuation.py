@@ -26,6 +26,7 @@ def juggling():
     return hj.find_limit_cycle(m.PaddleJuggler())
 
 
+@pytest.mark.slow
 def test_fold_and_flip_of_the_juggler(juggling):
     """Small amplitudes of the paddle end in a fold, large ones in a flip."""
     p = juggling.system
@@ -205,6 +206,7 @@ class Maps(hj.HybridSystem):
         return 1.0
 
 
+@pytest.mark.slow
 def test_multipliers_that_cross_the_circle_together_or_beside_others():
     """Test functions do not change their signs, or are small. The parameter is that of a part."""
     cycle = hj.find_limit_cycle(Maps(), hj.Guess("a", (0.47,) * 6))
@@ -219,6 +221,7 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
     np.testing.assert_allclose([x.value for x in points], [1.99, 2.0, 3.0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_shrinks_to_an_equilibrium():
     """The circle of Hopf's normal form has the radius sqrt(mu) and the multiplier exp(-2 mu)."""
     cycle = hj.find_limit_cycle(m.HopfOscillator())
@@ -260,6 +263,7 @@ class IntegrateAndFire(hj.HybridSystem):
         return hj.Guess("leak", (0.3,), 0.0)
 
 
+@pytest.mark.slow
 def test_a_spike_that_an_earlier_maximum_reaches_first():
     """Spikes lock to the sine from a fold on, where it just makes up for the mean. On the unstable
     side the potential has a maximum before each spike, which reaches the threshold, too."""

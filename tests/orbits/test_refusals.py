@@ -49,6 +49,7 @@ def test_what_is_no_cycle(system, guess, options, message):
         hj.find_limit_cycle(system, hj.Guess("a", (x,), *time), **options)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     """Of the logistic map, of which each period of a clock makes a step."""
 

@@ -19,6 +19,7 @@ def decaying(rates):
     return toy({"a": Field(("x", "y", "z"), field)}, period=1.0)
 
 
+@pytest.mark.slow
 def test_a_small_multiplier_of_an_autonomous_cycle():
     """exp(-2 mu T) from steps between which the direction of the flow turns."""
     cycle = hj.find_limit_cycle(hj.models.HopfOscillator(mu=40.0))

@@ -42,6 +42,7 @@ def found(noisy):
     return hj.recordings.phase_response(lost, BEAT, input="u")
 
 
+@pytest.mark.slow
 def test_a_rhythm_without_noise_is_found_exactly():
     exact = hj.recordings.phase_response(beats(0.0, trials=3), BEAT, input="u")
     np.testing.assert_allclose(exact.values, CURVE, atol=0.02)
@@ -112,6 +113,7 @@ def test_intervals_of_all_lengths_are_no_missed_events():
     assert len(periods) == len(slow.trials[0].events["beat"]) - 1
 
 
+@pytest.mark.slow
 def test_events_alone_are_identified(noisy, tmp_path):
     found = hj.identify_recording(
         noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=1

@@ -46,6 +46,7 @@ def recording():
     return {name: signal[t >= 10] for name, signal in signals.items()}
 
 
+@pytest.mark.slow
 def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     trial, out = (str(tmp_path / name) for name in ("trial.npz", "o"))
     np.savez(trial, **recording)

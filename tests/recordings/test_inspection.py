@@ -142,6 +142,7 @@ def test_drift_that_is_left_asks_for_a_smaller_number():
         assert f"`drift={advised}` takes it out" in finding.text
 
 
+@pytest.mark.slow
 def test_an_order_that_is_too_low_is_named():
     """Sensors with a high-pass filter add a mode to that of the system."""
     edge = signal.butter(1, 0.1, "high", fs=RATE)
@@ -182,6 +183,7 @@ def test_an_order_that_is_too_low_is_named():
         hj.recordings.choose_order(untried.data)
 
 
+@pytest.mark.slow
 def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_cycle):
     """A hundredth, which distortion of small pushes may be, is no reason to doubt; a third is."""
     force = hj.testing.random_force(100, 100, 8, rms=0.02, seed=0)

@@ -307,6 +307,7 @@ def fitted(*fits):
     return Population.from_fits(fits, {"subject": list("ab")[: len(fits)]})
 
 
+@pytest.mark.slow
 def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     """Each subject has a report, failures are named, and a second call computes nothing anew."""
     rows = ["file,subject,group,age"]

@@ -264,6 +264,7 @@ def identify(files, out, *more):
     return main(["identify", *trials, *options, "--out", str(out), *more])
 
 
+@pytest.mark.slow
 def test_the_command(files, tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
@@ -329,6 +330,7 @@ def test_signals_with_clocks_of_their_own(rhythm):
     np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_responses_of_a_model_are_by_the_section_of_the_push():
     """One state: a push of area 1 at section m decays by A; sections last 0.2, ..., 0.8."""
     N, a, b, c = (

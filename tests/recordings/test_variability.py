@@ -1,6 +1,7 @@
 """Multipliers from natural variability, and inputs that are feedback."""
 
 import numpy as np
+import pytest
 
 import hybridjax as hj
 from hybridjax.recordings.inspection.inspect import feedback
@@ -37,6 +38,7 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     return hj.recordings.section_data(recording, hj.AtEvent("e"), **options)
 
 
+@pytest.mark.slow
 def test_instruments_have_no_bias_by_noise():
     found = [hj.recordings.natural_multipliers(variable(0.7, seed=k)) for k in range(3)]
     (low, high), (_, top) = found[0].interval(0.99)[0], found[0].interval(plain=True)[0]

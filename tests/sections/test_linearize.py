@@ -205,6 +205,7 @@ class _Neuron(hj.HybridSystem):
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 
+@pytest.mark.slow
 def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
     cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
     half, most = (hj.Crossing("v", "rising", value) for value in (0.5, 0.8))

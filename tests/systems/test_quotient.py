@@ -188,6 +188,7 @@ class Inverter(
         return hj.Guess("plus", (0.1,))
 
 
+@pytest.mark.slow
 def test_scheduled_switches_close_after_half_a_period():
     symmetry = dict(swap={"plus": "minus"}, flipped="i", half_period=True)
     half = hj.Quotient(Inverter(), **symmetry)
