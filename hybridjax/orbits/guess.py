@@ -198,6 +198,8 @@ def _on_section(
             lanes, wait = moved.lanes, _patience(map, moved.lanes) - waited
             if wait <= 0:
                 break
+        if missed(moved):
+            _require_motion(map, moved.lanes)
         late = (
             f"Allow more time than {waited:.3g}, by `max_period`, or for the slow modes of a stiff "
             'system, take `settings=Settings(solver="auto")`. '
@@ -214,7 +216,6 @@ def _on_section(
         say(doing)
         moved, late = next_crossing(back)
         if is_default(section) and missed(moved) and not last:
-            _require_motion(map, moved.lanes)
             say("a section where the flow has led")
             later = dataclasses.replace(at_guess, anchor=moved.lanes)
             return _on_section(later, None, False, time, max_period, last=True)

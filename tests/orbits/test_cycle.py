@@ -7,7 +7,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.orbits.linear_flow import begin_later, last_turn
 
-from ..toys import Switched
+from ..toys import Field, Switched, toy
 
 
 FALL = hj.Crossing("v", "falling")
@@ -111,6 +111,29 @@ def test_van_der_pol(mu):
         cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0
     )
     assert not cycle.clocked and cycle.event_sequence == () and cycle.stable == (mu > 0)
+
+
+def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
+    """v' = 1 + v^2 from -1 to 1e5, in the time atan(1e5) + pi/4; at the guess a millionth of it."""
+    square = Field(("v",), lambda t, q, u: (1 + q[0] ** 2,))
+    spike = lambda t, q, u: q[0] - 1e5  # noqa: E731
+    again = lambda t, q, u: (-1.0,)  # noqa: E731
+    event = hj.Transition("spike", "a", "a", spike, "rising", again)
+    guess, section = hj.Guess("a", (9e4,)), hj.AtEvent("spike")
+    cycle = hj.find_limit_cycle(toy({"a": square}, [event]), guess, section=section)
+    np.testing.assert_allclose(cycle.period, np.arctan(1e5) + np.pi / 4, rtol=1e-9)
+
+
+def test_a_default_section_that_is_missed_is_replaced():
+    """No cycle of van der Pol's oscillator comes to y = 30."""
+    np.testing.assert_allclose(
+        vanderpol(1.0, (0.0, 30.0)).period, vanderpol(1.0, (2.0, 0.0)).period
+    )
+
+
+def test_a_flow_that_comes_to_rest_is_no_cycle():
+    with pytest.raises(hj.ComputationError, match="leads to an equilibrium of chart"):
+        vanderpol(-2.5, (0.1, 0.1))
 
 
 def test_a_conservative_system_has_a_family_of_cycles(amplitude=7.3):
