@@ -50,8 +50,19 @@ from .verdict import verdict
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
-# chart than it began. Fewer: slow transients remain. More: a vain search takes longer.
+# chart than it began; after the last of them, one that Newton's method may have led astray. Fewer:
+# slow transients remain. More: a vain search takes longer.
 _LATER = 8, 40
+_STRAYED = (
+    Result.NOT_CONVERGED,
+    Result.EQUILIBRIUM,
+    Result.GRAZING,
+    Result.ZENO,
+    Result.BLOW_UP,
+    Result.SECTION_MISSED,
+    Result.STEP_LIMIT,
+    Result.STEP_COLLAPSE,
+)
 # The rough size of a state that does not move is made smaller this many times, if the guess was far
 # from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
 # of a guess that is more than 1e18 times too large keep their errors.
@@ -207,18 +218,16 @@ def find_limit_cycle(
         check_begin(map)
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)
-    ends_elsewhere = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
-    if (cycle.result == Result.GUARD_BEYOND or ends_elsewhere) and not settle:
+    for periods in () if settle else _times_later(cycle, guess):
         # (From there the flow may lead to a cycle that is stable.)
-        for periods in _LATER:
-            say(f"the same after {periods} periods")
-            later = _map_after(map, section, periods)
-            if later is None:
-                break
-            other, other_turn = _judged(later, search(later, patient), given)
-            if int(other.result) in (Result.OK, Result.SINGULAR):
-                cycle, turn = other, other_turn
-                break
+        say(f"the same after {periods} periods")
+        later = _map_after(map, section, periods)
+        if later is None:
+            break
+        other, other_turn = _judged(later, solve(later, False, True, None), given)
+        if int(other.result) in (Result.OK, Result.SINGULAR):
+            cycle, turn = other, other_turn
+            break
     code = Result(int(cycle.result))
     checks.check_found(cycle)
     if code in (Result.OK, Result.SINGULAR):
@@ -290,6 +299,16 @@ def _with_result(cycle: LimitCycle, result: Result) -> LimitCycle:
     """The cycle with another result, and what is remembered with it."""
     other = dataclasses.replace(cycle, result=jax.device_put(np.int32(result)))
     return remembering(other, cycle)
+
+
+def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
+    """The periods of the flow after which a search that failed begins again."""
+    strays = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
+    if strays or cycle.result == Result.GUARD_BEYOND:
+        return _LATER
+    if int(cycle.result) in _STRAYED and not isinstance(guess, LimitCycle):
+        return _LATER[-1:]
+    return ()
 
 
 def _map_after(
