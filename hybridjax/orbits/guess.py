@@ -37,6 +37,10 @@ _PATIENCE = 1000.0
 # were at the guess. Fewer: cycles are lost if the guess lies where they are fast. More: vain
 # searches last longer.
 _LOOKS = 4
+# A default section lies so much farther on than the event or the time at which a search for another
+# one ended, as a part of the time after which that is given up. Smaller: it lies at the event.
+# Larger: time.
+_ONWARD = 3.7e-4
 # States that change by less than this part of their sizes in the time of their fastest mode are at
 # rest. Larger: slow cycles are taken for equilibria. Smaller: errors of the flow are taken for
 # motion.
@@ -217,7 +221,10 @@ def _on_section(
         moved, late = next_crossing(back)
         if is_default(section) and missed(moved) and not last:
             say("a section where the flow has led")
-            later = dataclasses.replace(at_guess, anchor=moved.lanes)
+            # (A search that is given up may end at an event.)
+            end = np.asarray(moved.lanes.t) + _ONWARD * _patience(map, moved.lanes)
+            onward = _go(map, "settling", moved.lanes, toward(end, -1, end))
+            later = dataclasses.replace(at_guess, anchor=onward)
             return _on_section(later, None, False, time, max_period, last=True)
         back = _arrived(map, f"{doing} ({place})", moved, advice, late)
     duration = np.asarray(back.t)[0] - np.asarray(lanes.t)[0]
@@ -232,11 +239,24 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     rate = kernels.field(s, a, t, lane.q[:n], np.zeros((s.nu, 1)))[:, 0, 0]
     time = sizes_near(s, a, float(t[0]), lane.q[:, 0], None).time
     sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
-    if np.all(np.abs(rate) * time <= _REST * sizes):
-        raise ComputationError(
-            f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', "
-            f"{lane.q[:n, 0]}, where nothing moves: start elsewhere."
+    if np.any(np.abs(rate) * time > _REST * sizes):
+        return
+    beyond = []
+    guards = s.guards(a)
+    if guards:
+        u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+        levels = kernels.watched(s, a, None, t, lane.q[:n], u, first)[:, 0, 0]
+        passed = [g for g, level in zip(guards, levels, strict=True) if level < 0]
+        beyond = [f"'{s.transitions[g].name}'" for g in passed]
+    text = ""
+    if beyond:
+        text = (
+            f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
+    raise ComputationError(
+        f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', "
+        f"{lane.q[:n, 0]}, where nothing moves: start elsewhere.{text}"
+    )
 
 
 @host_first

@@ -131,7 +131,26 @@ def test_a_default_section_that_is_missed_is_replaced():
     )
 
 
+def test_a_default_section_is_not_replaced_by_one_at_an_event():
+    """A Schmitt trigger with the levels 1 and -1, supplied by 2 and -2: its period is 2 ln 3."""
+    charts = {
+        name: Field(("v",), lambda t, q, u, supply=supply: (supply - q[0],))
+        for name, supply in (("up", 2.0), ("down", -2.0))
+    }
+    top = hj.Transition("top", "up", "down", lambda t, q, u: q[0] - 1, "rising")
+    bottom = hj.Transition("bottom", "down", "up", lambda t, q, u: q[0] + 1)
+    for far in (7.0, 40.0, 55.0):
+        cycle = hj.find_limit_cycle(
+            toy(charts, [top, bottom]), hj.Guess("down", (far,))
+        )
+        np.testing.assert_allclose(cycle.period, 2 * np.log(3), rtol=1e-10)
+
+
 def test_a_flow_that_comes_to_rest_is_no_cycle():
+    charging = Field(("v",), lambda t, q, u: (2.0 - q[0],))
+    top = hj.Transition("top", "a", "a", lambda t, q, u: q[0] - 1, "rising")
+    with pytest.raises(hj.ComputationError, match="beyond the guard of 'top'"):
+        hj.find_limit_cycle(toy({"a": charging}, [top]), hj.Guess("a", (1.5,)))
     with pytest.raises(hj.ComputationError, match="leads to an equilibrium of chart"):
         vanderpol(-2.5, (0.1, 0.1))
 
