@@ -316,6 +316,16 @@ def _widest() -> float:
     return brentq(late, 0.3, 0.4)
 
 
+def _shallowest(alpha: float) -> float:
+    """The slope at which the wheel, after an impact, just comes to the top of its spoke."""
+
+    def surplus(slope):
+        energy = 2 * np.sin(alpha) * np.sin(slope) / np.tan(2 * alpha) ** 2
+        return energy - (1 - np.cos(alpha - slope))
+
+    return brentq(surplus, 1e-6, alpha)
+
+
 _VDP = (0.05, 1.0, 5.0, 10.0)
 _AT_FALL = hj.Crossing("v", "falling")
 # The current of FitzHugh and Nagumo's equilibrium at v, where its trace is zero.
@@ -438,7 +448,10 @@ CASES: dict[str, Callable[[], Case]] = {
         "slope",
         (0.01, 0.3),
         {"section": hj.AtEvent("impact")},
+        ends=(_REST, OVER),
         marks=[],
+        border=(_shallowest(m.RimlessWheel().alpha), 0.3),
+        within=1e-5,
         exact=lambda c: (
             float(c.trajectory().events[0].after["w"]),
             float(c.system.exact()[0]),

@@ -187,6 +187,7 @@ class Simulator:
                     motion.ending = "Zeno"
                     return motion
                 event = self._at_once(motion, left, fired, self.clock or duration)
+                event = event or self._tick_too(motion)
         return motion
 
     def _at_once(self, motion, left, fired, span) -> Event | None:
@@ -206,6 +207,33 @@ class Simulator:
             if due is None and (put or late) and self.enabled(event, t, state):
                 due = event
         return due
+
+    def _tick_too(self, motion) -> Event | None:
+        """An event of another clock that ticks at the same time (docs/mathematics.md, "Clocks")."""
+        now = [e.name for e in motion.events[-5:] if e.time == motion.time]
+        ticked = [
+            event.schedule(self.p)
+            for event in self.model.events
+            if event.schedule is not None and event.name in now
+        ]
+        if not ticked:
+            return None
+        for event in self.exits[motion.chart]:
+            if event.schedule is None or not self.at_tick(event, motion.time):
+                continue
+            period, offset = event.schedule(self.p)
+            turn = round((motion.time - offset) / period)
+            over = [
+                (period, offset) == clock
+                or (
+                    period == clock[0]
+                    and turn < round((motion.time - clock[1]) / period)
+                )
+                for clock in ticked
+            ]
+            if not any(over) and self.enabled(event, motion.time, motion.state):
+                return event
+        return None
 
     def _before(self, event, chart, left, t, noise) -> tuple[bool, bool]:
         """Whether the chart that was left has this guard, too, and whether it was armed there."""
