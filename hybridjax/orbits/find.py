@@ -91,7 +91,8 @@ def find_limit_cycle(
     """Find a stable or unstable limit cycle by Newton's method on the return map.
 
     If Newton's method fails, as it does if a step leaves the domain of the return map, the search
-    is repeated with the smaller steps of the Levenberg-Marquardt method.
+    is repeated with the smaller steps of the Levenberg-Marquardt method, then from the state to
+    which the flow leads from the guess in 40 periods.
 
     A clocked system has the period of its clock, and the return map is taken at the guess's phase
     of the clock. The period of an autonomous system is computed; its return map is taken on
@@ -107,7 +108,8 @@ def find_limit_cycle(
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
         the section, else where the flow from the guess first crosses it. Default: the section
         right after the event that the guess names (`Guess(..., after="heelstrike")`), or else the
-        plane through the guess that is orthogonal to the flow (in scaled states).
+        plane through the guess that is orthogonal to the flow (in scaled states), or if the flow
+        does not return to that, such a plane through the state to which it leads.
     - `multiplicity`: number of periods of the clock, or returns to the section, after which the
         cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
         cycle that is the guess.
@@ -118,8 +120,9 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the
-        section is given up. Default: 1000 times the time scale of the states at the guess (in
-        charts with an implicit method, that of the slowest mode).
+        section is given up. Default: 1000 times the time scale of the states at the guess, or
+        where the search would be given up, if they are slower there (in charts with an implicit
+        method, that of the slowest mode).
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
         not depend on units (under a JAX transformation, those of the guess).
