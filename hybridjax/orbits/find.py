@@ -30,7 +30,12 @@ from .coincidence import SAME, check_begin, coincident, commutes, events_of, mee
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
-from .guess import require_similar, return_map_near
+from .guess import (
+    after_rarest_event,
+    is_default,
+    require_similar,
+    return_map_near,
+)
 from .linear_flow import keep_turn, last_turn, remembering
 from .newton import Solution, search, solve
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
@@ -50,9 +55,11 @@ from .verdict import verdict
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
-# chart than it began; after the last of them, one that Newton's method may have led astray. Fewer:
-# slow transients remain. More: a vain search takes longer.
+# chart than it began; after the last of them, one that Newton's method may have led astray; and
+# those within which an event is chosen as the section, in place of a plane. Fewer: slow transients
+# remain. More: a vain search takes longer.
 _LATER = 8, 40
+_EVENTFUL = 8
 _STRAYED = (
     Result.NOT_CONVERGED,
     Result.EQUILIBRIUM,
@@ -227,7 +234,10 @@ def find_limit_cycle(
         later = _map_after(map, section, periods)
         if later is None:
             break
-        other, other_turn = _judged(later, solve(later, False, True, None), given)
+        try:
+            other, other_turn = _judged(later, solve(later, False, True, None), given)
+        except ComputationError:  # (an event coincides with the beginning)
+            continue
         if int(other.result) in (Result.OK, Result.SINGULAR):
             cycle, turn = other, other_turn
             break
@@ -327,6 +337,13 @@ def _map_after(
         later = return_map_near(
             s, guess, section, map.multiplicity, wait, None, map.settings, given
         )
+        begin = None
+        if is_default(later.base):
+            begin = after_rarest_event(later, _EVENTFUL)
+        if begin is not None:
+            later = return_map_near(
+                s, begin, None, map.multiplicity, 0.0, None, map.settings, given
+            )
     except ComputationError:
         return None
     return dataclasses.replace(later, conserved=map.conserved)

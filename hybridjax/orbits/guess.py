@@ -16,7 +16,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, lane_at
-from ..engine.move import move
+from ..engine.move import Options, move
 from ..engine.search.state import Moved
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import Target, toward, until
@@ -37,6 +37,8 @@ _PATIENCE = 1000.0
 # were at the guess. Fewer: cycles are lost if the guess lies where they are fast. More: vain
 # searches last longer.
 _LOOKS = 4
+# Steps in which events are counted. More: memory. Fewer: rare events are missed.
+_RECORDED = 4096
 # A default section lies so much farther on than the event or the time at which a search for another
 # one ended, as a part of the time after which that is given up. Smaller: it lies at the event.
 # Larger: time.
@@ -229,6 +231,31 @@ def _on_section(
         back = _arrived(map, f"{doing} ({place})", moved, advice, late)
     duration = np.asarray(back.t)[0] - np.asarray(lanes.t)[0]
     return dataclasses.replace(map, anchor=lanes, expected=real(duration))
+
+
+def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
+    """The state right after the event that is rarest within some periods from the anchor on: each
+    turn meets it less often than other sections. `None` without events."""
+    s, lanes, settings = map.structure, to_host(map.anchor), to_host(map.settings)
+    end = lanes.t + periods * float(map.expected)
+    settings = Settings(
+        np.array(TRANSIENT), np.array(TRANSIENT), _RECORDED, settings.scale
+    )
+    options, u = Options(tape=True), np.zeros((s.nu, 1))
+    tape = move(s, lanes, u, until(end), settings, options=options).tape
+    assert tape is not None
+    code, follows = np.asarray(tape.code)[:, 0], np.asarray(tape.at_once)[:, 0]
+    # (A section at an event that another one follows at once is refused.)
+    happens = (code >= 0) & ~np.append(follows[1:], False)
+    if not happens.any():
+        return None
+    counts = np.bincount(code[code >= 0], minlength=len(s.transitions))
+    g = min(np.unique(code[happens]).tolist(), key=lambda g: counts[g])
+    row = np.flatnonzero(happens & (code == g))[-1]
+    a = int(tape.chart[row, 0])
+    state = np.asarray(tape.after)[row, : s.dims[a], 0]
+    name = s.transitions[g].name
+    return Guess(s.names[a], state, time=float(tape.t[row, 0]), after=name)
 
 
 def _require_motion(map: ReturnMap, lanes: Lanes) -> None:

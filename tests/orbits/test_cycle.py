@@ -146,6 +146,35 @@ def test_a_default_section_is_not_replaced_by_one_at_an_event():
         np.testing.assert_allclose(cycle.period, 2 * np.log(3), rtol=1e-10)
 
 
+def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
+    """Two cells with the drive 1.3 that spike at 1 and then push the other one back by 0.1: in half
+    a period e = exp(-T/2) solves 1.3 e^2 + 0.1 e = 0.3."""
+    cells = Field(("x", "y"), lambda t, q, u: (1.3 - q[0], 1.3 - q[1]))
+    spikes = [
+        hj.Transition(
+            "spike x",
+            "cells",
+            "cells",
+            lambda t, q, u: q[0] - 1,
+            "rising",
+            lambda t, q, u: (0.0, q[1] - 0.1),
+        ),
+        hj.Transition(
+            "spike y",
+            "cells",
+            "cells",
+            lambda t, q, u: q[1] - 1,
+            "rising",
+            lambda t, q, u: (q[0] - 0.1, 0.0),
+        ),
+    ]
+    cycle = hj.find_limit_cycle(
+        toy({"cells": cells}, spikes), hj.Guess("cells", (0, 0.5))
+    )
+    half = np.log(2 * 1.3 / (np.sqrt(0.1**2 + 4 * 1.3 * 0.3) - 0.1))
+    np.testing.assert_allclose(cycle.period, 2 * half, rtol=1e-10)
+
+
 def test_a_flow_that_comes_to_rest_is_no_cycle():
     charging = Field(("v",), lambda t, q, u: (2.0 - q[0],))
     top = hj.Transition("top", "a", "a", lambda t, q, u: q[0] - 1, "rising")
