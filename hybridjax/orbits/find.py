@@ -333,6 +333,8 @@ def _map_after(
     guess = Guess(s.names[a], anchor.q[: s.dims[a], 0], time=float(anchor.t[0]))
     wait = periods * float(map.expected)
     given = sizes_of(s, map.settings.scale)
+    if isinstance(map.base, AtEvent):  # (also of a guess that names it)
+        section = map.base
     try:
         later = return_map_near(
             s, guess, section, map.multiplicity, wait, None, map.settings, given

@@ -43,9 +43,8 @@ _RECORDED = 4096
 # one ended, as a part of the time after which that is given up. Smaller: it lies at the event.
 # Larger: time.
 _ONWARD = 3.7e-4
-# States that change by less than this part of their sizes in the time of their fastest mode are at
-# rest. Larger: slow cycles are taken for equilibria. Smaller: errors of the flow are taken for
-# motion.
+# States are at rest within this distance of an equilibrium, in sizes. Larger: slow cycles near an
+# equilibrium are taken for it. Smaller: errors of the flow are taken for motion.
 _REST = 1e-5
 
 
@@ -236,11 +235,10 @@ def _on_section(
 def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     """The state right after the event that is rarest within some periods from the anchor on: each
     turn meets it less often than other sections. `None` without events."""
-    s, lanes, settings = map.structure, to_host(map.anchor), to_host(map.settings)
+    s, lanes = map.structure, to_host(map.anchor)
     end = lanes.t + periods * float(map.expected)
-    settings = Settings(
-        np.array(TRANSIENT), np.array(TRANSIENT), _RECORDED, settings.scale
-    )
+    rough = np.array(TRANSIENT)
+    settings = Settings(rough, rough, _RECORDED, to_host(map.settings).scale)
     options, u = Options(tape=True), np.zeros((s.nu, 1))
     tape = move(s, lanes, u, until(end), settings, options=options).tape
     assert tape is not None
@@ -263,10 +261,12 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     s, lane = map.structure, to_host(lanes)
     a, t = int(lane.chart[0]), lane.t
     n = s.dims[a]
-    rate = kernels.field(s, a, t, lane.q[:n], np.zeros((s.nu, 1)))[:, 0, 0]
-    time = sizes_near(s, a, float(t[0]), lane.q[:, 0], None).time
+    by = kernels.field(s, a, t, lane.q[:n], np.zeros((s.nu, 1)))[..., 0]
     sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
-    if np.any(np.abs(rate) * time > _REST * sizes):
+    rate, jacobian = by[:, 0] / sizes, by[:, 2 : 2 + n] * sizes / sizes[:, None]
+    # (On a slow manifold rates are small, too, but the equilibrium is far away.)
+    distance = np.linalg.lstsq(jacobian, rate)[0]
+    if np.any(np.abs(distance) > _REST):
         return
     beyond = []
     guards = s.guards(a)
