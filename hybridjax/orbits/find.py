@@ -231,7 +231,7 @@ def find_limit_cycle(
     for periods in () if settle else _times_later(cycle, guess):
         # (From there the flow may lead to a cycle that is stable.)
         say(f"the same after {periods} periods")
-        later = _map_after(map, section, periods)
+        later = _map_after(map, section, periods, given)
         if later is None:
             break
         try:
@@ -325,30 +325,37 @@ def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
 
 
 def _map_after(
-    map: ReturnMap, section: Crossing | AtEvent | None, periods: int
+    map: ReturnMap, section: Crossing | AtEvent | None, periods: int, given: Sizes
 ) -> ReturnMap | None:
-    """The return map at the state to which the flow leads within some periods; None if it fails."""
-    s, anchor = map.structure, to_host(map.anchor)
-    a = int(anchor.chart[0])
-    guess = Guess(s.names[a], anchor.q[: s.dims[a], 0], time=float(anchor.t[0]))
+    """The return map at the state to which the flow leads within some periods, in the sizes that
+    states have there; None if it fails. `given`: sizes that users give."""
+    s, rough = map.structure, sizes_of(map.structure, map.settings.scale)
     wait = periods * float(map.expected)
-    given = sizes_of(s, map.settings.scale)
     if isinstance(map.base, AtEvent):  # (also of a guess that names it)
         section = map.base
+
+    def near(guess, settle, sizes):
+        limits = map.multiplicity, settle, None
+        return return_map_near(s, guess, section, *limits, map.settings, sizes)
+
     try:
-        later = return_map_near(
-            s, guess, section, map.multiplicity, wait, None, map.settings, given
-        )
+        later = near(_guess_at(map), wait, rough)
         begin = None
         if is_default(later.base):
             begin = after_rarest_event(later, _EVENTFUL)
-        if begin is not None:
-            later = return_map_near(
-                s, begin, None, map.multiplicity, 0.0, None, map.settings, given
-            )
+        later = near(_guess_at(later) if begin is None else begin, 0.0, given)
     except ComputationError:
         return None
     return dataclasses.replace(later, conserved=map.conserved)
+
+
+def _guess_at(map: ReturnMap) -> Guess:
+    """The anchor of a map, as a guess."""
+    s, anchor = map.structure, to_host(map.anchor)
+    a = int(anchor.chart[0])
+    name = map.base.name if isinstance(map.base, AtEvent) else None
+    state = anchor.q[: s.dims[a], 0]
+    return Guess(s.names[a], state, time=float(anchor.t[0]), after=name)
 
 
 def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
