@@ -27,7 +27,7 @@ from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap
-from .scale import Sizes, scale_of, sizes_near, slow_time
+from .scale import Sizes, fastest, scale_of, sizes_near, slow_time
 
 
 # An autonomous system is given up if it does not return within this multiple of the time scale of
@@ -145,6 +145,13 @@ def _patience(map: ReturnMap, lanes: Lanes) -> float:
     return _PATIENCE * max(near.time, slow_time(s, t, near.points))
 
 
+def _decays(map: ReturnMap, lanes: Lanes) -> bool:
+    """Test whether a mode decays at a lane."""
+    s, lane = map.structure, to_host(lanes)
+    a = int(lane.chart[0])
+    return bool(fastest(s, a, lane.t, lane.q[: s.dims[a]])[0] > 0)
+
+
 def _on_section(
     map: ReturnMap,
     section: Crossing | AtEvent | None,
@@ -199,9 +206,9 @@ def _on_section(
             waited = float(np.asarray(moved.lanes.t)[0]) - begin
             if not missed(moved) or max_period is not None:
                 break
-            # (The states may have become slower than they were at the guess.)
+            # (The states may have become slower than they were at the guess, or drift away.)
             lanes, wait = moved.lanes, _patience(map, moved.lanes) - waited
-            if wait <= 0:
+            if wait <= 0 or not _decays(map, lanes):
                 break
         if missed(moved):
             _require_motion(map, moved.lanes)
@@ -267,6 +274,10 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):
+        return
+    # (A state that drifts at a constant rate is near none.)
+    drift = rate - jacobian @ distance
+    if np.abs(drift).max() > 0.1 * np.abs(rate).max():
         return
     beyond = []
     guards = s.guards(a)

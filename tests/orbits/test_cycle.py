@@ -180,7 +180,10 @@ def test_a_flow_that_comes_to_rest_is_no_cycle():
         hj.find_limit_cycle(toy({"a": charging}, [top]), hj.Guess("a", (1.5,)))
     with pytest.raises(hj.ComputationError, match="leads to an equilibrium of chart"):
         vanderpol(-2.5, (0.1, 0.1))
-    # (Slow motion is none.)
+    # (Neither is a state that drifts away, nor slow motion.)
+    drift = Field(("v",), lambda t, q, u: (1.0 + 0 * q[0],))
+    with pytest.raises(hj.ComputationError, match="was not crossed within"):
+        hj.find_limit_cycle(toy({"a": drift}, [top]), hj.Guess("a", (1.5,)))
     far = hj.Crossing("x", "falling", value=10.0)
     with pytest.raises(hj.ComputationError, match="Allow more time than 1, by"):
         vanderpol(1000.0, (2.0, 0.0), section=far, max_period=1.0)
