@@ -228,16 +228,16 @@ def find_limit_cycle(
         check_begin(map)
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)
+    later_fault = ""
     for periods in () if settle else _times_later(cycle, guess):
         # (From there the flow may lead to a cycle that is stable.)
         say(f"the same after {periods} periods")
-        later = _map_after(map, section, periods, given)
-        if later is None:
-            break
         try:
+            later = _map_after(map, section, periods, given)
             other, other_turn = _judged(later, solve(later, False, True, None), given)
-        except ComputationError:  # (an event coincides with the beginning)
-            continue
+        except ComputationError as error:
+            later_fault = f" From the guess the flow leads to no cycle either: {error}"
+            break
         if int(other.result) in (Result.OK, Result.SINGULAR):
             cycle, turn = other, other_turn
             break
@@ -247,7 +247,8 @@ def find_limit_cycle(
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(checks.explain(cycle, turn, float(map.expected), settle))
+        reason = checks.explain(cycle, turn, float(map.expected), settle)
+        raise ComputationError(reason + later_fault)
     return cycle
 
 
@@ -326,9 +327,12 @@ def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
 
 def _map_after(
     map: ReturnMap, section: Crossing | AtEvent | None, periods: int, given: Sizes
-) -> ReturnMap | None:
+) -> ReturnMap:
     """The return map at the state to which the flow leads within some periods, in the sizes that
-    states have there; None if it fails. `given`: sizes that users give."""
+    states have there. `given`: sizes that users give.
+
+    **Raises:** `ComputationError` if the flow fails.
+    """
     s, rough = map.structure, sizes_of(map.structure, map.settings.scale)
     wait = periods * float(map.expected)
     if isinstance(map.base, AtEvent):  # (also of a guess that names it)
@@ -338,14 +342,11 @@ def _map_after(
         limits = map.multiplicity, settle, None
         return return_map_near(s, guess, section, *limits, map.settings, sizes)
 
-    try:
-        later = near(_guess_at(map), wait, rough)
-        begin = None
-        if is_default(later.base):
-            begin = after_rarest_event(later, _EVENTFUL)
-        later = near(_guess_at(later) if begin is None else begin, 0.0, given)
-    except ComputationError:
-        return None
+    later = near(_guess_at(map), wait, rough)
+    begin = None
+    if is_default(later.base):
+        begin = after_rarest_event(later, _EVENTFUL)
+    later = near(_guess_at(later) if begin is None else begin, 0.0, given)
     return dataclasses.replace(later, conserved=map.conserved)
 
 
