@@ -333,7 +333,7 @@ def _map_after(
 
     **Raises:** `ComputationError` if the flow fails.
     """
-    s, rough = map.structure, sizes_of(map.structure, map.settings.scale)
+    s, rough = map.structure, sizes_of(map.structure, map.scale)
     wait = periods * float(map.expected)
     if isinstance(map.base, AtEvent):  # (also of a guess that names it)
         section = map.base
