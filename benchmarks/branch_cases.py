@@ -272,6 +272,12 @@ def _juggler_marks() -> list[tuple[str, float]]:
     return [("fold", speed / (2 * np.pi)), ("flip", float(flip))]
 
 
+def _least_restitution() -> float:
+    """The restitution at Holmes's fold, where the paddle's largest speed is just enough."""
+    ratio = 4 * np.pi * float(m.PaddleJuggler().A) / 9.81
+    return (1 - ratio) / (1 + ratio)
+
+
 def _van_der_pol(cycle: hj.LimitCycle) -> tuple[float, float]:
     """Published periods (H. T. Davis, Introduction to nonlinear differential and integral
     equations, 1962, and others)."""
@@ -415,7 +421,7 @@ CASES: dict[str, Callable[[], Case]] = {
         m.PaddleJuggler(),
         "restitution",
         (0.6, 1.1),
-        marks=[("Neimark-Sacker", 1.0)],
+        marks=[("fold", _least_restitution()), ("Neimark-Sacker", 1.0)],
         exact=lambda c: (
             float(np.prod(c.multipliers).real),
             float(c.system.restitution**2),
