@@ -272,6 +272,12 @@ def _juggler_marks() -> list[tuple[str, float]]:
     return [("fold", speed / (2 * np.pi)), ("flip", float(flip))]
 
 
+def _least_restitution() -> float:
+    """The restitution at Holmes's fold, where the paddle's largest speed is just enough."""
+    ratio = 4 * np.pi * float(m.PaddleJuggler().A) / 9.81
+    return (1 - ratio) / (1 + ratio)
+
+
 def _van_der_pol(cycle: hj.LimitCycle) -> tuple[float, float]:
     """Published periods (H. T. Davis, Introduction to nonlinear differential and integral
     equations, 1962, and others)."""
@@ -314,6 +320,16 @@ def _widest() -> float:
         return np.log((1 + w) / (1 - high)) + np.log((1 + high) / (1 - w)) - 1.3
 
     return brentq(late, 0.3, 0.4)
+
+
+def _shallowest(alpha: float) -> float:
+    """The slope at which the wheel, after an impact, just comes to the top of its spoke."""
+
+    def surplus(slope):
+        energy = 2 * np.sin(alpha) * np.sin(slope) / np.tan(2 * alpha) ** 2
+        return energy - (1 - np.cos(alpha - slope))
+
+    return brentq(surplus, 1e-6, alpha)
 
 
 _VDP = (0.05, 1.0, 5.0, 10.0)
@@ -405,7 +421,7 @@ CASES: dict[str, Callable[[], Case]] = {
         m.PaddleJuggler(),
         "restitution",
         (0.6, 1.1),
-        marks=[("Neimark-Sacker", 1.0)],
+        marks=[("fold", _least_restitution()), ("Neimark-Sacker", 1.0)],
         exact=lambda c: (
             float(np.prod(c.multipliers).real),
             float(c.system.restitution**2),
@@ -438,7 +454,10 @@ CASES: dict[str, Callable[[], Case]] = {
         "slope",
         (0.01, 0.3),
         {"section": hj.AtEvent("impact")},
+        ends=(_REST, OVER),
         marks=[],
+        border=(_shallowest(m.RimlessWheel().alpha), 0.3),
+        within=1e-5,
         exact=lambda c: (
             float(c.trajectory().events[0].after["w"]),
             float(c.system.exact()[0]),

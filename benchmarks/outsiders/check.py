@@ -1,8 +1,10 @@
 """Truth from scipy: simulation with events of its own, and the examination of a cycle.
 
 Nothing here uses hybridjax. A guard fires when it passes zero in its direction while the motion is
-in the source chart. A guard that is beyond zero when a chart is entered does not fire until it has
-come back; this is reported. A guard that is zero at entry is armed by what follows.
+in the source chart. A guard that a reset puts at zero or beyond fires at once by the rule of
+docs/mathematics.md ("Events at once"). Another one that is beyond zero when a chart is entered does
+not fire until it has come back; this is reported. A guard that is zero at the start is armed by
+what follows.
 """
 
 import dataclasses
@@ -63,6 +65,18 @@ class Motion:
     time: float
     ending: str = "ok"
     together: list = dataclasses.field(default_factory=list)
+    armed: dict = dataclasses.field(
+        default_factory=dict
+    )  # of the last chart, at its end
+
+
+@dataclasses.dataclass
+class Left:
+    """A chart that an event has ended: its state there, and which of its guards were armed."""
+
+    chart: str
+    state: np.ndarray
+    armed: dict
 
 
 def parameters(model: Model) -> types.SimpleNamespace:
@@ -151,26 +165,107 @@ class Simulator:
             event = self._stay(motion, end, deadline, fired, record)
             if event is None:
                 return motion
-            before = motion.state
-            motion.events.append(Occurrence(motion.time, event.name))
-            motion.state = self.reset(event, motion.time, before)
-            motion.chart = event.target
-            fired = event
-            for other in motion.together:
-                fired = self._join(motion, event, other, before) or fired
-            motion.together = []
-            if not np.all(np.isfinite(motion.state)):
-                motion.ending = "reset is not finite"
-                return motion
-            recent = motion.events[-100:]
-            crowded = (
-                len(recent) == 100
-                and recent[-1].time - recent[0].time < 1e-7 * duration
-            )
-            if crowded or len(motion.events) > max_events:
-                motion.ending = "Zeno"
-                return motion
+            while event is not None:
+                before = motion.state
+                left = Left(motion.chart, before, motion.armed | {event.name: False})
+                motion.events.append(Occurrence(motion.time, event.name))
+                motion.state = self.reset(event, motion.time, before)
+                motion.chart = event.target
+                fired = event
+                for other in motion.together:
+                    fired = self._join(motion, event, other, before) or fired
+                motion.together = []
+                if not np.all(np.isfinite(motion.state)):
+                    motion.ending = "reset is not finite"
+                    return motion
+                recent = motion.events[-100:]
+                crowded = (
+                    len(recent) == 100
+                    and recent[-1].time - recent[0].time < 1e-7 * duration
+                )
+                if crowded or len(motion.events) > max_events:
+                    motion.ending = "Zeno"
+                    return motion
+                event = self._at_once(motion, left, fired, self.clock or duration)
+                event = event or self._tick_too(motion)
         return motion
+
+    def _at_once(self, motion, left, fired, span) -> Event | None:
+        """The first event whose guard the reset of `fired` has put at zero or beyond."""
+        chart, state, t = motion.chart, motion.state, motion.time
+        motion.armed, due = {}, None
+        for event in self.exits[chart]:
+            if event.guard is None:
+                continue
+            value, rate, noise = self._level(event, chart, t, state, span)
+            motion.armed[event.name] = value > noise
+            known, armed = self._before(event, chart, left, t, noise)
+            falls = rate < 0
+            at_zero = abs(value) <= noise and event is not fired and falls
+            put = at_zero and (armed or not known)
+            late = value < -noise and (armed or (falls and not known))
+            if due is None and (put or late) and self.enabled(event, t, state):
+                due = event
+        return due
+
+    def _tick_too(self, motion) -> Event | None:
+        """An event of another clock that ticks at the same time (docs/mathematics.md, "Clocks")."""
+        now = [e.name for e in motion.events[-5:] if e.time == motion.time]
+        ticked = [
+            event.schedule(self.p)
+            for event in self.model.events
+            if event.schedule is not None and event.name in now
+        ]
+        if not ticked:
+            return None
+        for event in self.exits[motion.chart]:
+            if event.schedule is None or not self.at_tick(event, motion.time):
+                continue
+            period, offset = event.schedule(self.p)
+            turn = round((motion.time - offset) / period)
+            over = [
+                (period, offset) == clock
+                or (
+                    period == clock[0]
+                    and turn < round((motion.time - clock[1]) / period)
+                )
+                for clock in ticked
+            ]
+            if not any(over) and self.enabled(event, motion.time, motion.state):
+                return event
+        return None
+
+    def _before(self, event, chart, left, t, noise) -> tuple[bool, bool]:
+        """Whether the chart that was left has this guard, too, and whether it was armed there."""
+        if chart == left.chart:
+            return True, bool(left.armed.get(event.name))
+        names = len(self.model.charts[chart][0]), len(self.model.charts[left.chart][0])
+        if names[0] != names[1]:
+            return False, False
+        value = float(self.guard(event, t, left.state))
+        alike = [
+            other
+            for other in self.exits[left.chart]
+            if other.guard is not None
+            and abs(float(self.guard(other, t, left.state)) - value) <= noise
+        ]
+        return bool(alike), any(left.armed.get(other.name) for other in alike)
+
+    def _level(self, event, chart, t, state, span) -> tuple[float, float, float]:
+        """A guard, its rate along the flow, and values of it that are only rounding."""
+        value = float(self.guard(event, t, state))
+        field = self.field(chart)(t, state)
+        largest = np.max(np.abs(state)) / max(np.max(np.abs(field)), 1e-300)
+        step = 1e-7 * (min(span, largest) if largest > 0 else span)
+        later = float(self.guard(event, t + step, state + step * field))
+        rate = (later - value) / step
+        noise = 1e-11 * span * abs(rate)
+        for k, x in enumerate(state):
+            moved = np.array(state)
+            moved[k] += 1e-6 * (abs(x) or 1.0)
+            slope = (float(self.guard(event, t, moved)) - value) / (moved[k] - x)
+            noise += 1e-13 * abs(slope * x)
+        return value, rate, noise
 
     def _join(self, motion, event, other, before) -> Event | None:
         """Fires an event that coincides with `event`, and says whether the order matters."""
@@ -196,10 +291,12 @@ class Simulator:
         ticks = [event for event in self.exits[chart] if event.schedule is not None]
         bound, tick = end, None
         for event in ticks:
+            recent = [x.name for x in motion.events[-5:] if x.time == entry]
             if (
                 fired is not None
                 and self.at_tick(event, entry)
                 and not self._same(event, fired)
+                and event.name not in recent
             ):
                 motion.remarks.append(f"'{event.name}' coincides with '{fired.name}'")
             when = self.next_tick(event, entry)
@@ -214,7 +311,7 @@ class Simulator:
             event.name: float(self.guard(event, entry, motion.state))
             for event in guards
         }
-        armed = dict.fromkeys(first)
+        armed = motion.armed = dict.fromkeys(first)
         solver = self._solver(chart, entry, motion.state, bound, end - entry)
         if solver is None:
             motion.ending = "the field is not finite"
@@ -504,7 +601,7 @@ def verify(orbit: Orbit, model: Model, multipliers: bool = True) -> Report:
     report.complaints += [r for r in report.remarks if "order matters" in r]
     report.complaints += compare_events(orbit, found)
     report.complaints += early_return(orbit, pieces, scale, nodes[0], clock)
-    report.complaints += ghosts(simulator, pieces, found, report)
+    report.complaints += ghosts(simulator, pieces, found)
     together = any("coincides" in r for r in report.remarks)
     if multipliers and not report.complaints and not together:
         mine = monodromy(simulator, orbit, legs, scale, clock is None, report)
@@ -585,7 +682,7 @@ def early_return(orbit, pieces, scale, row, clock) -> list:
     return []
 
 
-def ghosts(simulator, pieces, found, report) -> list:
+def ghosts(simulator, pieces, found) -> list:
     """Guards that the orbit is beyond all along."""
     complaints = []
     happened = {event.name for event in found}
@@ -686,7 +783,8 @@ class Settled:
 
 
 def settle(model: Model, chart: str, state, start: float, wall: float = 6.0) -> Settled:
-    """A long simulation from a guess: 'cycle', 'equilibrium', 'unsettled', or an ending."""
+    """A long simulation from a guess: 'cycle', 'equilibrium', 'unsettled', 'beyond a guard' for a
+    cycle that is outside of the model, or an ending."""
     clock = clock_of(model)
     simulator = Simulator(model, rtol=1e-9, per_period=8)
     deadline = time.monotonic() + wall
@@ -707,6 +805,9 @@ def settle(model: Model, chart: str, state, start: float, wall: float = 6.0) -> 
             return Settled(motion.ending, remarks=tuple(remarks))
         found = clock_return(motion, clock) if clock else own_return(motion)
         if found is not None:
+            turn = tail_of(motion, motion.time - found.period)
+            if found.what == "cycle" and ghosts(simulator, turn.pieces, turn.events):
+                found = dataclasses.replace(found, what="beyond a guard")
             return dataclasses.replace(found, remarks=tuple(remarks))
         chart, state, now = motion.chart, motion.state, motion.time
         if clock is None:
@@ -744,17 +845,20 @@ def state_at(motion: Motion, t: float):
     return None, None
 
 
+def tail_of(motion: Motion, begin: float) -> Motion:
+    """The steps and events of a motion after a time."""
+    pieces = []
+    for piece in motion.pieces:
+        steps = [step for step in piece.steps if step.t_max > begin]
+        if steps:
+            pieces.append(Piece(piece.chart, steps))
+    events = [event for event in motion.events if event.time > begin]
+    return Motion(pieces, events, [], motion.chart, motion.state, motion.time)
+
+
 def clock_return(motion: Motion, clock: float) -> Settled | None:
     size = sizes(motion)
-    tail = Motion(
-        [p for p in motion.pieces if p.steps and p.end > motion.time - 2 * clock],
-        [],
-        [],
-        motion.chart,
-        motion.state,
-        motion.time,
-    )
-    last = sizes(tail)
+    last = sizes(tail_of(motion, motion.time - 2 * clock))
     now = motion.time - 0.137 * clock  # not at an event of the clock
     chart, state = state_at(motion, now)
     if chart is None:
@@ -778,11 +882,9 @@ def own_return(motion: Motion) -> Settled | None:
     """A return of an autonomous motion to its last state, twice in a row."""
     pieces = [p for p in motion.pieces if p.steps]
     half = motion.time - 0.5 * (motion.time - pieces[0].begin)
-    tail = Motion(
-        [p for p in pieces if p.end > half], [], [], motion.chart, motion.state, 0.0
-    )
+    tail = tail_of(motion, half)
     last = sizes(tail)
-    recent = [e for e in motion.events if e.time > half]
+    recent = tail.events
     spread, largest = last[motion.chart]
     if not recent and np.all(spread <= 1e-6 * np.maximum(largest, 1e-6)):
         return Settled("equilibrium")

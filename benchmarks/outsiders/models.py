@@ -5,7 +5,9 @@ models get a new file, which names its own date. Afterwards only errors of the h
 against the sources are mended; no model and no guess changes in order to pass.
 
 Changes since the first run: the words of `truth` of "pulse vaccination" (its cycle without
-infection is unstable).
+infection is unstable) and of "buck, comparator on at the tick, duty 0". The checker follows the
+rules of docs/mathematics.md for guards beyond zero after a reset and for clocks that tick together,
+which were written after the models, and a motion that settles beyond a guard is no cycle.
 """
 
 import models_converters

@@ -250,7 +250,7 @@ def buck_duty_zero() -> Model:
             Start("on", (-1.0 - 1e-8, 0.0), 1e-6, kind="1e-8 before the event"),
             Start("on", (6.0, 12.0), 1e-6, kind="equilibrium beyond the guard"),
         ),
-        truth="none: in the chart on, all states of interest are beyond the comparator's level",
+        truth="at rest: the comparator opens the switch at once at each tick",
     )
 
 

@@ -30,7 +30,12 @@ from .coincidence import SAME, check_begin, coincident, commutes, events_of, mee
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle
-from .guess import require_similar, return_map_near
+from .guess import (
+    after_rarest_event,
+    is_default,
+    require_similar,
+    return_map_near,
+)
 from .linear_flow import keep_turn, last_turn, remembering
 from .near import repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
@@ -51,8 +56,21 @@ from .verdict import verdict
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
-# chart than it began. Fewer: slow transients remain. More: a vain search takes longer.
+# chart than it began; after the last of them, one that Newton's method may have led astray; and
+# those within which an event is chosen as the section, in place of a plane. Fewer: slow transients
+# remain. More: a vain search takes longer.
 _LATER = 8, 40
+_EVENTFUL = 8
+_STRAYED = (
+    Result.NOT_CONVERGED,
+    Result.EQUILIBRIUM,
+    Result.GRAZING,
+    Result.ZENO,
+    Result.BLOW_UP,
+    Result.SECTION_MISSED,
+    Result.STEP_LIMIT,
+    Result.STEP_COLLAPSE,
+)
 # The rough size of a state that does not move is made smaller this many times, if the guess was far
 # from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
 # of a guess that is more than 1e18 times too large keep their errors.
@@ -81,7 +99,8 @@ def find_limit_cycle(
     """Find a stable or unstable limit cycle by Newton's method on the return map.
 
     If Newton's method fails, as it does if a step leaves the domain of the return map, the search
-    is repeated with the smaller steps of the Levenberg-Marquardt method.
+    is repeated with the smaller steps of the Levenberg-Marquardt method, then from the state to
+    which the flow leads from the guess in 40 periods.
 
     A clocked system has the period of its clock, and the return map is taken at the guess's phase
     of the clock. The period of an autonomous system is computed; its return map is taken on
@@ -97,7 +116,8 @@ def find_limit_cycle(
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
         the section, else where the flow from the guess first crosses it. Default: the section
         right after the event that the guess names (`Guess(..., after="heelstrike")`), or else the
-        plane through the guess that is orthogonal to the flow (in scaled states).
+        plane through the guess that is orthogonal to the flow (in scaled states), or if the flow
+        does not return to that, such a plane through the state to which it leads.
     - `multiplicity`: number of periods of the clock, or returns to the section, after which the
         cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
         cycle that is the guess.
@@ -108,8 +128,9 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the
-        section is given up. Default: 1000 times the time scale of the states at the guess (in
-        charts with an implicit method, that of the slowest mode).
+        section is given up. Default: 1000 times the time scale of the states at the guess, or
+        where the search would be given up, if they are slower there (in charts with an implicit
+        method, that of the slowest mode).
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
         not depend on units (under a JAX transformation, those of the guess).
@@ -216,25 +237,27 @@ def find_limit_cycle(
             return cycle
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)
-    ends_elsewhere = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
-    if (cycle.result == Result.GUARD_BEYOND or ends_elsewhere) and not settle:
+    later_fault = ""
+    for periods in () if settle else _times_later(cycle, guess):
         # (From there the flow may lead to a cycle that is stable.)
-        for periods in _LATER:
-            say(f"the same after {periods} periods")
-            later = _map_after(map, section, periods)
-            if later is None:
-                break
-            other, other_turn = _judged(later, search(later, patient), given)
-            if int(other.result) in (Result.OK, Result.SINGULAR):
-                cycle, turn = other, other_turn
-                break
+        say(f"the same after {periods} periods")
+        try:
+            later = _map_after(map, section, periods, given)
+            other, other_turn = _judged(later, solve(later, False, True, None), given)
+        except ComputationError as error:
+            later_fault = f" From the guess the flow leads to no cycle either: {error}"
+            break
+        if int(other.result) in (Result.OK, Result.SINGULAR):
+            cycle, turn = other, other_turn
+            break
     code = Result(int(cycle.result))
     checks.check_found(cycle)
     if code in (Result.OK, Result.SINGULAR):
         if conserved:
             checks.check_conserved(cycle)
     if throw and code != Result.OK:
-        raise ComputationError(checks.explain(cycle, turn, float(map.expected), settle))
+        reason = checks.explain(cycle, turn, float(map.expected), settle)
+        raise ComputationError(reason + later_fault)
     return cycle
 
 
@@ -308,22 +331,48 @@ def _with_result(cycle: LimitCycle, result: Result) -> LimitCycle:
     return remembering(other, cycle)
 
 
+def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
+    """The periods of the flow after which a search that failed begins again."""
+    strays = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
+    if strays or cycle.result == Result.GUARD_BEYOND:
+        return _LATER
+    if int(cycle.result) in _STRAYED and not isinstance(guess, LimitCycle):
+        return _LATER[-1:]
+    return ()
+
+
 def _map_after(
-    map: ReturnMap, section: Crossing | AtEvent | None, periods: int
-) -> ReturnMap | None:
-    """The return map at the state to which the flow leads within some periods; None if it fails."""
+    map: ReturnMap, section: Crossing | AtEvent | None, periods: int, given: Sizes
+) -> ReturnMap:
+    """The return map at the state to which the flow leads within some periods, in the sizes that
+    states have there. `given`: sizes that users give.
+
+    **Raises:** `ComputationError` if the flow fails.
+    """
+    s, rough = map.structure, sizes_of(map.structure, map.scale)
+    wait = periods * float(map.expected)
+    if isinstance(map.base, AtEvent):  # (also of a guess that names it)
+        section = map.base
+
+    def near(guess, settle, sizes):
+        limits = map.multiplicity, settle, None
+        return return_map_near(s, guess, section, *limits, map.settings, sizes)
+
+    later = near(_guess_at(map), wait, rough)
+    begin = None
+    if is_default(later.base):
+        begin = after_rarest_event(later, _EVENTFUL)
+    later = near(_guess_at(later) if begin is None else begin, 0.0, given)
+    return dataclasses.replace(later, conserved=map.conserved)
+
+
+def _guess_at(map: ReturnMap) -> Guess:
+    """The anchor of a map, as a guess."""
     s, anchor = map.structure, to_host(map.anchor)
     a = int(anchor.chart[0])
-    guess = Guess(s.names[a], anchor.q[: s.dims[a], 0], time=float(anchor.t[0]))
-    wait = periods * float(map.expected)
-    given = sizes_of(s, map.settings.scale)
-    try:
-        later = return_map_near(
-            s, guess, section, map.multiplicity, wait, None, map.settings, given
-        )
-    except ComputationError:
-        return None
-    return dataclasses.replace(later, conserved=map.conserved)
+    name = map.base.name if isinstance(map.base, AtEvent) else None
+    state = anchor.q[: s.dims[a], 0]
+    return Guess(s.names[a], state, time=float(anchor.t[0]), after=name)
 
 
 def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:

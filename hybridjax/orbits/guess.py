@@ -16,7 +16,7 @@ from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, lane_at
-from ..engine.move import move
+from ..engine.move import Options, move
 from ..engine.search.state import Moved
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import Target, toward, until
@@ -27,12 +27,25 @@ from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap
-from .scale import Sizes, scale_of, sizes_near, slow_time
+from .scale import Sizes, fastest, scale_of, sizes_near, slow_time
 
 
 # An autonomous system is given up if it does not return within this multiple of the time scale of
 # the states at the guess. Smaller: slow cycles are lost. Larger: vain searches last longer.
 _PATIENCE = 1000.0
+# A search that would be given up looks so often whether the states have become slower than they
+# were at the guess. Fewer: cycles are lost if the guess lies where they are fast. More: vain
+# searches last longer.
+_LOOKS = 4
+# Steps in which events are counted. More: memory. Fewer: rare events are missed.
+_RECORDED = 4096
+# A default section lies so much farther on than the event or the time at which a search for another
+# one ended, as a part of the time after which that is given up. Smaller: it lies at the event.
+# Larger: time.
+_ONWARD = 3.7e-4
+# States are at rest within this distance of an equilibrium, in sizes. Larger: slow cycles near an
+# equilibrium are taken for it. Smaller: errors of the flow are taken for motion.
+_REST = 1e-5
 
 
 class _Plane(eqx.Module):
@@ -117,8 +130,6 @@ def return_map_near(
         map = dataclasses.replace(map, anchor=lanes)
     if period is not None:
         return dataclasses.replace(map, expected=real(multiplicity * float(period)))
-    if max_period is None:
-        max_period = _PATIENCE * max(near.time, slow_time(s, time[0], near.points))
     after = None if guess.after is None else AtEvent(guess.after)
     base = after if section is None else section
     return _on_section(
@@ -126,20 +137,38 @@ def return_map_near(
     )
 
 
+def _patience(map: ReturnMap, lanes: Lanes) -> float:
+    """The time after which a search for a section is given up at a lane."""
+    s, lane = map.structure, to_host(lanes)
+    a, t = int(lane.chart[0]), float(lane.t[0])
+    near = sizes_near(s, a, t, lane.q[:, 0], None)
+    return _PATIENCE * max(near.time, slow_time(s, t, near.points))
+
+
+def _decays(map: ReturnMap, lanes: Lanes) -> bool:
+    """Test whether a mode decays at a lane."""
+    s, lane = map.structure, to_host(lanes)
+    a = int(lane.chart[0])
+    return bool(fastest(s, a, lane.t, lane.q[: s.dims[a]])[0] > 0)
+
+
 def _on_section(
     map: ReturnMap,
     section: Crossing | AtEvent | None,
     is_after: bool,
     time: float,
-    wait: float,
+    max_period: float | None,
+    last: bool = False,
 ) -> ReturnMap:
     """The map of an autonomous system, with its anchor on the section and a rough period.
 
     **Arguments:** `section`; Default: the plane through the anchor, across the flow. `is_after`:
     whether an event of that name has led to the anchor. `time`, the time scale of the states;
-    `wait`, the longest time until the section is reached.
+    `max_period`, the longest time until the section is reached; Default: by the time scales of the
+    states at the anchor and where the search ends. `last`: whether to give up if the default plane
+    is missed; otherwise a plane through the state to which the flow has led is the next.
     """
-    s, lanes = map.structure, map.anchor
+    s, lanes, at_guess = map.structure, map.anchor, map
     a = int(np.asarray(lanes.chart)[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
     f, level, rate = jax.device_get(_at_anchor(dataclasses.replace(map, base=section)))
@@ -165,24 +194,107 @@ def _on_section(
         )
     map = dataclasses.replace(map, base=section)
 
-    late = (
-        f"Allow more time than {wait:.3g}, by `max_period`, or for the slow modes of a stiff "
-        'system, take `settings=Settings(solver="auto")`. '
-    )
+    def missed(moved):
+        return int(np.asarray(moved.result)[0]) == Result.SECTION_MISSED
 
-    def next_crossing(lanes, doing):
-        say(doing)
-        target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
-        target = to_section(target, section, map.event)
-        return _go(map, f"{doing} ({place})", lanes, target, advice, late)
+    def next_crossing(lanes):
+        wait = _patience(map, lanes) if max_period is None else max_period
+        begin = float(np.asarray(lanes.t)[0])
+        for _ in range(_LOOKS):
+            target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
+            moved = _moved(map, lanes, to_section(target, section, map.event))
+            waited = float(np.asarray(moved.lanes.t)[0]) - begin
+            if not missed(moved) or max_period is not None:
+                break
+            # (The states may have become slower than they were at the guess, or drift away.)
+            lanes, wait = moved.lanes, _patience(map, moved.lanes) - waited
+            if wait <= 0 or not _decays(map, lanes):
+                break
+        if missed(moved):
+            _require_motion(map, moved.lanes)
+        late = (
+            f"Allow more time than {waited:.3g}, by `max_period`, or for the slow modes of a stiff "
+            'system, take `settings=Settings(solver="auto")`. '
+        )
+        return moved, late
 
     if not on_section:
-        lanes = next_crossing(lanes, "looking for the section")
-    back = lanes
+        doing = "looking for the section"
+        say(doing)
+        moved, late = next_crossing(lanes)
+        lanes = _arrived(map, f"{doing} ({place})", moved, advice, late)
+    back, doing = lanes, "looking for the return to the section"
     for _ in range(map.multiplicity):
-        back = next_crossing(back, "looking for the return to the section")
+        say(doing)
+        moved, late = next_crossing(back)
+        if is_default(section) and missed(moved) and not last:
+            say("a section where the flow has led")
+            # (A search that is given up may end at an event.)
+            end = np.asarray(moved.lanes.t) + _ONWARD * _patience(map, moved.lanes)
+            onward = _go(map, "settling", moved.lanes, toward(end, -1, end))
+            later = dataclasses.replace(at_guess, anchor=onward)
+            return _on_section(later, None, False, time, max_period, last=True)
+        back = _arrived(map, f"{doing} ({place})", moved, advice, late)
     duration = np.asarray(back.t)[0] - np.asarray(lanes.t)[0]
     return dataclasses.replace(map, anchor=lanes, expected=real(duration))
+
+
+def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
+    """The state right after the event that is rarest within some periods from the anchor on: each
+    turn meets it less often than other sections. `None` without events."""
+    s, lanes = map.structure, to_host(map.anchor)
+    end = lanes.t + periods * float(map.expected)
+    rough = np.array(TRANSIENT)
+    settings = Settings(rough, rough, _RECORDED, to_host(map.settings).scale)
+    options, u = Options(tape=True), np.zeros((s.nu, 1))
+    tape = move(s, lanes, u, until(end), settings, options=options).tape
+    assert tape is not None
+    code, follows = np.asarray(tape.code)[:, 0], np.asarray(tape.at_once)[:, 0]
+    # (A section at an event that another one follows at once is refused.)
+    happens = (code >= 0) & ~np.append(follows[1:], False)
+    if not happens.any():
+        return None
+    counts = np.bincount(code[code >= 0], minlength=len(s.transitions))
+    g = min(np.unique(code[happens]).tolist(), key=lambda g: counts[g])
+    row = np.flatnonzero(happens & (code == g))[-1]
+    a = int(tape.chart[row, 0])
+    state = np.asarray(tape.after)[row, : s.dims[a], 0]
+    name = s.transitions[g].name
+    return Guess(s.names[a], state, time=float(tape.t[row, 0]), after=name)
+
+
+def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
+    """**Raises:** `ComputationError` if the states of a lane are at rest."""
+    s, lane = map.structure, to_host(lanes)
+    a, t = int(lane.chart[0]), lane.t
+    n = s.dims[a]
+    by = kernels.field(s, a, t, lane.q[:n], np.zeros((s.nu, 1)))[..., 0]
+    sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
+    rate, jacobian = by[:, 0] / sizes, by[:, 2 : 2 + n] * sizes / sizes[:, None]
+    # (On a slow manifold rates are small, too, but the equilibrium is far away.)
+    distance = np.linalg.lstsq(jacobian, rate)[0]
+    if np.any(np.abs(distance) > _REST):
+        return
+    # (A state that drifts at a constant rate is near none.)
+    drift = rate - jacobian @ distance
+    if np.abs(drift).max() > 0.1 * np.abs(rate).max():
+        return
+    beyond = []
+    guards = s.guards(a)
+    if guards:
+        u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+        levels = kernels.watched(s, a, None, t, lane.q[:n], u, first)[:, 0, 0]
+        passed = [g for g, level in zip(guards, levels, strict=True) if level < 0]
+        beyond = [f"'{s.transitions[g].name}'" for g in passed]
+    text = ""
+    if beyond:
+        text = (
+            f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
+        )
+    raise ComputationError(
+        f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', "
+        f"{lane.q[:n, 0]}, where nothing moves: start elsewhere.{text}"
+    )
 
 
 @host_first
@@ -192,19 +304,21 @@ def _at_anchor(map: ReturnMap):
     return map.slopes(map.anchor)[:, 0], watched.value[-1, 0], watched.rate[-1, 0]
 
 
-def _go(
-    map: ReturnMap,
-    doing: str,
-    lanes: Lanes,
-    target: Target,
-    advice: str = "",
-    if_late: str = "",
-) -> Lanes:
+def _go(map: ReturnMap, doing: str, lanes: Lanes, target: Target) -> Lanes:
     """The lane at a target, however many steps it takes.
+
+    **Raises:** `ComputationError`.
+    """
+    return _arrived(map, doing, _moved(map, lanes, target))
+
+
+def _arrived(
+    map: ReturnMap, doing: str, moved: Moved, advice: str = "", if_late: str = ""
+) -> Lanes:
+    """The lane at the end of a flow.
 
     **Raises:** `ComputationError` with advice, also with that for a section that is missed.
     """
-    moved = _moved(map, lanes, target)
     result = Result(int(np.asarray(moved.result)[0]))
     if result != Result.OK:
         lanes, s = to_host(moved.lanes), map.structure

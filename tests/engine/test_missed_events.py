@@ -170,3 +170,15 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
     armed = np.array([True])
     assert first_crossing(*ends, armed, margin).near[0]
     assert not first_crossing(*ends, armed, np.array([0.9])).near[0]
+
+
+@pytest.mark.parametrize("begin", [0.0, 10.0])
+def test_an_event_just_before_a_blow_up_is_found(begin):
+    """x' = x^2 from 1 is 1 / (1 - t): it reaches 1e11 in 1 - 1e-11, and infinity in 1."""
+    square = Field(("x",), lambda t, q, u: (q[0] ** 2,))
+    spike = lambda t, q, u: q[0] - 1e11  # noqa: E731
+    again = lambda t, q, u: (1.0,)  # noqa: E731
+    reset = hj.Transition("spike", "a", "a", spike, "rising", again)
+    path = hj.simulate(toy({"a": square}, [reset]), "a", (1.0,), 9.5, time=begin)
+    spikes = np.array([event.time for event in path.events]) - begin
+    np.testing.assert_allclose(spikes, np.arange(1, 10) * (1 - 1e-11), rtol=1e-9)

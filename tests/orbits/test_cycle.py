@@ -7,7 +7,7 @@ import pytest
 import hybridjax as hj
 from hybridjax.orbits.linear_flow import begin_later, last_turn
 
-from ..toys import Switched
+from ..toys import Field, Switched, toy
 
 
 FALL = hj.Crossing("v", "falling")
@@ -111,6 +111,82 @@ def test_van_der_pol(mu):
         cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0
     )
     assert not cycle.clocked and cycle.event_sequence == () and cycle.stable == (mu > 0)
+
+
+def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
+    """v' = 1 + v^2 from -1 to 1e5, in the time atan(1e5) + pi/4; at the guess a millionth of it."""
+    square = Field(("v",), lambda t, q, u: (1 + q[0] ** 2,))
+    spike = lambda t, q, u: q[0] - 1e5  # noqa: E731
+    again = lambda t, q, u: (-1.0,)  # noqa: E731
+    event = hj.Transition("spike", "a", "a", spike, "rising", again)
+    guess, section = hj.Guess("a", (9e4,)), hj.AtEvent("spike")
+    cycle = hj.find_limit_cycle(toy({"a": square}, [event]), guess, section=section)
+    np.testing.assert_allclose(cycle.period, np.arctan(1e5) + np.pi / 4, rtol=1e-9)
+
+
+def test_a_default_section_that_is_missed_is_replaced():
+    """No cycle of van der Pol's oscillator comes to y = 30."""
+    np.testing.assert_allclose(
+        vanderpol(1.0, (0.0, 30.0)).period, vanderpol(1.0, (2.0, 0.0)).period
+    )
+
+
+def test_a_default_section_is_not_replaced_by_one_at_an_event():
+    """A Schmitt trigger with the levels 1 and -1, supplied by 2 and -2: its period is 2 ln 3."""
+    charts = {
+        name: Field(("v",), lambda t, q, u, supply=supply: (supply - q[0],))
+        for name, supply in (("up", 2.0), ("down", -2.0))
+    }
+    top = hj.Transition("top", "up", "down", lambda t, q, u: q[0] - 1, "rising")
+    bottom = hj.Transition("bottom", "down", "up", lambda t, q, u: q[0] + 1)
+    cycle = hj.find_limit_cycle(toy(charts, [top, bottom]), hj.Guess("down", (40.0,)))
+    np.testing.assert_allclose(cycle.period, 2 * np.log(3), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
+    """Two cells with the drive 1.3 that spike at 1 and then push the other one back by 0.1: in half
+    a period e = exp(-T/2) solves 1.3 e^2 + 0.1 e = 0.3."""
+    cells = Field(("x", "y"), lambda t, q, u: (1.3 - q[0], 1.3 - q[1]))
+    spikes = [
+        hj.Transition(
+            "spike x",
+            "cells",
+            "cells",
+            lambda t, q, u: q[0] - 1,
+            "rising",
+            lambda t, q, u: (0.0, q[1] - 0.1),
+        ),
+        hj.Transition(
+            "spike y",
+            "cells",
+            "cells",
+            lambda t, q, u: q[1] - 1,
+            "rising",
+            lambda t, q, u: (q[0] - 0.1, 0.0),
+        ),
+    ]
+    cycle = hj.find_limit_cycle(
+        toy({"cells": cells}, spikes), hj.Guess("cells", (0, 0.5))
+    )
+    half = np.log(2 * 1.3 / (np.sqrt(0.1**2 + 4 * 1.3 * 0.3) - 0.1))
+    np.testing.assert_allclose(cycle.period, 2 * half, rtol=1e-10)
+
+
+def test_a_flow_that_comes_to_rest_is_no_cycle():
+    charging = Field(("v",), lambda t, q, u: (2.0 - q[0],))
+    top = hj.Transition("top", "a", "a", lambda t, q, u: q[0] - 1, "rising")
+    with pytest.raises(hj.ComputationError, match="beyond the guard of 'top'"):
+        hj.find_limit_cycle(toy({"a": charging}, [top]), hj.Guess("a", (1.5,)))
+    with pytest.raises(hj.ComputationError, match="leads to an equilibrium of chart"):
+        vanderpol(-2.5, (0.1, 0.1))
+    # (Neither is a state that drifts away, nor slow motion.)
+    drift = Field(("v",), lambda t, q, u: (1.0 + 0 * q[0],))
+    with pytest.raises(hj.ComputationError, match="was not crossed within"):
+        hj.find_limit_cycle(toy({"a": drift}, [top]), hj.Guess("a", (1.5,)))
+    far = hj.Crossing("x", "falling", value=10.0)
+    with pytest.raises(hj.ComputationError, match="Allow more time than 1, by"):
+        vanderpol(1000.0, (2.0, 0.0), section=far, max_period=1.0)
 
 
 def test_a_conservative_system_has_a_family_of_cycles(amplitude=7.3):

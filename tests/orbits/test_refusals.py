@@ -178,3 +178,19 @@ def test_constants_in_float32_are_exact():
         oscillator(lambda t, q: jnp.float32(0.0) * q[0]), hj.Guess("a", (2.0, 0.0))
     )
     np.testing.assert_allclose(cycle.period, 6.663286859, rtol=1e-8)
+
+
+def test_zeno_is_named_although_newton_went_elsewhere():
+    """Two tanks with one hose, which goes to the tank that falls to 1: they lose 0.25 together, so
+    that the hose has to be in both within a finite time."""
+    fields = {"first": (0.25, -0.5), "second": (-0.5, 0.25)}
+    charts = {
+        name: Field(("x", "y"), lambda t, q, u, rates=rates: rates)
+        for name, rates in fields.items()
+    }
+    events = [
+        hj.Transition("y low", "first", "second", lambda t, q, u: q[1] - 1),
+        hj.Transition("x low", "second", "first", lambda t, q, u: q[0] - 1),
+    ]
+    with pytest.raises(hj.ComputationError, match="accumulate in finite time"):
+        hj.find_limit_cycle(toy(charts, events), hj.Guess("first", (1.5, 1.5)))

@@ -22,10 +22,17 @@ from ..events import (
     with_schedules,
 )
 from ..lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
+from ..settings import ROUNDING
 from ..watch import Watch, watch
 from .accept import Verdict, accept, next_step, of_row, step_length
 from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
+
+
+# The shortest step near t = 0, where times resolve any step, as a part of the time allowed. Larger:
+# events of states that are about to leave all bounds, as spikes of a neuron, are missed. Smaller:
+# more steps until a blow-up is reported.
+_SHORTEST = 1e-18
 
 
 def without_events(
@@ -252,7 +259,13 @@ def _next_step(
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
-    return h, (too_long | verdict.refine | verdict.lost) & (h < INSTANT * task.span)
+    instant, t = INSTANT * task.span, state.lanes.t
+    # (A fast state needs steps that are shorter than an instant, as far as times resolve them.)
+    shortest = xp.minimum(instant, ROUNDING * xp.abs(t) + _SHORTEST * task.span)
+    stuck = (too_long & (h < shortest)) | (
+        (verdict.refine | verdict.lost) & (h < instant)
+    )
+    return h, stuck
 
 
 def level_counts(watched: Watch, span: Times) -> Mask:
