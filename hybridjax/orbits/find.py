@@ -296,7 +296,7 @@ def _judged(
 ) -> tuple[LimitCycle, Turn]:
     """The cycle of a solution, in its own sizes, with the result of all checks; and its turn."""
     map, solution = _in_own_sizes(map, solution, given)
-    cycle = _kept(map, solution)
+    cycle = kept(map, solution)
     if not solution.is_fixed_point:
         return cycle, solution.turn
     check_begin(cycle.return_map)
@@ -311,14 +311,14 @@ def _judged(
         again = solve(shorter)
         if again.is_fixed_point:
             solution = again._replace(steps=solution.steps)
-            cycle = _kept(shorter, solution)
+            cycle = kept(shorter, solution)
             checked = verdict(cycle)
     if checked.refused:
         cycle = _with_result(cycle, checked.result)
     return cycle, solution.turn
 
 
-def _kept(map: ReturnMap, solution: Solution) -> LimitCycle:
+def kept(map: ReturnMap, solution: Solution) -> LimitCycle:
     """The cycle of a solution, which remembers its last turn."""
     cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
     keep_turn(cycle, solution.turn)

@@ -28,6 +28,7 @@ from .checks import check_found, check_periodic
 from .coincidence import commutes, together
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
+from .find import kept
 from .guess import require_similar
 from .many import TILE, Found, Many, Solver
 from .newton import search as newton
@@ -199,7 +200,8 @@ def find_limit_cycles(
     check_periodic(first)
     map = map_for_sweep(guess, settings)
     require_similar(map, first)
-    return solved(systems, map, execution.batch, execution.threads)
+    sound = bool(guess.result == Result.OK) and not verdict(guess).refused
+    return solved(systems, map, execution.batch, execution.threads, checked=sound)
 
 
 def map_for_sweep(guess: LimitCycle, settings: Settings) -> ReturnMap:
@@ -216,14 +218,16 @@ def solved(
     size: int | None = None,
     workers: int = 1,
     known: Known | None = None,
+    checked: bool = True,
 ) -> LimitCycles:
     """The cycles of systems near that of a return map.
 
-    **Arguments:** `size`: systems per call. `known`: see `Tiles`.
+    **Arguments:** `size`: systems per call. `known`: see `Tiles`. `checked`: whether the cycle of
+    the map has passed its verdict; others are no itinerary for systems.
     """
     S = len(leaves_of(systems)[0])
     tiles = tiles_of(systems, map, size, workers)._replace(known=known)
-    if S < WORTH_COMPILING or not has_route(map):
+    if S < WORTH_COMPILING or not checked or not has_route(map):
         return as_cycles(tiles, tiles.solve(S))
     expected = np.full(S, float(map.expected))
     expected = expected if tiles.periods is None else tiles.periods
@@ -263,7 +267,7 @@ def _search(map: ReturnMap) -> ReturnMap | None:
         anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
         map = dataclasses.replace(map, anchor=anchor)
     solution = newton(map)
-    if not solution.is_fixed_point:
+    if not solution.is_fixed_point or verdict(kept(map, solution)).refused:
         return None
     return dataclasses.replace(map, anchor=to_host(solution.anchor))
 

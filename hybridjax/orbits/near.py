@@ -39,6 +39,7 @@ from .repeat import (
     travel,
 )
 from .return_map import ReturnMap
+from .verdict import verdict
 
 
 # Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
@@ -49,13 +50,16 @@ _calls: collections.Counter = collections.Counter()
 
 
 def route_near(guess: LimitCycle) -> Route | None:
-    """The route of a cycle; None for one that has none (see `has_route`), or is traced."""
+    """The route of a cycle; None for one that has none (see `has_route`), has a fault, or is
+    traced."""
     if is_traced(guess) or int(guess.result) != Result.OK:
         return None
     if not has_route(guess.return_map):
         return None
     with eval_context(), on_the_cpu(), at_ease():  # (also while a program is traced)
         guess = hosted(guess)
+        if verdict(guess).refused:  # (flags compare with what was recorded)
+            return None
         make = lambda: route_of(guess.return_map, last_turn(guess))  # noqa: E731
         return _routes.recall(guess, None, make)
 

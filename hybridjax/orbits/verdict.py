@@ -13,7 +13,7 @@ author meant, and multipliers of systems with more than `_MANY` states.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -24,6 +24,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import SAME_TIME
 from ..engine.replay import recorded_moves
+from ..errors import DefinitionError
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .linear_flow import hosted, last_turn
@@ -95,6 +96,12 @@ class Verdict(NamedTuple):
         if np.isnan(multipliers):
             return text
         return f"{text}, multipliers to {multipliers:.1g}"
+
+
+def require_sound(cycle: Any) -> None:
+    """**Raises:** `DefinitionError` for a cycle with a fault, from which others would have it."""
+    for finding in verdict(cycle).refused:
+        raise DefinitionError(f"the cycle that is the guess is none: {finding.text}")
 
 
 class _Path(NamedTuple):

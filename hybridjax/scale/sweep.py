@@ -31,6 +31,7 @@ from ..orbits.limit_cycles import (
     solved,
 )
 from ..orbits.return_map import ReturnMap
+from ..orbits.verdict import require_sound
 from ..systems.system import HybridSystem
 from .family import Axes, Family, Points, Space
 from .wanted import Measure, Want, Wanted
@@ -259,6 +260,7 @@ class SweepJob:
 
     def _guess(self) -> LimitCycle:
         if self.guess is not None:
+            require_sound(self.guess)
             return self.guess
         say("a cycle in the middle")
         with searching("as `guess`", (ComputationError, DefinitionError)):

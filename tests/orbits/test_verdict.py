@@ -145,6 +145,8 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
     assert cycles.ok.all() and ((cycles.codes >= 0).sum(axis=1) == 2).all()
     ghosts = hj.find_limit_cycles(systems, ghost)
     assert (ghosts.result == Result.GUARD_BEYOND).all()
+    with pytest.raises(hj.errors.DefinitionError, match="guess is none"):
+        hj.sweep(SchmittTrigger(), {"width": np.asarray(widths)}, guess=ghost)
     result = eqx.filter_jit(
         lambda w: hj.find_limit_cycle(SchmittTrigger(width=w), ghost).result
     )(jnp.asarray(0.3))
