@@ -218,39 +218,42 @@ def lane_jvp(
 
 
 def by_jacobian(function: Callable) -> Callable:
-    """A function of a tree with few numbers and of further arguments, with derivatives by the
-    numbers that are computed forwards, all at once.
+    """A function of a tree with few numbers, whose derivatives by these are computed forwards, all
+    at once; so are derivatives of derivatives.
 
     Reverse mode then transposes a product with the Jacobian, and stores nothing of the function.
     """
 
     @eqx.filter_custom_jvp
-    def derived(tree, *others):
-        return function(tree, *others)
+    def derived(tree):
+        return function(tree)
 
     @derived.def_jvp
     def rule(arguments, tangents):
-        tree, *others = arguments
+        (tree,), (tangent,) = arguments, tangents
         has = jax.tree_util.tree_map(
-            lambda x, t: t is not None, tree, tangents[0], is_leaf=lambda x: x is None
+            lambda x, t: t is not None, tree, tangent, is_leaf=lambda x: x is None
         )
         moving, still = eqx.partition(tree, has)
-        along, _ = ravel_pytree(eqx.filter(tangents[0], has))
-        numbers, back = ravel_pytree(moving)
+        along, _ = ravel_pytree(eqx.filter(tangent, has))
 
-        def of(moving):
-            value = function(eqx.combine(moving, still), *others)
-            smooth, rest = eqx.partition(value, eqx.is_inexact_array)
-            return smooth, rest
+        def with_columns(moving):
+            numbers, back = ravel_pytree(moving)
 
-        def push(direction):
-            return jax.jvp(of, (moving,), (back(direction),), has_aux=True)
+            def of(moving):
+                value = function(eqx.combine(moving, still))
+                return eqx.partition(value, eqx.is_inexact_array)
 
-        units = jnp.eye(len(numbers), dtype=numbers.dtype)
-        smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(units)
+            def push(direction):
+                return jax.jvp(of, (moving,), (back(direction),), has_aux=True)
+
+            units = jnp.eye(len(numbers), dtype=numbers.dtype)
+            smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(units)
+            return eqx.combine(smooth, rest), columns
+
+        value, columns = by_jacobian(with_columns)(moving)
         contract = lambda column: jnp.tensordot(along, column, 1)  # noqa: E731
-        tangent = jax.tree_util.tree_map(contract, columns)
-        return eqx.combine(smooth, rest), tangent
+        return value, jax.tree_util.tree_map(contract, columns)
 
     return derived
 

@@ -212,7 +212,7 @@ def find_limit_cycle(
         map, conserved={k: real(v) for k, v in (conserved or {}).items()}
     )
     near = last_turn(guess) if isinstance(guess, LimitCycle) else None
-    if isinstance(guess, LimitCycle) and is_inside_program():
+    if isinstance(guess, LimitCycle) and section is None and is_inside_program():
         route = route_near(guess)
         if route is not None:
             return traced_cycle(route, map)
@@ -231,9 +231,11 @@ def find_limit_cycle(
     )
     if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
         check_begin(map)
-    if isinstance(guess, LimitCycle):
+    if isinstance(guess, LimitCycle) and section is None:
         cycle = repeated_cycle(guess, map)
         if cycle is not None and _sizes_hold(map, cycle):
+            if conserved:
+                checks.check_conserved(cycle)
             return cycle
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)

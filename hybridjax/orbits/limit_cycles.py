@@ -30,7 +30,7 @@ from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .find import kept
 from .guess import require_similar
-from .many import TILE, Found, Many, Solver
+from .many import TILE, Many, Solver
 from .newton import search as newton
 from .repeat import has_route, leaves_of
 from .return_map import ReturnMap, turn_product
@@ -248,7 +248,7 @@ def solved(
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
     coincide = _coincide(cycles, solver)
-    if len(left := solver.pending):
+    if len(left := solver.left):
         near = _some_known(cycles) if known is None else known
         part = tiles_of(_some(systems, left), map, size, workers)
         rounds = part._replace(known=near).solve(len(left))
@@ -316,7 +316,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         found.factors,
         found.distance,
         found.turns,
-        np.where(missing, Result.NOT_CONVERGED, _singular(found, map)),
+        np.where(missing, Result.NOT_CONVERGED, Result.OK),
         codes,
         map.settings,
         map.conserved,
@@ -330,11 +330,6 @@ def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
     width = max(codes.shape[1], more.shape[1])
     fill = lambda x: np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)  # noqa: E731
     return np.maximum(fill(codes), fill(more))
-
-
-def _singular(found: Found, map: ReturnMap) -> Int[np.ndarray, " S"]:
-    """OK, or `SINGULAR` for cycles that are not isolated."""
-    return np.full(len(found.path), int(Result.OK))
 
 
 def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import identity, whole
 from .._core.execution import in_threads
 from .._core.executor import on_the_cpu
+from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import LEGS, Form, Itinerary
 from ..engine.itinerary.turn import Passage
 from .repeat import (
@@ -30,6 +30,7 @@ from .repeat import (
     correct,
     factors_across,
     judge,
+    on_device,
     route_of,
     travel,
 )
@@ -87,7 +88,7 @@ class Many(NamedTuple):
     def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
         """A function of all lanes, in calls of one size."""
         plan = Plan.of(itinerary)
-        map = jax.tree_util.tree_map(jnp.asarray, route.map)
+        map = on_device(route.map)
         program = whole(function, (itinerary.form,), (map,), loops=True)
 
         def run(k):
@@ -101,7 +102,10 @@ class Many(NamedTuple):
             return jax.tree_util.tree_map(lambda x: x[:left], result)
 
         tiles = range(0, len(rows), self.size)
-        parts = in_threads(run, tiles, min(self.workers, len(tiles)))
+        # (Two stacks of LAPACK at once may wait for each other for ever.)
+        alone = bool(map.conserved) or q.shape[1] > factorizations.MOST_ROWS
+        workers = 1 if alone else min(self.workers, len(tiles))
+        parts = in_threads(run, tiles, workers)
         return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
 
 
@@ -139,12 +143,16 @@ class Solver:
         S, d = len(many.t), map.anchor.q.shape[0]
         self.many, self._search = many, search
         key = _key(map, many.leaves)
-        if key not in _routes:
+        if key in _routes:
+            _routes.move_to_end(key)
+        else:
             _routes[key] = [route_of(map)]
             while len(_routes) > _KEPT:
                 _routes.popitem(last=False)
         self.routes = _routes[key]
-        self.pending = np.arange(S)
+        numbers = [np.isfinite(x.reshape(S, -1)).all(axis=1) for x in many.leaves]
+        self._finite = np.all([np.isfinite(many.expected), *numbers], axis=0)
+        self.pending = np.flatnonzero(self._finite)
         self._ends: dict[int, np.ndarray] = {}
         blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
         legs = blank(LEGS), blank(LEGS, d), blank(LEGS, d, d)
@@ -164,8 +172,10 @@ class Solver:
             map = self._search(int(self.pending[first]), int(near[first]), self)
             if map is None:
                 return
-            before = len(self.pending)
-            self.routes.append(route_of(map))
+            before, route = len(self.pending), route_of(map)
+            if not route.first.certain:
+                return
+            self.routes.append(route)
             self._take(len(self.routes) - 1)
             if len(self.pending) == before:
                 self.routes.pop()
@@ -182,7 +192,7 @@ class Solver:
     def _take(self, number: int) -> None:
         """Find the cycles of the systems without one on a route."""
         route, rows = self.routes[number], self.pending
-        if not len(rows):
+        if not len(rows) or not route.first.certain:
             return
         many, expected = self.many, float(route.map.expected)
         q = np.repeat(route.map.anchor.q.T, len(rows), axis=0)
@@ -199,11 +209,11 @@ class Solver:
             # (What has converged, and left the route, needs another one.)
             rows = rows[~attempt.converged]
             known = np.flatnonzero(self.found.path // 2 == number)
-            if not len(rows) or not attempt.ok.any():
+            if not len(rows) or not len(known):
                 break
             _, near = self.nearest(rows, known)
             q, ends = self.found.q[near], self._ends[number][near]
-        self.pending = np.flatnonzero(self.found.path < 0)
+        self.pending = np.flatnonzero(self._finite & (self.found.path < 0))
 
     def _keep(self, number: int, attempt: _Attempt, finer: bool = False) -> None:
         """Keep the cycles that an attempt has found."""
@@ -223,6 +233,11 @@ class Solver:
         S, E = len(self.many.t), passage.ends.shape[1]
         ends = self._ends.setdefault(number, np.full((S, E), np.nan))
         ends[rows] = passage.ends[ok]
+
+    @property
+    def left(self) -> Int[np.ndarray, " n"]:
+        """The systems without a cycle."""
+        return np.flatnonzero(self.found.path < 0)
 
     @property
     def itineraries(self) -> list[Itinerary]:
@@ -252,6 +267,7 @@ def _key(map: ReturnMap, leaves: tuple[np.ndarray, ...]) -> tuple:
 def _parameters(leaves: tuple[np.ndarray, ...]) -> Float[np.ndarray, "S p"]:
     """The numbers in which systems differ, in units of their spread."""
     flat = np.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
-    flat = flat - flat.mean(axis=0)
+    numbers = np.ma.masked_invalid(flat.astype(float))
+    flat = (numbers - numbers.mean(axis=0)).filled(0.0)
     spread = np.sqrt(np.mean(flat**2, axis=0))
     return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]

@@ -22,6 +22,7 @@ from ..engine.itinerary.rows import Form, Itinerary
 from ..engine.lanes import Lanes
 from ..systems.system import copies_of
 from ..systems.transition import TOGETHER
+from .crossing import AtEvent
 from .cycle import LimitCycle
 from .linear_flow import hosted, last_turn
 from .repeat import (
@@ -35,6 +36,7 @@ from .repeat import (
     judge,
     leaves_of,
     maps_of,
+    on_device,
     route_of,
     travel,
 )
@@ -61,7 +63,8 @@ def route_near(guess: LimitCycle) -> Route | None:
         if verdict(guess).refused:  # (flags compare with what was recorded)
             return None
         make = lambda: route_of(guess.return_map, last_turn(guess))  # noqa: E731
-        return _routes.recall(guess, None, make)
+        route = _routes.recall(guess, None, make)
+        return route if route.first.certain else None
 
 
 def _beginning(route: Route, map: ReturnMap) -> tuple:
@@ -106,15 +109,22 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
 
 def _coincide(route: Route, found: Corrected, expected):
     """Whether two events come together that do not on the known cycle."""
-    count = len(route.first.events)
-    pairs = [k for k in range(1, count) if _apart(route, k)]
-    between = [found.passage.ends[k] - found.passage.ends[k - 1] for k in pairs]
+    ends = found.passage.ends
+    pairs = [k for k in range(1, len(route.first.events)) if _apart(route, k)]
+    between = [ends[k] - ends[k - 1] for k in pairs]
+    if isinstance(route.map.base, AtEvent) and len(route.first.events) > 1:
+        between.append(ends[0] - found.passage.legs_t[0])
     if not between:
         return jnp.asarray(False)
     return (jnp.stack(between) <= TOGETHER * expected).any()
 
 
 def _apart(route: Route, k: int) -> bool:
+    """Whether event k comes later than the one before on the known cycle. (Of two that are
+    scheduled, the order is known.)"""
+    s, events = route.map.structure, route.first.events
+    if s.clocks[events[k]] >= 0 and s.clocks[events[k - 1]] >= 0:
+        return False
     ends, period = route.first.ends, float(route.map.expected)
     return bool(ends[k] - ends[k - 1] > TOGETHER * period)
 
@@ -126,7 +136,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     if route is None:
         return None
     form = route.first.form
-    arrays = jax.tree_util.tree_map(jnp.asarray, map)
+    arrays = on_device(map)
     key = form, identity((arrays,))
     _calls[key] += 1
     if _calls[key] < _WORTH_COMPILING:
@@ -135,7 +145,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
-            program = whole(_correct, (form,), (arrays,), loops=True)
+            program = whole(_correct, (itinerary.form,), (arrays,), loops=True)
             found = program(Plan.of(itinerary), *begin)
             converged, kept, fine = judge(route, found, t, expected)
             if fine or not (converged and kept):

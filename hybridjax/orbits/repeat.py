@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.executor import namespace, svdvals, to_host
+from .._core.executor import namespace, on_host, svdvals, to_host
 from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
@@ -66,6 +66,12 @@ class Plan(NamedTuple):
         """That of a loop that ends with the last row."""
         counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
         return cls(itinerary.rows, *counts)
+
+
+def on_device(map: ReturnMap) -> ReturnMap:
+    """A return map with arrays of JAX."""
+    move = lambda x: jnp.asarray(x) if on_host(x) else x  # noqa: E731
+    return jax.tree_util.tree_map(move, map)
 
 
 class Route(NamedTuple):
@@ -273,7 +279,7 @@ def _root_jvp(primals, tangents):
     options: Any = dict(columns=False, reverse=reverse)
     residual = lambda maps: turn(maps, form, plan, q, ends, **options)[1]  # noqa: E731
     _, moved = eqx.filter_jvp(residual, (maps,), (t_maps,))
-    passage, _ = turn(maps, form, plan, q, ends)
+    passage, _ = turn(maps, form, plan, q, ends, reverse=reverse)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
     return found, nothing._replace(q=step)

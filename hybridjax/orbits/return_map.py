@@ -31,6 +31,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
 from ..engine.events import arm, await_schedules, belongs, enabled
+from ..engine.itinerary.rows import LEGS
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -46,9 +47,6 @@ from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
 
-# Pieces of one turn. Fewer: strong contraction drowns in the product of the steps of a piece. More:
-# programs run longer.
-LEGS = 16
 # Least bound on the steps of a piece of a turn with an implicit method, and of the flow from one
 # section to the next. Smaller: a fast jump, as of van der Pol's oscillator at mu = 1000, or many
 # events reach it. Larger: vain searches last longer.

@@ -59,6 +59,14 @@ class Watched(NamedTuple):
     t: Float[Array, ""]
     value: Float[Array, " G"]
     rate: Float[Array, " G"]
+    enabled: Bool[Array, " G"]
+    """Whether their events are enabled."""
+
+    @classmethod
+    def unknown(cls, t: Float[Array, ""], width: int) -> "Watched":
+        """Watched functions of which nothing is known."""
+        far = jnp.full(width, jnp.inf)
+        return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,18 +121,18 @@ class Bodies:
         h = row.fraction * (course.ends[row.leg] - begin)
         if self._functions(a):
             is_correction = row.target >= 0
-            h = jnp.where(is_correction, _newton(now, row.target), h)
+            # (Where none is made, the rate may be zero, and NaN would enter reverse mode.)
+            rate = jnp.where(is_correction, now.rate, 1.0)
+            newton = _newton(now._replace(rate=rate), row.target)
+            h = jnp.where(is_correction, newton, h)
         y, error = self._advanced(a, course, h)
-        error = jnp.where(
-            row.target >= 0, course.error, jnp.maximum(course.error, error)
-        )
         return course._replace(
             t=course.t + h,
             y=y,
             begin=begin,
             before=now,
-            error=error,
-            left=course.left | self._has_left(a, row, course, now, q),
+            error=jnp.maximum(course.error, error),
+            left=course.left | self._has_left(a, row, course, now),
         )
 
     def _jump(self, body: Body, row: Rows, course: Course) -> Course:
@@ -140,6 +148,7 @@ class Bodies:
         elif not body.at_once:
             late = _newton(now, row.target)
             delay = self._delay(a, course, q, now, row.target)
+        left = course.left | self._has_left(a, row, course, now)
         t, q = course.t + late, q + field * late
         after = s.reset(member, t, q, u)
         onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
@@ -152,7 +161,6 @@ class Bodies:
         columns = jax.vmap(column)(course.y[1:, : s.dims[a]], delay)
         moved = jnp.concatenate([after[None], columns])
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
-        left = course.left | self._has_left(a, row, course, now, q)
         left = left | self._has_tick(a, course, t)
         return course._replace(
             t=t,
@@ -160,7 +168,7 @@ class Bodies:
             begin=t,
             delay=delay,
             ends=course.ends.at[row.leg].set(t),
-            before=self._unknown(t),
+            before=Watched.unknown(t, self.width),
             last=jnp.maximum(course.last, jnp.abs(late)),
             left=left | (t < course.begin),
         )
@@ -178,7 +186,7 @@ class Bodies:
             arrived = jnp.outer(jnp.append(late, delay), field)
             y = y.at[:, :n].add(arrived)
         t = course.t + late
-        left = course.left | self._has_left(a, row, course, now, q)
+        left = course.left | self._has_left(a, row, course, now)
         return course._replace(
             t=t,
             y=y,
@@ -228,17 +236,19 @@ class Bodies:
 
     def _watched(self, a: int, t, q, field) -> Watched:
         if not self._functions(a):
-            return self._unknown(t)
+            return Watched.unknown(t, self.width)
         values = lambda t, q: self._values(a, t, q)  # noqa: E731
         value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
         more = self.width - len(value)
         # (Rates of what is not watched are 1: nothing divides by zero.)
         value = jnp.pad(value, (0, more), constant_values=jnp.inf)
-        return Watched(t, value, jnp.pad(rate, (0, more), constant_values=1.0))
-
-    def _unknown(self, t) -> Watched:
-        """Watched functions of which nothing is known."""
-        return Watched(t, jnp.full(self.width, jnp.inf), jnp.ones(self.width))
+        rate = jnp.pad(rate, (0, more), constant_values=1.0)
+        enabled = jnp.ones(self.width, bool)
+        for place, g in enumerate(self.s.guards(a)):
+            if self.s.transitions[g].enabled is not None:
+                holds = self.s.enabled(g, t, q, self._no_input)
+                enabled = enabled.at[place].set(holds)
+        return Watched(t, value, rate, enabled)
 
     def _delay(self, a: int, course: Course, q, now: Watched, target):
         """Columns of the time at which a watched function is zero."""
@@ -250,20 +260,21 @@ class Bodies:
 
         return -jax.vmap(along)(course.y[1:, :n]) / now.rate[target]
 
-    def _has_left(self, a: int, row: Rows, course: Course, now: Watched, q):
-        """Test whether a watched function has another sign than on the recorded trajectory, or has
-        passed zero and come back since the row before."""
+    def _has_left(self, a: int, row: Rows, course: Course, now: Watched):
+        """Test whether a watched function has another sign than on the recorded trajectory (where
+        that is known), has passed zero and come back since the row before, or has led to an event
+        that was not enabled there; or whether the event of this row comes from the wrong side."""
         if not self._functions(a):
             return jnp.asarray(False)
-        held = now.value
-        for place, g in enumerate(self.s.guards(a)):
-            if self.s.transitions[g].enabled is not None:
-                enabled = self.s.enabled(g, now.t, q, self._no_input)
-                value = jnp.where(enabled, now.value[place], jnp.abs(now.value[place]))
-                held = held.at[place].set(value)
-        other = (jnp.sign(held) * row.signs < 0).any()
-        dips = _dips(course.before, now) & (row.signs > 0)
-        return other | dips.any()
+        known, before = row.signs != 0, course.before
+        # (Comparisons with NaN are false.)
+        other = known & ~(jnp.sign(now.value) * row.signs > 0)
+        dips = known & _dips(before, now, row.signs)
+        positive = (before.value > 0) & jnp.isfinite(before.value)
+        falls = known & positive & (now.value <= 0)
+        enabled = falls & (before.enabled | now.enabled)
+        rises = (row.target >= 0) & ~(now.rate[row.target] < 0)
+        return (other | dips | enabled).any() | rises
 
     def _has_tick(self, a: int, course: Course, t) -> Bool[Array, ""]:
         """Test whether a scheduled event was due in a leg that ends at t, before its end."""
@@ -283,12 +294,13 @@ def _newton(now: Watched, target) -> Float[Array, ""]:
     return -now.value[target] / now.rate[target]
 
 
-def _dips(before: Watched, now: Watched) -> Bool[Array, " G"]:
-    """Test whether a function that is positive at two times has been negative in between: whether
-    the cubic polynomial with its values and rates is."""
+def _dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:
+    """Test whether functions with these signs at two times have had the other one in between:
+    whether the cubic polynomials with their values and rates have."""
     h = now.t - before.t
-    first, last = before.value, now.value
-    rise, slope0, slope1 = last - first, h * before.rate, h * now.rate
+    first, last = signs * before.value, signs * now.value
+    rise = last - first
+    slope0, slope1 = h * signs * before.rate, h * signs * now.rate
     third = slope0 + slope1 - 2 * rise
     second = 3 * rise - 2 * slope0 - slope1
     # The minimum is at the larger root of the derivative if the polynomial is of order 3.

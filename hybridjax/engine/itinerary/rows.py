@@ -24,7 +24,8 @@ from ..target import AbstractLevels
 # Newton steps on the guard after the last step of a leg, by the method of the chart. A last one, of
 # Euler, follows. Fewer: lanes far from the recorded one miss their event. More: turns last longer.
 CORRECTIONS = 2
-# Pieces of a turn: columns begin anew in each. (See `orbits.return_map`.)
+# Pieces of one turn, in each of which columns begin anew. Fewer: strong contraction drowns in the
+# product of the steps of a piece. More: programs run longer.
 LEGS = 16
 # Rows of a table are a multiple of this. More: empty rows take time. Fewer: itineraries of other
 # lengths compile again.
@@ -109,6 +110,8 @@ class Itinerary(NamedTuple):
     """Transitions that are armed there."""
     events: tuple[int, ...]
     """Indices of transitions, in order."""
+    certain: bool
+    """Whether rows can tell if events at once are still due: those whose guard was beyond zero."""
 
 
 def levels_in(s: Structure, a: int, levels: AbstractLevels | None) -> bool:
@@ -211,13 +214,21 @@ def recorded(
             table.add(Body(STEP, a), k, leg.signs(t), **step)
         _end(s, table, k, leg, goes_on=k < len(legs) - 1)
     events = tuple(leg.code for leg in legs if leg.code >= 0)
+    certain = all(_is_certain(s, leg) for leg in legs if leg.at_once)
     if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
         table.include(Body(SECTION, leg.chart) for leg in legs)
     table.include(Body(PIECE, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
     begins = np.array(charts, np.int32), np.stack(armed, axis=1)
-    return _finished(table, ends, *begins, events)
+    return _finished(table, ends, *begins, events)._replace(certain=certain)
+
+
+def _is_certain(s: Structure, leg: _Leg) -> bool:
+    """Test whether the guard of an event at once was beyond zero."""
+    if _is_scheduled(s, leg.code):
+        return False
+    return bool(leg.ends[-1, s.guards(leg.chart).index(leg.code)] < 0)
 
 
 def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
@@ -253,21 +264,20 @@ def _end(s: Structure, table: _Table, k: int, leg: _Leg, goes_on: bool) -> None:
     step = Body(STEP, a)
     if leg.code == ARRIVE_LEVEL:
         level = len(s.guards(a))
+        signs = _but(signs, level)
         for _ in range(CORRECTIONS):
-            table.add(step, k, 0 * signs, target=level)
-        table.add(Body(SECTION, a), k, _but(signs, level), target=level)
+            table.add(step, k, signs, target=level)
+        table.add(Body(SECTION, a), k, signs, target=level)
     elif leg.code < 0:
         table.add(Body(SECTION, a), k, signs)
     else:
         jump, place = _jump(s, leg.code, leg.at_once)
         target = -1
-        if leg.at_once:
-            signs = 0 * signs
-        elif not _is_scheduled(s, leg.code):
+        if not (leg.at_once or _is_scheduled(s, leg.code)):
             target = s.guards(a).index(leg.code)
             signs = _but(signs, target)
             for _ in range(CORRECTIONS):
-                table.add(step, k, 0 * signs, target=target)
+                table.add(step, k, signs, target=target)
         # (A turn that ends with an event ends at a time that is free.)
         table.add(jump, k, signs, target=target, place=place, onward=goes_on)
 
@@ -307,10 +317,7 @@ def _before_events(tape: Tape) -> Float[np.ndarray, "d M"]:
 
 
 def _signs(s: Structure, levels, t, chart, q) -> Int[np.ndarray, "M G"]:
-    """Signs of the watched functions of charts at points; 0 where they are zero but for errors.
-
-    A guard whose event is not enabled counts as positive: nothing happens there.
-    """
+    """Signs of the watched functions of charts at points; 0 where they are zero but for errors."""
     width = max(len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims)))
     signs = np.zeros((len(t), width), int)
     for a in np.unique(chart).tolist():
@@ -321,12 +328,9 @@ def _signs(s: Structure, levels, t, chart, q) -> Int[np.ndarray, "M G"]:
             continue
         index = np.zeros(1, np.int32)
         value = kernels.watched(s, a, levels, *point, index)[:, 0]
-        for row, g in enumerate(s.guards(a)):
-            if s.transitions[g].enabled is not None:
-                enabled = kernels.enabled(s, s.member(g), *point)
-                value[row] = np.where(enabled, value[row], np.abs(value[row]))
-        largest = np.abs(value).max(axis=1, keepdims=True)
-        known = np.abs(value) > _NEAR_ZERO * largest
+        value = np.nan_to_num(value, posinf=np.inf, neginf=-np.inf)
+        finite = np.where(np.isfinite(value), np.abs(value), 0.0)
+        known = np.abs(value) > _NEAR_ZERO * finite.max(axis=1, keepdims=True)
         signs[here, :count] = np.where(known, np.sign(value), 0).T
     return signs
 
@@ -360,4 +364,4 @@ def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> It
     ends = np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS))
     form = Form(bodies, len(ends), len(rows.body), width)
     before = rows.leg[rows.piece < LEGS]
-    return Itinerary(form, rows, used, ends, last, charts, before, armed, events)
+    return Itinerary(form, rows, used, ends, last, charts, before, armed, events, True)

@@ -83,7 +83,6 @@ def follow(
 
     def depart(t, q, ends):
         zero = jnp.zeros_like(t)
-        unknown = jnp.full(form.watched, jnp.inf), jnp.ones(form.watched)
         y = jnp.concatenate([q[None], jnp.eye(C, d)])
         return Course(
             t=t,
@@ -92,7 +91,7 @@ def follow(
             begin=t,
             delay=jnp.zeros(C),
             ends=ends,
-            before=Watched(t, *unknown),
+            before=Watched.unknown(t, form.watched),
             error=zero,
             last=zero,
             left=jnp.asarray(False),
