@@ -1,7 +1,8 @@
 """A sweep in C, written for the vertical hopper: limit cycles and multipliers by Newton's method.
 
-One hopper after the other in one thread, by scipy's DOP853 with steps of its own error estimate, and
-variational equations beside the state. Each hopper begins at the cycle of its neighbor.
+One hopper after the other in one thread, by the coefficients of scipy's DOP853 with steps of its
+own error estimate, and variational equations beside the state. Each begins at the cycle of its
+neighbor.
 """
 
 import ctypes
