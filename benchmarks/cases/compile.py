@@ -63,7 +63,7 @@ AXES = {"k": np.linspace(8, 13, 50), "b": np.linspace(3, 7, 50)}
 PLANES = {
     "neurons": (
         "FitzHughNagumo",
-        {"current": np.linspace(0.48, 0.52, 50), "a": np.linspace(0.69, 0.71, 50)},
+        {"current": np.linspace(0.49, 0.51, 50), "a": np.linspace(0.698, 0.701, 50)},
     ),
     "bucks": (
         "BuckConverter",
