@@ -19,12 +19,16 @@ enum { FLIGHT, STANCE };
 /* Steps of a turn, turns of a hopper. More: hopeless hoppers cost more. Fewer: some are given up. */
 #define STEPS 1000
 #define TURNS 100
+/* Events of a turn, corrections of an event. More: hopeless turns cost more. Fewer: good ones end. */
+#define EVENTS 20
+#define CORRECTIONS 20
 /* Corrections (s) of an event that Euler's method makes, the last. Larger: its error, half their square
    times the rate of the field, would be seen. Smaller: more steps. */
 #define CLOSE 1e-8
 /* Residual of a cycle. Larger: multipliers of states beside the cycle. Smaller: error of the steps. */
 #define RESIDUAL 1e-10
-/* Bounds of the ratio of a step to the one before, and its margin. */
+/* Bounds of the ratio of a step to the one before, and its margin. Wider bounds, or a margin nearer to
+   one: more steps are rejected. Narrower, or a smaller margin: more steps. */
 #define SHRINK 0.2
 #define GROW 5.0
 #define MARGIN 0.9
@@ -92,10 +96,11 @@ INLINE double step(const int chart, const int start, const double *p, double t, 
   return fifth * fifth / ((fifth + 0.01 * third) * n);
 }
 
-/* The time from the end of a step of length h to the zero of the guard's cubic: values g and rates r
-   at both ends, the first positive, the last negative. */
+/* The time from the end of a step of length h back to the zero of the cubic that has a guard's values g
+   (the first positive, the last negative) and rates r at both ends: where Newton's method begins. */
 INLINE double back_to_zero(double h, const double *g, const double *r) {
-  double low = 0.0, high = 1.0, s = g[0] / (g[0] - g[1]);
+  double low = 0.0, high = 1.0;
+  double s = g[0] / (g[0] - g[1]);
   LOOP(i, 8) {
     double u = 1 - s;
     double value = u * u * ((1 + 2 * s) * g[0] + s * h * r[0])
@@ -116,7 +121,8 @@ INLINE double back_to_zero(double h, const double *g, const double *r) {
 INLINE void jump(const int chart, const int start, const double *p, double t, double *z,
                  const double *f) {
   const int w = width(start);
-  double rate = guard_rate(chart, start, p, t, f), delay[MOST], after[MOST];
+  double rate = guard_rate(chart, start, p, t, f);
+  double delay[MOST], after[MOST];
   double r = chart == FLIGHT ? p[RETENTION] : 1.0;
   LOOP(j, w - 1) {
     double change = chart == FLIGHT ? z[2 * w + 1 + j] : -p[K] * z[1 + j];
@@ -166,7 +172,7 @@ INLINE int leg(const int chart, const int start, const double *p, double end, do
     field(chart, start, p, x->t, x->z, k[0]);
     rates[1] = guard_rate(chart, start, p, x->t, k[0]);
     double change = back_to_zero(length, g, rates);
-    LOOP(i, 20) {
+    LOOP(i, CORRECTIONS) {
       if (fabs(change) < CLOSE) {
         LOOP(d, n) x->z[d] += change * k[0][d];
         x->t += change;
@@ -190,18 +196,20 @@ INLINE int leg(const int chart, const int start, const double *p, double end, do
 INLINE int turn(const int start, const double *p, double tolerance, const double *q, double *h,
                 Point *x) {
   const int w = width(start);
-  double period = 2 * M_PI / p[OMEGA], end = 1.5 * period;
+  double period = 2 * M_PI / p[OMEGA];
+  double end = 1.5 * period;
   *x = (Point){.chart = start, .start = start, .t = 0.5 * period};
   LOOP(i, w - 1) {
     x->z[i * w] = q[i];
     x->z[i * w + 1 + i] = 1.0;
   }
-  int events = 0, event;
+  int event;
+  int events = 0;
   do {
     if (x->chart == FLIGHT) event = leg(FLIGHT, start, p, end, tolerance, h, x);
     else event = leg(STANCE, start, p, end, tolerance, h + 1, x);
     events += event;
-  } while (event == 1 && events < 20);
+  } while (event == 1 && events < EVENTS);
   return event == 0 ? 0 : -1;
 }
 
@@ -236,13 +244,15 @@ INLINE int solve(const int n, double a[4][4], double *b) {
 /* The two multipliers (real and imaginary parts) that are not zero because of the stance. */
 INLINE void multipliers(const int n, const double *z, double *value) {
   const int w = n + 1;
-  double half = 0.0, minors = 0.0;
+  double half = 0.0;
+  double minors = 0.0; /* the sum of the principal minors of order two */
 #define ENTRY(i, j) z[(i) * w + 1 + (j)]
   LOOP(i, n) {
     half += 0.5 * ENTRY(i, i);
     LOOP(j, i) minors += ENTRY(i, i) * ENTRY(j, j) - ENTRY(i, j) * ENTRY(j, i);
   }
-  double square = half * half - minors, root = sqrt(fabs(square));
+  double square = half * half - minors;
+  double root = sqrt(fabs(square));
   value[0] = square > 0 ? half + root : half;
   value[1] = square > 0 ? 0.0 : root;
   value[2] = square > 0 ? half - root : half;
@@ -250,11 +260,13 @@ INLINE void multipliers(const int n, const double *z, double *value) {
 }
 
 /* One turn, and Newton's correction of `q` unless the turn ends in another chart, where its end is the
-   next start. Returns the residual, or infinity. */
+   next start, with an infinite residual. Returns the residual, or NAN without success. */
 INLINE double correct(const int start, const double *p, double tolerance, double *h, int *chart,
                       double *q, double *value) {
-  const int n = states(start), w = n + 1;
-  double a[4][4], b[4], residual = 0.0;
+  const int n = states(start);
+  const int w = width(start);
+  double a[4][4], b[4];
+  double residual = 0.0;
   Point x;
   if (turn(start, p, tolerance, q, h, &x)) return NAN;
   if (x.chart != start) {
