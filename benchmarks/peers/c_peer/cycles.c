@@ -1,7 +1,8 @@
 /* Limit cycles and multipliers of vertical hoppers, one after the other, in scalar code.
 
-   A turn is one period from the clock's phase 0.5, in flight (chart 0) or in stance (1). The state is
-   integrated beside its derivatives by the state at the start (columns), by the pair of tableau.h. */
+   A turn is one period from the clock's phase 0.5, in flight (chart 0) or in stance (1). The
+   state is integrated beside its derivatives by the state at the start (columns), by the pair
+   of tableau.h, which cycles.py writes. */
 
 #include <math.h>
 #include <string.h>
@@ -16,19 +17,22 @@ enum { FLIGHT, STANCE };
 
 /* Most numbers of a state with its columns: 4 x (1 + 4). */
 #define MOST 20
-/* Steps of a turn, turns of a hopper. More: hopeless hoppers cost more. Fewer: some are given up. */
+/* Steps of a turn, turns of a hopper. More: hopeless hoppers cost more. Fewer: some are given
+   up. */
 #define STEPS 1000
 #define TURNS 100
-/* Events of a turn, corrections of an event. More: hopeless turns cost more. Fewer: good ones end. */
+/* Events of a turn, corrections of an event. More: hopeless turns cost more. Fewer: good ones
+   end. */
 #define EVENTS 20
 #define CORRECTIONS 20
-/* Corrections (s) of an event that Euler's method makes, the last. Larger: its error, half their square
-   times the rate of the field, would be seen. Smaller: more steps. */
+/* Corrections (s) of an event that Euler's method makes, the last. Larger: its error, half
+   their square times the rate of the field, would be seen. Smaller: more steps. */
 #define CLOSE 1e-8
-/* Residual of a cycle. Larger: multipliers of states beside the cycle. Smaller: error of the steps. */
+/* Residual of a cycle. Larger: multipliers of states beside the cycle. Smaller: error of the
+   steps. */
 #define RESIDUAL 1e-10
-/* Bounds of the ratio of a step to the one before, and its margin. Wider bounds, or a margin nearer to
-   one: more steps are rejected. Narrower, or a smaller margin: more steps. */
+/* Bounds of the ratio of a step to the one before, and its margin. Wider bounds, or a margin
+   nearer to one: more steps are rejected. Narrower, or a smaller margin: more steps. */
 #define SHRINK 0.2
 #define GROW 5.0
 #define MARGIN 0.9
@@ -73,7 +77,8 @@ INLINE double guard_rate(const int chart, const int start, const double *p, doub
   return -p[K] * f[0] + p[A] * p[OMEGA] * cos(p[OMEGA] * t);
 }
 
-/* One step from `z`, where the field is `k[0]`, to `next`; the square of its error by `tolerance`. */
+/* One step from `z`, where the field is `k[0]`, to `next`; the square of its error by
+   `tolerance`. */
 INLINE double step(const int chart, const int start, const double *p, double t, double h,
                    double tolerance, const double *z, double k[][MOST], double *next) {
   const int n = states(chart) * width(start);
@@ -96,8 +101,9 @@ INLINE double step(const int chart, const int start, const double *p, double t, 
   return fifth * fifth / ((fifth + 0.01 * third) * n);
 }
 
-/* The time from the end of a step of length h back to the zero of the cubic that has a guard's values g
-   (the first positive, the last negative) and rates r at both ends: where Newton's method begins. */
+/* The time from the end of a step of length h back to the zero of the cubic that has a guard's
+   values g (the first positive, the last negative) and rates r at both ends: where Newton's
+   method begins. */
 INLINE double back_to_zero(double h, const double *g, const double *r) {
   double low = 0.0, high = 1.0;
   double s = g[0] / (g[0] - g[1]);
@@ -105,7 +111,8 @@ INLINE double back_to_zero(double h, const double *g, const double *r) {
     double u = 1 - s;
     double value = u * u * ((1 + 2 * s) * g[0] + s * h * r[0])
                    + s * s * ((3 - 2 * s) * g[1] - u * h * r[1]);
-    double slope = 6 * s * u * (g[1] - g[0]) + h * (u * (1 - 3 * s) * r[0] + s * (3 * s - 2) * r[1]);
+    double slope = 6 * s * u * (g[1] - g[0])
+                   + h * (u * (1 - 3 * s) * r[0] + s * (3 * s - 2) * r[1]);
     if (value > 0) low = s;
     else high = s;
     double next = s - value / slope;
@@ -140,8 +147,8 @@ INLINE void jump(const int chart, const int start, const double *p, double t, do
   LOOP(i, n) LOOP(j, w - 1) z[i * w + 1 + j] -= after[i * w] * delay[j];
 }
 
-/* Flow in one chart, to its event or to `end`. `*h`: the step to begin with, and that for the next
-   leg. Returns 0 at the end, 1 at an event after the jump, -1 without success. */
+/* Flow in one chart, to its event or to `end`. `*h`: the step to begin with, and that for the
+   next leg. Returns 0 at the end, 1 at an event after the jump, -1 without success. */
 INLINE int leg(const int chart, const int start, const double *p, double end, double tolerance,
                double *h, Point *x) {
   double k[STAGE_COUNT][MOST], next[MOST], g[2], rates[2];
@@ -259,8 +266,8 @@ INLINE void multipliers(const int n, const double *z, double *value) {
   value[3] = square > 0 ? 0.0 : -root;
 }
 
-/* One turn, and Newton's correction of `q` unless the turn ends in another chart, where its end is the
-   next start, with an infinite residual. Returns the residual, or NAN without success. */
+/* One turn, and Newton's correction of `q` unless the turn ends in another chart, where its end
+   is the next start, with an infinite residual. Returns the residual, or NAN without success. */
 INLINE double correct(const int start, const double *p, double tolerance, double *h, int *chart,
                       double *q, double *value) {
   const int n = states(start);
@@ -271,7 +278,7 @@ INLINE double correct(const int start, const double *p, double tolerance, double
   if (turn(start, p, tolerance, q, h, &x)) return NAN;
   if (x.chart != start) {
     *chart = x.chart;
-    LOOP(i, states(x.chart)) q[i] = x.z[i * w];
+    LOOP(i, 4) q[i] = i < states(x.chart) ? x.z[i * w] : 0.0;
     return INFINITY;
   }
   LOOP(i, n) {
@@ -286,11 +293,12 @@ INLINE double correct(const int start, const double *p, double tolerance, double
   return residual;
 }
 
-/* Cycles of `rows` x `columns` hoppers, whose parameters (nine each) are p. Each begins at the cycle of
-   the one before in its row, or above, the first at `chart` and `state`. Returns how many are found.
+/* Cycles of `rows` x `columns` hoppers, whose parameters (nine each) are p. Each begins at the
+   cycle of the one before in its row, or above, the first at `chart` and `state`. Returns how
+   many are found.
 
-   charts: where they are at phase 0.5, -1 without a cycle; q: their states there (4 each); values:
-   multipliers (two complex numbers each); turns: how many each has taken. */
+   charts: where they are at phase 0.5, -1 without a cycle; q: their states there (4 each);
+   values: multipliers (two complex numbers each); turns: how many each has taken. */
 int sweep(int rows, int columns, const double *p, double tolerance, int chart, const double *state,
           int *charts, double *q, double *values, int *turns) {
   double h[2] = {0.1, 0.1};
@@ -310,8 +318,13 @@ int sweep(int rows, int columns, const double *p, double tolerance, int chart, c
         residual = correct(STANCE, p + 9 * s, tolerance, h, &here, own, values + 4 * s);
     }
     turns[s] = count;
-    charts[s] = residual < RESIDUAL ? here : -1;
-    found += residual < RESIDUAL;
+    charts[s] = here;
+    if (residual < RESIDUAL) {
+      found += 1;
+      continue;
+    }
+    charts[s] = -1;
+    LOOP(i, 4) own[i] = values[4 * s + i] = NAN;
   }
   return found;
 }
