@@ -13,8 +13,13 @@ the hopper's).
 `derivatives`: the gradient of a coefficient of the characteristic polynomial by the hopper's nine
 parameters, in reverse mode and outside of `jit`, and a fit of two parameters to HTFs; `again`: the
 second of each. `responses`: the first `cycle.responses()` of the hopper and of a neuron, and the
-hopper's `cycle.htf` at 620 frequencies again. `cycles`: `find_limit_cycles` of 50 x 50 hoppers;
-`sweep`: `hj.sweep` of the same; `branch`: README's continuation; each a second time.
+hopper's `cycle.htf` at 620 frequencies again. `cycles`: `find_limit_cycles` of 50 x 50 hoppers, and
+the same by the sweep in C (`c`; `times_c`: as multiples of it). `sweep`: `hj.sweep` of the same;
+`branch`: README's continuation; each a second time. `repeats`: `find_limit_cycle` from a known
+cycle after a small change of a parameter, when four such calls have gone before. `in_program`:
+inside of `jit`, the gradient of the square of the monodromy's trace by the hopper's nine
+parameters. `neurons`, `bucks`, `compasses`: `find_limit_cycles` of 2500 of each (`found`: the
+share). Calls of these and of `cycles` again count by the least time of three.
 `second_process`: the sweep in a process that finds the compiled programs of another. `walkers`: a
 cycle of the hopper and of the five-link biped, and 80 experiments on a kneed walker (32 cycles, 16
 sections, steady start), each a second time.
@@ -46,9 +51,33 @@ JOBS = (
     "second_process",
     "branch",
     "walkers",
+    "repeats",
+    "in_program",
+    "neurons",
+    "bucks",
+    "compasses",
 )
-# A plane of 50 x 50 hoppers.
-AXES = {"k": np.linspace(9, 11, 50), "b": np.linspace(4.5, 5.5, 50)}
+# A plane of 50 x 50 hoppers. Where k is small, the clock's phase 0.5 lies in flight.
+AXES = {"k": np.linspace(8, 13, 50), "b": np.linspace(3, 7, 50)}
+# Planes of 50 x 50 systems of other models, so small that events keep their order.
+PLANES = {
+    "neurons": (
+        "FitzHughNagumo",
+        {"current": np.linspace(0.49, 0.51, 50), "a": np.linspace(0.698, 0.701, 50)},
+    ),
+    "bucks": (
+        "BuckConverter",
+        {"Vin": np.linspace(19, 21, 50), "R": np.linspace(21, 23, 50)},
+    ),
+    "compasses": (
+        "CompassGait",
+        {"mH": np.linspace(9.5, 10.5, 50), "m": np.linspace(4.9, 5.1, 50)},
+    ),
+}
+# Further calls of the short jobs, the least time of which counts.
+REPEAT = 3
+# Not seconds: shares, and ratios to the sweep in C.
+UNITLESS = ("found", "times_c")
 
 
 def run(show, options) -> None:
@@ -73,6 +102,9 @@ def run(show, options) -> None:
 
     for job in JOBS:
         for name, value in call("compile", job).items():
+            if name.endswith(UNITLESS):
+                show(f"{job}.{name}", value)
+                continue
             show(f"{job}.{name}.cpu", value)
             show(f"{job}.{name}.times_diffeqsolve", value / yardstick)
     for _, family in HOPPER[:1] if options.quick else HOPPER:
@@ -166,28 +198,44 @@ def derivatives() -> dict[str, float]:
     )
 
 
-def twice(**jobs: Callable[[], object]) -> dict[str, float]:
-    """CPU seconds of the first and the second call of each job."""
+def twice(*, repeat: int = 1, **jobs: Callable[[], object]) -> dict[str, float]:
+    """CPU seconds of the first call of each job, and the least of `repeat` further ones."""
     seconds = {}
     for name, job in jobs.items():
-        for state in ("", "_again"):
+        calls = []
+        for _ in range(1 + repeat):
             begin = time.process_time()
             job()
-            seconds[name + state] = time.process_time() - begin
+            calls.append(time.process_time() - begin)
+        seconds |= {name: calls[0], f"{name}_again": min(calls[1:])}
     return seconds
 
 
 def cycles() -> dict[str, float]:
-    """CPU seconds of the cycles of 50 x 50 hoppers, after that of one was found."""
+    """CPU seconds of the cycles of 50 x 50 hoppers, after that of one was found, and those of C."""
     import equinox as eqx
 
     import hybridjax as hj
 
+    from .problems import hoppers_in_c
+
     hj.enable_x64()
     make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
-    systems = make(*map(np.ravel, np.meshgrid(*AXES.values())))
+    k, b = np.meshgrid(*AXES.values(), indexing="ij")
+    systems = make(k.ravel(), b.ravel())
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    return twice(find_limit_cycles=lambda: hj.find_limit_cycles(systems, cycle))
+    found = {}
+
+    def find():
+        found["cycles"] = hj.find_limit_cycles(systems, cycle)
+
+    seconds = twice(find_limit_cycles=find, repeat=REPEAT)
+    share = float(found["cycles"].ok.mean())
+    c = hoppers_in_c(cycle, k, b, repeat=5)
+    if c is None:
+        return seconds | {"found": share}
+    ratio = seconds["find_limit_cycles_again"] / c.seconds.cpu
+    return seconds | {"found": share, "c": c.seconds.cpu, "again.times_c": ratio}
 
 
 def sweep() -> dict[str, float]:
@@ -232,6 +280,89 @@ def walkers() -> dict[str, float]:
         biped=lambda: hj.find_limit_cycle(hj.models.FiveLinkBiped()),
         kneed=lambda: hj.run_experiments(cycle, placed, u, "stance", start="steady"),
     )
+
+
+def repeats() -> dict[str, float]:
+    """CPU seconds of cycles near known ones, with new values of a parameter, after four others."""
+    import hybridjax as hj
+
+    hj.enable_x64()
+    seconds = {}
+    cases = {
+        "hopper": (hj.models.VerticalHopper, "k", 10.0),
+        "neuron": (hj.models.FitzHughNagumo, "current", 0.5),
+        "biped": (hj.models.FiveLinkBiped, "lean", 0.2),
+    }
+    for name, (make, parameter, value) in cases.items():
+        cycle = hj.find_limit_cycle(make())
+        calls = []
+        for i in range(1, 10):
+            system = make(**{parameter: value * (1 + 1e-4 * i)})
+            begin = time.process_time()
+            hj.find_limit_cycle(system, cycle)
+            calls.append(time.process_time() - begin)
+        seconds[name] = min(calls[4:])
+    return seconds
+
+
+def in_program() -> dict[str, float]:
+    """CPU seconds of a gradient by nine parameters inside of `jit`, after the cycle was found."""
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+
+    import hybridjax as hj
+
+    hj.enable_x64()
+    hopper = hj.models.VerticalHopper()
+    cycle = hj.find_limit_cycle(hopper)
+
+    def square(system):
+        """Of the sum of the multipliers, which has derivatives where two of them meet, too."""
+        factors = hj.find_limit_cycle(system, cycle).factors
+        monodromy = jnp.linalg.multi_dot(list(factors[::-1]))
+        return jnp.trace(monodromy) ** 2
+
+    gradient = eqx.filter_jit(eqx.filter_grad(square))
+    return twice(
+        gradient=lambda: jax.block_until_ready(gradient(hopper)), repeat=REPEAT
+    )
+
+
+def neurons() -> dict[str, float]:
+    """CPU seconds of the cycles of 50 x 50 neurons, after that of one was found."""
+    return plane("neurons")
+
+
+def bucks() -> dict[str, float]:
+    """The same of buck converters."""
+    return plane("bucks")
+
+
+def compasses() -> dict[str, float]:
+    """The same of compass walkers."""
+    return plane("compasses")
+
+
+def plane(name: str) -> dict[str, float]:
+    """CPU seconds of the cycles of 50 x 50 systems, after that of one, and the share found."""
+    import equinox as eqx
+
+    import hybridjax as hj
+
+    hj.enable_x64()
+    model, axes = PLANES[name]
+    make = getattr(hj.models, model)
+    many = eqx.filter_vmap(lambda *values: make(**dict(zip(axes, values, strict=True))))
+    systems = many(*map(np.ravel, np.meshgrid(*axes.values())))
+    cycle = hj.find_limit_cycle(make())
+    found = {}
+
+    def find():
+        found["cycles"] = hj.find_limit_cycles(systems, cycle)
+
+    seconds = twice(find_limit_cycles=find, repeat=REPEAT)
+    return seconds | {"found": float(found["cycles"].ok.mean())}
 
 
 def responses() -> dict[str, float]:

@@ -1,7 +1,9 @@
-"""Limit cycles and multipliers of 10 000 hoppers in one call, some of them against scipy.
+"""Limit cycles and multipliers of 10 000 hoppers in one call, beside C, and some against scipy.
 
 k in linspace(8, 13, 100) x b in linspace(3, 7, 100), other parameters the paper's. At some points
-the clock's phase 0.5, where the return map is taken, lies in flight.
+the clock's phase 0.5, where the return map is taken, lies in flight. `times_c`: multiple of the
+time of the sweep in C (peers/c_peer/cycles.c); `c.trace_error`: the largest difference of the sums
+of multipliers.
 """
 
 import equinox as eqx
@@ -17,7 +19,7 @@ import hybridjax as hj
 from hybridjax._core.results import Result
 from hybridjax.orbits.limit_cycles import LimitCycles, find_limit_cycles
 
-from .problems import cycle
+from .problems import cycle, hoppers_in_c
 
 
 def run(show, options) -> None:
@@ -48,6 +50,14 @@ def run(show, options) -> None:
     show("residual", float(cycles.residual[cycles.ok].max()))
     show("good", float((cycles.ok & (cycles.residual <= 1e-10)).mean()))
     show("in_flight", int((cycles.anchor.chart.ravel() == 0).sum()))
+    c = hoppers_in_c(base, k, b, 1 if options.quick else options.repeat)
+    if c is not None:
+        show("c.cpu", c.seconds.cpu)
+        show("c.found", float((c.cycles.charts >= 0).mean()))
+        show("times_c", later.cpu / c.seconds.cpu)
+        both = cycles.ok & (c.cycles.charts >= 0)
+        apart = (multipliers.sum(axis=1) - c.cycles.multipliers.sum(axis=1))[both]
+        show("c.trace_error", float(np.abs(apart).max()))
     _check(cycles, multipliers, show, 5 if options.quick else 20)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import truth
 from job import Job, make_job
+from peers.c_peer import CHARTS, cycles as c_cycles
 from peers.contest import Seconds, measure
+from peers.errors import Unavailable
 
 import hybridjax as hj
 from hybridjax.experiments import run as batched
 from hybridjax.experiments.response import course, flow_batch
 from hybridjax.experiments.run import Options, prepare
 from hybridjax.sections.placed import PlacedSections
+from hybridjax.systems.system import own_fields
 
 
 MODELS = {"hopper": hj.models.VerticalHopper, "bar": hj.models.TwoLeggedBar}
@@ -153,3 +156,24 @@ def first_and_later(work: Callable[[], Any], repeat: int) -> tuple[Any, float, S
     _, first = measure(wait)
     result, later = measure(wait, repeat)
     return result, max(first.wall - later.wall, 0.0), later
+
+
+class InC(NamedTuple):
+    """Cycles of hoppers by the sweep in C, and the seconds that it takes."""
+
+    cycles: c_cycles.Cycles
+    seconds: Seconds
+
+
+def hoppers_in_c(cycle: hj.LimitCycle, k, b, repeat: int) -> InC | None:
+    """The cycles of a grid of hoppers beginning near `cycle`; None without gcc."""
+    try:
+        sweep = c_cycles.setup()
+    except Unavailable:
+        return None
+    system = cycle.system
+    parameters = {x.name: float(getattr(system, x.name)) for x in own_fields(system)}
+    chart = CHARTS["hopper"][int(cycle.anchor.chart[0])]
+    state = np.array(cycle.anchor.q[:, 0])
+    grid = parameters | {"k": k, "b": b}
+    return InC(*measure(lambda: c_cycles.run(grid, chart, state, sweep), repeat))

@@ -32,20 +32,28 @@ NEAR = 1e-2
 ARRAY = np.ctypeslib.ndpointer(float, flags="C_CONTIGUOUS")
 
 
-def setup(job: Job):
-    """Compile the loop for the job's model.
+def compiled(source: pathlib.Path, *options: str) -> ctypes.CDLL:
+    """The library that gcc makes of a file.
 
     **Raises:** `Unavailable` without gcc.
     """
     gcc = shutil.which("gcc")
     if gcc is None:
         raise Unavailable("there is no gcc")
-    source = pathlib.Path(__file__).with_name(f"{job.model}.c")
     with tempfile.TemporaryDirectory() as folder:
-        library = pathlib.Path(folder, "loop.so")
-        options = ("-O3", "-march=native", "-shared", "-fPIC", "-o", library)
-        subprocess.run((gcc, *options, source, "-lm"), check=True)
-        loop = ctypes.CDLL(str(library)).run
+        library = pathlib.Path(folder, "peer.so")
+        shared = ("-O3", "-march=native", "-shared", "-fPIC", "-o", library)
+        subprocess.run((gcc, *shared, *options, source, "-lm"), check=True)
+        return ctypes.CDLL(str(library))
+
+
+def setup(job: Job):
+    """Compile the loop for the job's model.
+
+    **Raises:** `Unavailable` without gcc.
+    """
+    source = pathlib.Path(__file__).with_name(f"{job.model}.c")
+    loop = compiled(source).run
     integer, number = ctypes.c_int, ctypes.c_double
     loop.argtypes = (
         ARRAY,
