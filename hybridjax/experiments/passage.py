@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..engine import kernels
 from ..engine.itinerary.bodies import Watched, _dips
-from ..engine.itinerary.steps import solver_of
-from ..engine.runge_kutta import short_step
+from ..engine.runge_kutta import looped_step, short_step
 from ..engine.settings import Settings, size
 from ..systems.structure import Member, Structure
 from .plan import ROUNDING, Plan
@@ -104,14 +103,14 @@ def follow_table(
 
         def move(r, carry):
             passage, kept, outputs, answers = carry
-            row = jax.tree_util.tree_map(lambda x: x[r], rows)
-            now = held[row.section]
+            row = jax.tree_util.tree_map(lambda x: _at(x, r), rows)
+            now = _at(held, row.section)
             passage, kept = jax.lax.switch(
                 row.body, branches, row, now, passage, kept
             )
-            outputs = outputs.at[row.section].set(passage.output)
+            outputs = _put(outputs, passage.output, row.section, 0)
             if feedback is not None:
-                answers = answers.at[row.section].set(passage.answer)
+                answers = _put(answers, passage.answer, row.section, 0)
             return passage, kept, outputs, answers
 
         *carry, outputs, answers = jax.lax.fori_loop(
@@ -134,6 +133,14 @@ def follow_table(
         None if feedback is None else to_experiments(answers),
     )
     return response, left
+
+
+_put = jax.lax.dynamic_update_index_in_dim
+
+
+def _at(x: Array, k: Int[Array, ""]) -> Array:
+    """Entry k, which is within bounds: `x[k]` would test that."""
+    return jax.lax.dynamic_index_in_dim(x, k, 0, keepdims=False)
 
 
 class _Moves:
@@ -199,22 +206,22 @@ class _Moves:
         f = self._field(a, u)(x.t, q)
         now = self._watched(a, row, u, x.t, q, f)
         left = x.left | self._has_left(a, row, x.before, now)
-        to_end = self.ends[row.section] - x.t
+        to_end = _at(self.ends, row.section) - x.t
         target = jnp.maximum(row.target, 0)
         if self._functions(a):
-            to_zero = -now.value[target] / now.rate[target]
+            to_zero = -_at(now.value, target) / _at(now.rate, target)
             to_end = jnp.where(row.target >= 0, to_zero, to_end)
         planned = jnp.where(row.fixed > 0, row.fixed, row.part * to_end)
         h = jnp.where(row.begins | row.corrects, planned, x.h)
         end, error = self._stepped(a, u, x.t, q, h)
         left |= row.begins & (h < 0)
-        left |= ~row.corrects & (error > self.plan.slack[row.section])
-        share = jnp.where(row.corrects, 0.0, error * self.plan.weight[row.section])
+        left |= ~row.corrects & (error > _at(self.plan.slack, row.section))
+        share = jnp.where(row.corrects, 0.0, error * _at(self.plan.weight, row.section))
         t = x.t + h
         by_time = row.arrives & (row.target < 0)
-        t = jnp.where(by_time, self.ends[row.section], t)
+        t = jnp.where(by_time, _at(self.ends, row.section), t)
         if self._has_level(a):
-            arrived, late = self._landed(a, row, u, t, end)
+            arrived, late = self._landed_from(a, row, u, t, end)
             at_level = row.arrives & (row.target >= 0)
             t = jnp.where(at_level, arrived[0], t)
             end = jnp.where(at_level, arrived[1], end)
@@ -238,16 +245,15 @@ class _Moves:
         u = u + x.answer
         f = self._field(a, u)(x.t, q)
         now = self._watched(a, row, u, x.t, q, f)
-        late = -now.value[row.target] / now.rate[row.target]
-        t = x.t + late
+        (t, q), late = self._landed(a, row, u, x.t, q, f, now)
         member = Member(body.kind, row.place)
         reset = s.by_lane(lambda s, t, q, u: s.reset(member, t, q, u))
-        after = reset(t, q + f * late, u)
+        after = reset(t, q, u)
         # Where the next section comes first, the event waits.
-        due = t <= self.ends[row.section]
+        due = t <= _at(self.ends, row.section)
         if self._has_level(a):
             due &= now.value[-1 if self._is_widest(a) else len(s.guards(a))] > 0
-        found = (jnp.abs(late) <= self.allowed) & (now.rate[row.target] < 0)
+        found = (jnp.abs(late) <= self.allowed) & (_at(now.rate, row.target) < 0)
         happens = due & found & (t >= kept.t)
         left = x.left | self._has_left(a, row, x.before, now)
         left |= ~happens & ~row.may_wait
@@ -280,27 +286,25 @@ class _Moves:
 
     def _stepped(self, a: int, u, t, q, h):
         """The state after a step, and its error relative to what is allowed."""
-        import diffrax
-
-        solver = solver_of(self.s.method(a))
-        field = self._field(a, u)
-        term = diffrax.ODETerm(lambda t, q, _: field(t, q))
-        state = solver.init(term, t, t + h, q, None)
-        end, error, *_ = solver.step(term, t, t + h, q, None, state, False)
+        # (The step of diffrax's solver takes twice as long: it writes stages as `K.at[k].set`.)
+        end, error = looped_step(self.s.method(a), self._field(a, u), t, q, h)
         allowed = self.settings.rtol * size(self.settings, a, q, end)
         return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
 
-    def _landed(self, a: int, row: Rows, u, t, q):
-        """Time and state at the level near (t, q), and the last correction of the time."""
+    def _landed_from(self, a: int, row: Rows, u, t, q):
+        """Time and state at the zero near (t, q), and the last correction of the time."""
+        f = self._field(a, u)(t, q)
+        return self._landed(a, row, u, t, q, f, self._watched(a, row, u, t, q, f))
+
+    def _landed(self, a: int, row: Rows, u, t, q, f, now: Watched):
+        """The same, with the rates and the watched functions there."""
         field = self._field(a, u)
-        f = field(t, q)
-        now = self._watched(a, row, u, t, q, f)
-        h = -now.value[row.target] / now.rate[row.target]
+        h = -_at(now.value, row.target) / _at(now.rate, row.target)
         q, _ = short_step(field, t, q, f, h)
         t = t + h
         f = field(t, q)
         now = self._watched(a, row, u, t, q, f)
-        late = -now.value[row.target] / now.rate[row.target]
+        late = -_at(now.value, row.target) / _at(now.rate, row.target)
         return (t + late, q + f * late), late
 
     def _arrived(self, row: Rows, x: Passage) -> Passage:
@@ -313,6 +317,9 @@ class _Moves:
             section=jnp.full_like(x.section, 0) + following,
             events=x.events - jnp.where(ends_turn, turn, 0),
             fresh=x.fresh | row.arrives,
+            before=x.before._replace(
+                t=x.before.t - jnp.where(ends_turn, self.course.period, 0.0)
+            ),
             error=jnp.where(ends_turn, 0.0, x.error),
             largest=jnp.where(ends_turn, jnp.maximum(x.largest, x.error), x.largest),
         )
@@ -358,8 +365,9 @@ class _Moves:
         """Test whether a watched function has another sign than on the cycle, or a guard has passed
         zero and come back since the row before."""
         count, guards = self._functions(a), len(self.s.guards(a))
-        other = jnp.sign(now.value[:count]) * row.signs[:count, None] < 0
-        dips = _dips(before, now)[:guards]
+        signs = row.signs[:, None]
+        other = (jnp.sign(now.value) * signs < 0)[:count]
+        dips = (_dips(before, now) & (signs > 0))[:guards]
         return other.any(axis=0) | dips.any(axis=0)
 
 

@@ -24,10 +24,10 @@ from ..systems.transition import Scheduled
 from .plan import Plan
 
 
-# Newton steps on the guard after the last step to an event, by the method of the chart. A last one,
-# of Euler, follows. Fewer: experiments far from the cycle miss their event. More: events take
-# longer.
-_CORRECTIONS = 2
+# Newton steps on the guard after the last step to an event, by the method of the chart. Two more, a
+# short one and one of Euler, follow. None: a short step from a bad guess has errors of 1e-8 that
+# nobody reports. More: events take longer.
+_CORRECTIONS = 1
 # Rows of a table are a multiple of this. More: arrays are longer than needed. Fewer: tables of
 # other lengths compile again.
 _ROUND = 16
@@ -264,13 +264,13 @@ class _Writer:
         begin, points, at = self._begin(k, before)
         turn = e // len(self.events) * float(self.placed.cycle.period)
         duration = event.t + turn - begin
-        signs = np.zeros(self.width, int)
         if is_first or (before is not None and is_own):
-            newton, signs = points.newton[at, target], points.signs[at]
+            newton, signs = points.newton[at, target], points.signs[at].copy()
+            signs[target] = max(signs[target], 0)
         else:
             newton = duration = 0.0
-        signs = signs.copy()
-        signs[target] = max(signs[target], 0)
+            signs = np.zeros(self.width, int)
+            signs[target] = 1
         arrives = event.at_section and is_own
         about = dict(passed=e, target=target, signs=signs)
         self._leg(k, a, duration, newton, **about)
@@ -356,7 +356,7 @@ class _Writer:
                 part = lead / steps
             else:
                 fixed = duration / steps
-        inner = np.zeros(self.width, int)
+        inner = np.maximum(signs, 0)
         for j in range(steps):
             self._add(
                 Body(a),
