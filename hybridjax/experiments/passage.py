@@ -15,12 +15,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..engine import kernels
 from ..engine.itinerary.bodies import Watched, _dips
-from ..engine.runge_kutta import looped_step, short_step
+from ..engine.runge_kutta import looped_step
 from ..engine.settings import Settings, size
+from ..systems.solver import Method
 from ..systems.structure import Member, Structure
 from .plan import ROUNDING, Plan
 from .response import Course, Feedback, Response
-from .rows import Body, Form, Rows
+from .rows import BEGIN, Body, Form, Rows
 
 
 # The last correction of the time of an event may be this part of the period times the square root
@@ -29,21 +30,31 @@ from .rows import Body, Form, Rows
 _LAST = 5e-3
 
 
+# The classical method of order 4, for short steps.
+_CLASSICAL = Method(
+    "classical",
+    a=((0, 0, 0, 0), (0.5, 0, 0, 0), (0, 0.5, 0, 0), (0, 0, 1, 0)),
+    b=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    c=(0, 0.5, 0.5, 1),
+    error=(0, 0, 0, 0),
+    order=5.0,
+)
+
+
 class Passage(NamedTuple):
     """Experiments on their way, in L lanes."""
 
     t: Float[Array, " L"]
     q: Float[Array, "d L"]
-    section: Int[Array, " L"]
-    """The section that was passed last."""
-    events: Int[Array, " L"]
-    """Number of events since section 0."""
+    place: Int[Array, " L"]
+    """The place of the lane (see `Rows.at`)."""
     fresh: Bool[Array, " L"]
     """Whether the lane is on the section."""
     h: Float[Array, " L"]
-    """Length of steps of the present leg."""
-    before: Watched
-    """Watched functions where the last row began."""
+    """Length of the last step."""
+    value: Float[Array, "G L"]
+    """Watched functions where the last step began."""
+    rate: Float[Array, "G L"]
     error: Float[Array, " L"]
     """Error of this turn so far."""
     largest: Float[Array, " L"]
@@ -52,9 +63,9 @@ class Passage(NamedTuple):
     """Whether the table was left."""
     output: Float[Array, "ny L"]
     """Outputs at the last section."""
-    answer: Float[Array, "nu L"]
+    answer: Float[Array, "nu L"] | None
     """What a controller adds to the inputs."""
-    controller: Float[Array, "c L"]
+    controller: Float[Array, "c L"] | None
     """Its states."""
 
 
@@ -123,7 +134,7 @@ def follow_table(
     to_experiments = lambda x: jnp.moveaxis(x, -1, 0).reshape(S, n, -1)  # noqa: E731
     y = to_experiments(y)
     finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
-    left = end.left | ~finite | (end.section != 0) | ~end.fresh
+    left = end.left | ~finite | (end.place != BEGIN)
     response = Response(
         y,
         jnp.zeros(S, jnp.int32),
@@ -166,22 +177,26 @@ class _Moves:
         self.allowed = _LAST * course.period * jnp.sqrt(settings.rtol)
 
     def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
-        zero, none = jnp.zeros(S), jnp.zeros(S, jnp.int32)
-        states = 0 if self.feedback is None else self.feedback.matrices.A.shape[1]
+        zero = jnp.zeros(S)
+        value, rate = self._unknown(S)
+        answer = controller = None
+        if self.feedback is not None:
+            answer = jnp.zeros((self.s.nu, S))
+            controller = jnp.zeros((self.feedback.matrices.A.shape[1], S))
         return Passage(
             t=start[0],
             q=start[1:],
-            section=none,
-            events=none,
+            place=jnp.full(S, BEGIN, jnp.int32),
             fresh=jnp.ones(S, bool),
             h=zero,
-            before=self._unknown(start[0]),
+            value=value,
+            rate=rate,
             error=zero,
             largest=zero,
             left=jnp.zeros(S, bool),
             output=jnp.zeros((len(self.outputs.names), S)),
-            answer=jnp.zeros((self.s.nu, S)),
-            controller=jnp.zeros((states, S)),
+            answer=answer,
+            controller=controller,
         )
 
     def of(self, body: Body):
@@ -189,8 +204,7 @@ class _Moves:
         work = self._event if body.kind else self._leg
 
         def move(row: Rows, u, passage: Passage, kept: Kept):
-            here = passage.section == row.section
-            acts = here & (passage.events == row.passed)
+            acts = passage.place == row.at
             moved, kept = work(body, row, u, passage, kept, acts)
             return _where(acts, moved, passage), kept
 
@@ -202,14 +216,14 @@ class _Moves:
         q = x.q[: self.s.dims[a]]
         x = self._observed(a, row, u, q, x)
         kept = _where(acts & row.begins, Kept.of(x), kept)
-        u = u + x.answer
+        u = self._applied(u, x)
         f = self._field(a, u)(x.t, q)
-        now = self._watched(a, row, u, x.t, q, f)
-        left = x.left | self._has_left(a, row, x.before, now)
+        value, rate = self._watched(a, row, u, x.t, q, f)
+        left = x.left | self._has_left(a, row, x, value, rate)
         to_end = _at(self.ends, row.section) - x.t
         target = jnp.maximum(row.target, 0)
         if self._functions(a):
-            to_zero = -_at(now.value, target) / _at(now.rate, target)
+            to_zero = -_at(value, target) / _at(rate, target)
             to_end = jnp.where(row.target >= 0, to_zero, to_end)
         planned = jnp.where(row.fixed > 0, row.fixed, row.part * to_end)
         h = jnp.where(row.begins | row.corrects, planned, x.h)
@@ -221,17 +235,17 @@ class _Moves:
         by_time = row.arrives & (row.target < 0)
         t = jnp.where(by_time, _at(self.ends, row.section), t)
         if self._has_level(a):
-            arrived, late = self._landed_from(a, row, u, t, end)
+            arrived, late = self._landed(a, row, u, t, end)
             at_level = row.arrives & (row.target >= 0)
-            t = jnp.where(at_level, arrived[0], t)
-            end = jnp.where(at_level, arrived[1], end)
+            t, end = _where(at_level, arrived, (t, end))
             left |= at_level & ~(jnp.abs(late) <= self.allowed)
         x = x._replace(
             t=t,
             q=x.q.at[: self.s.dims[a]].set(end),
             fresh=jnp.zeros_like(x.fresh),
             h=h,
-            before=now,
+            value=value,
+            rate=rate,
             error=x.error + jax.lax.stop_gradient(share),
             left=left,
         )
@@ -242,31 +256,33 @@ class _Moves:
         a, s = body.chart, self.s
         b = s.chart_index(s.transitions[body.kind[0]].target)
         q = x.q[: s.dims[a]]
-        u = u + x.answer
+        u = self._applied(u, x)
         f = self._field(a, u)(x.t, q)
-        now = self._watched(a, row, u, x.t, q, f)
-        (t, q), late = self._landed(a, row, u, x.t, q, f, now)
+        value, rate = self._watched(a, row, u, x.t, q, f)
+        late = -_at(value, row.target) / _at(rate, row.target)
+        t = x.t + late
         member = Member(body.kind, row.place)
         reset = s.by_lane(lambda s, t, q, u: s.reset(member, t, q, u))
-        after = reset(t, q, u)
+        after = reset(t, q + f * late, u)
         # Where the next section comes first, the event waits.
         due = t <= _at(self.ends, row.section)
         if self._has_level(a):
-            due &= now.value[-1 if self._is_widest(a) else len(s.guards(a))] > 0
-        found = (jnp.abs(late) <= self.allowed) & (_at(now.rate, row.target) < 0)
+            due &= value[len(s.guards(a))] > 0
+        found = (jnp.abs(late) <= self.allowed) & (_at(rate, row.target) < 0)
         happens = due & found & (t >= kept.t)
-        left = x.left | self._has_left(a, row, x.before, now)
-        left |= ~happens & ~row.may_wait
+        left = x.left | self._has_left(a, row, x, value, rate)
+        value, rate = self._unknown(len(t))
         moved = x._replace(
             t=t,
             q=jnp.zeros_like(x.q).at[: s.dims[b]].set(after),
-            events=x.events + 1,
-            before=self._unknown(t),
-            left=left,
+            value=value,
+            rate=rate,
+            left=left | ~(happens | row.may_wait),
         )
         moved = self._arrived(row, moved)
-        back = x._replace(**kept._asdict(), before=self._unknown(kept.t))
-        return _where(happens | ~row.may_wait, moved, back), kept
+        waits = row.may_wait & ~happens
+        back = x._replace(**kept._asdict(), value=value, rate=rate)
+        return _where(waits, back, moved), kept
 
     def _observed(self, a: int, row: Rows, u, q, x: Passage) -> Passage:
         """The outputs at the section, for lanes that are there, and a controller's answer."""
@@ -281,7 +297,7 @@ class _Moves:
                 answer=jnp.where(x.fresh, answer, x.answer),
                 controller=jnp.where(x.fresh, states, x.controller),
             )
-        output = observe(x.t, q, u + x.answer)
+        output = observe(x.t, q, self._applied(u, x))
         return x._replace(output=jnp.where(x.fresh, output, x.output))
 
     def _stepped(self, a: int, u, t, q, h):
@@ -291,38 +307,33 @@ class _Moves:
         allowed = self.settings.rtol * size(self.settings, a, q, end)
         return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
 
-    def _landed_from(self, a: int, row: Rows, u, t, q):
-        """Time and state at the zero near (t, q), and the last correction of the time."""
-        f = self._field(a, u)(t, q)
-        return self._landed(a, row, u, t, q, f, self._watched(a, row, u, t, q, f))
-
-    def _landed(self, a: int, row: Rows, u, t, q, f, now: Watched):
-        """The same, with the rates and the watched functions there."""
+    def _landed(self, a: int, row: Rows, u, t, q):
+        """Time and state at the level near (t, q), and the last correction of the time."""
         field = self._field(a, u)
-        h = -_at(now.value, row.target) / _at(now.rate, row.target)
-        q, _ = short_step(field, t, q, f, h)
-        t = t + h
-        f = field(t, q)
-        now = self._watched(a, row, u, t, q, f)
-        late = -_at(now.value, row.target) / _at(now.rate, row.target)
-        return (t + late, q + f * late), late
+
+        def correct(_, carry):
+            (t, q), _ = carry
+            value, rate = self._watched(a, row, u, t, q, field(t, q))
+            h = -_at(value, row.target) / _at(rate, row.target)
+            end, _ = looped_step(_CLASSICAL, field, t, q, h)
+            return (t + h, end), h
+
+        return jax.lax.fori_loop(0, 2, correct, ((t, q), jnp.zeros_like(t)))
 
     def _arrived(self, row: Rows, x: Passage) -> Passage:
-        """The passage, on the next section if the row ends there."""
+        """The passage after a row, on the next section if the row ends there."""
         ends_turn = row.arrives & (row.section == self.N - 1)
-        following = jnp.where(ends_turn, 0, row.section + row.arrives)
-        turn = len(self.course.event_sequence)
         return x._replace(
             t=x.t - jnp.where(ends_turn, self.course.period, 0.0),
-            section=jnp.full_like(x.section, 0) + following,
-            events=x.events - jnp.where(ends_turn, turn, 0),
+            place=jnp.full_like(x.place, 0) + row.then,
             fresh=x.fresh | row.arrives,
-            before=x.before._replace(
-                t=x.before.t - jnp.where(ends_turn, self.course.period, 0.0)
-            ),
             error=jnp.where(ends_turn, 0.0, x.error),
             largest=jnp.where(ends_turn, jnp.maximum(x.largest, x.error), x.largest),
         )
+
+    def _applied(self, u, x: Passage):
+        """The inputs, with what a controller adds."""
+        return u if x.answer is None else u + x.answer
 
     # Functions of a chart.
 
@@ -339,18 +350,15 @@ class _Moves:
         """Number of watched functions."""
         return len(self.s.guards(a)) + self._has_level(a)
 
-    def _is_widest(self, a: int) -> bool:
-        return self._functions(a) == self.form.watched
+    def _unknown(self, lanes: int):
+        """Watched functions of which nothing is known, and their rates."""
+        known = jnp.zeros((self.form.watched, lanes))
+        return known + jnp.inf, known + 1.0
 
-    def _unknown(self, t) -> Watched:
-        """Watched functions of which nothing is known."""
-        known = jnp.zeros((self.form.watched, len(t)))
-        return Watched(t, known + jnp.inf, known + 1.0)
-
-    def _watched(self, a: int, row: Rows, u, t, q, f) -> Watched:
+    def _watched(self, a: int, row: Rows, u, t, q, f):
         """The guards of a chart and the level of the next section, and their rates."""
         if not self._functions(a):
-            return self._unknown(t)
+            return self._unknown(len(t))
         at = ft.partial(kernels.watched_at, a, self.s.guard_kinds(a))
         watched = self.s.by_lane(at, self.levels, name=("watched", a))
         index = ((row.section + 1) % self.N).astype(jnp.int32)[None]
@@ -359,16 +367,17 @@ class _Moves:
         more = (0, self.form.watched - len(value)), (0, 0)
         # (Rates of what is not watched are 1: nothing divides by zero.)
         value = jnp.pad(value, more, constant_values=jnp.inf)
-        return Watched(t, value, jnp.pad(rate, more, constant_values=1.0))
+        return value, jnp.pad(rate, more, constant_values=1.0)
 
-    def _has_left(self, a: int, row: Rows, before: Watched, now: Watched):
+    def _has_left(self, a: int, row: Rows, x: Passage, value, rate):
         """Test whether a watched function has another sign than on the cycle, or a guard has passed
-        zero and come back since the row before."""
+        zero and come back in the last step."""
         count, guards = self._functions(a), len(self.s.guards(a))
         signs = row.signs[:, None]
-        other = (jnp.sign(now.value) * signs < 0)[:count]
-        dips = (_dips(before, now) & (signs > 0))[:guards]
-        return other.any(axis=0) | dips.any(axis=0)
+        other = (jnp.sign(value) * signs < 0)[:count]
+        before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
+        dips = _dips(before, Watched(x.h, value, rate)) & (signs > 0)
+        return other.any(axis=0) | dips[:guards].any(axis=0)
 
 
 def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:

@@ -24,10 +24,10 @@ from ..systems.transition import Scheduled
 from .plan import Plan
 
 
-# Newton steps on the guard after the last step to an event, by the method of the chart. Two more, a
-# short one and one of Euler, follow. None: a short step from a bad guess has errors of 1e-8 that
-# nobody reports. More: events take longer.
-_CORRECTIONS = 1
+# Newton steps on the guard after the last step to an event, by the method of the chart. A last one,
+# of Euler, follows. Fewer: experiments far from the cycle miss their event. More: events take
+# longer.
+_CORRECTIONS = 2
 # Rows of a table are a multiple of this. More: arrays are longer than needed. Fewer: tables of
 # other lengths compile again.
 _ROUND = 16
@@ -42,6 +42,10 @@ _WORST_GUESS = 3.0
 _NEAR_SECTION = 0.1
 
 
+# The place at which a turn begins.
+BEGIN = 0
+
+
 class Rows(NamedTuple):
     """R rows of one turn; those of other kinds do not use a column."""
 
@@ -49,8 +53,10 @@ class Rows(NamedTuple):
     """Index among the bodies of the program."""
     section: Int[np.ndarray, " R"]
     """The section at which the interval begins."""
-    passed: Int[np.ndarray, " R"]
-    """Number of events since section 0 of experiments that the row moves."""
+    at: Int[np.ndarray, " R"]
+    """Number of the place of experiments that the row moves: section and events passed."""
+    then: Int[np.ndarray, " R"]
+    """That of their place afterwards."""
     begins: Bool[np.ndarray, " R"]
     """Whether the leg begins here; otherwise a step is as long as the last one."""
     corrects: Bool[np.ndarray, " R"]
@@ -177,16 +183,16 @@ class _Writer:
             _, self.before, self.after = each
         self.width = self.at_sections.signs.shape[1]
         self.rows: list[tuple] = []
+        self.places: dict[tuple[int, int], int] = {(0, 0): BEGIN}
         self.bodies: list[Body] = []
 
     def written(self) -> Table:
         for k in range(self.N):
             self._interval(k)
         used = len(self.rows)
-        idle = self.rows[0][:2] + (_NEVER,) + self.rows[0][3:]
-        self.rows += [idle] * (-used % _ROUND)
+        self.rows += self.rows[-1:] * (-used % _ROUND)
         number = np.int32
-        types = [number, number, number, bool, bool, bool]
+        types = [number, number, number, number, bool, bool, bool]
         types += [number, float, float, number, bool, number]
         columns = [
             np.array(x).astype(d)
@@ -389,9 +395,18 @@ class _Writer:
         if body not in self.bodies:
             self.bodies.append(body)
         number = self.bodies.index(body)
-        row = number, section, passed, begins, corrects, arrives
+        at = self._place(section, passed)
+        after = passed + bool(body.kind)
+        then = self._place(section + 1, after) if arrives else self._place(section, after)
+        row = number, section, at, then, begins, corrects, arrives
         row += target, part, fixed, place, may_wait, signs
         self.rows.append(row)
+
+    def _place(self, section: int, passed: int) -> int:
+        """The number of a place by section and events passed since section 0."""
+        if section == self.N:
+            section, passed = 0, passed - len(self.events)
+        return self.places.setdefault((section, passed), len(self.places))
 
     def _event_kind(self, g: int) -> tuple[int, Kind, int]:
         """The chart that a transition leaves, its kind, and its index there."""
@@ -428,8 +443,6 @@ class _Writer:
 
 
 _EVENT = "section", "t", "before", "after"
-# No experiment has passed so many events.
-_NEVER = -(2**30)
 
 
 def _events(placed: PlacedSections) -> list[_Event]:
