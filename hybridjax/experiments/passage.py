@@ -8,11 +8,11 @@ would last a negative time, a step has a larger error than planned, or an event 
 import functools as ft
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core.compilation import OneTier
 from ..engine import kernels
 from ..engine.itinerary.bodies import Watched, _dips
 from ..engine.runge_kutta import looped_step
@@ -385,12 +385,5 @@ def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
     return jax.tree_util.tree_map(ft.partial(jnp.where, mask), yes, no)
 
 
-def without_fusions():
-    """Options of the compiler with which these programs compile in half the time."""
-    return {"xla_cpu_use_fusion_emitters": False}
-
-
-program = eqx.filter_jit(
-    follow_table,
-    compiler_options=without_fusions(),  # type: ignore[arg-type]  (handed on to `jax.jit`)
-)
+# (XLA's newer code generator compiles these programs for twice as long.)
+program = OneTier(follow_table, {"xla_cpu_use_fusion_emitters": False})

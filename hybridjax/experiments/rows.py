@@ -140,15 +140,32 @@ def applies(s: Structure, placed: PlacedSections) -> bool:
     return plain and explicit and not at_once
 
 
-def table(
-    placed: PlacedSections, plan: Plan, *, spare: bool = False, density: int = 1
-) -> Table:
-    """The table of one turn around the cycle.
+class Tables(NamedTuple):
+    """The tables of experiments around a cycle, of the same length."""
 
-    **Arguments:** `plan`: the step schedule. `spare`: whether all events have rows beyond the next
-    section and before the last one. `density`: number of steps for each step of the plan.
-    """
-    return _Writer(to_host(placed), to_host(plan), spare, density).written()
+    near: Table
+    """For experiments near the cycle."""
+    far: Table
+    """For those that leave it: with twice as many steps, and rows for each event in the intervals
+    before and after its own."""
+
+
+def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
+    """The tables of one turn around the cycle by a step schedule; None if experiments cannot follow
+    one."""
+    placed, plan = to_host((placed, plan))
+    if not applies(placed.structure(), placed):
+        return None
+    near = _Writer(placed, plan, spare=False, density=1).written()
+    far = _Writer(placed, plan, spare=True, density=2).written()
+    return Tables(_of_length(near, far), _of_length(far, near))
+
+
+def _of_length(table: Table, other: Table) -> Table:
+    """A table with at least as many rows as another has, repetitions of its last one."""
+    more = max(len(other.rows.body) - len(table.rows.body), 0)
+    repeat = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])  # noqa: E731
+    return dataclasses.replace(table, rows=Rows(*map(repeat, table.rows)))
 
 
 class _Writer:
