@@ -345,7 +345,7 @@ class _Writer:
         signs, newton = np.zeros(self.width, int), 0.0
         if is_own:
             signs = points.signs[at]
-            newton = points.newton[at, target]
+            newton = 0.0 if by_time else points.newton[at, target]
         self._leg(
             k,
             a,
