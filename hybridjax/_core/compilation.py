@@ -292,9 +292,7 @@ _by_kind: dict[tuple, "_Program"] = {}
 _by_text: dict[Hashable, "_Program"] = {}
 
 
-def _program_of(
-    function: Callable, arguments: tuple
-) -> tuple[tuple, list, "_Program"]:
+def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Program"]:
     """The kind of arguments, their arrays, and the program of a function for them."""
     key = function, kind(arguments)
     arrays, static = eqx.partition(arguments, _is_array)

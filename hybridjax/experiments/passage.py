@@ -116,9 +116,7 @@ def follow_table(
             passage, kept, outputs, answers = carry
             row = jax.tree_util.tree_map(lambda x: _at(x, r), rows)
             now = _at(held, row.section)
-            passage, kept = jax.lax.switch(
-                row.body, branches, row, now, passage, kept
-            )
+            passage, kept = jax.lax.switch(row.body, branches, row, now, passage, kept)
             outputs = _put(outputs, passage.output, row.section, 0)
             if feedback is not None:
                 answers = _put(answers, passage.answer, row.section, 0)
@@ -338,9 +336,8 @@ class _Moves:
     # Functions of a chart.
 
     def _field(self, a: int, u):
-        field = self.s.by_lane(
-            lambda s, t, q, u: s.field(a, t, q, u), name=("field", a)
-        )
+        of_lane = lambda s, t, q, u: s.field(a, t, q, u)  # noqa: E731
+        field = self.s.by_lane(of_lane, name=("field", a), by_row=False)
         return lambda t, q: field(t, q, u)
 
     def _has_level(self, a: int) -> bool:
@@ -360,7 +357,7 @@ class _Moves:
         if not self._functions(a):
             return self._unknown(len(t))
         at = ft.partial(kernels.watched_at, a, self.s.guard_kinds(a))
-        watched = self.s.by_lane(at, self.levels, name=("watched", a))
+        watched = self.s.by_lane(at, self.levels, name=("watched", a), by_row=False)
         index = ((row.section + 1) % self.N).astype(jnp.int32)[None]
         values = lambda t, q: watched(t, q, u, index)  # noqa: E731
         value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), f))

@@ -414,7 +414,9 @@ class _Writer:
         number = self.bodies.index(body)
         at = self._place(section, passed)
         after = passed + bool(body.kind)
-        then = self._place(section + 1, after) if arrives else self._place(section, after)
+        then = (
+            self._place(section + 1, after) if arrives else self._place(section, after)
+        )
         row = number, section, at, then, begins, corrects, arrives
         row += target, part, fixed, place, may_wait, signs
         self.rows.append(row)

@@ -313,8 +313,13 @@ class Campaign:
         if tables is None:
             yield from self._searched(u, start, execution, name)
             return
-        for rows, (part, left) in self._followed(tables.near, u, start, execution, name):
-            yield rows, self._completed(part, np.flatnonzero(left), u[rows], start[:, rows])
+        for rows, (part, left) in self._followed(
+            tables.near, u, start, execution, name
+        ):
+            yield (
+                rows,
+                self._completed(part, np.flatnonzero(left), u[rows], start[:, rows]),
+            )
 
     @property
     def _tables(self) -> Tables | None:
