@@ -39,7 +39,7 @@ _NEAR_ZERO = 1e-7
 _WORST_GUESS = 3.0
 # An event has rows beyond a section that is nearer than this part of the interval. Smaller: some
 # experiments leave the table. Larger: more events have rows that nearly no experiment needs.
-_NEAR_SECTION = 0.1
+_NEAR_SECTION = 0.05
 
 
 # The place at which a turn begins.
@@ -66,7 +66,7 @@ class Rows(NamedTuple):
     target: Int[np.ndarray, " R"]
     """The row of the watched function whose zero is the end of the leg; -1 for a known time."""
     part: Float[np.ndarray, " R"]
-    """Length of a step, as a part of the time to the end of the leg (for a zero, Newton's guess)."""
+    """Length of a step, as a part of the time to the end of the leg (to a zero, Newton's guess)."""
     fixed: Float[np.ndarray, " R"]
     """Length of a step where Newton's guess is bad; 0 where it is not."""
     place: Int[np.ndarray, " R"]

@@ -313,34 +313,33 @@ class Campaign:
         if tables is None:
             yield from self._searched(u, start, execution, name)
             return
-        for rows, (part, left) in self._followed(
-            tables.near, u, start, execution, name
-        ):
-            yield (
-                rows,
-                self._completed(part, np.flatnonzero(left), u[rows], start[:, rows]),
-            )
+        size = execution.batch or len(u)
+        followed = self._followed(tables.near, u, start, execution, name)
+        for rows, (part, left) in followed:
+            left = np.flatnonzero(left)
+            yield rows, self._completed(part, left, u[rows], start[:, rows], size)
 
     @property
     def _tables(self) -> Tables | None:
         """The tables that experiments follow, made once for the same sections and schedule."""
         make = lambda: tables(self.placed, self.stepping.plan)  # noqa: E731
-        return _tables.recall(self.stepping, id(self.placed), make)
+        return _tables.recall(self.stepping, None, make)
 
-    def _completed(self, part: Response, left: np.ndarray, u, start) -> Response:
+    def _completed(
+        self, part: Response, left: np.ndarray, u, start, size: int
+    ) -> Response:
         """A response in which the experiments that have `left` their table are run again: along one
-        with more rows, and where they leave that too, by a search."""
-        size = len(u)
-        whole = Execution(batch=size, workers=1)
-        if len(left) and self._tables.near is not self._tables.far:
-            again = u[left], start[:, left], whole, "experiments far from the cycle"
+        with more rows, in a batch of this size, and where they leave that too, by a search."""
+        name = "experiments far from the cycle"
+        if len(left):
+            whole = Execution(batch=size, workers=1)
+            again = u[left], start[:, left], whole, name
             ((_, (new, gone)),) = self._followed(self._tables.far, *again)
             part = _with_rows(part, left, new)
             left = left[gone]
         if len(left):
             few = Execution(batch=_round_up(len(left), size), workers=1)
-            again = u[left], start[:, left], few, "experiments far from the cycle"
-            ((_, new),) = self._searched(*again)
+            ((_, new),) = self._searched(u[left], start[:, left], few, name)
             part = _with_rows(part, left, new)
         return part
 
