@@ -78,16 +78,18 @@ def take_step(
 
 
 def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
-    a, c = jnp.asarray(method.a, q.dtype), jnp.asarray(method.c, q.dtype)
-
-    def stage(k, K):
-        rate = field(t + c[k] * h, q + h * jnp.tensordot(a[k], K, 1))
-        # (`K.at[k].set` tests whether k is within bounds, and twice the time is gone.)
-        return jax.lax.dynamic_update_index_in_dim(K, rate, k, 0)
+    def stage(K, xs):
+        row, c, k = xs
+        return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
 
     stages = len(method.c)
     begin = jnp.zeros((stages, *q.shape), q.dtype)
-    return jax.lax.fori_loop(0, stages, stage, begin)
+    tableau = (
+        jnp.asarray(method.a, q.dtype),
+        jnp.asarray(method.c, q.dtype),
+        jnp.arange(stages),
+    )
+    return jax.lax.scan(stage, begin, tableau)[0]
 
 
 def looped_step(

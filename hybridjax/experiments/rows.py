@@ -291,7 +291,7 @@ class _Writer:
             newton, signs = points.newton[at, target], points.signs[at].copy()
             signs[target] = max(signs[target], 0)
         else:
-            newton = duration = 0.0
+            newton, duration = None, 0.0
             signs = np.zeros(self.width, int)
             signs[target] = 1
         arrives = event.at_section and is_own
@@ -342,10 +342,10 @@ class _Writer:
         duration = self.ends[k] - begin
         by_time = np.isfinite(self.placed.bound.time[(k + 1) % self.N])
         target = -1 if by_time else len(self.s.guards(a))
-        signs, newton = np.zeros(self.width, int), 0.0
+        signs, newton = np.zeros(self.width, int), None
         if is_own:
             signs = points.signs[at]
-            newton = 0.0 if by_time else points.newton[at, target]
+            newton = None if by_time else points.newton[at, target]
         self._leg(
             k,
             a,
@@ -362,21 +362,23 @@ class _Writer:
         k: int,
         a: int,
         duration: float,
-        newton: float,
+        newton: float | None,
         *,
         passed: int,
         target: int,
         signs: np.ndarray,
         arrives: bool = False,
     ) -> None:
-        """Write the steps of a leg of this duration on the cycle."""
+        """Write the steps of a leg of this duration on the cycle.
+
+        `newton`: Newton's guess of the duration there; None where it is not needed, or right.
+        """
         steps = max(1, int(np.ceil(duration / self.plan.h[k] - 1e-6)))
         steps *= self.density
         part, fixed = 1 / steps, 0.0
-        if target >= 0 and newton != 0.0:
-            lead = duration / newton
-            if 1 / _WORST_GUESS < lead < _WORST_GUESS:
-                part = lead / steps
+        if newton is not None:
+            if duration / _WORST_GUESS < newton < duration * _WORST_GUESS:
+                part = duration / newton / steps
             else:
                 fixed = duration / steps
         inner = np.maximum(signs, 0)
