@@ -266,28 +266,56 @@ class TwoTiers:
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_hidden(arguments):
             return one_tier(self._function, self.large)(*arguments)
-        key = self._function, kind(arguments)
-        arrays, static = eqx.partition(arguments, _is_array)
-        leaves, structure = jax.tree_util.tree_flatten(arrays)
+        key, leaves, program = _program_of(self._function, arguments)
         if key not in self._chosen:
-
-            def run(leaves):
-                arrays = jax.tree_util.tree_unflatten(structure, leaves)
-                return self._function(*eqx.combine(arrays, static))
-
-            with _choosing, uncollected():
+            with _choosing:
                 if key not in self._chosen:  # by another thread in the meantime
                     say_compiling(True)
-                    program = _lowered(key, run, leaves)
                     self._chosen[key] = program, program.choose(self.large)
                     say_compiling(False)
         program, executable = self._chosen[key]
         return program.run(executable, leaves)
 
 
+class OneTier:
+    """`function(*arguments)`, compiled once by options that suit it.
+
+    For functions that compile in about a second: of these a quick executable is no gain.
+    """
+
+    def __init__(self, function: Callable, options: dict[str, Any]):
+        self._function, self._options = function, options
+
+    def __call__(self, *arguments: Any) -> Any:
+        if not _is_simple() or is_hidden(arguments):
+            return one_tier(self._function, True)(*arguments)
+        _, leaves, program = _program_of(self._function, arguments)
+        with _choosing:
+            executable = program.only(self._options)
+        return program.run(executable, leaves)
+
+
 _choosing = threading.Lock()
 _by_kind: dict[tuple, "_Program"] = {}
 _by_text: dict[Hashable, "_Program"] = {}
+
+
+def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Program"]:
+    """The kind of arguments, their arrays, and the program of a function for them."""
+    key = function, kind(arguments)
+    arrays, static = eqx.partition(arguments, _is_array)
+    leaves, structure = jax.tree_util.tree_flatten(arrays)
+
+    def run(leaves):
+        arrays = jax.tree_util.tree_unflatten(structure, leaves)
+        return function(*eqx.combine(arrays, static))
+
+    if key not in _by_kind:
+        with _choosing, uncollected():
+            say_compiling(True)
+            _lowered(key, run, leaves)
+            say_compiling(False)
+    return key, leaves, _lowered(key, run, leaves)
 
 
 def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
@@ -331,6 +359,15 @@ class _Program:
         if self._quick is None:
             self._quick = self._lowered.compile(compiler_options=compiler_options())
         return self._quick
+
+    def only(self, options: dict[str, Any]) -> jax.stages.Compiled:
+        """The executable that these options give, of a program that has no other."""
+        if self._full is None:
+            known = {name: x for name, x in options.items() if _is_known(name, x)}
+            say_compiling(True)
+            self._full = self._lowered.compile(compiler_options=known)
+            say_compiling(False)
+        return self._full
 
     def _optimize(self) -> jax.stages.Compiled:
         self._full = self._full or self._lowered.compile()

@@ -57,12 +57,15 @@ def one_lane(tree: Any) -> Any:
     return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
-def by_lane(function: Callable, *trees: Any, quick: bool = False) -> Callable:
+def by_lane(
+    function: Callable, *trees: Any, quick: bool = False, by_row: bool = True
+) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
     Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
     others have more is the same for all of them, and what depends on nothing else is computed once.
     `quick`: to compile, instead of to run: without trigonometric functions of many lanes.
+    `by_row`: as in `vectorized`.
     """
     arrays, static = eqx.partition([shared(x) for x in trees], eqx.is_array)
     axes = [x.axes() if isinstance(x, PerLane) else None for x in trees]
@@ -73,7 +76,7 @@ def by_lane(function: Callable, *trees: Any, quick: bool = False) -> Callable:
     @ft.cache
     def program(common: tuple[bool, ...], many: bool):
         in_axes = (axes, *[None if c else -1 for c in common])
-        work = vectorized(on_lane, trigonometry=many)
+        work = vectorized(on_lane, trigonometry=many, by_row=by_row)
         # Traced once, however often it is called: a Runge-Kutta step has ten stages.
         return jax.jit(jax.vmap(work, in_axes=in_axes, out_axes=-1))
 

@@ -92,6 +92,25 @@ def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
     return jax.lax.scan(stage, begin, tableau)[0]
 
 
+def looped_step(
+    method: Method, field: LaneField, t: AnyTimes, q: States, h: AnyTimes
+) -> tuple[States, States]:
+    """The end of a step of an explicit method, and its estimated error; stages are not unrolled."""
+    apart = jax.lax.optimization_barrier
+    stages, a, c = len(method.c), jnp.asarray(method.a), jnp.asarray(method.c)
+    weighted = lambda w, K: jnp.sum(w[:, None, None] * K, axis=0)  # noqa: E731
+
+    def stage(k, K):
+        # (States and rates apart: XLA would compute one of them again in each row of the other.)
+        y = apart(q + h * weighted(a[k], K))
+        rate = apart(field(t + c[k] * h, y))
+        return jax.lax.dynamic_update_index_in_dim(K, rate, k, 0)
+
+    K = jax.lax.fori_loop(0, stages, stage, jnp.zeros((stages, *q.shape), q.dtype))
+    end, error = (weighted(jnp.asarray(w), K) for w in (method.b, method.error))
+    return q + h * end, h * error
+
+
 def _unrolled_stages(method, field, t, q, h) -> list[States]:
     K: list[jax.Array] = []
     for row, c in zip(method.a, method.c, strict=True):

@@ -34,8 +34,17 @@ from ..systems.system import Output, OutputNames
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design, require_inputs
 from .noise import ProcessNoise
+from .passage import program
 from .plan import Accuracy, Stepping, plan_flow
-from .response import Course, Feedback, course, flow_batch, require_shape
+from .response import (
+    Course,
+    Feedback,
+    Response,
+    course,
+    flow_batch,
+    require_shape,
+)
+from .rows import Table, Tables, tables
 from .start import StartName, linearized, periodic_start, steady_start
 
 
@@ -300,30 +309,65 @@ class Campaign:
         self, u, start, execution: Execution, name: str
     ) -> Iterator[tuple[slice, Any]]:
         """Yield rows and their `Response`, batch after batch."""
-        stepping, base, feedback = (
-            self.stepping,
-            self.at_sections.on_cycle,
-            self.feedback,
-        )
-        loop = (
-            None
-            if feedback is None
-            else from_host(Feedback(feedback, jax.numpy.asarray(base)))
-        )
+        tables = self._tables
+        if tables is None:
+            yield from self._searched(u, start, execution, name)
+            return
+        size = execution.batch or len(u)
+        followed = self._followed(tables.near, u, start, execution, name)
+        for rows, (part, left) in followed:
+            left = np.flatnonzero(left)
+            yield rows, self._completed(part, left, u[rows], start[:, rows], size)
 
-        def arguments(rows):
-            # (Nobody changes them before the program is done, so they may share memory.)
-            x, held = jax.device_put((start[:, rows], u[rows]))
-            return (
-                self.at_sections.course,
-                stepping.plan,
-                x,
-                held,
-                stepping.settings,
-                loop,
-            )
+    @property
+    def _tables(self) -> Tables | None:
+        """The tables that experiments follow, made once for the same sections and schedule."""
+        make = lambda: tables(self.placed, self.stepping.plan)  # noqa: E731
+        return _tables.recall(self.stepping, None, make)
 
+    def _completed(
+        self, part: Response, left: np.ndarray, u, start, size: int
+    ) -> Response:
+        """A response in which the experiments that have `left` their table are run again: along one
+        with more rows, in a batch of this size, and where they leave that too, by a search."""
+        name = "experiments far from the cycle"
+        if len(left):
+            whole = Execution(batch=size, workers=1)
+            again = u[left], start[:, left], whole, name
+            ((_, (new, gone)),) = self._followed(self._tables.far, *again)
+            part = _with_rows(part, left, new)
+            left = left[gone]
+        if len(left):
+            few = Execution(batch=_round_up(len(left), size), workers=1)
+            ((_, new),) = self._searched(u[left], start[:, left], few, name)
+            part = _with_rows(part, left, new)
+        return part
+
+    def _followed(
+        self, table: Table, u, start, execution: Execution, name: str
+    ) -> Iterator[tuple[slice, Any]]:
+        """Yield rows, their `Response` along a table, and which have left it, batch after batch."""
+        further = table.form, table.rows, np.int32(table.count)
+        arguments = lambda rows: (*self._arguments(u, start, rows), *further)  # noqa: E731
+        return in_batches(program, arguments, len(u), execution, name)
+
+    def _searched(
+        self, u, start, execution: Execution, name: str
+    ) -> Iterator[tuple[slice, Any]]:
+        """Yield rows and their `Response` with a search for events, batch after batch."""
+        arguments = lambda rows: self._arguments(u, start, rows)  # noqa: E731
         return in_batches(self._program, arguments, len(u), execution, name)
+
+    def _arguments(self, u, start, rows: slice | np.ndarray) -> tuple:
+        """Arguments of a program for some experiments."""
+        loop = None
+        if self.feedback is not None:
+            on_cycle = jax.numpy.asarray(self.at_sections.on_cycle)
+            loop = from_host(Feedback(self.feedback, on_cycle))
+        # (Nobody changes them before the program is done, so they may share memory.)
+        x, held = jax.device_put((start[:, rows], u[rows]))
+        stepping = self.stepping
+        return self.at_sections.course, stepping.plan, x, held, stepping.settings, loop
 
     def _require_outputs(self, y, result) -> None:
         finite = np.isfinite(y)
@@ -462,6 +506,26 @@ class _AtSections(NamedTuple):
 
 
 _resolved = Memory()
+_tables = Memory()
+
+
+def _with_rows(part: Response, rows: np.ndarray, new: Response) -> Response:
+    """A response with some experiments replaced."""
+
+    def put(x, y):
+        x = np.array(x)
+        x[rows] = y
+        return x
+
+    return jax.tree_util.tree_map(put, part, new)
+
+
+def _round_up(count: int, most: int) -> int:
+    """The size of a batch for so many experiments: of few sizes, so that few are compiled."""
+    size = _VECTOR
+    while size < count:
+        size *= 2
+    return min(size, most)
 
 
 def divide(S: int, execution: Execution) -> Execution:

@@ -233,19 +233,24 @@ class Structure:
         return len(self.inputs)
 
     def by_lane(
-        self, function: Callable, *trees: Any, name: Hashable = None
+        self,
+        function: Callable,
+        *trees: Any,
+        name: Hashable = None,
+        by_row: bool = True,
     ) -> Callable:
         """Vectorize `function(structure, *trees, *arguments)` over the lanes on the last axis of
         `arguments`. Lanes may have parameters of their own (see `PerLane`).
 
-        A function with a `name` is made once for the same trees, and traced once.
+        A function with a `name` is made once for the same trees, and traced once. `by_row`: as in
+        `vectorized`.
         """
 
         def make():
             if isinstance(self.source, PerLane):
                 of_source = lambda source, *x: function(Structure(source), *x)  # noqa: E731
-                return by_lane(of_source, self.source, *trees)
-            return by_lane(lambda *x: function(self, *x), *trees)
+                return by_lane(of_source, self.source, *trees, by_row=by_row)
+            return by_lane(lambda *x: function(self, *x), *trees, by_row=by_row)
 
         return make() if name is None else self.once(name, trees, make)
 

@@ -42,7 +42,9 @@ _FACTORIZATIONS = {
 _OUTER = ("jit", "pjit", "cond", "while", "scan", "custom_linear_solve")
 
 
-def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
+def vectorized(
+    function: Callable, *, trigonometry: bool = True, by_row: bool = True
+) -> Callable:
     """`function` with the functions of `factorizations`, and if wanted with those of
     `trigonometry`, in place of those of `jnp`.
 
@@ -51,6 +53,8 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
     CPU `function` is called as it is.
 
     **Arguments:** `function`, from pytrees of arrays or numbers to a pytree of arrays or numbers.
+    `by_row`: whether vectors are put together row by row, which is faster unless a program keeps
+    them apart from what is done with them.
 
     **Returns:** a function with the same arguments that returns arrays of the same shapes, dtypes
     and weak types as `jax.jit(function)` would.
@@ -65,7 +69,8 @@ def vectorized(function: Callable, *, trigonometry: bool = True) -> Callable:
             lambda *arguments: function(*arguments), return_shape=True
         )
         program, shapes = trace(*arguments)
-        jaxpr = _row_by_row(program.jaxpr) if trigonometry else program.jaxpr
+        separate = trigonometry and by_row
+        jaxpr = _row_by_row(program.jaxpr) if separate else program.jaxpr
         program = program.replace(jaxpr=_replaced(jaxpr, trigonometry))
         values = jex.jaxpr_as_fun(program)(*jax.tree_util.tree_leaves(arguments))
         values = [v if isinstance(v, jax.Array) else jnp.asarray(v) for v in values]

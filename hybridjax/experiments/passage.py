@@ -1,0 +1,386 @@
+"""Experiments that follow a table of legs and events (`rows.py`), without a search.
+
+All experiments are moved at once, in lanes on the last axis. A lane that does not follow the table
+is marked: a watched function has another sign than on the cycle, or has dipped through zero, a leg
+would last a negative time, a step has a larger error than planned, or an event was not found.
+"""
+
+import functools as ft
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.compilation import OneTier
+from ..engine import kernels
+from ..engine.itinerary.bodies import Watched, _dips
+from ..engine.runge_kutta import looped_step
+from ..engine.settings import Settings, size
+from ..systems.solver import Method
+from ..systems.structure import Member, Structure
+from .plan import ROUNDING, Plan
+from .response import Course, Feedback, Response
+from .rows import BEGIN, Body, Form, Rows
+
+
+# The last correction of the time of an event may be this part of the period times the square root
+# of the accuracy: what it leaves is its square. Larger: errors that nobody reports. Smaller: more
+# experiments are searched for their events.
+_LAST = 5e-3
+
+
+# The classical method of order 4, for short steps.
+_CLASSICAL = Method(
+    "classical",
+    a=((0, 0, 0, 0), (0.5, 0, 0, 0), (0, 0.5, 0, 0), (0, 0, 1, 0)),
+    b=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    c=(0, 0.5, 0.5, 1),
+    error=(0, 0, 0, 0),
+    order=5.0,
+)
+
+
+class Passage(NamedTuple):
+    """Experiments on their way, in L lanes."""
+
+    t: Float[Array, " L"]
+    q: Float[Array, "d L"]
+    place: Int[Array, " L"]
+    """The place of the lane (see `Rows.at`)."""
+    fresh: Bool[Array, " L"]
+    """Whether the lane is on the section."""
+    h: Float[Array, " L"]
+    """Length of the last step."""
+    value: Float[Array, "G L"]
+    """Watched functions where the last step began."""
+    rate: Float[Array, "G L"]
+    error: Float[Array, " L"]
+    """Error of this turn so far."""
+    largest: Float[Array, " L"]
+    """Largest error of a turn."""
+    left: Bool[Array, " L"]
+    """Whether the table was left."""
+    output: Float[Array, "ny L"]
+    """Outputs at the last section."""
+    answer: Float[Array, "nu L"] | None
+    """What a controller adds to the inputs."""
+    controller: Float[Array, "c L"] | None
+    """Its states."""
+
+
+class Kept(NamedTuple):
+    """A passage where the present leg began, to which an event beyond the section goes back."""
+
+    t: Float[Array, " L"]
+    q: Float[Array, "d L"]
+    fresh: Bool[Array, " L"]
+    error: Float[Array, " L"]
+    left: Bool[Array, " L"]
+
+    @classmethod
+    def of(cls, x: Passage) -> "Kept":
+        return cls(x.t, x.q, x.fresh, x.error, x.left)
+
+
+def follow_table(
+    course: Course,
+    plan: Plan,
+    start: Float[Array, "m S"],
+    u: Float[Array, "S n nu"],
+    settings: Settings,
+    feedback: Feedback | None,
+    form: Form,
+    rows: Rows,
+    count: Int[Array, ""] | int,
+) -> tuple[Response, Bool[Array, " S"]]:
+    """Flow S experiments as `response.flow_batch` does, along a table.
+
+    **Arguments:** `count`: number of rows that are used; an integer if the result is differentiated
+    in reverse mode.
+
+    **Returns:** the response, and which experiments have left the table: their responses are
+    meaningless.
+    """
+    N, (S, n, nu) = len(course.bound.time), u.shape
+    moves = _Moves(course, plan, settings, feedback, form)
+    branches = [moves.of(body) for body in form.bodies]
+    # Periods, then sections; lanes last.
+    held = jnp.transpose(u, (1, 2, 0)).reshape(n // N, N, nu, S)
+
+    def turn(carry, held):
+        outputs = jnp.zeros((N, len(moves.outputs.names), S))
+        answers = jnp.zeros((N, nu, S))
+
+        def move(r, carry):
+            passage, kept, outputs, answers = carry
+            row = jax.tree_util.tree_map(lambda x: _at(x, r), rows)
+            now = _at(held, row.section)
+            passage, kept = jax.lax.switch(row.body, branches, row, now, passage, kept)
+            outputs = _put(outputs, passage.output, row.section, 0)
+            if feedback is not None:
+                answers = _put(answers, passage.answer, row.section, 0)
+            return passage, kept, outputs, answers
+
+        *carry, outputs, answers = jax.lax.fori_loop(
+            0, count, move, (*carry, outputs, answers)
+        )
+        return tuple(carry), (outputs, answers)
+
+    begin = moves.begin(start, S)
+    (end, _), (y, answers) = jax.lax.scan(turn, (begin, Kept.of(begin)), held)
+    to_experiments = lambda x: jnp.moveaxis(x, -1, 0).reshape(S, n, -1)  # noqa: E731
+    y = to_experiments(y)
+    finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
+    left = end.left | ~finite | (end.place != BEGIN)
+    response = Response(
+        y,
+        jnp.zeros(S, jnp.int32),
+        jnp.full(S, -1),
+        ROUNDING + plan.least + end.largest,
+        jnp.concatenate([end.t[None], end.q]).T,
+        None if feedback is None else to_experiments(answers),
+    )
+    return response, left
+
+
+_put = jax.lax.dynamic_update_index_in_dim
+
+
+def _at(x: Array, k: Int[Array, ""]) -> Array:
+    """Entry k, which is within bounds: `x[k]` would test that."""
+    return jax.lax.dynamic_index_in_dim(x, k, 0, keepdims=False)
+
+
+class _Moves:
+    """What rows do."""
+
+    def __init__(
+        self,
+        course: Course,
+        plan: Plan,
+        settings: Settings,
+        feedback: Feedback | None,
+        form: Form,
+    ):
+        self.course, self.plan, self.settings = course, plan, settings
+        self.feedback, self.form = feedback, form
+        self.s = Structure(course.system)
+        self.outputs = self.s.resolve_outputs(course.outputs)
+        self.levels = course.bound.levels
+        self.N = len(course.bound.time)
+        following = (jnp.arange(self.N) + 1) % self.N
+        turns = jnp.where(following == 0, course.period, 0.0)
+        self.ends = course.bound.time[following] + turns
+        self.allowed = _LAST * course.period * jnp.sqrt(settings.rtol)
+
+    def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
+        zero = jnp.zeros(S)
+        value, rate = self._unknown(S)
+        answer = controller = None
+        if self.feedback is not None:
+            answer = jnp.zeros((self.s.nu, S))
+            controller = jnp.zeros((self.feedback.matrices.A.shape[1], S))
+        return Passage(
+            t=start[0],
+            q=start[1:],
+            place=jnp.full(S, BEGIN, jnp.int32),
+            fresh=jnp.ones(S, bool),
+            h=zero,
+            value=value,
+            rate=rate,
+            error=zero,
+            largest=zero,
+            left=jnp.zeros(S, bool),
+            output=jnp.zeros((len(self.outputs.names), S)),
+            answer=answer,
+            controller=controller,
+        )
+
+    def of(self, body: Body):
+        """The function (row, inputs, passage, kept) of rows with this body."""
+        work = self._event if body.kind else self._leg
+
+        def move(row: Rows, u, passage: Passage, kept: Kept):
+            acts = passage.place == row.at
+            moved, kept = work(body, row, u, passage, kept, acts)
+            return _where(acts, moved, passage), kept
+
+        return move
+
+    def _leg(self, body: Body, row: Rows, u, x: Passage, kept: Kept, acts):
+        """A step toward the end of a leg, or a correction of the time at which it ends."""
+        a = body.chart
+        q = x.q[: self.s.dims[a]]
+        x = self._observed(a, row, u, q, x)
+        kept = _where(acts & row.begins, Kept.of(x), kept)
+        u = self._applied(u, x)
+        f = self._field(a, u)(x.t, q)
+        value, rate = self._watched(a, row, u, x.t, q, f)
+        left = x.left | self._has_left(a, row, x, value, rate)
+        to_end = _at(self.ends, row.section) - x.t
+        target = jnp.maximum(row.target, 0)
+        if self._functions(a):
+            to_zero = -_at(value, target) / _at(rate, target)
+            to_end = jnp.where(row.target >= 0, to_zero, to_end)
+        planned = jnp.where(row.fixed > 0, row.fixed, row.part * to_end)
+        h = jnp.where(row.begins | row.corrects, planned, x.h)
+        end, error = self._stepped(a, u, x.t, q, h)
+        left |= row.begins & (h < 0)
+        left |= ~row.corrects & (error > _at(self.plan.slack, row.section))
+        share = jnp.where(row.corrects, 0.0, error * _at(self.plan.weight, row.section))
+        t = x.t + h
+        by_time = row.arrives & (row.target < 0)
+        t = jnp.where(by_time, _at(self.ends, row.section), t)
+        if self._has_level(a):
+            arrived, late = self._landed(a, row, u, t, end)
+            at_level = row.arrives & (row.target >= 0)
+            t, end = _where(at_level, arrived, (t, end))
+            left |= at_level & ~(jnp.abs(late) <= self.allowed)
+        x = x._replace(
+            t=t,
+            q=x.q.at[: self.s.dims[a]].set(end),
+            fresh=jnp.zeros_like(x.fresh),
+            h=h,
+            value=value,
+            rate=rate,
+            error=x.error + jax.lax.stop_gradient(share),
+            left=left,
+        )
+        return self._arrived(row, x), kept
+
+    def _event(self, body: Body, row: Rows, u, x: Passage, kept: Kept, acts):
+        """An event, and the reset; or back to where the leg began."""
+        a, s = body.chart, self.s
+        b = s.chart_index(s.transitions[body.kind[0]].target)
+        q = x.q[: s.dims[a]]
+        u = self._applied(u, x)
+        f = self._field(a, u)(x.t, q)
+        value, rate = self._watched(a, row, u, x.t, q, f)
+        late = -_at(value, row.target) / _at(rate, row.target)
+        t = x.t + late
+        member = Member(body.kind, row.place)
+        reset = s.by_lane(lambda s, t, q, u: s.reset(member, t, q, u))
+        after = reset(t, q + f * late, u)
+        # Where the next section comes first, the event waits.
+        due = t <= _at(self.ends, row.section)
+        if self._has_level(a):
+            due &= value[len(s.guards(a))] > 0
+        found = (jnp.abs(late) <= self.allowed) & (_at(rate, row.target) < 0)
+        happens = due & found & (t >= kept.t)
+        left = x.left | self._has_left(a, row, x, value, rate)
+        value, rate = self._unknown(len(t))
+        moved = x._replace(
+            t=t,
+            q=jnp.zeros_like(x.q).at[: s.dims[b]].set(after),
+            value=value,
+            rate=rate,
+            left=left | ~(happens | row.may_wait),
+        )
+        moved = self._arrived(row, moved)
+        waits = row.may_wait & ~happens
+        back = x._replace(**kept._asdict(), value=value, rate=rate)
+        return _where(waits, back, moved), kept
+
+    def _observed(self, a: int, row: Rows, u, q, x: Passage) -> Passage:
+        """The outputs at the section, for lanes that are there, and a controller's answer."""
+        observe = self.s.by_lane(lambda s, t, q, u: self.outputs(a, t, q, u))
+        if self.feedback is not None:
+            A, B, C, D, _ = (m[row.section] for m in self.feedback.matrices)
+            on_cycle = self.feedback.on_cycle[row.section][:, None]
+            deviation = observe(x.t, q, u) - on_cycle
+            answer = -(C @ x.controller + D @ deviation)
+            states = A @ x.controller + B @ deviation
+            x = x._replace(
+                answer=jnp.where(x.fresh, answer, x.answer),
+                controller=jnp.where(x.fresh, states, x.controller),
+            )
+        output = observe(x.t, q, self._applied(u, x))
+        return x._replace(output=jnp.where(x.fresh, output, x.output))
+
+    def _stepped(self, a: int, u, t, q, h):
+        """The state after a step, and its error relative to what is allowed."""
+        # (The step of diffrax's solver takes twice as long: it writes stages as `K.at[k].set`.)
+        end, error = looped_step(self.s.method(a), self._field(a, u), t, q, h)
+        allowed = self.settings.rtol * size(self.settings, a, q, end)
+        return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
+
+    def _landed(self, a: int, row: Rows, u, t, q):
+        """Time and state at the level near (t, q), and the last correction of the time."""
+        field = self._field(a, u)
+
+        def correct(_, carry):
+            (t, q), _ = carry
+            value, rate = self._watched(a, row, u, t, q, field(t, q))
+            h = -_at(value, row.target) / _at(rate, row.target)
+            end, _ = looped_step(_CLASSICAL, field, t, q, h)
+            return (t + h, end), h
+
+        return jax.lax.fori_loop(0, 2, correct, ((t, q), jnp.zeros_like(t)))
+
+    def _arrived(self, row: Rows, x: Passage) -> Passage:
+        """The passage after a row, on the next section if the row ends there."""
+        ends_turn = row.arrives & (row.section == self.N - 1)
+        return x._replace(
+            t=x.t - jnp.where(ends_turn, self.course.period, 0.0),
+            place=jnp.full_like(x.place, 0) + row.then,
+            fresh=x.fresh | row.arrives,
+            error=jnp.where(ends_turn, 0.0, x.error),
+            largest=jnp.where(ends_turn, jnp.maximum(x.largest, x.error), x.largest),
+        )
+
+    def _applied(self, u, x: Passage):
+        """The inputs, with what a controller adds."""
+        return u if x.answer is None else u + x.answer
+
+    # Functions of a chart.
+
+    def _field(self, a: int, u):
+        of_lane = lambda s, t, q, u: s.field(a, t, q, u)  # noqa: E731
+        field = self.s.by_lane(of_lane, name=("field", a), by_row=False)
+        return lambda t, q: field(t, q, u)
+
+    def _has_level(self, a: int) -> bool:
+        return self.levels is not None and self.levels.present(self.s, a)
+
+    def _functions(self, a: int) -> int:
+        """Number of watched functions."""
+        return len(self.s.guards(a)) + self._has_level(a)
+
+    def _unknown(self, lanes: int):
+        """Watched functions of which nothing is known, and their rates."""
+        known = jnp.zeros((self.form.watched, lanes))
+        return known + jnp.inf, known + 1.0
+
+    def _watched(self, a: int, row: Rows, u, t, q, f):
+        """The guards of a chart and the level of the next section, and their rates."""
+        if not self._functions(a):
+            return self._unknown(len(t))
+        at = ft.partial(kernels.watched_at, a, self.s.guard_kinds(a))
+        watched = self.s.by_lane(at, self.levels, name=("watched", a), by_row=False)
+        index = ((row.section + 1) % self.N).astype(jnp.int32)[None]
+        values = lambda t, q: watched(t, q, u, index)  # noqa: E731
+        value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), f))
+        more = (0, self.form.watched - len(value)), (0, 0)
+        # (Rates of what is not watched are 1: nothing divides by zero.)
+        value = jnp.pad(value, more, constant_values=jnp.inf)
+        return value, jnp.pad(rate, more, constant_values=1.0)
+
+    def _has_left(self, a: int, row: Rows, x: Passage, value, rate):
+        """Test whether a watched function has another sign than on the cycle, or a guard has passed
+        zero and come back in the last step."""
+        count, guards = self._functions(a), len(self.s.guards(a))
+        signs = row.signs[:, None]
+        other = (jnp.sign(value) * signs < 0)[:count]
+        before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
+        dips = _dips(before, Watched(x.h, value, rate)) & (signs > 0)
+        return other.any(axis=0) | dips[:guards].any(axis=0)
+
+
+def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
+    """Of each lane one of two trees."""
+    return jax.tree_util.tree_map(ft.partial(jnp.where, mask), yes, no)
+
+
+# (XLA's newer code generator compiles these programs for twice as long.)
+program = OneTier(follow_table, {"xla_cpu_use_fusion_emitters": False})

@@ -1,0 +1,486 @@
+"""The course of an experiment as a table: its legs and events from section to section.
+
+Around a limit cycle charts and events follow each other as on the cycle. One turn is a table of
+rows, each of which moves all experiments at once (`passage.py`): a step in a chart, a correction of
+the time of an event, or an event. A *leg* lies between sections and events.
+
+An event near a section may happen on its other side in some experiments. Then it has rows in both
+intervals: a row moves those experiments that have passed as many events as it says. An event that
+turns out to lie beyond the next section is undone.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._core.executor import to_host
+from ..engine import kernels
+from ..engine.lanes import IDLE
+from ..sections.placed import PlacedSections
+from ..systems.structure import Kind, Member, Structure
+from ..systems.transition import Scheduled
+from .plan import Plan
+
+
+# Newton steps on the guard after the last step to an event, by the method of the chart. A last one,
+# of Euler, follows. Fewer: experiments far from the cycle miss their event. More: events take
+# longer.
+_CORRECTIONS = 2
+# Rows of a table are a multiple of this. More: arrays are longer than needed. Fewer: tables of
+# other lengths compile again.
+_ROUND = 16
+# A guard whose value is below this part of its largest one in the chart may have either sign.
+# Larger: a guard that is passed is not noticed. Smaller: rounding at events is taken for a passage.
+_NEAR_ZERO = 1e-7
+# The time to an event is Newton's guess times a factor from the cycle, if that is below this and
+# above its inverse. Larger: bad guesses set the length of steps. Smaller: good ones are not used.
+_WORST_GUESS = 3.0
+# An event has rows beyond a section that is nearer than this part of the interval. Smaller: some
+# experiments leave the table. Larger: more events have rows that nearly no experiment needs.
+_NEAR_SECTION = 0.05
+
+
+# The place at which a turn begins.
+BEGIN = 0
+
+
+class Rows(NamedTuple):
+    """R rows of one turn; those of other kinds do not use a column."""
+
+    body: Int[np.ndarray, " R"]
+    """Index among the bodies of the program."""
+    section: Int[np.ndarray, " R"]
+    """The section at which the interval begins."""
+    at: Int[np.ndarray, " R"]
+    """Number of the place of experiments that the row moves: section and events passed."""
+    then: Int[np.ndarray, " R"]
+    """That of their place afterwards."""
+    begins: Bool[np.ndarray, " R"]
+    """Whether the leg begins here; otherwise a step is as long as the last one."""
+    corrects: Bool[np.ndarray, " R"]
+    """Whether a step is a correction of the time of an event."""
+    arrives: Bool[np.ndarray, " R"]
+    """Whether the row ends on the next section."""
+    target: Int[np.ndarray, " R"]
+    """The row of the watched function whose zero is the end of the leg; -1 for a known time."""
+    part: Float[np.ndarray, " R"]
+    """Length of a step, as a part of the time to the end of the leg (to a zero, Newton's guess)."""
+    fixed: Float[np.ndarray, " R"]
+    """Length of a step where Newton's guess is bad; 0 where it is not."""
+    place: Int[np.ndarray, " R"]
+    """Of an event: index of the transition among those of its kind."""
+    may_wait: Bool[np.ndarray, " R"]
+    """Of an event: whether it may happen beyond the next section instead."""
+    signs: Int[np.ndarray, "R G"]
+    """Signs of the watched functions of the chart where a row begins; 0 where they may have
+    either."""
+
+
+class Body(NamedTuple):
+    """What rows of one kind do, for the compiler: legs in a chart, or events of a kind."""
+
+    chart: int
+    kind: Kind = ()
+
+
+class Form(NamedTuple):
+    """All of a table that a program is compiled for. (Hashable.)"""
+
+    bodies: tuple[Body, ...]
+    watched: int
+    """Largest number of watched functions of a chart."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of one turn, of which the first `count` are used."""
+
+    form: Form
+    rows: Rows
+    count: int
+
+
+class _Event(NamedTuple):
+    """An event on the cycle."""
+
+    section: int
+    """The section before it."""
+    t: float
+    transition: int
+    before: Float[np.ndarray, " d"]
+    after: Float[np.ndarray, " d"]
+    at_section: bool
+    """Whether the next section is this event."""
+
+
+class _Points(NamedTuple):
+    """Watched functions at P points of the cycle."""
+
+    newton: Float[np.ndarray, "P G"]
+    """Newton's guesses of the times to their zeros."""
+    signs: Int[np.ndarray, "P G"]
+
+
+def applies(s: Structure, placed: PlacedSections) -> bool:
+    """Test whether experiments can follow a table: with explicit methods, and events at the zeros
+    of guards that are always enabled."""
+    charts = np.unique(np.asarray(placed.lanes.chart)).tolist()
+    codes = np.unique(np.asarray(placed.tape.code))
+    taken = [s.transitions[g] for g in codes[codes >= 0].tolist()]
+    used = {*charts, *(s.chart_index(x.target) for x in taken)}
+    plain = all(
+        x.enabled is None and not isinstance(x.guard, Scheduled)
+        for x in s.transitions
+        if s.chart_index(x.source) in used
+    )
+    explicit = not any(s.method(a).implicit for a in used)
+    at_once = np.asarray(placed.tape.at_once)[np.asarray(placed.tape.code) >= 0].any()
+    return plain and explicit and not at_once
+
+
+class Tables(NamedTuple):
+    """The tables of experiments around a cycle, of the same length."""
+
+    near: Table
+    """For experiments near the cycle."""
+    far: Table
+    """For those that leave it: with twice as many steps, and rows for each event in the intervals
+    before and after its own."""
+
+
+def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
+    """The tables of one turn around the cycle by a step schedule; None if experiments cannot follow
+    one."""
+    placed, plan = to_host((placed, plan))
+    if not applies(placed.structure(), placed):
+        return None
+    near = _Writer(placed, plan, spare=False, density=1).written()
+    far = _Writer(placed, plan, spare=True, density=2).written()
+    return Tables(_of_length(near, far), _of_length(far, near))
+
+
+def _of_length(table: Table, other: Table) -> Table:
+    """A table with at least as many rows as another has, repetitions of its last one."""
+    more = max(len(other.rows.body) - len(table.rows.body), 0)
+    repeat = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])  # noqa: E731
+    return dataclasses.replace(table, rows=Rows(*map(repeat, table.rows)))
+
+
+class _Writer:
+    """Writes the rows of a table, one after the other."""
+
+    def __init__(self, placed: PlacedSections, plan: Plan, spare: bool, density: int):
+        self.placed, self.plan = placed, plan
+        self.spare, self.density = spare, density
+        self.s = placed.structure()
+        self.N = placed.n_sections
+        self.t, self.chart = placed.lanes.t, placed.lanes.chart
+        self.ends = self.t + placed.duration
+        self.events = _events(placed)
+        self.levels = placed.bound.levels
+        # (One scale of each guard for all points: at an event alone it would be rounding.)
+        at = [np.array([getattr(x, name) for x in self.events]) for name in _EVENT]
+        section, times, before, after = at
+        numbers = range(len(self.events))
+        places = [
+            (np.arange(self.N), self.t, self.chart, placed.lanes.q),
+            (section, times, [self._chart(e) for e in numbers], before.T),
+            (section, times, [self._chart(e + 1) for e in numbers], after.T),
+        ]
+        places = [x for x in places if len(x[0])]
+        joined = [np.concatenate(x, axis=-1) for x in zip(*places, strict=True)]
+        points = self._points(*joined)
+        cuts = np.cumsum([len(x[0]) for x in places])[:-1]
+        parts = [np.split(x, cuts) for x in points]
+        each = [_Points(*x) for x in zip(*parts, strict=True)]
+        self.at_sections = each[0]
+        if self.events:
+            _, self.before, self.after = each
+        self.width = self.at_sections.signs.shape[1]
+        self.rows: list[tuple] = []
+        self.places: dict[tuple[int, int], int] = {(0, 0): BEGIN}
+        self.bodies: list[Body] = []
+
+    def written(self) -> Table:
+        for k in range(self.N):
+            self._interval(k)
+        used = len(self.rows)
+        self.rows += self.rows[-1:] * (-used % _ROUND)
+        number = np.int32
+        types = [number, number, number, number, bool, bool, bool]
+        types += [number, float, float, number, bool, number]
+        columns = [
+            np.array(x).astype(d)
+            for x, d in zip(zip(*self.rows, strict=True), types, strict=True)
+        ]
+        bodies = tuple(sorted(self.bodies))
+        place = np.array([bodies.index(body) for body in self.bodies], number)
+        rows = Rows(*columns)
+        rows = rows._replace(body=place[rows.body])
+        return Table(Form(bodies, self.width), rows, used)
+
+    def _interval(self, k: int) -> None:
+        """Write the rows from section k to the next."""
+        events, passed = self._happening(k), self._passed(k)
+        for e in events:
+            self._to_event(k, e, is_first=e == passed)
+        for count in sorted(self._arriving(k)):
+            self._to_section(k, count)
+
+    def _happening(self, k: int) -> list[int]:
+        """Numbers of the events that may happen after section k, counted from section 0."""
+        turn = len(self.events)
+        around = range(-turn, 2 * turn) if turn else range(0)
+        return [e for e in around if k in self._intervals(e)]
+
+    def _intervals(self, e: int) -> list[int]:
+        """Sections after which event e may happen, counted from section 0."""
+        turn, number = divmod(e, len(self.events))
+        event = self.events[number]
+        own = event.section
+        within = self.ends[own] - self.t[own]
+        late = self.ends[own] - event.t < _NEAR_SECTION * within
+        early = event.t - self.t[own] < _NEAR_SECTION * within
+        found = [own]
+        if (late or self.spare) and not event.at_section:
+            found.append(own + 1)
+        if early or self.spare:
+            found.append(own - 1)
+        return [k + turn * self.N for k in found]
+
+    def _passed(self, k: int) -> int:
+        """Number of events on the cycle before section k."""
+        turn, section = divmod(k, self.N)
+        before = sum(event.section < section for event in self.events)
+        return before + turn * len(self.events)
+
+    def _arriving(self, k: int) -> set[int]:
+        """Numbers of events after which the next section may be reached by a leg."""
+        after = self._passed(k + 1)
+        counts = {after}
+        for e in self._happening(k):
+            if k + 1 in self._intervals(e):
+                counts |= {e, e + 1}
+        if self.events and self._ends_with_event(k):
+            counts.discard(after)
+        return counts
+
+    def _ends_with_event(self, k: int) -> bool:
+        return any(event.at_section and event.section == k for event in self.events)
+
+    def _chart(self, passed: int) -> int:
+        """The chart after so many events."""
+        if not self.events:
+            return int(self.chart[0])
+        event = self.events[(passed - 1) % len(self.events)]
+        return self.s.chart_index(self.s.transitions[event.transition].target)
+
+    def _to_event(self, k: int, e: int, is_first: bool) -> None:
+        """Write the leg from section k, or from the event before, to event e."""
+        event = self.events[e % len(self.events)]
+        a, kind, place = self._event_kind(event.transition)
+        target = self.s.guards(a).index(event.transition)
+        is_own = e // len(self.events) * self.N + event.section == k
+        before = e - 1 if e - 1 in self._happening(k) else None
+        begin, points, at = self._begin(k, before)
+        turn = e // len(self.events) * float(self.placed.cycle.period)
+        duration = event.t + turn - begin
+        if is_first or (before is not None and is_own):
+            newton, signs = points.newton[at, target], points.signs[at].copy()
+            signs[target] = max(signs[target], 0)
+        else:
+            newton, duration = None, 0.0
+            signs = np.zeros(self.width, int)
+            signs[target] = 1
+        arrives = event.at_section and is_own
+        about = dict(passed=e, target=target, signs=signs)
+        self._leg(k, a, duration, newton, **about)
+        nothing = np.zeros(self.width, int)
+        for _ in range(_CORRECTIONS):
+            self._add(
+                Body(a),
+                k,
+                passed=e,
+                target=target,
+                signs=nothing,
+                corrects=True,
+                part=1.0,
+            )
+        at_event = self.before.signs[e % len(self.events)].copy()
+        at_event[target] = 0
+        if self._has_level(a):
+            at_event[-1] = 0
+        waits = len(self._intervals(e)) > 1
+        self._add(
+            Body(a, kind),
+            k,
+            passed=e,
+            target=target,
+            signs=at_event,
+            place=place,
+            may_wait=waits,
+            arrives=arrives,
+        )
+
+    def _begin(self, k: int, before: int | None) -> tuple[float, _Points, int]:
+        """Time, points and index at which a leg in the interval after section k begins."""
+        if before is None:
+            return float(self.t[k]), self.at_sections, k
+        turn, number = divmod(before, len(self.events))
+        t = self.events[number].t + turn * float(self.placed.cycle.period)
+        return t, self.after, number
+
+    def _to_section(self, k: int, count: int) -> None:
+        """Write the leg to the section after k, of experiments that have passed so many events."""
+        a = self._chart(count)
+        is_own = count == self._passed(k + 1)
+        has_event = count > self._passed(k)
+        last = self._passed(k + 1) - 1 if is_own and has_event else None
+        begin, points, at = self._begin(k, last)
+        duration = self.ends[k] - begin
+        by_time = np.isfinite(self.placed.bound.time[(k + 1) % self.N])
+        target = -1 if by_time else len(self.s.guards(a))
+        signs, newton = np.zeros(self.width, int), None
+        if is_own:
+            signs = points.signs[at]
+            newton = None if by_time else points.newton[at, target]
+        self._leg(
+            k,
+            a,
+            duration,
+            newton,
+            passed=count,
+            target=target,
+            signs=signs,
+            arrives=True,
+        )
+
+    def _leg(
+        self,
+        k: int,
+        a: int,
+        duration: float,
+        newton: float | None,
+        *,
+        passed: int,
+        target: int,
+        signs: np.ndarray,
+        arrives: bool = False,
+    ) -> None:
+        """Write the steps of a leg of this duration on the cycle.
+
+        `newton`: Newton's guess of the duration there; None where it is not needed, or right.
+        """
+        steps = max(1, int(np.ceil(duration / self.plan.h[k] - 1e-6)))
+        steps *= self.density
+        part, fixed = 1 / steps, 0.0
+        if newton is not None:
+            if duration / _WORST_GUESS < newton < duration * _WORST_GUESS:
+                part = duration / newton / steps
+            else:
+                fixed = duration / steps
+        inner = np.maximum(signs, 0)
+        for j in range(steps):
+            self._add(
+                Body(a),
+                k,
+                passed=passed,
+                target=target,
+                signs=inner if j else signs,
+                begins=j == 0,
+                part=part,
+                fixed=fixed,
+                arrives=arrives and j == steps - 1,
+            )
+
+    def _add(
+        self,
+        body: Body,
+        section: int,
+        *,
+        passed: int,
+        target: int,
+        signs: np.ndarray,
+        begins: bool = False,
+        corrects: bool = False,
+        arrives: bool = False,
+        part: float = 0.0,
+        fixed: float = 0.0,
+        place: int = 0,
+        may_wait: bool = False,
+    ) -> None:
+        if body not in self.bodies:
+            self.bodies.append(body)
+        number = self.bodies.index(body)
+        at = self._place(section, passed)
+        after = passed + bool(body.kind)
+        then = (
+            self._place(section + 1, after) if arrives else self._place(section, after)
+        )
+        row = number, section, at, then, begins, corrects, arrives
+        row += target, part, fixed, place, may_wait, signs
+        self.rows.append(row)
+
+    def _place(self, section: int, passed: int) -> int:
+        """The number of a place by section and events passed since section 0."""
+        if section == self.N:
+            section, passed = 0, passed - len(self.events)
+        return self.places.setdefault((section, passed), len(self.places))
+
+    def _event_kind(self, g: int) -> tuple[int, Kind, int]:
+        """The chart that a transition leaves, its kind, and its index there."""
+        member: Member = self.s.member(g)
+        a = self.s.chart_index(self.s.transitions[g].source)
+        return a, member.kind, int(member.place[0])
+
+    def _has_level(self, a: int) -> bool:
+        return self.levels is not None and self.levels.present(self.s, a)
+
+    def _points(self, section, t, chart, q) -> _Points:
+        """Watched functions at points after these sections."""
+        s, chart = self.s, np.asarray(chart, int)
+        charts = range(len(s.dims))
+        width = max(len(s.guards(a)) + self._has_level(a) for a in charts)
+        newton, signs = np.zeros((len(t), width)), np.zeros((len(t), width), int)
+        for a in np.unique(chart).tolist():
+            count = len(s.guards(a)) + self._has_level(a)
+            here = np.flatnonzero(chart == a)
+            if not count:
+                continue
+            n, index = s.dims[a], (section[here] + 1) % self.N
+            point = np.asarray(t)[here], q[:n, here], np.zeros((s.nu, 1))
+            columns = kernels.watched(s, a, self.levels, *point, index)
+            field = kernels.field(s, a, *point)[:, 0]
+            value = columns[:, 0]
+            rate = columns[:, 1] + np.sum(columns[:, 2 : 2 + n] * field, axis=1)
+            with np.errstate(all="ignore"):
+                newton[here, :count] = np.nan_to_num(-value / rate).T
+            largest = np.abs(value).max(axis=1, keepdims=True)
+            known = np.abs(value) > _NEAR_ZERO * largest
+            signs[here, :count] = np.where(known, np.sign(value), 0).T
+        return _Points(newton, signs)
+
+
+_EVENT = "section", "t", "before", "after"
+
+
+def _events(placed: PlacedSections) -> list[_Event]:
+    """The events of one turn, in order."""
+    tape, found = placed.tape, []
+    for k in range(placed.n_sections):
+        rows = np.flatnonzero(tape.code[:, k] >= 0)
+        moves = np.flatnonzero(tape.code[:, k] != IDLE)
+        for row in rows:
+            found.append(
+                _Event(
+                    section=k,
+                    t=float(tape.t[row, k]),
+                    transition=int(tape.code[row, k]),
+                    before=tape.before[row, :, k],
+                    after=tape.after[row, :, k],
+                    at_section=bool(row == moves[-1]),
+                )
+            )
+    return found
