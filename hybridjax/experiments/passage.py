@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core.compilation import OneTier
 from ..engine import kernels
-from ..engine.itinerary.bodies import Watched, _dips
+from ..engine.itinerary.bodies import Watched, dips
 from ..engine.runge_kutta import looped_step
 from ..engine.settings import Settings, size
 from ..systems.solver import Method
@@ -371,10 +371,11 @@ class _Moves:
         zero and come back in the last step."""
         count, guards = self._functions(a), len(self.s.guards(a))
         signs = row.signs[:, None]
-        other = (jnp.sign(value) * signs < 0)[:count]
+        # (Comparisons with NaN are false.)
+        other = ((signs != 0) & ~(jnp.sign(value) * signs > 0))[:count]
         before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
-        dips = _dips(before, Watched(x.h, value, rate)) & (signs > 0)
-        return other.any(axis=0) | dips[:guards].any(axis=0)
+        returns = dips(before, Watched(x.h, value, rate), signs) & (signs != 0)
+        return other.any(axis=0) | returns[:guards].any(axis=0)
 
 
 def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:

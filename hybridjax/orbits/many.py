@@ -39,6 +39,10 @@ from .return_map import ReturnMap
 
 # Lanes of a call. More: their arrays leave the cache. Fewer: calls cost more.
 TILE = 250
+# Part of the systems that a route must suit, for another one to be tried. Larger: systems that
+# routes would suit are searched. Smaller: sweeps of relaxation oscillators, whose jumps each move
+# to other steps, try many in vain.
+_WORTH = 0.125
 # Rounds in which systems begin from neighbors, and routes that searches find for systems that no
 # route suits. More: hopeless systems cost more. Fewer: more are left to the search.
 _ROUNDS, _SEARCHES = 4, 6
@@ -163,9 +167,9 @@ class Solver:
         """Find cycles on the known routes, then on new ones."""
         for number in range(len(self.routes)):
             self._take(number)
-        for _ in range(_SEARCHES):
+        for _ in range(_SEARCHES + 1 - len(self.routes)):
             known = np.flatnonzero(self.found.path >= 0)
-            if not len(self.pending) or not len(known):
+            if not len(self.pending) or len(known) < _WORTH * len(self.found.path):
                 return
             distance, near = self.nearest(self.pending, known)
             first = np.argmin(distance)
@@ -177,8 +181,7 @@ class Solver:
                 return
             self.routes.append(route)
             self._take(len(self.routes) - 1)
-            if len(self.pending) == before:
-                self.routes.pop()
+            if before - len(self.pending) < _WORTH * before:
                 return
 
     def nearest(self, rows, known) -> tuple[np.ndarray, np.ndarray]:

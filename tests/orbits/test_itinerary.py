@@ -8,6 +8,7 @@ import pytest
 
 import hybridjax as hj
 from hybridjax.orbits import limit_cycles, near
+from hybridjax.orbits.repeat import Maps, Plan, correct, leaves_of, on_device
 
 
 class Free(hj.Chart):
@@ -126,3 +127,19 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
         alone = hj.find_limit_cycle(cycles[i].system)
         found = cycles.multipliers[i][: len(alone.multipliers)]
         assert np.allclose(np.sort(found), np.sort(alone.multipliers), atol=1e-8)
+
+
+def test_programs_of_many_systems_factorize_nothing(free):
+    """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
+    route = near.route_near(free)
+    leaves = tuple(np.repeat(np.asarray(x)[None], 4, 0) for x in leaves_of(free.system))
+    times = np.zeros(4), np.full(4, float(free.period))
+    q = np.repeat(route.map.anchor.q.T, 4, axis=0)
+    ends = np.repeat(route.first.ends[None], 4, axis=0)
+    map, plan = on_device(route.map), Plan.of(route.first)
+
+    def program(leaves, t, expected, q, ends):
+        return correct(Maps(map, leaves, t, expected), route.first.form, plan, q, ends)
+
+    text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
+    assert "while" in text and "@lapack_" not in text

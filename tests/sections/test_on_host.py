@@ -1,6 +1,7 @@
 """Derivatives of cycles and sections, which come from the host outside of programs."""
 
 import dataclasses
+import functools as ft
 
 import equinox as eqx
 import jax
@@ -26,9 +27,11 @@ def measured(guess, family):
     def measure(system):
         cycle = hj.find_limit_cycle(system, guess)
         model = hj.linearize(cycle, family)
-        matrices = model.A, model.B, model.C, cycle.factors
+        # (Repeated cycles are divided into other pieces.)
+        monodromy = ft.reduce(lambda product, factor: factor @ product, cycle.factors)
+        matrices = model.A, model.B, model.C, monodromy
         polynomial = model.characteristic_polynomial()
-        return *matrices, polynomial, cycle.period, cycle.anchor.q, cycle.legs.q
+        return *matrices, polynomial, cycle.period, cycle.anchor.q
 
     return measure
 

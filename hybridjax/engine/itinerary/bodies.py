@@ -59,7 +59,7 @@ class Watched(NamedTuple):
     t: Float[Array, ""]
     value: Float[Array, " G"]
     rate: Float[Array, " G"]
-    enabled: Bool[Array, " G"]
+    enabled: Bool[Array, " G"] | bool = True
     """Whether their events are enabled."""
 
     @classmethod
@@ -269,12 +269,12 @@ class Bodies:
         known, before = row.signs != 0, course.before
         # (Comparisons with NaN are false.)
         other = known & ~(jnp.sign(now.value) * row.signs > 0)
-        dips = known & _dips(before, now, row.signs)
+        returns = known & dips(before, now, row.signs)
         positive = (before.value > 0) & jnp.isfinite(before.value)
         falls = known & positive & (now.value <= 0)
         enabled = falls & (before.enabled | now.enabled)
         rises = (row.target >= 0) & ~(now.rate[row.target] < 0)
-        return (other | dips | enabled).any() | rises
+        return (other | returns | enabled).any() | rises
 
     def _has_tick(self, a: int, course: Course, t) -> Bool[Array, ""]:
         """Test whether a scheduled event was due in a leg that ends at t, before its end."""
@@ -294,7 +294,7 @@ def _newton(now: Watched, target) -> Float[Array, ""]:
     return -now.value[target] / now.rate[target]
 
 
-def _dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:
+def dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:
     """Test whether functions with these signs at two times have had the other one in between:
     whether the cubic polynomials with their values and rates have."""
     h = now.t - before.t
