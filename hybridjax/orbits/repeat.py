@@ -35,9 +35,9 @@ from .shooting import ATOL, RTOL
 MOST_TURNS = 10
 
 
-# Size of a Newton step, relative to the tolerance, at which no further turn is taken. Larger:
-# residuals stay near the tolerance. Smaller: one turn more for most lanes.
-_SMALL = 0.05
+# Size of a Newton step, relative to the accuracy of a step of the flow, at which no further turn is
+# taken. Larger: residuals stay near the tolerance. Smaller: one turn more for most lanes.
+_SMALL = 0.5
 # Steps of an itinerary for each one that the search took, first for all systems, then for those
 # whose errors are too large. More: turns last longer. Fewer: more systems need the second.
 _DENSITY, _FINER = 0.9, 2.0
@@ -226,6 +226,9 @@ def _solve(
 
 
 def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+    # (Steps are judged relative to `RTOL`.)
+    enough = jnp.minimum(_SMALL * maps.map.settings.rtol / RTOL, 1.0)
+
     def again(carry):
         before, q, settled = carry
         passage, residual = turn(maps, form, plan, q, before.passage.ends)
@@ -234,7 +237,7 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
         found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
-        closed = (excess <= _SMALL) | ((excess <= 1) & (before.excess <= 1))
+        closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
         return found, _where(settled, q, q + step), settled | closed
 
     def going(carry):
