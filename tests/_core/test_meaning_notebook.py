@@ -14,6 +14,13 @@ from hybridjax._core.meaning import change_of, code_digest, current
 from ..conftest import no_compilation
 
 
+@pytest.fixture(autouse=True)
+def options_of_numpy():
+    """Cells may change options of NumPy, for themselves."""
+    with np.printoptions(), np.errstate():
+        yield
+
+
 matplotlib.use("agg")
 
 IMPORTS = """
