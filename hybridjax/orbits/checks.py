@@ -374,11 +374,8 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
         )
         if path.result != Result.OK:
             return f" It stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}'."
-    if int(turn.result) != Result.STEP_LIMIT:
-        return ""
-    explicit = (x for x in points(s, lanes) if not is_implicit(s, x[0]))
-    rate = max((float(fastest(s, *x).max()) for x in explicit), default=0.0)
-    if rate * expected < STIFF:
+    rate = rate_of_short_steps(s, turn, expected)
+    if rate == 0.0:
         return ""
     return (
         f" The system is stiff: a mode decays in a time of {1 / rate:.2g}, in a period of "
@@ -386,6 +383,16 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
         'rest. Use an implicit one, e.g. `settings=Settings(solver="auto")`, or allow more steps, '
         "e.g. `settings=Settings(max_steps=20_000)`."
     )
+
+
+def rate_of_short_steps(s: Structure, turn: Turn, expected: float) -> float:
+    """The rate of the mode because of which a turn has reached the limit on steps of explicit
+    methods; 0 for none."""
+    if int(turn.result) != Result.STEP_LIMIT:
+        return 0.0
+    explicit = (x for x in points(s, turn.legs) if not is_implicit(s, x[0]))
+    rate = max((float(fastest(s, *x).max()) for x in explicit), default=0.0)
+    return rate if rate * expected >= STIFF else 0.0
 
 
 def _about_decisions(s: Structure) -> str:

@@ -240,7 +240,8 @@ def find_limit_cycle(
     solution, map = _solution(map, patient, near, guess)
     cycle, turn = _judged(map, solution, given)
     later_fault = ""
-    for periods in () if settle else _times_later(cycle, guess):
+    slow = _is_slow(map, turn)
+    for periods in () if settle or slow else _times_later(cycle, guess):
         # (From there the flow may lead to a cycle that is stable.)
         say(f"the same after {periods} periods")
         try:
@@ -331,6 +332,15 @@ def _with_result(cycle: LimitCycle, result: Result) -> LimitCycle:
     """The cycle with another result, and what is remembered with it."""
     other = dataclasses.replace(cycle, result=jax.device_put(np.int32(result)))
     return remembering(other, cycle)
+
+
+def _is_slow(map: ReturnMap, turn: Turn) -> bool:
+    """Test whether many periods of a flow would take too long: a stiff one, or one that has reached
+    even the larger limit on steps."""
+    if int(turn.result) != Result.STEP_LIMIT:
+        return False
+    stiff = checks.rate_of_short_steps(map.structure, turn, float(map.expected)) > 0
+    return stiff or map.settings.max_steps >= ENOUGH
 
 
 def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
