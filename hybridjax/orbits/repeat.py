@@ -354,7 +354,11 @@ def judge(route: Route, found: Corrected, t, expected) -> tuple:
     sizes = route.map.sizes
     defect = found.jacobian * sizes / sizes[:, None]
     kept = kept & (xp.min(svdvals(defect), axis=-1) >= SINGULAR)
-    if route.map.base is not None and not route.first.events:
+    if route.map.base is None:
+        # (The last event of a turn that ends with one may come later than the turn ends.)
+        late = xp.abs(passage.t - (t + expected))
+        kept = kept & (late <= ROUNDING * expected)
+    elif not route.first.events:
         apart = xp.abs(passage.legs_q - found.q[..., None, :]) / route.map.sizes
         kept = kept & (apart.max(axis=(-2, -1)) > _APART)  # (it is no equilibrium)
     return converged, kept, passage.error <= 1

@@ -117,8 +117,7 @@ class Bodies:
         q = self._state(a, course)
         field = self._field(a, course.t, q)
         now = self._watched(a, course.t, q, field)
-        begin = jnp.where(row.first, course.t, course.begin)
-        h = row.fraction * (course.ends[row.leg] - begin)
+        h = row.fraction * (course.ends[row.leg] - course.begin)
         if self._functions(a):
             is_correction = row.target >= 0
             # (Where none is made, the rate may be zero, and NaN would enter reverse mode.)
@@ -129,7 +128,6 @@ class Bodies:
         return course._replace(
             t=course.t + h,
             y=y,
-            begin=begin,
             before=now,
             error=jnp.maximum(course.error, error),
             left=course.left | self._has_left(a, row, course, now),

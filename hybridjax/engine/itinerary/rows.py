@@ -46,8 +46,6 @@ class Rows(NamedTuple):
     body: Int[np.ndarray, " R"]
     """Index among the `bodies` of the program."""
     leg: Int[np.ndarray, " R"]
-    first: Bool[np.ndarray, " R"]
-    """Whether the leg begins here."""
     fraction: Float[np.ndarray, " R"]
     """Length of a step, as a part of the leg."""
     target: Int[np.ndarray, " R"]
@@ -85,8 +83,6 @@ class Form(NamedTuple):
     """All of an itinerary that a program is compiled for. (Hashable.)"""
 
     bodies: tuple[Body, ...]
-    legs: int
-    rows: int
     watched: int
     """Largest number of watched functions of a chart."""
 
@@ -111,7 +107,7 @@ class Itinerary(NamedTuple):
     events: tuple[int, ...]
     """Indices of transitions, in order."""
     certain: bool
-    """Whether rows can tell if events at once are still due: those whose guard was beyond zero."""
+    """Whether rows can tell if all events are still due (see `_is_certain`)."""
 
 
 def levels_in(s: Structure, a: int, levels: AbstractLevels | None) -> bool:
@@ -136,7 +132,6 @@ class _Table:
         leg: int,
         signs: np.ndarray,
         *,
-        first: bool = False,
         fraction: float = 0.0,
         target: int = -1,
         place: int = 0,
@@ -146,7 +141,7 @@ class _Table:
         self.include([body])
         number = self.bodies.index(body)
         places = target, place, piece
-        self.rows.append((number, leg, first, fraction, *places, onward, signs))
+        self.rows.append((number, leg, fraction, *places, onward, signs))
 
 
 class _Leg(NamedTuple):
@@ -210,11 +205,10 @@ def recorded(
                 table.add(Body(PIECE, a), k, unknown, piece=len(charts))
                 charts.append(a)
                 armed.append(_armed(s, a, t, leg.signs(t)))
-            step = dict(first=j == 0, fraction=fraction)
-            table.add(Body(STEP, a), k, leg.signs(t), **step)
+            table.add(Body(STEP, a), k, leg.signs(t), fraction=fraction)
         _end(s, table, k, leg, goes_on=k < len(legs) - 1)
     events = tuple(leg.code for leg in legs if leg.code >= 0)
-    certain = all(_is_certain(s, leg) for leg in legs if leg.at_once)
+    certain = all(_is_certain(s, leg) for leg in legs)
     if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
         table.include(Body(SECTION, leg.chart) for leg in legs)
@@ -225,7 +219,12 @@ def recorded(
 
 
 def _is_certain(s: Structure, leg: _Leg) -> bool:
-    """Test whether the guard of an event at once was beyond zero."""
+    """Test whether rows can tell if the event of a leg is still due: not if it comes after no time,
+    unless it happens at once, with its guard beyond zero."""
+    if leg.code < 0:
+        return True
+    if not leg.at_once:
+        return bool(leg.times[-1] > leg.times[0])
     if _is_scheduled(s, leg.code):
         return False
     return bool(leg.ends[-1, s.guards(leg.chart).index(leg.code)] < 0)
@@ -354,7 +353,7 @@ def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> It
         table.add(Body(NOTHING), 0, np.zeros(width, int))
     columns = [np.array(x) for x in zip(*table.rows, strict=True)]
     number = np.int32
-    types = number, number, bool, float, *[number] * 3, bool, number
+    types = number, number, float, *[number] * 3, bool, number
     rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))
@@ -362,6 +361,6 @@ def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> It
     rows = rows._replace(body=place[rows.body])
     last = len(ends) - 1
     ends = np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS))
-    form = Form(bodies, len(ends), len(rows.body), width)
     before = rows.leg[rows.piece < LEGS]
+    form = Form(bodies, width)
     return Itinerary(form, rows, used, ends, last, charts, before, armed, events, True)
