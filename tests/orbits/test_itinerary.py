@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.orbits import limit_cycles, near
+from hybridjax.orbits import batches, limit_cycles, near
 from hybridjax.orbits.repeat import Maps, Plan, correct, leaves_of, on_device
 
 
@@ -146,6 +146,8 @@ def test_gradients_inside_of_programs_are_differences(free):
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     """Where the clock's phase of the anchor lies in stance for some, in flight for others."""
     monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
+    # (No system is left to the search side by side, which would hide faults of routes.)
+    monkeypatch.setattr(batches.Tiles, "solve", None)
     k, b = np.meshgrid(np.linspace(8, 13, 8), np.linspace(3, 7, 8))
     make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
     systems = make(jnp.asarray(k.ravel()), jnp.asarray(b.ravel()))
@@ -174,6 +176,16 @@ def test_programs_of_many_systems_factorize_nothing(free):
 
     text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
     assert "while" in text and "@lapack_" not in text
+
+
+def test_the_route_itself_leads_to_the_papers_hopper(compiled):
+    """With independent digits of the multipliers; the search is not asked."""
+    guess = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.05))
+    map = guess.return_map.at_phase_of(hj.models.VerticalHopper())
+    cycle = near.repeated_cycle(guess, map)
+    assert cycle is not None and int(cycle.iterations) <= 5
+    true = -0.24898333 + 0.69933325j
+    np.testing.assert_allclose(cycle.multipliers[0], true, atol=1e-8)
 
 
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
