@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.interpolate import CubicSpline
 from scipy.signal import detrend
 
 from .._core.arguments import require_equal
@@ -32,10 +33,13 @@ from .smoothing import (
     gaps,
     inside,
     means,
+    require_passing,
     spline,
 )
 
 
+Signals = Float[np.ndarray, "n k"]
+"""Several signals, sample by sample."""
 DriftCycles = Annotated[float, Number("four cycles or more", low=4, infinite=True)]
 """Shortest duration of a drift; infinite: a constant. Shorter: responses to the inputs are removed
 with the drift."""
@@ -89,247 +93,365 @@ def section_data(
     that repeat from cycle to cycle, a bandwidth below the rate of the rhythm, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
     """
-    inputs, outputs = tuple(inputs), tuple(outputs)
-    for name in (*inputs, *outputs):
-        values = [x[np.isfinite(x)] for _, x in recording.samples(name)]
-        if not any(len(x) and np.ptp(x) for x in values):
-            raise DefinitionError(
-                f"{name} is constant in all trials: repair it, or leave it out."
-            )
-    if not (inputs or outputs):
-        raise DefinitionError(
-            "events alone determine no multipliers: name inputs or outputs."
-        )
+    inputs = tuple(inputs)
+    outputs = tuple(outputs)
+    _require_signals(recording, (*inputs, *outputs))
     if not outputs and timing is None:
         timing = "duration"
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
-    if None not in (n_sections, phase.n_sections):
+    if n_sections is not None and phase.n_sections is not None:
         require_equal(
             "`n_sections` and phase", "n_sections", n_sections, phase.n_sections
         )
     N = n_sections or phase.n_sections or HARMONICS
-    bandwidth = N / phase.period if bandwidth is None else float(bandwidth)
-    smoothing.require_passing(bandwidth, 1 / phase.period)
-    nu, columns = len(inputs), [recording.column(x) for x in (*inputs, *outputs)]
-    parts, trials, cycles, spikes = [], [], [], np.zeros(len(columns), int)
-    for number, (trial, stretches) in enumerate(phase.by_trial(recording)):
-        signals, struck = _without_spikes(
-            trial.time, trial.values[:, columns], nu, stretches
-        )
-        spikes += struck
-        for name, count in zip(
-            (*inputs, *outputs), np.isfinite(signals).sum(axis=0), strict=True
-        ):
-            if (
-                count < 2 * FEWEST
-            ):  # (a half of them is left out to see what interpolation loses)
-                text = f"trial '{trial.name}' has {count} samples of {name}: leave the trial out."
-                raise DefinitionError(text)
-        sections = _sample(
-            trial.time, signals, nu, stretches, N, phase.period, bandwidth, sampled
-        )
-        if timing is not None:
-            sections = _with_times(sections, N, phase.period, timing)
-        if not sections:
-            continue
-        k = np.concatenate([x.k for x in sections]) % N
-        mean = average_cycle(k, np.concatenate([x.values for x in sections]), N)
-        parts += [x._replace(values=x.values - mean[x.k % N]) for x in sections]
-        trials += [number] * len(sections)
-        cycles += [mean] * len(sections)
+    if bandwidth is None:
+        bandwidth = N / phase.period
+    require_passing(bandwidth, 1 / phase.period)
+    plan = _Plan(inputs, outputs, N, phase.period, float(bandwidth), sampled, timing)
+    parts, spikes = _sample_trials(recording, phase, plan)
     if not parts:
         raise DefinitionError(
             "the recording holds no whole cycle without gaps: record longer."
         )
-    cycle = np.average(cycles, axis=0, weights=[len(x.k) for x in parts])
-    _require_changes(parts, cycle, nu, outputs)
-    names = [Signal(x, recording.unit(x)) for x in (*inputs, *outputs)]
+    lengths = [len(part.k) for part in parts]
+    cycle = np.average([part.cycle for part in parts], axis=0, weights=lengths)
+    _require_changes(parts, cycle, plan)
+    if timing is not None:
+        longest = parts[int(np.argmax(lengths))]
+        time = recording.trials[longest.trial].time
+        _require_times(longest, N, float(np.median(np.diff(time))))
+    nu = len(inputs)
+    names = [Signal(name, recording.unit(name)) for name in plan.signals]
     if timing is not None:
         names.append(Signal("time" if timing == "clock" else "duration", "s"))
         spikes = np.append(spikes, 0)
-        part, trial = max(
-            zip(parts, trials, strict=True), key=lambda pair: len(pair[0].k)
-        )
-        _require_times(part, N, float(np.median(np.diff(recording.trials[trial].time))))
     # A smoothing spline averages over neighbors on both sides.
-    lead = phase.lead * N + (0 if np.isinf(bandwidth) else 1)
-    change = np.median(np.concatenate([x.change for x in parts]), axis=0)
-    squares = np.concatenate([x.values[:, nu : nu + len(outputs)] ** 2 for x in parts])
-    size = np.maximum(np.nanmean(squares, axis=0), np.finfo(float).tiny)
-    about: dict[str, Any] = {"n_sections": N, "lead": lead, "drift": np.inf}
-    about |= {"inputs": tuple(names[:nu]), "outputs": tuple(names[nu:])}
-    records = (
-        Record(*np.split(x.values, [nu], 1), first_section=int(x.k[0]) % N, **about)
-        for x in parts
-    )
+    smoothed = 0 if np.isinf(bandwidth) else 1
+    records = [
+        Record(
+            part.values[:, :nu],
+            part.values[:, nu:],
+            n_sections=N,
+            first_section=int(part.k[0]) % N,
+            inputs=tuple(names[:nu]),
+            outputs=tuple(names[nu:]),
+            lead=phase.lead * N + smoothed,
+            drift=np.inf,
+        )
+        for part in parts
+    ]
     data = SectionData(
-        tuple(records),
-        tuple(x.t for x in parts),
-        tuple(trials),
-        cycle[:, :nu],
-        cycle[:, nu:],
-        phase.period,
-        bandwidth,
-        tuple(spikes.tolist()),
-        float(np.sqrt(change / size).max(initial=0)),
+        records=tuple(records),
+        times=tuple(part.t for part in parts),
+        trials=tuple(part.trial for part in parts),
+        cycle_inputs=cycle[:, :nu],
+        cycle_outputs=cycle[:, nu:],
+        period=phase.period,
+        bandwidth=plan.bandwidth,
+        spikes=tuple(spikes.tolist()),
+        unresolved=_unresolved(parts, plan),
     )
     warn_of(slow_sampling(data))
     return data
 
 
-def _without_spikes(
-    time: Series,
-    signals: Float[np.ndarray, "n nuy"],
-    nu: int,
-    stretches: Sequence[Winding],
-) -> tuple[Float[np.ndarray, "n nuy"], Int[np.ndarray, " nuy"]]:
-    """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
-    signals, counts = signals.copy(), []
-    times, phases, cycle = [np.zeros(0)], [np.zeros(0)], 0.0
-    for w in (
-        stretches
-    ):  # the phase continues from stretch to stretch, each from a new cycle on
-        times.append(w.time)
-        phases.append(w.phase - np.floor(w.phase[0]) + cycle)
-        cycle = np.ceil(phases[-1][-1])
-    time_of, phase = np.concatenate(times), np.concatenate(phases)
-    for i, x in enumerate(signals.T):
-        heights = (smoothing.input_spikes if i < nu else smoothing.spike_heights)(x)
-        at = np.flatnonzero(heights)
-        if len(at) and len(time_of):
-            phase_there = np.interp(time[at], time_of, phase)
-            at = at[~smoothing.recurring(heights[at], phase_there, np.ptp(phase))]
-        x[at] = np.nan
-        counts.append(len(at))
-    return signals, np.array(counts)
+class _Plan(NamedTuple):
+    """How all trials are sampled; the fields are those of `section_data`."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    n_sections: int
+    period: float
+    bandwidth: float
+    sampled: Literal["mean", "middle"]
+    timing: Literal["clock", "duration"] | None
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        return self.inputs + self.outputs
+
+    @property
+    def of_outputs(self) -> slice:
+        """The columns of the outputs, without times of crossing."""
+        return slice(len(self.inputs), len(self.signals))
 
 
 class _Sections(NamedTuple):
-    """Samples of one stretch at sections k[0], k[0] + 1, ...; whether the phase was observed."""
+    """Samples of one stretch at sections k[0], k[0] + 1, ..."""
 
+    trial: int
     k: Int[np.ndarray, " n"]
     t: Series
     observed: Bool[np.ndarray, " n"]
-    values: Float[np.ndarray, "n nuy"]
-    change: Float[np.ndarray, "n ny"]
+    """Whether the phase was observed, not interpolated."""
+    values: Signals
+    """Inputs, outputs, and times of crossing if they are wanted."""
+    change: Signals
     """Mean squares of changes of the outputs, if every second sample is left out."""
+    cycle: Signals
+    """Average values of the trial at each section, which are subtracted."""
+
+
+def _require_signals(recording: Recording, names: Sequence[str]) -> None:
+    """**Raises:** `DefinitionError` for no signals, and for one that is constant."""
+    for name in names:
+        samples = [x[np.isfinite(x)] for _, x in recording.samples(name)]
+        if not any(len(x) and np.ptp(x) for x in samples):
+            raise DefinitionError(
+                f"{name} is constant in all trials: repair it, or leave it out."
+            )
+    if not names:
+        raise DefinitionError(
+            "events alone determine no multipliers: name inputs or outputs."
+        )
+
+
+def _sample_trials(
+    recording: Recording, phase: Phase, plan: _Plan
+) -> tuple[list[_Sections], Int[np.ndarray, " nuy"]]:
+    """Return the samples of all stretches as deviations from the average cycle of their trial, and
+    the number of samples of each signal that were left out as spikes."""
+    N = plan.n_sections
+    columns = [recording.column(name) for name in plan.signals]
+    parts: list[_Sections] = []
+    spikes = np.zeros(len(columns), int)
+    for number, (trial, stretches) in enumerate(phase.by_trial(recording)):
+        signals, counts = _without_spikes(trial, columns, stretches, len(plan.inputs))
+        spikes += counts
+        for name, x in zip(plan.signals, signals.T, strict=True):
+            samples = int(np.isfinite(x).sum())
+            # A half of them is left out to see what interpolation loses.
+            if samples < 2 * FEWEST:
+                raise DefinitionError(
+                    f"trial '{trial.name}' has {samples} samples of {name}: leave the trial out."
+                )
+        sections = _sample(number, trial.time, signals, stretches, plan)
+        if not sections:
+            continue
+        if plan.timing is not None:
+            sections = _with_times(sections, plan)
+        section = np.concatenate([x.k % N for x in sections])
+        values = np.concatenate([x.values for x in sections])
+        cycle = average_cycle(section, values, N)
+        for x in sections:
+            deviations = x.values - cycle[x.k % N]
+            parts.append(x._replace(values=deviations, cycle=cycle))
+    return parts, spikes
+
+
+def _unresolved(parts: list[_Sections], plan: _Plan) -> float:
+    """Return the median change of an output if every second sample is left out, relative to its rms
+    deviation; of the output with the largest ratio."""
+    deviations = np.concatenate([part.values[:, plan.of_outputs] for part in parts])
+    size = np.nanmean(deviations**2, axis=0)
+    change = np.median(np.concatenate([part.change for part in parts]), axis=0)
+    ratio = change / np.maximum(size, np.finfo(float).tiny)
+    return float(np.sqrt(ratio).max(initial=0))
+
+
+def _without_spikes(
+    trial: Trial, columns: Sequence[int], stretches: Sequence[Winding], nu: int
+) -> tuple[Signals, Int[np.ndarray, " nuy"]]:
+    """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
+    signals = trial.values[:, columns]
+    counts = np.zeros(len(columns), int)
+    time, phase = _counted_through(stretches)
+    for i, x in enumerate(signals.T):
+        heights = smoothing.input_spikes(x) if i < nu else smoothing.spike_heights(x)
+        at = np.flatnonzero(heights)
+        if len(at) and len(time):
+            phase_there = np.interp(trial.time[at], time, phase)
+            of_motion = smoothing.recurring(heights[at], phase_there, np.ptp(phase))
+            at = at[~of_motion]
+        x[at] = np.nan
+        counts[i] = len(at)
+    return signals, counts
+
+
+def _counted_through(stretches: Sequence[Winding]) -> tuple[Series, Series]:
+    """Return times and phases of all stretches of a trial, each of which begins in a new cycle."""
+    times = [np.zeros(0)]
+    phases = [np.zeros(0)]
+    cycle = 0.0
+    for stretch in stretches:
+        times.append(stretch.time)
+        phases.append(stretch.phase - np.floor(stretch.phase[0]) + cycle)
+        cycle = np.ceil(phases[-1][-1])
+    return np.concatenate(times), np.concatenate(phases)
 
 
 def _require_changes(
-    parts: list[_Sections],
-    cycle: Float[np.ndarray, "N nuy"],
-    nu: int,
-    outputs: Sequence[str],
+    parts: list[_Sections], cycle: Float[np.ndarray, "N nuy"], plan: _Plan
 ) -> None:
     """**Raises:** `DefinitionError` for an output that most cycles repeat, but no input."""
-    whole = [x.values[: len(x.k) // len(cycle) * len(cycle)] for x in parts]
-    whole = [x.reshape(-1, *cycle.shape) for x in whole]
-    steps = np.concatenate([np.abs(np.diff(x, axis=0)).max(axis=1) for x in whole])
-    steps = np.sort(np.nan_to_num(steps, nan=np.inf), axis=0)[len(steps) // 2 :]
-    same = steps.min(axis=0, initial=np.inf) <= 1e3 * ROUNDING * np.abs(cycle).max(
-        axis=0
-    )
-    for name in compress(outputs, same[nu:] & ~same[:nu].any()):
-        text = f"{name} is the same in all cycles, but for rounding: it holds no deviations. "
-        raise DefinitionError(f"{text}Record it while it varies, or leave it out.")
+    steps = []
+    for part in parts:
+        whole = len(part.k) // len(cycle) * len(cycle)
+        cycles = part.values[:whole].reshape(-1, *cycle.shape)
+        steps.append(np.abs(np.diff(cycles, axis=0)).max(axis=1))
+    sizes = np.sort(np.nan_to_num(np.concatenate(steps), nan=np.inf), axis=0)
+    larger_half = sizes[len(sizes) // 2 :]
+    rounding = 1e3 * ROUNDING * np.abs(cycle).max(axis=0)
+    repeats = larger_half.min(axis=0, initial=np.inf) <= rounding
+    if repeats[: len(plan.inputs)].any():
+        return
+    for name in compress(plan.outputs, repeats[plan.of_outputs]):
+        raise DefinitionError(
+            f"{name} is the same in all cycles, but for rounding: it holds no deviations. "
+            "Record it while it varies, or leave it out."
+        )
 
 
 def _require_times(part: _Sections, N: int, step: float) -> None:
     """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
     errors depend on the place of a crossing between samples, which are `step` seconds apart."""
-    at = np.flatnonzero((part.k % N == 0) & np.isfinite(part.values[:, -1]))[
-        3:-3
-    ]  # (no ends)
-    if len(at) > 20:  # (of fewer cycles, the seven waves below explain too much)
-        t, late = part.t[at], detrend(part.values[at, -1])
-        waves = np.exp(2j * np.pi / step * np.outer(t - detrend(t), np.arange(4))).view(
-            float
+    known = (part.k % N == 0) & np.isfinite(part.values[:, -1])
+    inner = np.flatnonzero(known)[3:-3]
+    # Of fewer cycles, the seven waves below explain too much.
+    if len(inner) <= 20:
+        return
+    t = part.t[inner]
+    late = detrend(part.values[inner, -1])
+    place = (t - detrend(t)) / step
+    waves = np.exp(2j * np.pi * np.outer(place, np.arange(4))).view(float)
+    unexplained = late - waves @ np.linalg.lstsq(waves, late)[0]
+    # Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.
+    if unexplained.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
+        raise DefinitionError(
+            "the times of sections deviate only by rounding and interpolation between samples, "
+            "as if the phase were the clock's own: use outputs, not times, or another phase."
         )
-        left = late - waves @ np.linalg.lstsq(waves, late)[0]
-        # (Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.)
-        if left.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
-            raise DefinitionError(
-                "the times of sections deviate only by rounding and interpolation between samples, "
-                "as if the phase were the clock's own: use outputs, not times, or another phase."
-            )
 
 
 def _sample(
+    trial: int,
     time: Series,
-    signals: Float[np.ndarray, "n nuy"],
-    nu: int,
+    signals: Signals,
     stretches: Sequence[Winding],
-    N: int,
-    period: float,
-    bandwidth: float,
-    sampled: Literal["mean", "middle"],
+    plan: _Plan,
 ) -> list[_Sections]:
-    """Sample a trial (nu inputs, then outputs) in stretches of a whole cycle; NaN in gaps."""
-    sections, kept = [], [np.flatnonzero(np.isfinite(x)) for x in signals.T[nu:]]
-    curves = [
-        [spline(time[k], x[k], bandwidth) for k in (at, at[::2], at[1::2])]
-        for x, at in zip(signals.T[nu:], kept, strict=True)
-    ]
-    for w in stretches:
-        first, last = w.phase[[0, -1]] * N
-        k = np.arange(np.ceil(first - 1e-9), np.floor(last + 1e-9) + 1).astype(
-            int
-        )  # rounding
+    """Sample the signals of a trial in all stretches of a whole cycle; NaN in gaps."""
+    N = plan.n_sections
+    nu = len(plan.inputs)
+    of_output = [_Output.through(time, x, plan) for x in signals.T[nu:]]
+    of_input = [_Input(time, x, plan) for x in signals.T[:nu]]
+    sections = []
+    for stretch in stretches:
+        k = _crossed(stretch, N)
         if len(k) <= N:
             continue
-        t = np.clip(w.when(k / N), *w.time[[0, -1]])
-        start, end = t[:-1], t[1:]
-        observed = ~inside(
-            w.gaps[np.diff(w.gaps, axis=1)[:, 0] > period / N], start, start
-        )
-        values, change = (np.zeros((len(start), signals.shape[1] - k)) for k in (0, nu))
-        for i, x in enumerate(signals.T):
-            finite = np.isfinite(x)
-            holes = gaps(time[finite], bridgeable(time[finite], period / N))
-            lost = inside(holes, start, end)
-            if i >= nu:
-                values[:, i], *halves = (curve(start) for curve in curves[i - nu])
-                change[:, i - nu] = np.mean((halves - values[:, i]) ** 2, axis=0)
-                lost = inside(holes, start, start) | ~observed
-            elif sampled == "mean":
-                values[:, i] = means(time, x, t)
-            else:
-                at = time[finite]
-                values[:, i] = x[finite][
-                    np.searchsorted((at[:-1] + at[1:]) / 2, (start + end) / 2)
-                ]
-            values[lost, i] = np.nan
-        sections.append(_Sections(k[:-1], start, observed, values, change))
+        t = np.clip(stretch.when(k / N), stretch.time[0], stretch.time[-1])
+        start = t[:-1]
+        long_gaps = np.diff(stretch.gaps, axis=1)[:, 0] > plan.period / N
+        observed = ~inside(stretch.gaps[long_gaps], start, start)
+        values = np.zeros((len(start), signals.shape[1]))
+        change = np.zeros((len(start), len(of_output)))
+        for i, x in enumerate(of_input):
+            values[:, i] = x.between(t)
+        for i, x in enumerate(of_output):
+            values[:, nu + i] = np.where(observed, x.at(start), np.nan)
+            change[:, i] = x.change(start)
+        none = np.zeros((0, 0))
+        sections.append(_Sections(trial, k[:-1], start, observed, values, change, none))
     return sections
 
 
-def _with_times(
-    parts: list[_Sections], N: int, period: float, timing: Literal["clock", "duration"]
-) -> list[_Sections]:
-    """Append the time of crossing as an output."""
-    late = [np.diff(np.where(p.observed, p.t, np.nan), prepend=np.nan) for p in parts]
-    if timing == "clock" and parts:
-        # A line through the times of each section, t = T cycle + a[section], all with the same
-        # slope T; cycles are counted through gaps.
-        cycles = [
-            p.k // N
-            + round((p.t[0] - parts[0].t[0]) / period - (p.k[0] - parts[0].k[0]) / N)
-            for p in parts
-        ]
-        section = np.concatenate([p.k % N for p in parts])
-        both = np.stack(
-            [np.concatenate(cycles), np.concatenate([p.t for p in parts])], axis=1
-        )
-        x, z = (both - average_cycle(section, both, N)[section]).T
-        z = np.where(
-            np.concatenate([p.observed for p in parts]),
-            z - (x @ z) / (x @ x) * x,
-            np.nan,
-        )
-        late = np.split(z, np.cumsum([len(p.k) for p in parts])[:-1])
-    pairs = zip(parts, late, strict=True)
-    return [p._replace(values=np.column_stack([p.values, z])) for p, z in pairs]
+def _crossed(stretch: Winding, N: int) -> Int[np.ndarray, " n1"]:
+    """Return the sections that a stretch crosses, counted from phase 0."""
+    rounding = 1e-9
+    first = np.ceil(stretch.phase[0] * N - rounding)
+    last = np.floor(stretch.phase[-1] * N + rounding)
+    return np.arange(first, last + 1).astype(int)
+
+
+def _long_gaps(time: Series, plan: _Plan) -> Float[np.ndarray, "g 2"]:
+    """Return the gaps between samples of one signal that splines do not bridge."""
+    return gaps(time, bridgeable(time, plan.period / plan.n_sections))
+
+
+class _Output(NamedTuple):
+    """An output as a function of time."""
+
+    curve: CubicSpline
+    halves: tuple[CubicSpline, CubicSpline]
+    """Splines through the even samples, and through the odd ones."""
+    gaps: Float[np.ndarray, "g 2"]
+
+    @classmethod
+    def through(cls, time: Series, values: Series, plan: _Plan) -> "_Output":
+        finite = np.flatnonzero(np.isfinite(values))
+
+        def through(samples: Int[np.ndarray, " _"]) -> CubicSpline:
+            return spline(time[samples], values[samples], plan.bandwidth)
+
+        halves = through(finite[::2]), through(finite[1::2])
+        return cls(through(finite), halves, _long_gaps(time[finite], plan))
+
+    def at(self, time: Series) -> Series:
+        """Return the output at some times; NaN in long gaps."""
+        return np.where(inside(self.gaps, time, time), np.nan, self.curve(time))
+
+    def change(self, time: Series) -> Series:
+        """Return the mean square of the changes if every second sample is left out."""
+        whole = self.curve(time)
+        return np.mean([(half(time) - whole) ** 2 for half in self.halves], axis=0)
+
+
+class _Input:
+    """An input that is held, or averaged, from section to section."""
+
+    def __init__(self, time: Series, values: Series, plan: _Plan):
+        finite = np.isfinite(values)
+        self.time = time[finite]
+        self.values = values[finite]
+        self.gaps = _long_gaps(self.time, plan)
+        self.sampled = plan.sampled
+
+    def between(self, edges: Series) -> Series:
+        """Return one value between each two successive times; NaN if it touches a long gap."""
+        start = edges[:-1]
+        end = edges[1:]
+        if self.sampled == "mean":
+            values = means(self.time, self.values, edges)
+        else:
+            halfway = (self.time[:-1] + self.time[1:]) / 2
+            values = self.values[np.searchsorted(halfway, (start + end) / 2)]
+        return np.where(inside(self.gaps, start, end), np.nan, values)
+
+
+def _with_times(parts: list[_Sections], plan: _Plan) -> list[_Sections]:
+    """Append the time of crossing as an output, NaN where the phase was not observed."""
+    times = [np.where(x.observed, x.t, np.nan) for x in parts]
+    if plan.timing == "clock":
+        late = _after_clock(parts, times, plan)
+    else:
+        late = [np.diff(t, prepend=np.nan) for t in times]
+    return [
+        part._replace(values=np.column_stack([part.values, x]))
+        for part, x in zip(parts, late, strict=True)
+    ]
+
+
+def _after_clock(
+    parts: list[_Sections], times: list[Series], plan: _Plan
+) -> list[Series]:
+    """Return times minus those of the clock: a line through the times of each section,
+    t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
+    N = plan.n_sections
+    begin = parts[0].t[0] / plan.period - parts[0].k[0] / N
+    cycles = [
+        part.k // N + round(part.t[0] / plan.period - part.k[0] / N - begin)
+        for part in parts
+    ]
+    section = np.concatenate([part.k % N for part in parts])
+    both = np.column_stack(
+        [np.concatenate(cycles), np.concatenate([part.t for part in parts])]
+    )
+    cycle, time = (both - average_cycle(section, both, N)[section]).T
+    slope = (cycle @ time) / (cycle @ cycle)
+    late = np.where(np.isnan(np.concatenate(times)), np.nan, time - slope * cycle)
+    return np.split(late, np.cumsum([len(part.k) for part in parts])[:-1])
 
 
 @checked
@@ -345,32 +467,34 @@ def without_drift(
     **Raises:** `DefinitionError` for unknown signals, fewer than four cycles, or a phase of other
     trials.
     """
-    columns, trials = [recording.column(x) for x in signals], []
+    columns = [recording.column(name) for name in signals]
+    trials = []
     for trial, stretches in phase.by_trial(recording):
         values = trial.values.copy()
         for k in columns:
-            middle, level = cycle_means(
-                trial, smoothing.without_spikes(values[:, k]), stretches, phase.period
-            )
-            if (
-                len(middle) >= FEWEST and cycles < np.inf
-            ):  # (a constant drift is the mean)
-                slow = spline(
-                    middle, level - level.mean(), 0.5 / (cycles * phase.period)
-                )
-                values[:, k] -= slow(np.clip(trial.time, middle[0], middle[-1]))
+            smooth = smoothing.without_spikes(values[:, k])
+            middle, level = cycle_means(trial, smooth, stretches, phase.period)
+            # (A constant drift is the mean, which stays.)
+            if len(middle) >= FEWEST and cycles < np.inf:
+                bandwidth = 0.5 / (cycles * phase.period)
+                drift = spline(middle, level - level.mean(), bandwidth)
+                values[:, k] -= drift(np.clip(trial.time, middle[0], middle[-1]))
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)
 
 
 def cycle_means(
     trial: Trial, x: Series, stretches: Sequence[Winding], period: float
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+) -> tuple[Series, Series]:
     """Return the middle of each cycle without a long gap, and the mean of a signal over it."""
     holes = gaps(trial.time[np.isfinite(x)], LONGEST_GAP * period)
-    middles, levels = [np.zeros(0)], [np.zeros(0)]
-    for edges in (w.edges() for w in stretches):
-        whole = ~inside(holes, edges[:-1], edges[1:])
-        middles.append(((edges[:-1] + edges[1:]) / 2)[whole])
+    middles = [np.zeros(0)]
+    levels = [np.zeros(0)]
+    for stretch in stretches:
+        edges = stretch.edges()
+        start = edges[:-1]
+        end = edges[1:]
+        whole = ~inside(holes, start, end)
+        middles.append((start + end)[whole] / 2)
         levels.append(means(trial.time, x, edges)[whole])
     return np.concatenate(middles), np.concatenate(levels)
