@@ -14,14 +14,15 @@ need not be the same at 0 and at 1, and of which term k is weaker by
 $\exp(-\pi^2 k^2 s^2 \varphi / 2)$.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..._core.execution import on_all_cores
 from ...errors import DefinitionError
-from ..phase import Phase
+from ..phase import Phase, Winding
 from ..recording import Recording
 from ..smoothing import bridgeable, gaps, inside
 
@@ -69,54 +70,68 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
     """
-    samples, pairs = recording.samples(name), phase.by_trial(recording)
-    if not all(w.linear for _, parts in pairs for w in parts):
+    stretches = phase.by_trial(recording)
+    if not all(part.linear for _, parts in stretches for part in parts):
         raise DefinitionError(
             "`phase` must be of events or a Crossing, not a KinematicPhase."
         )
-    starts, durations, steps, inputs = [], [], [], []
-    for (trial, x), (_, parts) in zip(samples, pairs, strict=True):
+    trials: list[Intervals] = []
+    for (trial, x), (_, parts) in zip(recording.samples(name), stretches, strict=True):
         finite = np.isfinite(x)
         if finite.sum() < 2:
             raise DefinitionError(
                 f"trial '{trial.name}' has no samples of {name}: leave it out."
             )
-        start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in parts)])
-        duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in parts)])
-        holes = gaps(trial.time[finite], bridgeable(trial.time[finite]))
-        # An interval may begin or end just where the input does.
-        used = ~inside(holes, start + 1e-9 * duration, start + (1 - 1e-9) * duration)
-        if not used.any():
-            continue
-        start, duration = start[used], duration[used]
-        step = float(np.median(duration)) / _STEPS
-        nodes = np.arange(2 * int(np.ceil(1.5 * duration.max() / step)) + 1) / 2
-        x = x[finite] - x[finite].mean()  # (under which the phase advances evenly)
-        inputs.append(np.interp(start + nodes[:, None] * step, trial.time[finite], x))
-        starts.append(start)
-        durations.append(duration)
-        steps.append(np.full(len(start), step))
-    if not starts:
+        found = _of_trial(trial.time[finite], x[finite], parts, len(trials))
+        if found is not None:
+            trials.append(found)
+    if not trials:
         raise DefinitionError(f"{name} has no samples between two events: record both.")
-    if not any(np.ptp(x) > 0 for x in inputs):
+    if not any(np.ptp(x.inputs) > 0 for x in trials):
         raise DefinitionError(
             f"the input {name} is constant: name the signal that acted."
         )
-    longest = max(map(len, inputs))
-    inputs = [np.pad(x, ((0, longest - len(x)), (0, 0)), "edge") for x in inputs]
-    trial = np.repeat(np.arange(len(starts)), list(map(len, starts)))
-    start, duration, step = map(np.concatenate, (starts, durations, steps))
-    return Intervals(start, duration, trial, step, np.concatenate(inputs, axis=1))
+    longest = max(len(x.inputs) for x in trials)
+    inputs = [
+        np.pad(x.inputs, ((0, longest - len(x.inputs)), (0, 0)), "edge") for x in trials
+    ]
+    return Intervals(
+        start=np.concatenate([x.start for x in trials]),
+        duration=np.concatenate([x.duration for x in trials]),
+        trial=np.concatenate([x.trial for x in trials]),
+        step=np.concatenate([x.step for x in trials]),
+        inputs=np.concatenate(inputs, axis=1),
+    )
 
 
-def basis(
-    phase: Float[np.ndarray, " n"], waves: int, jitter: float = 0.0
-) -> Float[np.ndarray, "n p"]:
+def _of_trial(
+    time: Lanes, x: Lanes, stretches: Sequence[Winding], number: int
+) -> Intervals | None:
+    """Return the intervals of a trial during which its input x was sampled, if there are any."""
+    start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in stretches)])
+    duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in stretches)])
+    holes = gaps(time, bridgeable(time))
+    # An interval may begin or end just where the input does.
+    margin = 1e-9 * duration
+    used = ~inside(holes, start + margin, start + duration - margin)
+    if not used.any():
+        return None
+    start = start[used]
+    duration = duration[used]
+    step = float(np.median(duration)) / _STEPS
+    steps = int(np.ceil(1.5 * duration.max() / step))
+    half_steps = np.arange(2 * steps + 1)[:, None] * step / 2
+    # The phase advances evenly under the mean input.
+    inputs = np.interp(start + half_steps, time, x - x.mean())
+    trial = np.full(len(start), number)
+    return Intervals(start, duration, trial, np.full(len(start), step), inputs)
+
+
+def basis(phase: Lanes, waves: int, jitter: float = 0.0) -> Table:
     """Return 1 and half waves cos(pi k phase), as they act on a phase with this jitter."""
     angle = np.pi * np.arange(waves + 1)
-    return np.cos(angle * phase[:, None]) * np.exp(
-        -((jitter * angle) ** 2) / 2 * phase[:, None]
-    )
+    left_by_jitter = np.exp(-((jitter * angle) ** 2) / 2 * phase[:, None])
+    return np.cos(angle * phase[:, None]) * left_by_jitter
 
 
 def tabulated(waves: int, jitter: float) -> Table:
@@ -139,93 +154,164 @@ def forecast(
     intervals: Intervals, table: Table, coefficients: Curve, rates: Curve
 ) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
-    curve, rate = table @ coefficients, rates[intervals.trial]
+    rate = rates[intervals.trial]
 
-    def chunk(first: int) -> Forecast:
+    def of_chunk(first: int) -> Forecast:
         rows = slice(first, first + _CHUNK)
-        return _integrate(
-            intervals.inputs[:, rows], intervals.step[rows], rate[rows], curve, table
+        phase_model = _PhaseModel(table, coefficients)
+        return phase_model.integrate(
+            intervals.inputs[:, rows], intervals.step[rows], rate[rows]
         )
 
-    parts = on_all_cores(chunk, range(0, len(rate), _CHUNK))
-    return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
+    parts = on_all_cores(of_chunk, range(0, len(rate), _CHUNK))
+    return Forecast(
+        duration=np.concatenate([x.duration for x in parts]),
+        rate=np.concatenate([x.rate for x in parts]),
+        slopes=np.concatenate([x.slopes for x in parts]),
+    )
 
 
-def _integrate(
-    inputs: Nodes, h: Lanes, w: Lanes, curve: Curve, table: Table
-) -> Forecast:
-    """Integrate by the classical Runge-Kutta method, and derivatives by the trapezoidal rule."""
-    L, p = len(h), table.shape[1] + 1
-    result, rows = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p))), np.arange(L)
-    slope = np.gradient(curve) * _POINTS
+class _Running(NamedTuple):
+    """Intervals that have not ended yet, at the start of a step."""
 
-    def at(values, phase):
-        x = np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS
-        k = x.astype(np.int64)
-        return values[k] + (x - k) * (values[k + 1] - values[k])
+    rows: Int[np.ndarray, " l"]
+    """Their places among all intervals."""
+    step: Lanes
+    rate: Lanes
+    """Rates without input."""
+    phase: Lanes
+    u: Lanes
+    drift: Float[np.ndarray, "l p1"]
+    """Derivatives of the phase with respect to coefficients and rate."""
+    force: Float[np.ndarray, "l p1"]
+    """Derivatives of the rate of the phase with respect to coefficients and rate."""
+    growth: Lanes
+    """Derivative of the rate of the phase with respect to the phase."""
 
-    def force(phase, u):
-        """Return derivatives of the rate with respect to each coefficient, and to w."""
-        nearest = np.ceil(np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS - 0.5).astype(
-            np.int64
+    def of(self, lanes: Bool[np.ndarray, " l"]) -> "_Running":
+        return _Running(*(x[lanes] for x in self))
+
+
+class _PhaseModel:
+    """A curve, tabulated, and the steps of its phase model."""
+
+    def __init__(self, table: Table, coefficients: Curve):
+        self.table = table
+        self.curve = table @ coefficients
+        self.slope = np.gradient(self.curve) * _POINTS
+
+    def _place(self, phase: Lanes) -> Lanes:
+        """Return places in the table, counted from 0."""
+        return np.clip(phase, 0.0, 1.5 - 1e-6) * _POINTS
+
+    def _at(self, values: Curve, phase: Lanes) -> Lanes:
+        """Interpolate tabulated values linearly."""
+        place = self._place(phase)
+        k = place.astype(np.int64)
+        return values[k] + (place - k) * (values[k + 1] - values[k])
+
+    def _force(self, phase: Lanes, u: Lanes) -> Float[np.ndarray, "l p1"]:
+        nearest = np.ceil(self._place(phase) - 0.5).astype(np.int64)
+        by_coefficients = self.table[nearest] * u[:, None]
+        by_rate = np.ones((len(u), 1))
+        return np.concatenate([by_coefficients, by_rate], axis=1)
+
+    def integrate(self, inputs: Nodes, step: Lanes, rate: Lanes) -> Forecast:
+        """Integrate until all phases are 1: the phase by the classical Runge-Kutta method, and its
+        derivatives by the trapezoidal rule."""
+        L = len(step)
+        p = self.table.shape[1] + 1
+        forecast = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p)))
+        phase = np.zeros(L)
+        u = inputs[0]
+        now = _Running(
+            rows=np.arange(L),
+            step=step,
+            rate=rate,
+            phase=phase,
+            u=u,
+            drift=np.zeros((L, p)),
+            force=self._force(phase, u),
+            growth=self._at(self.slope, phase) * u,
         )
-        return np.concatenate(
-            [table[nearest] * u[:, None], np.ones((len(u), 1))], axis=1
-        )
+        steps = (len(inputs) - 1) // 2
+        for j in range(steps):
+            middle = inputs[2 * j + 1][now.rows]
+            end = inputs[2 * j + 2][now.rows]
+            phase, first, last = self._runge_kutta(now, middle, end)
+            # After the last step, a phase grows at its own rate.
+            ended = (phase >= 1) | (j == steps - 1)
+            part = np.ones(len(phase))
+            part[ended], per_step = _end(
+                now.phase[ended],
+                phase[ended],
+                first[ended],
+                last[ended],
+                (now.rate * now.step)[ended],
+            )
+            after = self._derivatives(now, phase, end, np.minimum(part, 1.0))
+            rows = now.rows[ended]
+            forecast.duration[rows] = (j + part[ended]) * now.step[ended]
+            forecast.rate[rows] = per_step / now.step[ended]
+            forecast.slopes[rows] = -after.drift[ended] / forecast.rate[rows, None]
+            if ended.all():
+                break
+            now = after.of(~ended)
+        return forecast
 
-    phase, drift, u0 = np.zeros(L), np.zeros((L, p)), inputs[0]
-    forced, growth = force(phase, u0), at(slope, phase) * u0
-    steps = (len(inputs) - 1) // 2
-    for j in range(steps):
-        u1, u2 = inputs[2 * j + 1][rows], inputs[2 * j + 2][rows]
-        k1 = h * (w + at(curve, phase) * u0)
-        k2 = h * (w + at(curve, phase + k1 / 2) * u1)
-        k3 = h * (w + at(curve, phase + k2 / 2) * u1)
-        k4 = h * (w + at(curve, phase + k3) * u2)
-        after = phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6
-        done = (after >= 1) | (j == steps - 1)  # what is left passes at its own rate
-        part, ended = np.ones(len(h)), rows[done]
-        if len(ended):
-            part[done], speed = _end(*(x[done] for x in (phase, after, k1, k4, w * h)))
-            result.rate[ended] = speed / h[done]
-        short = np.minimum(part, 1.0)
-        forced_after, growth_after = force(after, u2), at(slope, after) * u2
-        half = short * h / 2
-        exponent = half * ((2 - short) * growth + short * growth_after)
-        gain = np.exp(
-            np.clip(exponent, -0.5, 0.5)
-        )  # where a curve jumps, its slope is unknown
-        drift += half[:, None] * forced
+    def _runge_kutta(
+        self, now: _Running, middle: Lanes, end: Lanes
+    ) -> tuple[Lanes, Lanes, Lanes]:
+        """Return the phase after a step, and its rates per step at both ends.
+
+        **Arguments:** `middle`, `end`: inputs in the middle and at the end of the step.
+        """
+
+        def advance(phase: Lanes, u: Lanes) -> Lanes:
+            return now.step * (now.rate + self._at(self.curve, phase) * u)
+
+        k1 = advance(now.phase, now.u)
+        k2 = advance(now.phase + k1 / 2, middle)
+        k3 = advance(now.phase + k2 / 2, middle)
+        k4 = advance(now.phase + k3, end)
+        return now.phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6, k1, k4
+
+    def _derivatives(
+        self, now: _Running, phase: Lanes, u: Lanes, part: Lanes
+    ) -> _Running:
+        """Return the state after a step, or, where an interval ends, after a part of it."""
+        force = self._force(phase, u)
+        growth = self._at(self.slope, phase) * u
+        half = part * now.step / 2
+        exponent = half * ((2 - part) * now.growth + part * growth)
+        # Where a curve jumps, its slope is unknown.
+        gain = np.exp(np.clip(exponent, -0.5, 0.5))
+        drift = now.drift + half[:, None] * now.force
         drift *= gain[:, None]
-        drift[done] += (half * (1 - short))[done, None] * forced[done]
-        drift += (half * short)[:, None] * forced_after
-        result.duration[ended] = (j + part[done]) * h[done]
-        result.slopes[ended] = -drift[done] / result.rate[ended, None]
-        if done.all():
-            break
-        keep = ~done
-        rows, u0, h, w, phase = rows[keep], u2[keep], h[keep], w[keep], after[keep]
-        drift, forced, growth = drift[keep], forced_after[keep], growth_after[keep]
-    return result
+        drift += (half * (1 - part))[:, None] * now.force
+        drift += (half * part)[:, None] * force
+        return _Running(now.rows, now.step, now.rate, phase, u, drift, force, growth)
 
 
-def _end(a: Lanes, b: Lanes, m0: Lanes, m1: Lanes, own: Lanes) -> tuple[Lanes, Lanes]:
+def _end(
+    before: Lanes, after: Lanes, first: Lanes, last: Lanes, own: Lanes
+) -> tuple[Lanes, Lanes]:
     """Return the part of a step at whose end the phase is 1, and the rate there per step.
 
-    It is the root of the cubic with the values a, b and slopes m0, m1 at both ends of the step.
-    Beyond the step, the phase grows at its own rate.
+    It is the root of the cubic with the given phases and rates (per step) at both ends of the step.
+    Beyond the step, the phase grows at its `own` rate.
     """
-    beyond = b >= 1
-    s = np.clip((1 - a) / np.where(b > a, b - a, 1.0), 0.0, 1.0)
-    rate = b - a
+    rise = after - before
+    cubic = first + last - 2 * rise
+    quadratic = 3 * rise - 2 * first - last
+    part = np.clip((1 - before) / np.where(rise > 0, rise, 1.0), 0.0, 1.0)
+    rate = rise
     for _ in range(4):  # Newton's iterations: to rounding
-        value = a * (1 + 2 * s) * (1 - s) ** 2 + m0 * s * (1 - s) ** 2
-        value += b * s * s * (3 - 2 * s) + m1 * s * s * (s - 1)
-        rate = (
-            6 * s * (1 - s) * (b - a)
-            + m0 * (1 - 4 * s + 3 * s * s)
-            + m1 * s * (3 * s - 2)
-        )
-        rate = np.where(rate > 0, rate, b - a)
-        s = np.clip(s - (value - 1) / np.where(rate > 0, rate, 1.0), 0.0, 1.0)
-    return np.where(beyond, s, 1 + (1 - b) / own), np.where(beyond, rate, own)
+        value = before + part * (first + part * (quadratic + part * cubic))
+        rate = first + part * (2 * quadratic + part * 3 * cubic)
+        rate = np.where(rate > 0, rate, rise)
+        correction = (value - 1) / np.where(rate > 0, rate, 1.0)
+        part = np.clip(part - correction, 0.0, 1.0)
+    reached = after >= 1
+    part = np.where(reached, part, 1 + (1 - after) / own)
+    return part, np.where(reached, rate, own)
