@@ -18,91 +18,121 @@ from scipy import optimize, special, stats
 
 Reals = Float[np.ndarray, " N"]
 Design = Float[np.ndarray, "N p"]
+Labels = Int[np.ndarray, " N"]
+
+# Degrees of freedom that count as infinite. More: roots of digamma functions overflow. Fewer: exact
+# variances are moderated.
+_EXACT = 1e9
 
 
 class Mixed(NamedTuple):
-    """Coefficients and their small-sample covariance; Psi (`between`), that of its elements
-    (`uncertainty`), and the derivatives (`slopes`) of the `plain` covariance by these."""
+    """A fitted mean of subjects."""
 
     coefficients: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
+    """For small samples."""
     between: Float[np.ndarray, "q q"]
+    """Psi, the covariance between subjects."""
     plain: Float[np.ndarray, "p p"]
+    """The covariance if Psi were known."""
     slopes: Float[np.ndarray, "k p p"]
+    """Derivatives of the plain covariance with respect to the elements of Psi."""
     uncertainty: Float[np.ndarray, "k k"]
+    """Covariance of the elements of Psi."""
     most: int
+    """Degrees of freedom of a t test."""
 
     def contrast(self, w: Float[np.ndarray, " p"]) -> tuple[float, float, float]:
         """Return value, standard error and degrees of freedom of a contrast (of a single one, those
         of Kenward and Roger are Satterthwaite's), at most those of a t test."""
-        slope = np.einsum("i,kij,j->k", w, self.slopes, w)
-        square = (
-            2
-            * (w @ self.plain @ w) ** 2
-            / max(slope @ self.uncertainty @ slope, 1e-300)
-        )
+        value = float(w @ self.coefficients)
         error = float(np.sqrt(w @ self.covariance @ w))
-        return float(w @ self.coefficients), error, float(np.clip(square, 1, self.most))
+        slope = np.einsum("i,kij,j->k", w, self.slopes, w)
+        scatter = max(slope @ self.uncertainty @ slope, 1e-300)
+        freedom = 2 * (w @ self.plain @ w) ** 2 / scatter
+        return value, error, float(np.clip(freedom, 1, self.most))
 
 
 def mixed(
     y: Reals,
     v: Reals,
     x: Design,
-    subjects: Int[np.ndarray, " N"],
-    cells: Int[np.ndarray, " N"],
+    subjects: Labels,
+    cells: Labels,
 ) -> Mixed:
     """Fit by restricted maximum likelihood, with covariances after Kenward and Roger (1997).
 
     Psi is free between cells that some subject shares, and zero between others (Welch's case).
     """
-    same, cell = subjects[:, None] == subjects, np.eye(cells.max() + 1)[cells]
-    i, j = np.nonzero(np.tril(cell.T @ same @ cell))
+    same = subjects[:, None] == subjects
+    cell = np.eye(cells.max() + 1)[cells]
+    row, column = np.nonzero(np.tril(cell.T @ same @ cell))
     scale = max(float(np.std(y)), float(np.sqrt(v.mean())), 1e-300)
-    y, v = y / scale, v / scale**2
+    y = y / scale
+    v = v / scale**2
 
-    def fitted(free):
-        lower = np.zeros((cell.shape[1],) * 2)
-        lower[i, j] = free
-        total = np.diag(v) + same * (cell @ lower @ lower.T @ cell.T)
+    def squares(free):
+        """Return a factor of Psi and, for generalized least squares, the covariance of the
+        estimates, that of the coefficients, their weights, and the projection to residuals."""
+        lower = np.zeros((cell.shape[1], cell.shape[1]))
+        lower[row, column] = free
+        between = cell @ lower @ lower.T @ cell.T
+        total = np.diag(v) + same * between
         w = np.linalg.inv(total)
-        phi = np.linalg.inv(x.T @ w @ x)
-        wx = w @ x @ phi
-        return lower, total, phi, wx, w - wx @ x.T @ w
+        plain = np.linalg.inv(x.T @ w @ x)
+        weights = w @ x @ plain
+        projection = w - weights @ x.T @ w
+        return lower, total, plain, weights, projection
 
     def cost(free):
-        lower, total, phi, _, projection = fitted(free)
-        r = projection @ y
-        slope = cell.T @ (same * (projection - np.outer(r, r))) @ cell
-        value = np.linalg.slogdet(total)[1] - np.linalg.slogdet(phi)[1] + y @ r
-        return value / 2, (slope @ lower)[i, j]
+        """Return minus the logarithm of the restricted likelihood, and its derivatives."""
+        lower, total, plain, _, projection = squares(free)
+        residual = projection @ y
+        _, volume = np.linalg.slogdet(total)
+        _, volume_of_means = np.linalg.slogdet(plain)
+        by_total = same * (projection - np.outer(residual, residual))
+        by_factor = cell.T @ by_total @ cell @ lower
+        value = (volume - volume_of_means + y @ residual) / 2
+        return value, by_factor[row, column]
 
-    start = np.where(i == j, 0.7, 0.0)
+    start = np.where(row == column, 0.7, 0.0)
     best = optimize.minimize(
-        cost, start, jac=True, method="L-BFGS-B", options={"ftol": 1e-13}
+        cost,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        options={"ftol": 1e-13},
     )
     # A spread below 1e-5 of the scale is zero, up to the accuracy of the optimizer.
-    lower, _, phi, wx, projection = fitted(np.where(np.abs(best.x) < 1e-5, 0.0, best.x))
+    free = np.where(np.abs(best.x) < 1e-5, 0.0, best.x)
+    lower, _, plain, weights, projection = squares(free)
     # Derivatives of the covariance of all estimates by the elements of Psi, (k, N, N).
-    both = np.einsum("nk,mk->knm", cell[:, i], cell[:, j])
-    change = same * np.maximum(both, np.swapaxes(both, 1, 2))
-    moved, effect = projection @ change, change @ wx
-    uncertainty = np.linalg.pinv(
-        np.einsum("kij,lji->kl", moved, moved) / 2, hermitian=True
+    both = np.einsum("nk,mk->knm", cell[:, row], cell[:, column])
+    either = np.maximum(both, np.swapaxes(both, 1, 2))
+    change = same * either
+    moved = projection @ change
+    information = np.einsum("kij,lji->kl", moved, moved) / 2
+    uncertainty = np.linalg.pinv(information, hermitian=True)
+    effect = change @ weights
+    correction = np.einsum(
+        "kl,kip,ij,ljq->pq",
+        uncertainty,
+        effect,
+        projection,
+        effect,
+        optimize=True,
     )
-    extra = np.einsum(
-        "kl,kip,ij,ljq->pq", uncertainty, effect, projection, effect, optimize=True
-    )
-    sums = np.array([x[row].sum(axis=0) for row in np.unique(same, axis=0)])
-    square = scale**2
+    each = np.unique(same, axis=0)
+    sums = np.array([x[rows].sum(axis=0) for rows in each])
+    freedom = len(sums) - np.linalg.matrix_rank(sums)
     return Mixed(
-        wx.T @ y * scale,
-        (phi + 2 * extra) * square,
-        lower @ lower.T * square,
-        phi * square,
-        wx.T @ effect,
-        uncertainty * square**2,
-        max(len(sums) - np.linalg.matrix_rank(sums), 1),
+        coefficients=weights.T @ y * scale,
+        covariance=(plain + 2 * correction) * scale**2,
+        between=lower @ lower.T * scale**2,
+        plain=plain * scale**2,
+        slopes=weights.T @ effect,
+        uncertainty=uncertainty * scale**4,
+        most=max(freedom, 1),
     )
 
 
@@ -112,13 +142,18 @@ def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     that scatter less than their errors would have none."""
     fit = mixed(y, v, x, np.arange(len(y)), np.zeros(len(y), int))
     square = weighted_squares(y, v + fit.between[0, 0], x) / fit.most
-    return fit._replace(covariance=fit.plain * max(square, 1.0), slopes=0 * fit.slopes)
+    covariance = fit.plain * max(square, 1.0)
+    return fit._replace(covariance=covariance, slopes=np.zeros_like(fit.slopes))
 
 
 def weighted_squares(y: Reals, v: Reals, x: Design) -> float:
     """Return the sum of squares of the weighted residuals."""
-    x, y = x / np.sqrt(v)[:, None], y / np.sqrt(v)
-    return float(np.sum((y - x @ np.linalg.lstsq(x, y)[0]) ** 2))
+    weight = 1 / np.sqrt(v)
+    regressors = x * weight[:, None]
+    target = y * weight
+    solution = np.linalg.lstsq(regressors, target)[0]
+    residual = target - regressors @ solution
+    return float(residual @ residual)
 
 
 def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
@@ -128,15 +163,18 @@ def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
 
     def bound(tail):
         quantile = stats.chi2.isf(tail, len(y) - x.shape[1])
-        if weighted_squares(y, v, x) < quantile:
+
+        def excess(variance):
+            return weighted_squares(y, v + variance, x) - quantile
+
+        if excess(0.0) < 0:
             return 0.0
-        excess = lambda variance: weighted_squares(y, v + variance, x) - quantile  # noqa: E731
         return float(np.sqrt(_root(excess, 0.0, largest)))
 
     return bound(0.025), bound(0.975)
 
 
-def moderated(v: Reals, freedom: Reals, trend: Float[np.ndarray, "N k"]) -> Reals:
+def moderated(v: Reals, freedom: Reals, trend: Design) -> Reals:
     """Return variances with less scatter: means of each, weighted by its degrees of freedom, and of
     the common trend of their logarithms, weighted by the freedom that fits their scatter (empirical
     Bayes: Smyth 2004).
@@ -144,18 +182,21 @@ def moderated(v: Reals, freedom: Reals, trend: Float[np.ndarray, "N k"]) -> Real
     Variances that are estimated from few blocks would otherwise give the largest weights to
     subjects whose errors happen to be underestimated.
     """
-    half, surplus = np.minimum(freedom, 1e9) / 2, len(v) - trend.shape[1]
+    half = np.minimum(freedom, _EXACT) / 2
+    surplus = len(v) - trend.shape[1]
     if surplus < 3 or half.min() > 1e6:
         return v
     log = np.log(v) - special.digamma(half) + np.log(half)
     mean = trend @ np.linalg.lstsq(trend, log)[0]
-    excess = np.sum((log - mean) ** 2) / surplus - special.polygamma(1, half).mean()
+    scatter = np.sum((log - mean) ** 2) / surplus
+    excess = scatter - special.polygamma(1, half).mean()
     # The half of the prior freedom, at which a log chi-squared has the variance of the excess.
-    prior = 1e9
-    if excess > 1e-9:
-        prior = _root(lambda z: special.polygamma(1, z) - excess, 1e-3, 1e9)
+    prior = _EXACT
+    if excess > 1 / _EXACT:
+        prior = _root(lambda half: special.polygamma(1, half) - excess, 1e-3, _EXACT)
     common = np.exp(mean + special.digamma(prior) - np.log(prior))
-    return (prior * common + half * v) / (prior + half)
+    weighted = prior * common + half * v
+    return weighted / (prior + half)
 
 
 def _root(function: Any, low: float, high: float) -> Any:

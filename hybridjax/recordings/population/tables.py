@@ -32,16 +32,21 @@ def table_of(table: Columns, rows: int) -> Any:
         require_axes(f"column '{name}' of `table`", values, {"estimates": rows})
     frame = package("pandas").DataFrame(columns)
     labels = ["subject", *factors_of(frame)]
-    if len(rows_without := np.flatnonzero(frame[labels].isna().any(axis=1))):
-        text = f"row {rows_without[0]} of `table` has no {' or no '.join(labels)}"
-        raise DefinitionError(f"{text}: name it, or leave the row out.")
+    incomplete = np.flatnonzero(frame[labels].isna().any(axis=1))
+    if len(incomplete):
+        missing = " or no ".join(labels)
+        raise DefinitionError(
+            f"row {incomplete[0]} of `table` has no {missing}: name it, or leave the row out."
+        )
     frame = frame.astype(dict.fromkeys(labels, str))
-    for subject, groups in (
-        frame.groupby("subject")["group"] if "group" in frame else ()
-    ):
-        if len(groups.unique()) > 1:
-            text = f"{' and '.join(map(repr, groups.unique()))}: conditions may differ, not groups."
-            raise DefinitionError(f"subject '{subject}' is in the groups {text}")
+    if "group" in frame:
+        for subject, groups in frame.groupby("subject")["group"].unique().items():
+            if len(groups) > 1:
+                names = " and ".join(map(repr, groups))
+                raise DefinitionError(
+                    f"subject '{subject}' is in the groups {names}: conditions may differ, not "
+                    "groups."
+                )
     return frame
 
 
@@ -60,22 +65,23 @@ def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
 
     **Raises:** `DefinitionError` if no factor has all of them.
     """
-    for factor in factors_of(table):
+    factors = factors_of(table)
+    for factor in factors:
         if len(set(labels)) == len(labels) and set(labels) <= set(table[factor]):
             return factor, table[factor].isin(labels)
-    listed = ", ".join(
-        f"'{x}'" for factor in factors_of(table) for x in table[factor].unique()
+    given = " and ".join(map(repr, labels))
+    existing = [repr(x) for factor in factors for x in table[factor].unique()]
+    raise DefinitionError(
+        f"{given} are no two conditions or groups of `table`, which has "
+        f"{', '.join(existing) or 'neither'}."
     )
-    text = (
-        f"are no two conditions or groups of `table`, which has {listed or 'neither'}"
-    )
-    raise DefinitionError(f"{' and '.join(map(repr, labels))} {text}.")
 
 
 def require(subjects: Mapping[str, Iterable[str]], needed: int) -> None:
     """**Raises:** `DefinitionError` if a group or condition has fewer subjects."""
     for cell, names in subjects.items():
-        if (count := len(set(names))) < needed:
+        count = len(set(names))
+        if count < needed:
             raise DefinitionError(
                 f"'{cell}' has too few subjects: {count} of {needed} needed."
             )
