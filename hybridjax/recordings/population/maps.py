@@ -22,6 +22,15 @@ from ..._core.text import p_value
 from .tables import Columns, require, rows_with, signed, table_of
 
 
+# Subjects up to which all relabelings are tried, 4096 at most. More: time. Fewer: p-values scatter
+# where they could be exact.
+_ALL = 12
+
+Maps = Inexact[np.ndarray, "n *grid"]
+Signs = Float[np.ndarray, "P n"]
+"""A relabeling in each row: the weight +1 or -1 of each subject."""
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class MapResult:
     """A mean, or a tested difference, of the maps of subjects.
@@ -44,18 +53,17 @@ class MapResult:
     methods: str
 
     def __repr__(self) -> str:
-        size, t = np.abs(self.values).max(), np.abs(self.t).max()
-        inside = zip(self.axes.items(), np.nonzero(self.significant), strict=True)
-        spans = (
-            f"{n} {x[i].min():.3g} to {x[i].max():.3g}"
-            for (n, x), i in inside
-            if len(i)
-        )
+        spans = []
+        places = np.nonzero(self.significant)
+        for (name, x), place in zip(self.axes.items(), places, strict=True):
+            if len(place):
+                spans.append(f"{name} {x[place].min():.3g} to {x[place].max():.3g}")
         where = ", ".join(spans) or "none"
+        largest = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
         return (
-            f"MapResult({' x '.join(self.axes)}: largest {size:.4g} {self.unit}".rstrip()
-            + f", band of +- {np.median(self.reach):.3g} (median)\n"
-            f"  largest |t| {t:.3g}, {p_value(float(self.p.min()))}\n"
+            f"MapResult({' x '.join(self.axes)}: largest {largest}, "
+            f"band of +- {np.median(self.reach):.3g} (median)\n"
+            f"  largest |t| {np.abs(self.t).max():.3g}, {p_value(float(self.p.min()))}\n"
             f"  significant: {self.significant.sum()} of {self.t.size} points, {where})"
         )
 
@@ -85,7 +93,8 @@ class PopulationMaps:
         values = np.asarray(values)
         self.values = values if values.imag.any() else values.real
         self.axes = {str(name): np.asarray(x, float) for name, x in axes.items()}
-        self.table, self.unit = table_of(table, len(values)), unit
+        self.table = table_of(table, len(values))
+        self.unit = unit
         grid = {name: len(x) for name, x in self.axes.items()}
         require_axes("`values`", values, {"rows": len(values)} | grid)
 
@@ -105,8 +114,11 @@ class PopulationMaps:
 
         **Raises:** `DefinitionError` for an unknown label, or fewer than three subjects.
         """
-        rows = ... if label is None else rows_with(self.table, label)[1].to_numpy()
-        each = self._by_subject(np.arange(len(self.values))[rows])
+        rows = np.arange(len(self.values))
+        if label is not None:
+            _, has_label = rows_with(self.table, label)
+            rows = np.flatnonzero(has_label)
+        each = self._by_subject(rows)
         require({label or "all": each}, 3)
         y = np.stack(list(each.values()))
         text = f"Mean of {len(y)} subjects with a simultaneous 95 % band"
@@ -125,12 +137,13 @@ class PopulationMaps:
         than three subjects in both conditions, or in a group.
         """
         factor, _ = rows_with(self.table, a, b)
-        label = self.table[factor].to_numpy()
-        first, second = (self._by_subject(np.flatnonzero(label == x)) for x in (a, b))
+        first = self._by_subject(np.flatnonzero(self.table[factor] == a))
+        second = self._by_subject(np.flatnonzero(self.table[factor] == b))
         if factor == "condition":
             pairs = {s: y - second[s] for s, y in first.items() if s in second}
             require({f"{a} and {b}": pairs}, 3)
-            y, true = np.stack(list(pairs.values())), np.ones(len(pairs))
+            y = np.stack(list(pairs.values()))
+            true = np.ones(len(y))
         else:
             require({a: first, b: second}, 3)
             y = np.stack([*first.values(), *second.values()])
@@ -139,55 +152,85 @@ class PopulationMaps:
         return self._result(y, true, y, draws, seed, text)
 
     def _by_subject(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        groups = self.table.iloc[rows].groupby("subject", sort=False).groups
+        by_subject = self.table.iloc[rows].groupby("subject", sort=False)
         return {
-            str(name): self.values[index].mean(axis=0) for name, index in groups.items()
+            str(name): self.values[index].mean(axis=0)
+            for name, index in by_subject.groups.items()
         }
 
     def _result(
-        self, y, true: np.ndarray, null, draws: int, seed: int, text: str
+        self,
+        y: np.ndarray,
+        true: np.ndarray,
+        null: np.ndarray,
+        draws: int,
+        seed: int,
+        text: str,
     ) -> MapResult:
         """Return the mean, or of two groups the difference, with the band and p-values of the
         largest statistics of relabeled maps `null`."""
-        paired, grid = bool((true > 0).all()), y.shape[1:]
+        paired = bool((true > 0).all())
         signs = relabelings(true, paired, draws, np.random.default_rng(seed))
-        step = max(1, 8_000_000 // y[0].size)  # statistics of a part fit into 64 MB
-        parts = (signs[i : i + step] for i in range(0, len(signs), step))
-        largest = [np.abs(moments(null, part, paired)[2]).max(axis=1) for part in parts]
-        largest = np.sort(np.concatenate(largest))
-        value, error, t = (x.reshape(grid) for x in moments(y, true[None], paired))
+        largest = _largest(null, signs, paired)
+        value, error, t = moments(y, true[None], paired)
         # Up to rounding; the true labels count, too.
-        count = len(largest) - np.searchsorted(largest, np.abs(t) * (1 - 1e-9))
+        below = np.searchsorted(largest, np.abs(t) * (1 - 1e-9))
+        above = np.maximum(len(largest) - below, 1)
         reach = np.quantile(largest, 0.95, method="higher") * error
-        amount = "all" if len(true) <= 12 else "random"
-        way = f"{len(signs)} {'sign flips' if paired else 'permutations of labels'}"
-        methods = signed(f"{text}, by the largest |t| of {amount} {way}.")
-        each, p = y if paired else y[:0], np.maximum(count, 1) / len(largest)
-        inside = np.abs(value) > reach
+        amount = "all" if len(true) <= _ALL else "random"
+        kind = "sign flips" if paired else "permutations of labels"
+        grid = y.shape[1:]
         return MapResult(
-            value, each, reach, t, p, inside, self.axes, self.unit, methods
+            values=value.reshape(grid),
+            each=y if paired else y[:0],
+            reach=reach.reshape(grid),
+            t=t.reshape(grid),
+            p=(above / len(largest)).reshape(grid),
+            significant=(np.abs(value) > reach).reshape(grid),
+            axes=self.axes,
+            unit=self.unit,
+            methods=signed(
+                f"{text}, by the largest |t| of {amount} {len(signs)} {kind}."
+            ),
         )
 
 
+def _largest(y: Maps, signs: Signs, paired: bool) -> Float[np.ndarray, " P"]:
+    """Return the largest |t| over the grid of each relabeling, in ascending order."""
+    at_once = max(1, 8_000_000 // y[0].size)  # statistics of a part fit into 64 MB
+    largest = []
+    for first in range(0, len(signs), at_once):
+        _, _, t = moments(y, signs[first : first + at_once], paired)
+        largest.append(np.abs(t).max(axis=1))
+    return np.sort(np.concatenate(largest))
+
+
 def relabelings(
-    true: Float[np.ndarray, " n"], paired: bool, draws: int, rng: np.random.Generator
-) -> Float[np.ndarray, "P n"]:
+    true: Float[np.ndarray, " n"],
+    paired: bool,
+    draws: int,
+    rng: np.random.Generator,
+) -> Signs:
     """Return weights +1 and -1 of the subjects, the true ones among them: of up to 12 subjects all
     flips of signs (those of all signs alike give the same) or divisions into two groups."""
-    if len(true) > 12:
+    n = len(true)
+    if n > _ALL:
         signs = rng.permuted(np.tile(true, (draws, 1)), axis=1)
-        signs = rng.choice([-1.0, 1.0], signs.shape) if paired else signs
-        return np.concatenate([true[None], signs[1:]])
-    signs = np.array(list(itertools.product([1.0, -1.0], repeat=len(true))))
-    return signs[signs[:, 0] > 0] if paired else signs[signs.sum(axis=1) == true.sum()]
+        if paired:
+            signs = rng.choice([-1.0, 1.0], signs.shape)
+        signs[0] = true
+        return signs
+    signs = np.array(list(itertools.product([1.0, -1.0], repeat=n)))
+    if paired:
+        return signs[signs[:, 0] > 0]
+    return signs[signs.sum(axis=1) == true.sum()]
 
 
-def moments(
-    y: Inexact[np.ndarray, "n *grid"], signs: Float[np.ndarray, "P n"], paired: bool
-):
+def moments(y: Maps, signs: Signs, paired: bool):
     """Return means or differences of two means, standard errors and Student's t for each relabeling
     (P, V); of complex maps |t|, the root of the F ratio of a complex mean."""
-    n, y = len(y), y.reshape(len(y), -1)
+    n = len(y)
+    y = y.reshape(n, -1)
     square = np.sum(np.abs(y) ** 2, axis=0)
     if paired:
         mean = signs @ y / n
@@ -195,10 +238,14 @@ def moments(
     else:
         is_first = (signs > 0).astype(float)
         k = is_first[0].sum()
-        a, b = is_first @ y / k, (1 - is_first) @ y / (n - k)
-        mean = a - b
-        inside = square - k * np.abs(a) ** 2 - (n - k) * np.abs(b) ** 2
-        variance = inside / (n - 2) * (1 / k + 1 / (n - k))
+        first = is_first @ y / k
+        second = (1 - is_first) @ y / (n - k)
+        mean = first - second
+        within = square - k * np.abs(first) ** 2 - (n - k) * np.abs(second) ** 2
+        variance = within / (n - 2) * (1 / k + 1 / (n - k))
     # A map that is zero in all subjects has no statistic.
-    error = np.sqrt(np.maximum(variance, 1e-24 * np.maximum(square / n, 1e-290)))
-    return mean, error, (np.abs(mean) if np.iscomplexobj(mean) else mean) / error
+    least = 1e-24 * np.maximum(square / n, 1e-290)
+    error = np.sqrt(np.maximum(variance, least))
+    if np.iscomplexobj(mean):
+        return mean, error, np.abs(mean) / error
+    return mean, error, mean / error
