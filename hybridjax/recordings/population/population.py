@@ -71,16 +71,17 @@ class Population:
                 raise DefinitionError(
                     f"`values` and `errors` of '{name}' must have {rows} rows."
                 )
-            wrong = np.isfinite(values[name]) & ~(error > 0)
-            for subject, number in zip(
-                self.table["subject"][wrong], error[wrong], strict=True
-            ):
-                text = f"has the standard error {number:.3g}: it must be a positive number."
-                raise DefinitionError(f"'{name}' of subject '{subject}' {text}")
+            wrong = np.flatnonzero(np.isfinite(self.values[name]) & ~(error > 0))
+            if len(wrong):
+                row = wrong[0]
+                raise DefinitionError(
+                    f"'{name}' of subject '{self.table['subject'][row]}' has the standard error "
+                    f"{error[row]:.3g}: it must be a positive number."
+                )
         self.units = dict.fromkeys(values, "") | dict(units or {})
-        self.freedom = (
-            np.full(rows, np.inf) if freedom is None else np.asarray(freedom, float)
-        )
+        self.freedom = np.full(rows, np.inf)
+        if freedom is not None:
+            self.freedom = np.asarray(freedom, float)
 
     @classmethod
     def from_fits(
@@ -96,41 +97,32 @@ class Population:
         differ.
         """
         frame = table_of(table, len(fits))
+        _require_comparable(fits, frame["subject"])
         most = max((len(fit.coefficients) for fit in fits), default=0)
-        numbers = np.full((2, 2 + most, len(fits)), np.nan)
-        for row, (subject, fit) in enumerate(zip(frame["subject"], fits, strict=True)):
-            outputs = [getattr(x, "outputs", ()) for x in (fits[0], fit)]
-            pair = f"the fits of subjects '{frame['subject'][0]}' and '{subject}'"
-            require_equal(pair, "outputs", *outputs)
-            if not np.isfinite(fit.covariance).all():
-                text = f"the fit of subject '{subject}' has no covariance"
-                raise DefinitionError(
-                    f"{text}: record more strides, or leave the subject out."
-                )
-            z, covariance = complex(fit.multipliers[0]), fit.multiplier_covariances[0]
-            polar = np.array(
-                [[z.real, z.imag], [-z.imag / abs(z), z.real / abs(z)]]
-            ) / abs(z)
-            squares = *np.diag(polar @ covariance @ polar.T), *np.diag(fit.covariance)
-            values = abs(z), abs(np.angle(z)) if z.imag else np.nan, *fit.coefficients
-            numbers[:, : len(values), row] = values, np.sqrt(squares)
         kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
-        values, errors = (dict(zip(kinds, x, strict=True)) for x in numbers)
-        return cls(
-            frame,
-            values,
-            errors,
-            {"angle": "rad"},
-            [x.covariance_freedom for x in fits],
-        )
+        values = {kind: np.full(len(fits), np.nan) for kind in kinds}
+        errors = {kind: np.full(len(fits), np.nan) for kind in kinds}
+        for row, fit in enumerate(fits):
+            z = complex(fit.multipliers[0])
+            angle = abs(np.angle(z)) if z.imag else np.nan
+            # Derivatives of modulus and angle with respect to real and imaginary part.
+            radial = np.array([z.real, z.imag]) / abs(z)
+            polar = np.stack([radial, np.array([-z.imag, z.real]) / abs(z) ** 2])
+            of_polar = polar @ fit.multiplier_covariances[0] @ polar.T
+            numbers = (abs(z), angle, *fit.coefficients)
+            squares = (*np.diag(of_polar), *np.diag(fit.covariance))
+            for kind, number, square in zip(kinds, numbers, squares, strict=False):
+                values[kind][row] = number
+                errors[kind][row] = np.sqrt(square)
+        freedom = [fit.covariance_freedom for fit in fits]
+        return cls(frame, values, errors, {"angle": "rad"}, freedom)
 
     def __repr__(self) -> str:
-        count = self.table.assign(cell=cells_of(self.table)).groupby(
-            "cell", sort=False
-        )["subject"]
-        cells = "; ".join(f"{c}: {n} subjects" for c, n in count.nunique().items())
+        cells = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)
+        counts = cells["subject"].nunique().items()
+        counted = "; ".join(f"{cell}: {count} subjects" for cell, count in counts)
         names = ", ".join(self.values)
-        return folded(f"Population({names}; {cells}; {len(self.table)} estimates)")
+        return folded(f"Population({names}; {counted}; {len(self.table)} estimates)")
 
     def mean(self, quantity: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean over subjects, and the spread between them, in each group and condition.
@@ -145,17 +137,20 @@ class Population:
         """
         parts = []
         for cell, data in self._cells(quantity, 2 + len(covariates), covariates):
-            y, v, slopes = (
-                data["y"].to_numpy(),
-                data["v"].to_numpy(),
-                data.filter(like=_SLOPE),
-            )
+            y = data["y"].to_numpy()
+            v = data["v"].to_numpy()
+            slopes = data.filter(like=_SLOPE)
             x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
-            fit, weights = meta(y, v, x), np.eye(x.shape[1])
-            spread = np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x)
-            names = [n if cell == "all" else f"{n}, {cell}" for n in ("mean", *slopes)]
-            parts.append(self._effects(quantity, names, len(y), fit, weights, spread))
-            parts[-1].loc[0, "p"] = np.nan
+            fit = meta(y, v, x)
+            spread = (np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x))
+            names = ["mean", *slopes]
+            if cell != "all":
+                names = [f"{name}, {cell}" for name in names]
+            part = self._effects(
+                quantity, names, len(y), fit, np.eye(x.shape[1]), spread
+            )
+            part.loc[0, "p"] = np.nan
+            parts.append(part)
         return _result(
             parts,
             f"Means of {quantity} and 95 % intervals: random-effects model with the standard error "
@@ -177,19 +172,20 @@ class Population:
         **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
         """
         data, cell, w, pairs = self._contrast(quantity, a, b, covariates)
-        subject, slopes = data["subject"].factorize()[0], data.filter(like=_SLOPE)
+        subject, _ = data["subject"].factorize()
+        slopes = data.filter(like=_SLOPE)
         x = np.column_stack([np.eye(len(w))[cell], slopes - slopes.mean()])
         fit = mixed(data["y"].to_numpy(), data["v"].to_numpy(), x, subject, cell)
         weights = np.eye(x.shape[1])[len(w) - 1 :]
         weights[0, : len(w)] = w
-        spread, (y, v) = (np.nan,) * 3, pairs.to_numpy().T
+        spread = (np.nan, np.nan, np.nan)
+        y, v = pairs.to_numpy().T
         if len(y) > 2:
-            spread = (
-                np.sqrt(w @ fit.between @ w),
-                *spread_interval(y, v, np.ones((len(y), 1))),
-            )
+            bounds = spread_interval(y, v, np.ones((len(y), 1)))
+            spread = (np.sqrt(w @ fit.between @ w), *bounds)
         n = subject.max() + 1
-        rows = self._effects(quantity, [f"{a} - {b}", *slopes], n, fit, weights, spread)
+        names = [f"{a} - {b}", *slopes]
+        rows = self._effects(quantity, names, n, fit, weights, spread)
         return _result(
             [rows],
             f"Difference of {quantity} ({a} - {b}; {n} subjects, {len(y)} with all conditions) and "
@@ -208,23 +204,28 @@ class Population:
         """
         parts = []
         for _, data in self._cells(quantity, 3):
-            y, v = data["y"].to_numpy(), data["v"].to_numpy()
+            y = data["y"].to_numpy()
+            v = data["v"].to_numpy()
             fit = meta(y, v, np.ones((len(y), 1)))
-            mean, between = fit.coefficients[0], fit.between[0, 0]
+            mean = fit.coefficients[0]
+            between = fit.between[0, 0]
             share = between / (between + v)
-            square = share * v + (1 - share) ** 2 * fit.covariance[0, 0]
-            square += 2 * v**2 / (v + between) ** 3 * fit.uncertainty[0, 0]
-            value, error = mean + share * (y - mean), np.sqrt(square)
+            of_mean = (1 - share) ** 2 * fit.covariance[0, 0]
+            of_spread = 2 * v**2 / (v + between) ** 3 * fit.uncertainty[0, 0]
+            error = np.sqrt(share * v + of_mean + of_spread)
+            value = mean + share * (y - mean)
             reach = stats.t.ppf(0.975, fit.most) * error
             part = data[["subject", "cell"]].assign(
-                quantity=quantity, unit=self.units[quantity]
+                quantity=quantity,
+                unit=self.units[quantity],
+                estimate=y,
+                standard_error=np.sqrt(v),
+                prediction=value,
+                prediction_error=error,
+                low=value - reach,
+                high=value + reach,
             )
-            part = part.assign(estimate=y, standard_error=np.sqrt(v), prediction=value)
-            parts.append(
-                part.assign(
-                    prediction_error=error, low=value - reach, high=value + reach
-                )
-            )
+            parts.append(part)
         text = f"Single subjects: best linear unbiased predictions of {quantity} (Prasad and Rao)."
         return _result(parts, text)
 
@@ -262,23 +263,27 @@ class Population:
             raise DefinitionError(
                 "`labels` must be two conditions of three or more subjects."
             )
-        ones, rows = np.ones((len(y), 1)), []
-        low, high = spread_interval(y, v, ones)
+        ones = np.ones((len(y), 1))
         spread = np.sqrt(meta(y, v, ones).between[0, 0])
+        narrow, wide = spread_interval(y, v, ones)
+        paired = bool(labels)
+
+        def significant(n: int, spread: float) -> int:
+            test = _test(v, n, spread, difference, paired)
+            return int(monte_carlo(test, draws, seed).value.sum())
+
+        rows = []
         for n in subjects:
-            tests = [
-                _test(v, n, x, difference, bool(labels)) for x in (spread, high, low)
-            ]
-            count, *bounds = (
-                int(monte_carlo(f, draws, seed).value.sum()) for f in tests
-            )
-            least, most = (stats.binomtest(k, draws).proportion_ci() for k in bounds)
-            rows.append((n, count / draws, least.low, most.high, spread, draws))
+            # A wide spread between subjects gives a low power.
+            low = stats.binomtest(significant(n, wide), draws).proportion_ci().low
+            high = stats.binomtest(significant(n, narrow), draws).proportion_ci().high
+            power = significant(n, spread) / draws
+            rows.append((n, power, low, high, spread, draws))
         columns = ("subjects", "power", "power_low", "power_high", "spread", "draws")
         return _result(
             [package("pandas").DataFrame(rows, columns=columns)],
             f"Power for a difference of {difference:g} in {quantity} "
-            f"({'paired differences' if labels else 'two groups'}): {draws} simulated populations "
+            f"({'paired differences' if paired else 'two groups'}): {draws} simulated populations "
             f"with the spread and errors of a pilot of {len(y)} subjects.",
         )
 
@@ -303,30 +308,43 @@ class Population:
         **Raises:** `DefinitionError` without a column `strides` or a spread between subjects, and
         as `mean`.
         """
-        cells = [data[["y", "v"]].to_numpy().T for _, data in self._cells(quantity, 3)]
-        between = np.mean([meta(y, v, np.ones((len(y), 1))).between for y, v in cells])
-        trials = (
-            self._trials(quantity).assign(strides=self._numbers("strides")).dropna()
+        between = np.mean(
+            [
+                meta(
+                    data["y"].to_numpy(), data["v"].to_numpy(), np.ones((len(data), 1))
+                ).between
+                for _, data in self._cells(quantity, 3)
+            ]
         )
-        by = trials.groupby(["subject", "cell"])
-        count = by["y"].count()
-        scatter = (count - 1) * (by["y"].var().fillna(0.0) - by["v"].mean())
-        trial = max(scatter.sum() / max((count - 1).sum(), 1), 0.0)
-        between -= trial * np.mean(1 / count) * (trial > 0)
+        trials = self._trials(quantity).assign(strides=self._numbers("strides"))
+        trials = trials.dropna()
+        by_subject = trials.groupby(["subject", "cell"])
+        count = by_subject["y"].count()
+        excess = by_subject["y"].var().fillna(0.0) - by_subject["v"].mean()
+        surplus = (count - 1).sum()
+        trial = max(((count - 1) * excess).sum() / max(surplus, 1), 0.0)
+        if trial > 0:
+            between -= trial * np.mean(1 / count)
         if not between > 0:
-            text = f"subjects differ in '{quantity}' by no more than their errors"
-            raise DefinitionError(f"{text}: find their spread from more subjects.")
+            raise DefinitionError(
+                f"subjects differ in '{quantity}' by no more than their errors: find their spread "
+                "from more subjects."
+            )
         stride = np.mean(trials["v"] * trials["strides"])
         k = max(round(np.sqrt(trial / between * subject_cost / trial_cost)), 1)
         cost = (subject_cost + k * trial_cost) / stride_cost
-        row = {"quantity": quantity, "trials": k}
-        row |= {"strides": np.sqrt(stride * cost / (k**2 * between + k * trial))}
-        row |= {"subject_spread": np.sqrt(between), "trial_spread": np.sqrt(trial)}
-        row |= {"stride_spread": np.sqrt(stride)}
-        text = (
-            "Trials and strides: smallest variance of the mean for its cost (Cochran)."
+        row = {
+            "quantity": quantity,
+            "trials": k,
+            "strides": np.sqrt(stride * cost / (k**2 * between + k * trial)),
+            "subject_spread": np.sqrt(between),
+            "trial_spread": np.sqrt(trial),
+            "stride_spread": np.sqrt(stride),
+        }
+        return _result(
+            [package("pandas").DataFrame([row])],
+            "Trials and strides: smallest variance of the mean for its cost (Cochran).",
         )
-        return _result([package("pandas").DataFrame([row])], text)
 
     def _numbers(self, name: str) -> np.ndarray:
         values = np.asarray(self.table.get(name, ""))
@@ -339,17 +357,18 @@ class Population:
     def _trials(self, quantity: str) -> Any:
         """Return subject, factors, cell, estimate and moderated variance of each row."""
         if quantity not in self.values:
-            listed = ", ".join(self.values)
             raise DefinitionError(
-                f"there is no quantity '{quantity}'; quantities are {listed}."
+                f"there is no quantity '{quantity}'; quantities are {', '.join(self.values)}."
             )
-        y, v = np.asarray(self.values[quantity]), np.asarray(self.errors[quantity]) ** 2
-        trend, strides = np.ones((len(y), 1)), np.asarray(self.table.get("strides", ""))
+        y = np.asarray(self.values[quantity])
+        v = np.asarray(self.errors[quantity]) ** 2
+        trend = np.ones((len(y), 1))
+        strides = np.asarray(self.table.get("strides", ""))
         if strides.dtype.kind in "iuf" and np.ptp(strides) > 0:
             trend = np.column_stack([trend, np.log(np.maximum(strides, 1.0))])
-        v[~np.isfinite(y)] = np.nan
-        i = np.isfinite(y)
-        v[i] = moderated(v[i], self.freedom[i], trend[i])
+        known = np.isfinite(y)
+        v[~known] = np.nan
+        v[known] = moderated(v[known], self.freedom[known], trend[known])
         frame = self.table[["subject", *factors_of(self.table)]]
         return frame.assign(cell=cells_of(frame), y=y, v=v)
 
@@ -358,18 +377,21 @@ class Population:
     ) -> Any:
         """Return a row for each subject in each group and condition; trials are averaged."""
         slopes = {_SLOPE + name: self._numbers(name) for name in covariates}
-        frame = self._trials(quantity).assign(**slopes)
-        frame = frame.assign(w=1 / frame["v"], wy=frame["y"] / frame["v"])
-        frame = frame[np.isfinite(frame["y"]) & (True if rows is None else rows)]
+        trials = self._trials(quantity)
+        weight = 1 / trials["v"]
+        frame = trials.assign(w=weight, wy=weight * trials["y"], **slopes)
+        if rows is not None:
+            frame = frame[rows]
+        frame = frame[np.isfinite(frame["y"])]
         by = frame.groupby(["subject", *factors_of(frame), "cell"], sort=False)
         data = by[["w", "wy"]].sum().join(by[list(slopes)].mean()).reset_index()
         return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
     def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
-        cells = dict(
-            list(self._merged(quantity, covariates).groupby("cell", sort=False))
-        )
-        require({c: x["subject"] for c, x in cells.items()} or {"all": ()}, needed)
+        merged = self._merged(quantity, covariates)
+        cells = dict(list(merged.groupby("cell", sort=False)))
+        subjects = {cell: data["subject"] for cell, data in cells.items()}
+        require(subjects or {"all": ()}, needed)
         return cells.items()
 
     def _contrast(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
@@ -381,10 +403,10 @@ class Population:
         cell, names = data["cell"].factorize()
         is_a = data.drop_duplicates("cell")[factor].to_numpy() == a
         w = np.where(is_a, 1 / max(is_a.sum(), 1), -1 / max((~is_a).sum(), 1))
-        parts = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2).groupby(
-            "subject"
-        )
-        return data, cell, w, parts[["y", "v"]].sum()[parts.size() == len(names)]
+        weighted = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2)
+        of_subjects = weighted.groupby("subject")
+        whole = of_subjects.size() == len(names)
+        return data, cell, w, of_subjects[["y", "v"]].sum()[whole]
 
     def _effects(
         self,
@@ -392,21 +414,46 @@ class Population:
         names: list[str],
         subjects: int,
         fit: Mixed,
-        weights,
-        spread,
+        weights: np.ndarray,
+        spread: tuple[float, ...],
     ) -> Any:
+        """Return a row for each contrast of a fit; the first has the spread and its interval."""
         value, error, freedom = np.array([fit.contrast(w) for w in weights]).T
         reach = stats.t.ppf(0.975, freedom) * error
-        frame = package("pandas").DataFrame({"quantity": quantity, "effect": names})
-        frame = frame.assign(
-            unit=self.units[quantity], subjects=subjects, estimate=value
-        )
-        frame = frame.assign(standard_error=error, freedom=freedom, low=value - reach)
-        frame = frame.assign(
-            high=value + reach, p=2 * stats.t.sf(abs(value) / error, freedom)
+        frame = package("pandas").DataFrame(
+            {
+                "quantity": quantity,
+                "effect": names,
+                "unit": self.units[quantity],
+                "subjects": subjects,
+                "estimate": value,
+                "standard_error": error,
+                "freedom": freedom,
+                "low": value - reach,
+                "high": value + reach,
+                "p": 2 * stats.t.sf(abs(value) / error, freedom),
+            }
         )
         frame.loc[0, ["spread", "spread_low", "spread_high"]] = spread
         return frame
+
+
+def _require_comparable(
+    fits: Sequence[MultiplierEstimate], subjects: Sequence[str]
+) -> None:
+    """**Raises:** `DefinitionError` for a fit without covariance, and other outputs."""
+    for subject, fit in zip(subjects, fits, strict=True):
+        require_equal(
+            f"the fits of subjects '{subjects[0]}' and '{subject}'",
+            "outputs",
+            getattr(fits[0], "outputs", ()),
+            getattr(fit, "outputs", ()),
+        )
+        if not np.isfinite(fit.covariance).all():
+            raise DefinitionError(
+                f"the fit of subject '{subject}' has no covariance: record more strides, or leave "
+                "the subject out."
+            )
 
 
 def _result(parts: list, text: str) -> Any:
@@ -415,19 +462,26 @@ def _result(parts: list, text: str) -> Any:
     return frame
 
 
-def _test(v, n: int, spread: float, difference: float, paired: bool):
+def _test(
+    variances: np.ndarray,
+    n: int,
+    spread: float,
+    difference: float,
+    paired: bool,
+):
     """Return a function of a random generator that simulates subjects, and returns whether the
     difference differs from zero."""
     subjects = np.arange(n if paired else 2 * n)
     group = subjects // n
-    x, w = np.eye(group[-1] + 1)[group], np.array([1.0, -1.0])[: group[-1] + 1]
+    x = np.eye(group[-1] + 1)[group]
+    contrast = np.array([1.0, -1.0])[: group[-1] + 1]
 
     def draw(rng: np.random.Generator) -> int:
-        variance = rng.choice(v, len(subjects))
-        y = np.sqrt(spread**2 + variance) * rng.normal(size=len(subjects))
+        v = rng.choice(variances, len(subjects))
+        y = np.sqrt(spread**2 + v) * rng.normal(size=len(subjects))
         y += difference * (group == 0)
-        fit = meta(y, variance, x) if paired else mixed(y, variance, x, subjects, group)
-        value, error, freedom = fit.contrast(w)
+        fit = meta(y, v, x) if paired else mixed(y, v, x, subjects, group)
+        value, error, freedom = fit.contrast(contrast)
         return int(abs(value) > stats.t.isf(0.025, freedom) * error)
 
     return draw
