@@ -3,11 +3,10 @@ trials that differ from the others in units, columns, clocks or cycles."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import fft
+from scipy import fft, stats
 
 from ..._core.findings import Finding, listed
 from ..findings import CLEAR, places
@@ -19,10 +18,13 @@ from ..smoothing import RANGES, Series
 
 # Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
 # plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
-_FROZEN = 0.25, 10, 4
+_FROZEN_CYCLES = 0.25
+_FROZEN_SAMPLES = 10
+_FROZEN_PLATEAUS = 4
 # Least fraction of samples on plateaus at an extreme that is clipping, and its ratio to those on
 # other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are reported.
-_CLIPPED, _MOSTLY = 0.005, 5
+_CLIPPED = 0.005
+_MOSTLY = 5
 # Relative difference of the number of levels from a power of two that is an overflow. Larger:
 # impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
 _ALL_LEVELS = 0.01
@@ -44,41 +46,45 @@ _ALIKE = 1.2
 _OFF = 10.0
 # Least correlation of average cycles that are alike, each of so many values. Larger: noisy cycles
 # differ. Smaller: other events and swapped signals pass.
-_CORRELATED, _PHASES = 0.8, HARMONICS // 2
+_CORRELATED = 0.8
+_PHASES = HARMONICS // 2
 # Relative difference of periods of trials. Larger: other speeds pass. Smaller: jitter is reported.
 _OTHER_PERIOD = 0.02
 # Fewest cycles that have a usual duration. Larger: short trials are not judged. Smaller: chance is.
 _STRETCH = 8
 # Difference from the median duration of cycles that makes an odd one, in medians of differences and
 # in periods. Larger: lost samples pass. Smaller: variable rhythms are reported.
-_ODD, _ALIKE_PERIODS = 12.0, 0.05
+_ODD = 12.0
+_ALIKE_PERIODS = 0.05
 # Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
-_COSINES, _RATIO = 24, 20.0
+_COSINES = 24
+_RATIO = 20.0
 
 Cycles = Float[np.ndarray, "k P"]
+Samples = Float[np.ndarray, "n k"]
 Rows = Bool[np.ndarray, " n"]
 
 
 def placeholders(x: Series, period: float, is_input: bool) -> Rows:
     """Find numbers such as -9999, far from all other samples."""
     whole = np.unique(x[x == np.round(x)])
-    marked = np.isin(
-        x, [value for value in whole if _is_placeholder(abs(float(value)))]
-    )
+    marks = [value for value in whole if _is_placeholder(abs(float(value)))]
+    marked = np.isin(x, marks)
     usual = x[np.isfinite(x) & ~marked]
     if not marked.any() or not len(usual) or not np.ptp(usual):
         return np.zeros(len(x), bool)
-    return marked & (
-        np.maximum(usual.min() - x, x - usual.max()) > RANGES * np.ptp(usual)
-    )
+    distance = np.maximum(usual.min() - x, x - usual.max())
+    return marked & (distance > RANGES * np.ptp(usual))
 
 
 def _is_placeholder(size: float) -> bool:
     """Return whether programs write this number for "no value": 999, 8888, 32768, 1e20, ..."""
+    largest_integers = {2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1}
+    if size in largest_integers or size >= 1e15:
+        return True
     digits = f"{size:.0f}"
-    full = size in {2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1}
-    return full or size >= 1e15 or (len(digits) >= 3 and set(digits) in ({"9"}, {"8"}))
+    return len(digits) >= 3 and set(digits) in ({"9"}, {"8"})
 
 
 def frozen(x: Series, period: float, is_input: bool) -> Rows:
@@ -89,12 +95,17 @@ def frozen(x: Series, period: float, is_input: bool) -> Rows:
     """
     first, length = _runs(x)
     plateaus = length[length >= 3]
-    limit = max(_FROZEN[0] * period, _FROZEN[1])
-    if len(plateaus) > 0.5 * len(x) / period:  # as those of a foot on the ground
-        limit = (
-            np.inf if is_input else max(limit, _FROZEN[2] * float(np.median(plateaus)))
-        )
-    return np.repeat((length > limit) & ~(is_input & (x[first] == 0)), length)
+    limit = max(_FROZEN_CYCLES * period, _FROZEN_SAMPLES)
+    # Plateaus in most cycles belong to the rhythm, as those of a foot on the ground.
+    in_most_cycles = len(plateaus) > 0.5 * len(x) / period
+    if in_most_cycles and is_input:
+        return np.zeros(len(x), bool)
+    if in_most_cycles:
+        limit = max(limit, _FROZEN_PLATEAUS * float(np.median(plateaus)))
+    failed = length > limit
+    if is_input:
+        failed &= x[first] != 0
+    return np.repeat(failed, length)
 
 
 def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
@@ -107,15 +118,17 @@ def clipped(recording: Recording, name: str) -> Iterator[Finding]:
     """Find plateaus at the largest or least value, and nowhere else; one at 0 is no clipping."""
     for trial, x in recording.samples(name):
         first, length = _runs(x)
-        value, length = x[first[length >= 3]], length[length >= 3]
+        plateau = length >= 3
+        value = x[first[plateau]]
+        length = length[plateau]
         if not len(value):
             continue
-        ends = [
-            v for v in (np.nanmin(x), np.nanmax(x)) if v != 0 and (value == v).sum() > 1
-        ]
+        extremes = [v for v in (np.nanmin(x), np.nanmax(x)) if v != 0]
+        ends = [v for v in extremes if (value == v).sum() > 1]
         at_ends = np.isin(value, ends)
         count = length[at_ends].sum()
-        if count >= max(1, _CLIPPED * len(x), _MOSTLY * length[~at_ends].sum()):
+        elsewhere = length[~at_ends].sum()
+        if count >= max(1, _CLIPPED * len(x), _MOSTLY * elsewhere):
             levels = " and ".join(f"{v:.4g}" for v in ends)
             yield Finding(
                 "clipped", f"{name} is cut off at {levels} in trial '{trial.name}'."
@@ -131,43 +144,54 @@ def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
             continue
         step = float(np.diff(levels).min())
         count = (x - levels[0]) / step
+        # Whole numbers, but for rounding.
+        if np.nanmax(np.abs(count - np.round(count))) >= 1e-3:
+            continue
         whole = 1 + round(float(np.nanmax(count)))
-        off = np.nanmax(np.abs(count - np.round(count)))
-        bits = round(np.log2(whole))  # (of many levels, the outermost are not met)
+        # (Of many levels, the outermost are not met.)
+        bits = round(np.log2(whole))
         jumps = np.diff(count) / 2.0**bits
-        both = min((jumps > 0.5).sum(), (jumps < -0.5).sum())
-        if (
-            off < 1e-3 and abs(whole / 2.0**bits - 1) < _ALL_LEVELS and both
-        ):  # but for rounding
-            remedy = f"undo it (`numpy.unwrap` with period={2**bits * step:.6g})"
-            text = f"{name} jumps by its whole range in trial '{trial.name}': {remedy}."
-            yield Finding("overflow", text, "refused")
+        up_and_down = (jumps > 0.5).any() and (jumps < -0.5).any()
+        if up_and_down and abs(whole / 2.0**bits - 1) < _ALL_LEVELS:
+            yield Finding(
+                "overflow",
+                f"{name} jumps by its whole range in trial '{trial.name}': undo it (`numpy.unwrap` "
+                f"with period={2**bits * step:.6g}).",
+                "refused",
+            )
             return
 
 
 def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Finding]:
     """Find inputs that are constant in some trials only."""
     for name in names:
-        samples = recording.samples(name)
-        finite = [x[np.isfinite(x)] for _, x in samples]
-        width: list[Any] = [np.ptp(x) if len(x) else 0.0 for x in finite]
-        silent = [
-            f"'{t.name}'" for (t, _), w in zip(samples, width, strict=True) if not w
-        ]
-        if silent and max(width):
-            text = f"{name} does not change in trial {listed(silent)}: if it acted there and was "
-            yield Finding("a silent input", f"{text}not recorded, leave the trial out.")
+        silent = []
+        for trial, x in recording.samples(name):
+            x = x[np.isfinite(x)]
+            if not len(x) or not np.ptp(x):
+                silent.append(f"'{trial.name}'")
+        if 0 < len(silent) < len(recording.trials):
+            yield Finding(
+                "a silent input",
+                f"{name} does not change in trial {listed(silent)}: if it acted there and was not "
+                "recorded, leave the trial out.",
+            )
 
 
 def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
     """Find two columns with the same numbers."""
     for a, b in combinations(names, 2):
-        for trial in recording.trials:
-            x, y = (trial.values[:, recording.column(name)] for name in (a, b))
+        pairs = zip(recording.samples(a), recording.samples(b), strict=True)
+        for (trial, x), (_, y) in pairs:
             both = np.isfinite(x) & np.isfinite(y)
-            if both.any() and np.ptp(x[both]) > 0 and (x == y)[both].mean() > _EQUAL:
-                text = f"{a} and {b} are the same numbers in trial '{trial.name}': leave one out."
-                yield Finding("a signal twice", text, "refused")
+            if not both.any() or not np.ptp(x[both]):
+                continue
+            if (x == y)[both].mean() > _EQUAL:
+                yield Finding(
+                    "a signal twice",
+                    f"{a} and {b} are the same numbers in trial '{trial.name}': leave one out.",
+                    "refused",
+                )
                 break
 
 
@@ -179,86 +203,138 @@ def repeated_rows(
     Windows of successive samples are compared first. If most of those that two trials share are at
     the same distance, both trials are compared sample by sample.
     """
-    columns, trials = [recording.column(name) for name in names], recording.trials
-    values = [t.values[:, columns] for t in trials]
-    size = _SAME * np.ma.masked_invalid(np.concatenate(values)).std(axis=0).filled(0.0)
-    keys = [_keys(x / np.where(size > 0, size, 1.0)) for x in values]
-    repeated, findings = [np.zeros(len(x), bool) for x in values], []
+    columns = [recording.column(name) for name in names]
+    trials = recording.trials
+    values = [trial.values[:, columns] for trial in trials]
+    deviation = np.ma.masked_invalid(np.concatenate(values)).std(axis=0)
+    tolerance = _SAME * deviation.filled(0.0)
+    keys = [_keys(x / np.where(tolerance > 0, tolerance, 1.0)) for x in values]
+    repeated = [np.zeros(len(x), bool) for x in values]
+    findings = []
     for i, j in combinations(range(len(trials)), 2):
-        x, y = values[i], values[j]
-        _, first, second = np.intersect1d(keys[i], keys[j], return_indices=True)
-        shifts, counts = np.unique(first - second, return_counts=True)
-        if max(counts, default=0) < max(_WINDOW, len(first) / 2):
+        shift = _shift(keys[i], keys[j])
+        if shift is None:
             continue
-        shift = int(shifts[np.argmax(counts)])
-        first, last = max(0, shift), min(len(x), len(y) + shift)
-        same = np.zeros(len(y), bool)
-        off = np.abs(x[first:last] - y[first - shift : last - shift])
-        same[first - shift : last - shift] = (~(off > size)).all(axis=1)
-        same |= same.mean() > _EQUAL
+        same = _same_rows(values[i], values[j], shift, tolerance)
         if (same & ~repeated[j]).any():
             repeated[j] |= same
-            text = f"{places([trials[j]], [same])}: these samples are in trial '{trials[i].name}'"
+            where = places([trials[j]], [same])
             findings.append(
-                Finding("a trial twice", f"{text} too, and count once.", "left out")
+                Finding(
+                    "a trial twice",
+                    f"{where}: these samples are in trial '{trials[i].name}' too, and count once.",
+                    "left out",
+                )
             )
     return repeated, findings
 
 
-def _keys(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " m"]:
+def _keys(values: Samples) -> Float[np.ndarray, " m"]:
     """Return a number for each window of successive rows of rounded values (exactly: integers)."""
-    weights = (
-        np.random.default_rng(0)
-        .integers(1, 2**20, (_WINDOW, values.shape[1]))
-        .astype(float)
-    )
-    rows, last = np.round(values), max(len(values) - _WINDOW + 1, 0)
+    shape = (_WINDOW, values.shape[1])
+    weights = np.random.default_rng(0).integers(1, 2**20, shape).astype(float)
+    rows = np.round(values)
+    last = max(len(values) - _WINDOW + 1, 0)
     return np.sum([rows[k : k + last] @ weights[k] for k in range(_WINDOW)], axis=0)
+
+
+def _shift(x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> int | None:
+    """Return the distance at which two trials share most of their common windows, if they do."""
+    _, first, second = np.intersect1d(x, y, return_indices=True)
+    if not len(first):
+        return None
+    shifts, counts = np.unique(first - second, return_counts=True)
+    if counts.max() < max(_WINDOW, len(first) / 2):
+        return None
+    return int(shifts[np.argmax(counts)])
+
+
+def _same_rows(
+    x: Samples,
+    y: Samples,
+    shift: int,
+    tolerance: Float[np.ndarray, " k"],
+) -> Rows:
+    """Return the rows of y that are in x, so many rows later; all, if nearly all are."""
+    same = np.zeros(len(y), bool)
+    first = max(0, shift)
+    last = min(len(x), len(y) + shift)
+    shared = slice(first - shift, last - shift)
+    differs = np.abs(x[first:last] - y[shared]) > tolerance
+    same[shared] = ~differs.any(axis=1)
+    if same.mean() > _EQUAL:
+        same[:] = True
+    return same
 
 
 def other_settings(
     recording: Recording, names: list[str], outputs: tuple[str, ...]
 ) -> Iterator[Finding]:
     """Find trials in which a signal has another unit or zero, or two outputs changed places."""
+    if len(recording.trials) < 2:
+        return
     levels = [[_levels(x) for _, x in recording.samples(name)] for name in names]
     low, middle, high = np.array(levels).transpose(2, 0, 1)
     width = high - low
-    for s, trial in enumerate(recording.trials if len(recording.trials) > 1 else ()):
+    for s, trial in enumerate(recording.trials):
         peers = np.delete(middle, s, axis=1)
-        usual, span = (
-            np.median(peers, axis=1),
-            np.median(np.delete(width, s, axis=1), axis=1),
-        )
-        # alike[i, j]: signal i is where signal j usually is.
-        widths = np.broadcast_arrays(width[:, s, None], span)
-        alike = np.abs(middle[:, s, None] - usual) < np.minimum(*widths)
-        alike &= np.minimum(*widths) * _ALIKE > np.maximum(*widths)
-        of_outputs = [k for k, name in enumerate(names) if name in outputs]
-        for i, j in combinations(of_outputs, 2):
-            if alike[i, j] and alike[j, i] and not (alike[i, i] or alike[j, j]):
-                pair = f"{names[i]} and {names[j]}"
-                text = f"{pair} have changed places in trial '{trial.name}': swap its columns."
-                yield Finding("swapped columns", text, "refused")
+        usual = np.median(peers, axis=1)
+        usual_width = np.median(np.delete(width, s, axis=1), axis=1)
+        swapped = _swapped(middle[:, s], width[:, s], usual, usual_width)
+        for i, j in combinations(range(len(names)), 2):
+            if swapped[i, j] and {names[i], names[j]} <= set(outputs):
+                yield Finding(
+                    "swapped columns",
+                    f"{names[i]} and {names[j]} have changed places in trial '{trial.name}': swap "
+                    "its columns.",
+                    "refused",
+                )
                 return
         for k, name in enumerate(names):
-            if not (width[k, s] > 0 and span[k] > 0):
+            if not (width[k, s] > 0 and usual_width[k] > 0):
                 continue
-            ratio, is_output = width[k, s] / span[k], name in outputs
-            off = abs(middle[k, s] - usual[k])
-            # Pushes may be chosen to be ten times as strong.
-            units = np.log(
-                (10, 180 / np.pi, 1e2, 1e3, 1e6) if is_output else (1e3, 1e6)
-            )
-            if np.abs(abs(np.log(ratio)) - units).min() < np.log(_ALIKE):
-                text = f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?"
+            ratio = width[k, s] / usual_width[k]
+            is_output = name in outputs
+            scatter = np.abs(peers[k] - usual[k]).max()
+            least = max(usual_width[k] / _OFF, _OFF * scatter)
+            if _is_unit(ratio, is_output):
                 yield Finding(
-                    "another unit", text, "refused" if is_output else "warned"
+                    "another unit",
+                    f"{name} varies {ratio:.3g} times as much in trial '{trial.name}': its unit?",
+                    "refused" if is_output else "warned",
                 )
-            elif is_output and off > max(
-                span[k] / _OFF, _OFF * np.abs(peers[k] - usual[k]).max()
-            ):
-                place = f"{middle[k, s]:.4g} in trial '{trial.name}', at {usual[k]:.4g} elsewhere"
-                yield Finding("another zero", f"the median of {name} lies at {place}.")
+            elif is_output and abs(middle[k, s] - usual[k]) > least:
+                yield Finding(
+                    "another zero",
+                    f"the median of {name} lies at {middle[k, s]:.4g} in trial '{trial.name}', at "
+                    f"{usual[k]:.4g} elsewhere.",
+                )
+
+
+def _swapped(
+    middle: Float[np.ndarray, " k"],
+    width: Float[np.ndarray, " k"],
+    usual: Float[np.ndarray, " k"],
+    usual_width: Float[np.ndarray, " k"],
+) -> Bool[np.ndarray, "k k"]:
+    """Return which pairs of signals are each where the other one usually is, and not where they
+    usually are themselves."""
+    narrower = np.minimum(width[:, None], usual_width)
+    wider = np.maximum(width[:, None], usual_width)
+    # alike[i, j]: signal i is where signal j usually is.
+    alike = np.abs(middle[:, None] - usual) < narrower
+    alike &= narrower * _ALIKE > wider
+    at_home = np.diag(alike)
+    return alike & alike.T & ~(at_home[:, None] | at_home)
+
+
+def _is_unit(ratio: float, is_output: bool) -> bool:
+    """Return whether a ratio is one of two units, up or down."""
+    units = [1e3, 1e6]
+    if is_output:  # pushes may be chosen to be ten times as strong
+        units += [10, 180 / np.pi, 1e2]
+    distance = np.abs(abs(np.log(ratio)) - np.log(units))
+    return bool(distance.min() < np.log(_ALIKE))
 
 
 def _levels(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
@@ -272,22 +348,28 @@ def clocks(recording: Recording) -> Iterator[Finding]:
     jumps = []
     steps = [float(np.median(np.diff(t.time))) for t in recording.trials]
     for s, trial in enumerate(recording.trials):
-        ratio = steps[s] / float(np.median(steps[:s] + steps[s + 1 :] or steps))
-        thousands = np.log(ratio) / np.log(1000.0)
-        if round(thousands) and abs(thousands - round(thousands)) < np.log(
-            _ALIKE
-        ) / np.log(1000.0):
-            text = f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart: its unit?"
-            yield Finding("another unit of time", text, "refused")
+        others = steps[:s] + steps[s + 1 :]
+        ratio = steps[s] / float(np.median(others or steps))
+        thousands = round(np.log(ratio) / np.log(1000.0))
+        off = abs(np.log(ratio) - thousands * np.log(1000.0))
+        if thousands and off < np.log(_ALIKE):
+            yield Finding(
+                "another unit of time",
+                f"samples of trial '{trial.name}' are {ratio:.4g} times as far apart: its unit?",
+                "refused",
+            )
         step = np.diff(trial.time) / steps[s]
-        if (np.abs(step - 1) < 0.01).mean() > 0.95:
+        is_regular = (np.abs(step - 1) < 0.01).mean() > 0.95
+        if is_regular:
             jumps += [
                 f"trial '{trial.name}', by {steps[s] * step[k]:.3g} at {trial.time[k]:.2f} s"
                 for k in np.flatnonzero(step > 5)  # fewer: lost samples
             ]
     if jumps:
-        text = f"{listed(jumps)}: if this was no pause, make a trial of each part."
-        yield Finding("jump of the clock", text)
+        yield Finding(
+            "jump of the clock",
+            f"{listed(jumps)}: if this was no pause, make a trial of each part.",
+        )
 
 
 def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
@@ -301,16 +383,19 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
         odd = off > max(_ODD * float(np.median(off)), _ALIKE_PERIODS * usual)
         if not odd.any():
             continue
-        text = f"{odd.sum()} cycles of trial '{trial.name}' last {period[odd].mean():.4g}, all "
-        text += f"others about {usual:.4g}: if "
+        durations = (
+            f"{odd.sum()} cycles of trial '{trial.name}' last {period[odd].mean():.4g}, all others "
+            f"about {usual:.4g}"
+        )
         if odd.mean() < 0.1:
-            text += (
-                "samples were lost and times numbered anew, make a trial of each part."
+            yield Finding(
+                "odd cycles",
+                f"{durations}: if samples were lost and times numbered anew, make a trial of each "
+                "part.",
             )
-            yield Finding("odd cycles", text)
         elif np.abs(period[odd] / usual - 2).max() < 2 * _ALIKE_PERIODS:
             missed.append(
-                f"{text}events were missed, in gaps or between levels, choose others."
+                f"{durations}: if events were missed, in gaps or between levels, choose others."
             )
     for text in missed:
         everywhere = len(missed) == len(recording.trials)
@@ -321,74 +406,87 @@ def other_cycles(
     recording: Recording, phase: Phase, outputs: tuple[str, ...]
 ) -> Iterator[Finding]:
     """Find trials with another period, sign of an output, or start of the cycles."""
-    names = [t.name for t in recording.trials]
-    periods = np.array([np.median(p) if len(p) else np.nan for p in phase.periods])
-    for s in np.flatnonzero(np.isfinite(periods)):
-        peers = np.delete(periods, s)
-        usual = (
-            np.median(peers[np.isfinite(peers)])
-            if np.isfinite(peers).any()
-            else periods[s]
-        )
-        if abs(periods[s] / usual - 1) > max(_OTHER_PERIOD, CLEAR * phase.jitter):
-            text = f"cycles of trial '{names[s]}' last {periods[s]:.4g}, of the others {usual:.4g}."
-            yield Finding("another period", text)
+    names = [trial.name for trial in recording.trials]
+    yield from _other_periods(phase, names)
+    if not outputs:
+        return
     mean = np.array([_average_cycles(recording, phase, name) for name in outputs])
-    finite = (
-        np.flatnonzero(np.isfinite(mean).all(axis=(0, 2)))
-        if outputs
-        else np.zeros(0, int)
-    )
-    for s in finite if len(finite) > 1 else ():
-        usual = np.median(mean[:, finite[finite != s]], axis=1)
-        yield from _difference(mean[:, s], usual, names[s], list(outputs))
+    known = np.flatnonzero(np.isfinite(mean).all(axis=(0, 2)))
+    if len(known) < 2:
+        return
+    for s in known:
+        usual = np.median(mean[:, known[known != s]], axis=1)
+        yield from _difference(mean[:, s], usual, names[s], outputs)
 
 
-def _average_cycles(
-    recording: Recording, phase: Phase, name: str
-) -> Float[np.ndarray, "S P"]:
+def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
+    """Find trials with another period."""
+    periods = np.array([np.median(x) if len(x) else np.nan for x in phase.periods])
+    tolerance = max(_OTHER_PERIOD, CLEAR * phase.jitter)
+    for s in np.flatnonzero(np.isfinite(periods)):
+        others = np.delete(periods, s)
+        others = others[np.isfinite(others)]
+        if not len(others):
+            return
+        usual = np.median(others)
+        if abs(periods[s] / usual - 1) > tolerance:
+            yield Finding(
+                "another period",
+                f"cycles of trial '{names[s]}' last {periods[s]:.4g}, of the others {usual:.4g}.",
+            )
+
+
+def _average_cycles(recording: Recording, phase: Phase, name: str) -> Cycles:
     """Return the mean of a signal at each phase, without the mean of all, for each trial."""
-    cycles, trials = [], phase.by_trial(recording)
+    cycles = []
+    trials = phase.by_trial(recording)
     for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
         at = np.full(len(x), np.nan)
         for part in parts:
             at = np.fmax(at, part.at(trial.time))
-        finite = np.isfinite(at) & np.isfinite(x)
-        bins = (np.mod(at[finite], 1) * _PHASES).astype(int) % _PHASES
-        with np.errstate(invalid="ignore"):
-            mean = np.bincount(bins, x[finite], _PHASES) / np.bincount(
-                bins, minlength=_PHASES
-            )
-        cycles.append(mean - mean.mean())
+        known = np.isfinite(at) & np.isfinite(x)
+        means = stats.binned_statistic(
+            at[known] % 1, x[known], bins=_PHASES, range=(0, 1)
+        ).statistic
+        cycles.append(means - means.mean())
     return np.array(cycles)
 
 
 def _difference(
-    mean: Cycles, usual: Cycles, name: str, outputs: list[str]
+    mean: Cycles, usual: Cycles, name: str, outputs: Sequence[str]
 ) -> Iterator[Finding]:
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
-    def correlations(x):
+    def correlations(x: Cycles) -> Float[np.ndarray, " k"]:
         size = np.sqrt((x**2).sum(axis=1) * (usual**2).sum(axis=1))
         return (x * usual).sum(axis=1) / np.maximum(size, np.finfo(float).tiny)
 
     alike = correlations(mean)
     unlike = np.flatnonzero(alike <= _CORRELATED)
+    if not len(unlike):
+        return
+    if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
+        yield Finding(
+            "another sign",
+            f"{outputs[unlike[0]]} has the other sign in trial '{name}': turn it.",
+            "refused",
+        )
+        return
     shifted = [correlations(np.roll(mean, m, axis=1)).min() for m in range(_PHASES)]
     best = int(np.argmax(shifted))
-    if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
-        text = f"{outputs[unlike[0]]} has the other sign in trial '{name}': turn it."
-        yield Finding("another sign", text, "refused")
-    elif len(unlike) and best and shifted[best] > _CORRELATED:
+    if best and shifted[best] > _CORRELATED:
         away = min(best, _PHASES - best) / _PHASES
-        text = f"cycles of trial '{name}' begin {away:.2g} of a cycle away from the others."
-        yield Finding("another event", text, "refused")
-    elif len(unlike):
-        which = ", ".join(outputs[k] for k in unlike)
-        text = (
-            f"the average cycle of {which} in trial '{name}' is not that of the others."
+        yield Finding(
+            "another event",
+            f"cycles of trial '{name}' begin {away:.2g} of a cycle away from the others.",
+            "refused",
         )
-        yield Finding("another cycle", text)
+        return
+    which = ", ".join(outputs[k] for k in unlike)
+    yield Finding(
+        "another cycle",
+        f"the average cycle of {which} in trial '{name}' is not that of the others.",
+    )
 
 
 def slow_changes(
@@ -397,15 +495,19 @@ def slow_changes(
     """Find means over cycles that change much more slowly than they scatter, where changes slower
     than some cycles have been `removed`."""
     for name in outputs:
-        power, trials = np.zeros(_COSINES), phase.by_trial(recording)
+        power = np.zeros(_COSINES)
+        trials = phase.by_trial(recording)
         for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
             for part in parts:
-                level = cycle_means(trial, x, [part], phase.period)[1]
+                _, level = cycle_means(trial, x, [part], phase.period)
                 if len(level) >= 2 * _COSINES:
-                    power += (
-                        np.asarray(fft.dct(level, norm="ortho"))[1 : _COSINES + 1] ** 2
-                    )
-        if power[: _COSINES // 4].mean() > _RATIO * power[_COSINES // 4 :].mean():
-            text = f"{name} drifts or slips: if that is the sensor, "
-            text += f"`drift={min(50.0, removed / 2):g}` takes it out."
-            yield Finding("drift", text)
+                    waves = np.asarray(fft.dct(level, norm="ortho"))
+                    power += waves[1 : _COSINES + 1] ** 2
+        slow = power[: _COSINES // 4].mean()
+        fast = power[_COSINES // 4 :].mean()
+        if slow > _RATIO * fast:
+            drift = min(50.0, removed / 2)
+            yield Finding(
+                "drift",
+                f"{name} drifts or slips: if that is the sensor, `drift={drift:g}` takes it out.",
+            )
