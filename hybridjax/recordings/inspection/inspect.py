@@ -5,6 +5,7 @@ Do the outputs answer each input, alike in all parts of a recording, and was it 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import compress, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -17,17 +18,19 @@ from ..._core.findings import Finding, listed, warn_of
 from ..data import SectionData
 from ..findings import CLEAR, NAME_REFERENCE, Inspection, place, places
 from ..phase import Phase
-from ..recording import Recording
+from ..recording import Recording, Trial
 from ..smoothing import FEWEST
 from . import faults
 
 
 # Numbers of outputs per cycle that are predicted: the first for which there are `_ENOUGH` cycles
 # per unknown. More cycles: short recordings are not checked. Fewer: predictions are noise.
-_SECTIONS, _ENOUGH = (8, 4, 2), 3
+_SECTIONS = (8, 4, 2)
+_ENOUGH = 3
 # Cycles of a part, at least, and parts of a record, at most. More: short faults are diluted, or
 # long records take longer. Fewer: the gain of a part is noise.
-_SHORTEST, _PARTS = 16, 4
+_SHORTEST = 16
+_PARTS = 4
 # Unexplained power of a part relative to the median that makes a disturbance. Larger: stumbles
 # pass. Smaller: noisy parts are reported.
 _DISTURBED = 9.0
@@ -35,18 +38,23 @@ _DISTURBED = 9.0
 # Smaller: real deviations along the cycle are called errors.
 _SHIFTED = 0.7
 
-_NOT_MEASURED = (
-    (
-        "no value",
-        faults.placeholders,
-        "has samples that stand for no value, such as -9999",
-    ),
-    (
-        "frozen",
-        faults.frozen,
-        "does not change at all, as if a sensor or wire had failed",
-    ),
-)
+_NOT_MEASURED = {
+    "no value": faults.placeholders,
+    "frozen": faults.frozen,
+}
+_TEXTS = {
+    "no value": "{} has samples that stand for no value, such as -9999 ({}): taken for missing.",
+    "frozen": "{} does not change at all, as if a sensor or wire had failed ({}): taken for "
+    "missing.",
+    "another sign": "the outputs answer {} with the other sign ({}): turn it.",
+    "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another trial, "
+    "or came earlier or later.",
+    "disturbed": "something else than {} moved the outputs ({}).",
+}
+"""Texts of findings by their causes; signals and places are filled in."""
+
+Signals = Float[np.ndarray, "t k"]
+"""Several signals in each cycle."""
 
 
 @checked
@@ -72,7 +80,8 @@ def inspect(
 
     **Raises:** `DefinitionError` for unknown names, and for an output that is an input.
     """
-    inputs, outputs = tuple(inputs), tuple(outputs)
+    inputs = tuple(inputs)
+    outputs = tuple(outputs)
     require_apart(inputs, outputs)
     names = [
         name
@@ -81,47 +90,76 @@ def inspect(
     ]
     findings: list[Finding] = []
     clean = recording
-    columns = [recording.column(x) for x in outputs]
+    columns = [recording.column(name) for name in outputs]
     periods = [_samples_per_cycle(t.values[:, columns]) for t in recording.trials]
     for name in names:
-        for cause, samples_of, text in _NOT_MEASURED:
-            pairs = zip(clean.samples(name), periods, strict=True)
-            bad = [samples_of(x, period, name in inputs) for (_, x), period in pairs]
-            if any(map(np.any, bad)):
-                text = (
-                    f"{name} {text} ({places(clean.trials, bad)}): taken for missing."
-                )
-                findings.append(Finding(cause, text, "left out"))
-                clean = _masked(clean, [name], bad)
+        clean, more = _without_failures(clean, name, periods, name in inputs)
+        findings += more
         findings += faults.clipped(clean, name)
-        findings += () if name in inputs else faults.wrapped(clean, name)
+        if name not in inputs:
+            findings += faults.wrapped(clean, name)
     findings += faults.silent_inputs(clean, [name for name in names if name in inputs])
     findings += faults.doubled_signals(clean, names)
     copies, more = faults.repeated_rows(clean, names)
     findings += more
     clean = _masked(clean, names, copies)
-    kept = []
-    for trial, rows in zip(clean.trials, copies, strict=True):
-        lost = np.isfinite(trial.values[:, columns]).sum(axis=0) < FEWEST
-        if not lost.any():
-            kept.append(trial)
-        elif not rows.all():
-            text = f"trial '{trial.name}' has no samples of {outputs[int(np.argmax(lost))]}."
-            findings.append(Finding("an empty trial", text, "left out"))
-    if kept:
-        clean = clean.with_trials(kept)
-        findings += [
-            *faults.other_settings(clean, names, outputs),
-            *faults.clocks(clean),
-        ]
+    trials, more = _trials_with_samples(clean, copies, outputs)
+    findings += more
+    if trials:
+        clean = clean.with_trials(trials)
+        findings += faults.other_settings(clean, names, outputs)
+        findings += faults.clocks(clean)
     else:
-        text = "no trial has samples of all outputs that can be used."
-        findings.append(Finding("an empty recording", text, "refused"))
+        findings.append(
+            Finding(
+                "an empty recording",
+                "no trial has samples of all outputs that can be used.",
+                "refused",
+            )
+        )
     if phase is not None and data is not None:
-        same = len(phase.stretches) == len(recording.trials)
-        findings += inspect_cycles(recording if same else clean, phase, data)
+        of_all = len(phase.stretches) == len(recording.trials)
+        findings += inspect_cycles(recording if of_all else clean, phase, data)
     warn_of(findings)
     return Inspection(tuple(findings), clean)
+
+
+def _without_failures(
+    recording: Recording,
+    name: str,
+    periods: Sequence[float],
+    is_input: bool,
+) -> tuple[Recording, list[Finding]]:
+    """Return the recording without samples of a signal that were certainly not measured."""
+    findings = []
+    for cause, samples_of in _NOT_MEASURED.items():
+        pairs = zip(recording.samples(name), periods, strict=True)
+        bad = [samples_of(x, period, is_input) for (_, x), period in pairs]
+        if any(rows.any() for rows in bad):
+            text = _TEXTS[cause].format(name, places(recording.trials, bad))
+            findings.append(Finding(cause, text, "left out"))
+            recording = _masked(recording, [name], bad)
+    return recording, findings
+
+
+def _trials_with_samples(
+    recording: Recording,
+    copies: Sequence[Bool[np.ndarray, " _"]],
+    outputs: Sequence[str],
+) -> tuple[list[Trial], list[Finding]]:
+    """Return the trials with samples of all outputs; copies of other trials need no finding."""
+    columns = [recording.column(name) for name in outputs]
+    trials = []
+    findings = []
+    for trial, rows in zip(recording.trials, copies, strict=True):
+        lost = np.isfinite(trial.values[:, columns]).sum(axis=0) < FEWEST
+        if not lost.any():
+            trials.append(trial)
+        elif not rows.all():
+            name = outputs[int(np.argmax(lost))]
+            text = f"trial '{trial.name}' has no samples of {name}."
+            findings.append(Finding("an empty trial", text, "left out"))
+    return trials, findings
 
 
 def inspect_cycles(
@@ -129,16 +167,17 @@ def inspect_cycles(
 ) -> list[Finding]:
     """Return the findings that need the phase and the data at the sections."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
-    return [
+    removed = data.records[0].drift or np.inf
+    findings = [
         *faults.odd_cycles(recording, phase),
         *inexact_events(data),
         *faults.other_cycles(recording, phase, outputs),
-        *faults.slow_changes(
-            recording, phase, outputs, data.records[0].drift or np.inf
-        ),
-        *(unanswered(data, [t.name for t in recording.trials]) if outputs else ()),
-        *feedback(data),
+        *faults.slow_changes(recording, phase, outputs, removed),
     ]
+    if outputs:
+        findings += unanswered(data, [trial.name for trial in recording.trials])
+    findings += feedback(data)
+    return findings
 
 
 def _masked(
@@ -159,16 +198,19 @@ def _samples_per_cycle(values: Float[np.ndarray, "n k"]) -> float:
 
     A swing crosses the middle half of the range between the quantiles 10 and 90 %.
     """
-    counts = [float(len(values))]
-    for x in (x[np.isfinite(x)] for x in values.T):
-        low, high = np.quantile(x, [0.1, 0.9]) if len(x) else (0.0, 0.0)
+    counts = []
+    for x in values.T:
+        x = x[np.isfinite(x)]
+        if not len(x):
+            continue
+        low, high = np.quantile(x, [0.1, 0.9])
         margin = 0.25 * (high - low)
-        side = np.where(x > high - margin, 1, np.where(x < low + margin, -1, 0))
+        side = np.sign((x > high - margin) * 1 - (x < low + margin) * 1)
         at = np.flatnonzero(side)
-        up = at[1:][np.diff(side[at]) > 0]
-        if len(up) > 2:
-            counts.append(float(np.median(np.diff(up))))
-    return max(counts[1:] or counts)
+        upward = at[1:][np.diff(side[at]) > 0]
+        if len(upward) > 2:
+            counts.append(float(np.median(np.diff(upward))))
+    return max(counts, default=float(len(values)))
 
 
 class _Part(NamedTuple):
@@ -176,12 +218,28 @@ class _Part(NamedTuple):
 
     trial: int
     time: Float[np.ndarray, " n"]
-    before: Float[np.ndarray, "t k"]
+    before: Signals
     """Outputs of the cycle before the predicted one."""
-    inputs: list[Float[np.ndarray, "t k"]]
+    inputs: list[Signals]
     """Means of each input over parts of the cycles around the predicted one."""
-    outputs: Float[np.ndarray, "t k"]
+    outputs: Signals
     """Outputs of the predicted cycle."""
+
+    def regressors(self) -> Signals:
+        return np.concatenate([self.before, *self.inputs], axis=1)
+
+
+class _Answer(NamedTuple):
+    """The response of the outputs to an input in one part."""
+
+    gain: float
+    """Relative to that learned from other parts."""
+    error: float
+    """Standard error of the gain."""
+    left: float
+    """Mean square of the residuals."""
+    explained: float
+    """Mean square of the learned response."""
 
 
 def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
@@ -197,117 +255,141 @@ def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
     for i, name in enumerate(data.inputs):
         for sections in _SECTIONS:
             parts = [
-                p for r in range(len(data.records)) for p in _parts(data, r, sections)
+                part
+                for record in range(len(data.records))
+                for part in _parts(data, record, sections)
             ]
-            size = [float(p.inputs[i].std()) for p in parts]
-            pushed = [
-                p for p, x in zip(parts, size, strict=True) if x > 0.1 * np.median(size)
-            ]
+            sizes = [float(part.inputs[i].std()) for part in parts]
+            least = 0.1 * np.median(sizes) if sizes else 0.0
+            pushed = list(compress(parts, np.array(sizes) > least))
             answers = _answers(pushed, i)
-            if len(answers):
-                where = [place(names[p.trial], p.time) for p in pushed]
+            if answers:
+                where = [place(names[part.trial], part.time) for part in pushed]
                 yield from _odd(name, answers, where, len(data.inputs) > 1)
                 break
 
 
 def _odd(
-    name: str, answers: Float[np.ndarray, "n 4"], where: list[str], several: bool
+    name: str,
+    answers: Sequence[_Answer],
+    where: Sequence[str],
+    several: bool,
 ) -> Iterator[Finding]:
     """Find odd gains of an input; `where`: places of the parts. `several`: it is not alone."""
-    gain, error, left, explained = answers.T
-    usual = float(np.median(gain))
-    together = abs(error**-2.0 @ gain) / np.sqrt((error**-2.0).sum())
+    gain, error, left, explained = np.array(answers).T
+    weight = error**-2.0
+    together = abs(weight @ gain) / np.sqrt(weight.sum())
     if together < CLEAR and np.mean((gain / error) ** 2) < CLEAR:
-        text = f"the outputs do not answer {name}: was it recorded with them?"
-        yield Finding("no answer", text, "warned" if several else "refused")
+        yield Finding(
+            "no answer",
+            f"the outputs do not answer {name}: was it recorded with them?",
+            "warned" if several else "refused",
+        )
         return
+    usual = float(np.median(gain))
     turned = gain < -np.maximum(usual / 2, CLEAR * error)
-    foreign = (gain < usual / 2) & (gain + CLEAR * error < usual)
+    foreign = (gain < usual / 2) & (gain + CLEAR * error < usual) & ~turned
     disturbed = left > np.maximum(_DISTURBED * np.median(left), explained / 4)
-    first = np.select([turned, foreign, disturbed], [0, 1, 2], -1)
-    texts = {
-        "another sign": "the outputs answer {} with the other sign ({}): turn it.",
-        "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another "
-        "trial, or came earlier or later.",
-        "disturbed": "something else than {} moved the outputs ({}).",
+    disturbed &= ~turned & ~foreign
+    causes = {
+        "another sign": turned,
+        "foreign input": foreign,
+        "disturbed": disturbed,
     }
-    for k, (cause, text) in enumerate(texts.items()):
-        if spans := [where[n] for n in np.flatnonzero(first == k)]:
-            text = text.format(name, listed(spans))
-            yield Finding(
-                cause, text, "refused" if cause == "another sign" else "warned"
-            )
+    for cause, parts in causes.items():
+        if parts.any():
+            text = _TEXTS[cause].format(name, listed(list(compress(where, parts))))
+            action = "refused" if cause == "another sign" else "warned"
+            yield Finding(cause, text, action)
 
 
-def _answers(parts: list[_Part], i: int) -> Float[np.ndarray, "n 4"]:
-    """Return for each part the gain of its response relative to that learned from other trials, its
-    standard error, and mean squares of residuals and of the learned response. Too few: none."""
-    regressors = [np.concatenate([p.before, *p.inputs], axis=1) for p in parts]
+def _answers(parts: Sequence[_Part], i: int) -> list[_Answer]:
+    """Return the answers to input i, learned for each part from other trials (or, of a single
+    trial, from its other parts). Too few: none."""
+    regressors = [part.regressors() for part in parts]
     squares = [x.T @ x for x in regressors]
     products = [x.T @ p.outputs for x, p in zip(regressors, parts, strict=True)]
     answers = []
-    for n, (part, x) in enumerate(zip(parts, regressors, strict=True)):
-        training = [k for k, p in enumerate(parts) if p.trial != part.trial]
-        training = training or [k for k in range(len(parts)) if k != n]
-        unknowns = x.shape[1]
+    for n, part in enumerate(parts):
+        training = [k for k, other in enumerate(parts) if other.trial != part.trial]
+        if not training:
+            training = [k for k in range(len(parts)) if k != n]
+        unknowns = regressors[n].shape[1]
         if sum(len(regressors[k]) for k in training) < _ENOUGH * unknowns:
-            return np.zeros((0, 4))
+            return []
         square = np.sum([squares[k] for k in training], axis=0)
-        square += (
-            1e-4 * np.trace(square) / unknowns * np.eye(unknowns)
-        )  # of collinear inputs
-        b = np.linalg.solve(square, np.sum([products[k] for k in training], axis=0))
-        first = sum(u.shape[1] for u in (part.before, *part.inputs[:i]))
-        predicted = part.inputs[i] @ b[first : first + part.inputs[i].shape[1]]
-        response = part.outputs - x @ b + predicted
-        power = float((predicted**2).sum())
-        gain = float((response * predicted).sum()) / power
-        each = ((response - gain * predicted) * predicted).sum(axis=1)
-        error = float(np.sqrt((each**2).sum())) / power
-        left = float(((response - predicted) ** 2).mean())
-        answers.append((gain, error, left, float((predicted**2).mean())))
-    return np.array(answers).reshape(-1, 4)
+        product = np.sum([products[k] for k in training], axis=0)
+        # Inputs may be collinear.
+        ridge = 1e-4 * np.trace(square) / unknowns
+        b = np.linalg.solve(square + ridge * np.eye(unknowns), product)
+        answers.append(_answer(part, i, b))
+    return answers
+
+
+def _answer(part: _Part, i: int, b: Signals) -> _Answer:
+    """Return the answer to input i of a part, where b are learned coefficients."""
+    first = sum(x.shape[1] for x in (part.before, *part.inputs[:i]))
+    of_input = slice(first, first + part.inputs[i].shape[1])
+    predicted = part.inputs[i] @ b[of_input]
+    response = part.outputs - part.regressors() @ b + predicted
+    power = float((predicted**2).sum())
+    gain = float((response * predicted).sum()) / power
+    by_cycle = ((response - gain * predicted) * predicted).sum(axis=1)
+    return _Answer(
+        gain=gain,
+        error=float(np.linalg.norm(by_cycle)) / power,
+        left=float(((response - predicted) ** 2).mean()),
+        explained=float((predicted**2).mean()),
+    )
 
 
 def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     """Yield the parts of a record, inputs in their rms, outputs in robust standard deviations."""
-    record, N = data.records[r], data.n_sections
-    sections = min(N, sections)
-    first, ahead = -record.first_section % N, -(-record.lead // N)
-    size_u, size_y = data.rms()
-    robust = 1.4826 * np.nanmedian(
-        np.abs(np.concatenate([x.y for x in data.records])), axis=0
-    )
-    size_y = np.maximum(
-        robust, 0.1 * size_y
-    )  # (more than half of the samples may be zero)
-    at = np.linspace(0, N, sections, endpoint=False).astype(int)
+    record = data.records[r]
+    N = data.n_sections
+    first = -record.first_section % N
     cycles = (len(record.u) - first) // N
     number = min(_PARTS, cycles // _SHORTEST)
-    edges = np.linspace(0, cycles, number + 1).astype(int)[: number and None]
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        where = slice(first + a * N, first + b * N)
-        u = (record.u[where] / size_u).reshape(b - a, N, -1)
-        y = (record.y[where] / size_y).reshape(b - a, N, -1)[:, at].reshape(b - a, -1)
-        y = np.clip(y, -8, 8)  # outliers
-        means = [x.mean(axis=1) for x in np.array_split(u, sections, axis=1)]
-        u, rows = np.stack(means, axis=1), np.arange(1, b - a - ahead)
+    if not number:
+        return
+    whole = slice(first, first + cycles * N)
+    u = (record.u[whole] / data.rms()[0]).reshape(cycles, N, -1)
+    y = (record.y[whole] / _robust_size(data)).reshape(cycles, N, -1)
+    sections = min(N, sections)
+    means = [x.mean(axis=1) for x in np.array_split(u, sections, axis=1)]
+    u = np.stack(means, axis=1)
+    at = np.linspace(0, N, sections, endpoint=False).astype(int)
+    y = np.clip(y[:, at].reshape(cycles, -1), -8, 8)  # outliers
+    time = data.times[r][whole].reshape(cycles, N)
+    ahead = -(-record.lead // N)
+    edges = np.linspace(0, cycles, number + 1).astype(int)
+    for a, b in pairwise(edges):
+        rows = np.arange(a + 1, b - ahead)
         inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
-        usable = np.isfinite(inputs).all(axis=(1, 2, 3))
-        usable &= np.isfinite(y[rows - 1]).all(axis=1) & np.isfinite(y[rows]).all(
-            axis=1
-        )
-        if usable.sum() >= _SHORTEST / 2:
-            rows, inputs = rows[usable], inputs[usable]
-            each = [
-                _centered(inputs[..., i].reshape(len(rows), -1))
-                for i in range(u.shape[2])
-            ]
-            before, outputs = _centered(y[rows - 1]), _centered(y[rows])
-            yield _Part(data.trials[r], data.times[r][where], before, each, outputs)
+        known = np.isfinite(inputs).all(axis=(1, 2, 3))
+        known &= np.isfinite(y[rows - 1]).all(axis=1)
+        known &= np.isfinite(y[rows]).all(axis=1)
+        rows = rows[known]
+        if len(rows) >= _SHORTEST / 2:
+            by_input = np.moveaxis(inputs[known], -1, 0)
+            yield _Part(
+                trial=data.trials[r],
+                time=time[a:b].ravel(),
+                before=_centered(y[rows - 1]),
+                inputs=[_centered(x.reshape(len(rows), -1)) for x in by_input],
+                outputs=_centered(y[rows]),
+            )
 
 
-def _centered(x: Float[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
+def _robust_size(data: SectionData) -> Float[np.ndarray, " ny"]:
+    """Return standard deviations of the outputs from the medians of their moduli, but not less than
+    a tenth of the rms: more than half of the samples may be zero."""
+    deviations = np.abs(np.concatenate([record.y for record in data.records]))
+    robust = 1.4826 * np.nanmedian(deviations, axis=0)
+    return np.maximum(robust, 0.1 * data.rms()[1])
+
+
+def _centered(x: Signals) -> Signals:
     """Subtract the means: each part has a level of its own."""
     return x - x.mean(axis=0)
 
@@ -315,30 +397,34 @@ def _centered(x: Float[np.ndarray, "t k"]) -> Float[np.ndarray, "t k"]:
 def inexact_events(data: SectionData) -> Iterator[Finding]:
     """Find events whose times scatter: outputs after them deviate along the average cycle, by times
     that do not depend on those of the events before."""
-    N, size = data.n_sections, data.rms()[1]
+    N = data.n_sections
+    size = data.rms()[1]
+    tiny = np.finfo(float).tiny
     waves = 2j * np.pi * np.fft.fftfreq(N, 1 / N)[:, None]
-    slope = (
-        np.fft.ifft(waves * np.fft.fft(data.cycle_outputs, axis=0), axis=0).real / size
-    )
-    slope, late, whole, left = slope[: N // 5].ravel(), [], 0.0, 0.0
-    for r in data.records:
-        first = -r.first_section % N
-        y = (r.y[first:] / size)[: (len(r.y) - first) // N * N].reshape(
-            -1, N * len(size)
-        )
-        y = y[np.isfinite(y[:, : len(slope)]).all(axis=1), : len(slope)]
-        late.append(y @ slope / max(slope @ slope, np.finfo(float).tiny))
-        whole, left = (
-            whole + (y**2).sum(),
-            left + ((y - late[-1][:, None] * slope) ** 2).sum(),
-        )
-    times = np.concatenate(late)
-    follows = abs(times[1:] @ times[:-1]) / max(times @ times, np.finfo(float).tiny)
+    spectrum = np.fft.fft(data.cycle_outputs, axis=0)
+    slope = np.fft.ifft(waves * spectrum, axis=0).real / size
+    slope = slope[: N // 5].ravel()
+    times = []
+    whole = 0.0
+    left = 0.0
+    for record in data.records:
+        first = -record.first_section % N
+        cycles = (len(record.y) - first) // N
+        y = (record.y / size)[first : first + cycles * N]
+        y = y.reshape(cycles, N * len(size))[:, : len(slope)]
+        y = y[np.isfinite(y).all(axis=1)]
+        late = y @ slope / max(slope @ slope, tiny)
+        times.append(late)
+        whole += (y**2).sum()
+        left += ((y - late[:, None] * slope) ** 2).sum()
+    late = np.concatenate(times)
+    follows = abs(late[1:] @ late[:-1]) / max(late @ late, tiny)
     # (Times beyond a cycle are those of outputs that do not change along it.)
-    if left < (1 - _SHIFTED) * whole and follows < 0.5 and times.std() < 1:
-        text = f"the starts of cycles seem to scatter by {times.std():.2g} of a cycle: use an angle"
+    if left < (1 - _SHIFTED) * whole and follows < 0.5 and late.std() < 1:
         yield Finding(
-            "inexact events", f"{text}, or a crossing where the signal changes fast."
+            "inexact events",
+            f"the starts of cycles seem to scatter by {late.std():.2g} of a cycle: use an angle, "
+            "or a crossing where the signal changes fast.",
         )
 
 
@@ -351,22 +437,32 @@ def feedback(data: SectionData) -> Iterator[Finding]:
     regression on it is unbiased (Söderström and Stoica, *System Identification*, 1989, ch. 10:
     direct identification in closed loop). The same holds if an output leaks into the input.
     """
+    if data.cycles < 6:
+        return
     deviations, _ = data.rms()
-    shapes = np.nan_to_num(data.cycle_outputs - np.nanmean(data.cycle_outputs, axis=0))
-    for i, name in enumerate(data.inputs if data.cycles >= 6 else ()):
-        repeated = float(np.nanvar(data.cycle_inputs[:, i]))
-        share = repeated / max(
-            repeated + float(deviations[i]) ** 2, np.finfo(float).tiny
-        )
+    shapes = _varying(data.cycle_outputs)
+    for name, cycle, deviation in zip(
+        data.inputs, data.cycle_inputs.T, deviations, strict=True
+    ):
+        repeated = float(np.nanvar(cycle))
+        share = repeated / max(repeated + float(deviation) ** 2, np.finfo(float).tiny)
         if share > 0.5:
-            text = f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: "
-            yield Finding("feedback", f"{text}fits are biased. {NAME_REFERENCE}")
-        elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
-            mean = np.nan_to_num(
-                data.cycle_inputs[:, i] - np.nanmean(data.cycle_inputs[:, i])
+            yield Finding(
+                "feedback",
+                f"{100 * share:.0f} % of the variance of {name} repeats with the cycle: fits are "
+                f"biased. {NAME_REFERENCE}",
             )
-            left = mean - shapes @ np.linalg.lstsq(shapes, mean)[0]
-            if left @ left < 0.1 * (mean @ mean):
-                text = f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats "
-                text += "as they do): fits are biased. Name the perturbation alone as the input."
-                yield Finding("feedback", text)
+        elif share > CLEAR**2 / data.cycles and data.n_sections > 2 * shapes.shape[1]:
+            shape = _varying(cycle)
+            unlike = shape - shapes @ np.linalg.lstsq(shapes, shape)[0]
+            if unlike @ unlike < 0.1 * (shape @ shape):
+                yield Finding(
+                    "feedback",
+                    f"{name} contains the outputs ({100 * share:.0f} % of its variance repeats as "
+                    "they do): fits are biased. Name the perturbation alone as the input.",
+                )
+
+
+def _varying(cycle: np.ndarray) -> np.ndarray:
+    """Return an average cycle without its mean; zero where it is unknown."""
+    return np.nan_to_num(cycle - np.nanmean(cycle, axis=0))
