@@ -22,20 +22,32 @@ from .model import Forecast, Intervals, Table, forecast, tabulated
 WAVES = 20
 # Most Gauss-Newton steps, and most halvings of a step or updates of jitter, smoothness and
 # miscounted intervals. More: time. Fewer: fits end before convergence.
-_STEPS, _ROUNDS = 30, 8
+_STEPS = 30
+_ROUNDS = 8
 # Relative changes at convergence: of the cost, and of jitter and smoothness. Larger: estimates
 # depend on the start. Smaller: more iterations for digits that noise hides.
-_SETTLED, _SAME = 1e-6, 0.01
+_SETTLED = 1e-6
+_SAME = 0.01
 # Blocks from which standard errors are computed: one per trial if there are so many, else parts of
 # trials with at least so many intervals. More, shorter: blocks are not independent. Fewer, longer:
 # standard errors scatter.
-_BLOCKS, _SHORTEST_BLOCK = 30, 10
+_BLOCKS = 30
+_SHORTEST_BLOCK = 10
+
+
+_TINY = np.finfo(float).tiny
+
+Curve = Float[np.ndarray, " p"]
+Square = Float[np.ndarray, "p p"]
+Lanes = Float[np.ndarray, " L"]
+"""A number for each interval."""
+Slopes = Float[np.ndarray, "L p"]
 
 
 class Smoothness(NamedTuple):
     """The prior of a curve."""
 
-    penalty: Float[np.ndarray, " p"]
+    penalty: Curve
     """Addition to the curvature of the sum of squares; zero for the mean."""
     noise: float
     """Variance of the residual of an interval, s^2, times the excess."""
@@ -44,30 +56,44 @@ class Smoothness(NamedTuple):
     evidence: float
     """Twice the logarithm of the likelihood ratio to a flat curve."""
 
+    @staticmethod
+    def none(waves: int) -> "Smoothness":
+        return Smoothness(np.zeros(waves + 1), noise=0.0, excess=1.0, evidence=0.0)
+
 
 class CurveFit(NamedTuple):
     """A curve and the rates of the trials."""
 
-    coefficients: Float[np.ndarray, " p"]
+    coefficients: Curve
     rates: Float[np.ndarray, " trials"]
     jitter: float
     """Standard deviation of the phase at the end of a cycle."""
     used: Bool[np.ndarray, " L"]
     """Intervals that are not miscounted."""
-    residual: Float[np.ndarray, " L"]
+    residual: Lanes
     """Residuals of the durations, in s."""
     forecast: Forecast
     smoothness: Smoothness
     converged: bool
 
     @property
-    def penalty(self) -> Float[np.ndarray, " p"]:
+    def penalty(self) -> Curve:
         return self.smoothness.penalty
+
+    @property
+    def by_rate(self) -> Lanes:
+        """Derivatives of the durations with respect to the rate of their trial."""
+        return self.forecast.slopes[:, -1]
+
+    @property
+    def missed(self) -> Lanes:
+        """By how many cycles each interval misses its forecast."""
+        return self.residual * self.forecast.rate
 
     def counted(self) -> Bool[np.ndarray, " L"]:
         """Return the intervals whose forecast is off by less than half a cycle: others contain a
         missed or a false event."""
-        return np.abs(self.residual * self.forecast.rate) < 0.5
+        return np.abs(self.missed) < 0.5
 
 
 def fit_curve(
@@ -79,36 +105,55 @@ def fit_curve(
     Intervals whose forecast is off by half a cycle or more were miscounted, and not used.
     `start`: a fit with as many half waves or fewer.
     """
-    flat = Smoothness(np.zeros(waves + 1), 0.0, 1.0, 0.0)
-    if start is None:
-        used = np.ones(len(intervals.start), bool)
-        rates = intervals.sums(1.0 * used) / intervals.sums(intervals.duration)
-        ahead = Forecast(0.0 * used, 0.0 * used, np.zeros((len(used), waves + 2)))
-        fit = CurveFit(
-            np.zeros(waves + 1), rates, 0.0, used, ahead.rate, ahead, flat, True
-        )
-    else:
-        a = np.pad(start.coefficients, (0, waves + 1 - len(start.coefficients)))
-        fit = start._replace(coefficients=a, used=start.counted(), smoothness=flat)
+    fit = _start(intervals, waves, start)
+    rough = fit.smoothness
     for _ in range(_ROUNDS):
-        table, before = tabulated(waves, fit.jitter), fit
+        before = fit
+        table = tabulated(waves, fit.jitter)
         if waves:
-            rough = _look(intervals, table, fit._replace(smoothness=flat))
-            fit = fit._replace(smoothness=_smoothness(intervals, rough))
+            without = _look(intervals, table, fit._replace(smoothness=rough))
+            fit = fit._replace(smoothness=_smoothness(intervals, without))
         fit = _minimize(intervals, table, _look(intervals, table, fit))
         used = fit.counted()
-        fit = fit._replace(
-            jitter=float((fit.residual * fit.forecast.rate)[used].std()), used=used
-        )
-        same = abs(fit.jitter - before.jitter) < _SAME * fit.jitter
-        change = abs(before.penalty[-1] - fit.penalty[-1])
-        if (
-            same
-            and (used == before.used).all()
-            and change <= 10 * _SAME * fit.penalty[-1]
-        ):
+        fit = fit._replace(jitter=float(fit.missed[used].std()), used=used)
+        if _is_settled(before, fit):
             break
     return fit
+
+
+def _start(intervals: Intervals, waves: int, start: CurveFit | None) -> CurveFit:
+    """Return another fit with so many half waves, or, without one, the mean rate of each trial."""
+    smoothness = Smoothness.none(waves)
+    if start is not None:
+        more = waves + 1 - len(start.coefficients)
+        return start._replace(
+            coefficients=np.pad(start.coefficients, (0, more)),
+            used=start.counted(),
+            smoothness=smoothness,
+        )
+    L = len(intervals.start)
+    counts = intervals.sums(np.ones(L))
+    return CurveFit(
+        coefficients=np.zeros(waves + 1),
+        rates=counts / intervals.sums(intervals.duration),
+        jitter=0.0,
+        used=np.ones(L, bool),
+        residual=np.zeros(L),
+        forecast=Forecast(np.zeros(L), np.zeros(L), np.zeros((L, waves + 2))),
+        smoothness=smoothness,
+        converged=True,
+    )
+
+
+def _is_settled(before: CurveFit, fit: CurveFit) -> bool:
+    """Return whether a round changed neither jitter, nor smoothness, nor the used intervals."""
+    stiffness = fit.penalty[-1]
+    change = abs(before.penalty[-1] - stiffness)
+    return (
+        abs(fit.jitter - before.jitter) < _SAME * fit.jitter
+        and change <= 10 * _SAME * stiffness
+        and bool((fit.used == before.used).all())
+    )
 
 
 def _look(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
@@ -121,99 +166,132 @@ def _look(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
 def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
     """Gauss-Newton iteration over curve and rates."""
 
-    def cost_of(fit):
-        a = fit.coefficients
-        return float((fit.residual[fit.used] ** 2).sum() + a @ (fit.penalty * a))
-
+    cost = _cost(fit)
     for _ in range(_STEPS):
         across, along = projected(intervals, fit)
         curvature = across.T @ across + np.diag(fit.penalty)
         downhill = across.T @ fit.residual - fit.penalty * fit.coefficients
         step = np.linalg.lstsq(curvature, downhill)[0]
         faster = along @ np.append(1.0, -step)
-        for k in range(_ROUNDS):
-            rates = np.maximum(fit.rates + faster / 2**k, fit.rates / 2)  # (never zero)
-            new = fit._replace(coefficients=fit.coefficients + step / 2**k, rates=rates)
-            new = _look(intervals, table, new)
-            if cost_of(new) < cost_of(fit):
+        for halving in range(_ROUNDS):
+            part = 0.5**halving
+            rates = fit.rates + part * faster
+            trial = fit._replace(
+                coefficients=fit.coefficients + part * step,
+                rates=np.maximum(rates, fit.rates / 2),  # (never zero)
+            )
+            trial = _look(intervals, table, trial)
+            if _cost(trial) < cost:
                 break
         else:
             return fit
-        gain, fit = 1 - cost_of(new) / cost_of(fit), new
+        gain = 1 - _cost(trial) / cost
+        fit = trial
+        cost = _cost(fit)
         if gain < _SETTLED:
             return fit
     return fit._replace(converged=False)
 
 
+def _cost(fit: CurveFit) -> float:
+    """Return the penalized sum of squares."""
+    squares = fit.residual[fit.used] ** 2
+    roughness = fit.coefficients @ (fit.penalty * fit.coefficients)
+    return float(squares.sum() + roughness)
+
+
 def projected(
     intervals: Intervals, fit: CurveFit
-) -> tuple[Float[np.ndarray, "L p"], Float[np.ndarray, "trials p1"]]:
+) -> tuple[Slopes, Float[np.ndarray, "trials p1"]]:
     """Return derivatives with respect to the coefficients, without the part that the rates of the
     trials explain (zero for miscounted intervals), and what rates explain of the residuals, and of
     these derivatives."""
-    slopes, by_rate = fit.forecast.slopes[:, :-1], fit.forecast.slopes[:, -1]
-    square = np.maximum(intervals.sums(by_rate**2 * fit.used), np.finfo(float).tiny)
+    slopes = fit.forecast.slopes[:, :-1]
+    by_rate = fit.by_rate
+    square = np.maximum(intervals.sums(by_rate**2 * fit.used), _TINY)
     columns = np.column_stack([fit.residual, slopes]) * (by_rate * fit.used)[:, None]
-    along = np.stack([intervals.sums(x) for x in columns.T], axis=1) / square[:, None]
-    return (slopes - by_rate[:, None] * along[intervals.trial, 1:]) * fit.used[
-        :, None
-    ], along
+    products = np.stack([intervals.sums(x) for x in columns.T], axis=1)
+    along = products / square[:, None]
+    across = slopes - by_rate[:, None] * along[intervals.trial, 1:]
+    return across * fit.used[:, None], along
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
     """Return the blocks whose errors count as independent: successive intervals of one trial."""
-    trial, counts = intervals.trial, np.bincount(intervals.trial)
+    trial = intervals.trial
+    counts = np.bincount(trial)
     if len(counts) >= _BLOCKS:
         return trial
     length = max(_SHORTEST_BLOCK, len(trial) // (2 * _BLOCKS))
     place = np.concatenate([np.arange(n) for n in counts])
-    block = np.minimum(place // length, np.maximum(counts[trial] // length, 1) - 1)
+    last = np.maximum(counts[trial] // length, 1) - 1
+    block = np.minimum(place // length, last)
     return np.unique(trial * (block.max() + 1) + block, return_inverse=True)[1]
 
 
 def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     """Maximize the marginal likelihood of the durations near a fit."""
-    tiny = np.finfo(float).tiny
     across, along = projected(intervals, fit)
-    residual = (
-        fit.residual - fit.forecast.slopes[:, -1] * along[intervals.trial, 0]
-    ) * fit.used
-    p = across.shape[1]
-    curvature, pull = across.T @ across, across.T @ residual
-    # Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
-    noise_only = residual - across @ np.linalg.lstsq(curvature, pull)[0]
-    freedom = max(int(fit.used.sum()) - len(fit.rates) - p, 1)
-    variance = float(noise_only @ noise_only) / freedom
-    block = _blocks(intervals)
-    sums = np.stack([np.bincount(block, x * noise_only) for x in across.T], axis=1)
-    values, axes = np.linalg.eigh(curvature)
-    determined = values > 1e-6 * values[-1]  # beyond rounding
-    excess = float(((sums @ axes[:, determined]) ** 2 / values[determined]).sum())
-    excess = (
-        max(excess / int(determined.sum()) / variance, 1.0) if variance > 0 else 1.0
-    )
-    noise, weight = variance * excess, np.arange(1.0, p) ** 4
-    score = pull + curvature @ fit.coefficients
+    by_rates = fit.by_rate * along[intervals.trial, 0]
+    residual = (fit.residual - by_rates) * fit.used
+    noise, excess = _noise(intervals, fit, across, residual)
+    weight = np.arange(1.0, across.shape[1]) ** 4
+    curvature = across.T @ across
+    score = across.T @ residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
     share = curvature[1:, 0] / curvature[0, 0]
     inner = curvature[1:, 1:] - np.outer(share, curvature[0, 1:])
+    pull = score[1:] - share * score[0]
     gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
-    gain = np.maximum(gain, 0.0) / max(noise, tiny)
-    pull = (axes.T @ ((score[1:] - share * score[0]) / np.sqrt(weight))) ** 2
-    pull = pull / max(noise, tiny) ** 2
+    unit = max(noise, _TINY)
+    gain = np.maximum(gain, 0.0) / unit
+    power = (axes.T @ (pull / np.sqrt(weight)) / unit) ** 2
 
     def improbable(log_size: float) -> float:
+        """Return minus twice the logarithm of the likelihood of tau^2."""
         size = np.exp(log_size)
-        return float((np.log1p(size * gain) - size * pull / (1 + size * gain)).sum())
+        return float((np.log1p(size * gain) - size * power / (1 + size * gain)).sum())
 
     # Logarithms of tau^2, around that at which the best direction is half noise.
-    grid = np.arange(-24.0, 24.5, 0.5) - np.log(max(gain[-1], tiny))
+    grid = np.arange(-24.0, 24.5, 0.5) - np.log(max(gain[-1], _TINY))
     best = grid[np.argmin([improbable(x) for x in grid])]
     top = optimize.minimize_scalar(
-        improbable, bounds=(best - 0.5, best + 0.5), method="bounded"
+        improbable,
+        bounds=(best - 0.5, best + 0.5),
+        method="bounded",
     )
-    penalty = np.append(0.0, noise * weight / np.exp(top.x))
-    return Smoothness(penalty, noise, excess, max(-float(top.fun), 0.0))
+    return Smoothness(
+        penalty=np.append(0.0, noise * weight / np.exp(top.x)),
+        noise=noise,
+        excess=excess,
+        evidence=max(-float(top.fun), 0.0),
+    )
+
+
+def _noise(
+    intervals: Intervals,
+    fit: CurveFit,
+    across: Slopes,
+    residual: Lanes,
+) -> tuple[float, float]:
+    """Return the variance of noise, and its excess in sums over blocks.
+
+    Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
+    """
+    curvature = across.T @ across
+    noise = residual - across @ np.linalg.lstsq(curvature, across.T @ residual)[0]
+    freedom = int(fit.used.sum()) - len(fit.rates) - across.shape[1]
+    variance = float(noise @ noise) / max(freedom, 1)
+    if not variance > 0:
+        return 0.0, 1.0
+    block = _blocks(intervals)
+    sums = np.stack([np.bincount(block, x * noise) for x in across.T], axis=1)
+    values, axes = np.linalg.eigh(curvature)
+    determined = values > 1e-6 * values[-1]  # beyond rounding
+    ratios = (sums @ axes[:, determined]) ** 2 / values[determined]
+    each = float(ratios.sum()) / int(determined.sum()) / variance
+    excess = max(each, 1.0)
+    return variance * excess, excess
 
 
 def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float, float]:
@@ -226,21 +304,26 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     they claim).
     """
     across, _ = projected(intervals, fit)
-    data, smooth = across.T @ across, np.diag(fit.penalty)
-    curvature, block = data + smooth, _blocks(intervals)
-    count, p = int(block.max()) + 1, across.shape[1]
-    score, shares, left_out = (
-        np.zeros((count, p)),
-        np.zeros((count, p, p)),
-        np.zeros(count),
-    )
-    for k in range(count):
+    data = across.T @ across
+    smooth = np.diag(fit.penalty)
+    curvature = data + smooth
+    block = _blocks(intervals)
+    score = []
+    shares = []
+    left_out = 0.0
+    for k in range(int(block.max()) + 1):
         rows = (block == k) & fit.used
-        x, error = across[rows], fit.residual[rows]
-        shares[k] = x.T @ x
-        error = error + x @ np.linalg.lstsq(curvature - shares[k], x.T @ error)[0]
-        score[k], left_out[k] = x.T @ error, error @ error
-    meat = score.T @ score + fit.smoothness.noise * smooth
-    covariance = sandwich(curvature, meat, shares + smooth / count)
+        x = across[rows]
+        error = fit.residual[rows]
+        share = x.T @ x
+        by_others = np.linalg.lstsq(curvature - share, x.T @ error)[0]
+        error = error + x @ by_others
+        shares.append(share)
+        score.append(x.T @ error)
+        left_out += float(error @ error)
+    scores = np.array(score)
+    meat = scores.T @ scores + fit.smoothness.noise * smooth
+    parts = np.array(shares) + smooth / len(shares)
+    covariance = sandwich(curvature, meat, parts)
     detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
-    return covariance, float(left_out.sum()), detail
+    return covariance, left_out, detail
