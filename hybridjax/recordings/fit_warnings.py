@@ -220,8 +220,6 @@ def about_natural_multipliers(result: Any) -> Iterator[Finding]:
     if high >= 1:
         text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
         yield Finding("stability", text)
-    if result.doubt:
-        yield Finding("order", result.doubt)
 
 
 def about_phase_response(r: Any) -> Iterator[Finding]:

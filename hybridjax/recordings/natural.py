@@ -11,6 +11,7 @@ has no such bias (instrumental variables, two-stage least squares: Söderström 
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Annotated, NamedTuple
 
 import equinox as eqx
@@ -55,8 +56,8 @@ class NaturalMultipliers(eqx.Module):
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
-    - `doubt`: a sentence if one multiplier more changes the largest modulus, as one for slow drift
-      of the outputs does; else "".
+    - `findings`: reasons to doubt the multipliers. One of them is that one multiplier more changes
+      the largest modulus, as one for slow drift of the outputs does.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -67,7 +68,7 @@ class NaturalMultipliers(eqx.Module):
     cycles: int = eqx.field(static=True)
     records: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
-    doubt: str = eqx.field(static=True, default="")
+    findings: tuple[Finding, ...] = ()
 
     def interval(
         self, level: Probability = 0.95, *, plain: bool = False
@@ -78,30 +79,29 @@ class NaturalMultipliers(eqx.Module):
         They are percentiles of the bootstrap, widened by the ratio of Student's distribution for so
         many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015).
         """
-        n = max(self.cycles / self.block, 2.0)
-        reach = np.sqrt(n / (n - 1)) * stats.t.ppf((1 + level) / 2, n - 1)
+        blocks = max(self.cycles / self.block, 2.0)
+        wider = np.sqrt(blocks / (blocks - 1))
+        reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
         draws = self.plain_draws if plain else self.draws
         return np.quantile(np.abs(draws), stats.norm.cdf([-reach, reach]), axis=0).T
 
-    @property
-    def warnings(self) -> tuple[Finding, ...]:
-        """Limits of what the data support."""
-        return tuple(about_natural_multipliers(self))
-
     def __repr__(self) -> str:
-        d, b = len(self.multipliers), self.block
         lines = [
-            f"NaturalMultipliers({self.cycles} cycles, order {d}, blocks of {b} cycles)"
+            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
+            f"{self.block} cycles)",
+            *_printed("by instruments", self.multipliers, self.interval()),
+            *_printed("least squares", self.plain, self.interval(plain=True)),
+            print_findings(self.findings, "  "),
         ]
-        for plain, values in enumerate((self.multipliers, self.plain)):
-            for z, (low, high) in zip(
-                values, self.interval(plain=bool(plain)), strict=True
-            ):
-                name = "least squares" if plain else "by instruments"
-                value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
-                bounds = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
-                lines.append(f"  {name:15s} {value:>15s}   {bounds}")
-        return "\n".join([*lines, print_findings(self.warnings, "  ")]).rstrip()
+        return "\n".join(lines).rstrip()
+
+
+def _printed(name: str, multipliers: Draws, bounds: np.ndarray) -> Iterator[str]:
+    for z, (low, high) in zip(multipliers, bounds, strict=True):
+        value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+        yield (
+            f"  {name:15s} {value:>15s}   modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
+        )
 
 
 @checked
@@ -128,30 +128,43 @@ def natural_multipliers(
     - `data`: result of `section_data(..., inputs=())`; the average cycle of each trial is
       subtracted.
     - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
-      one multiplier more contradicts the largest modulus, `doubt` says so. Default: 1.
+      one multiplier more contradicts the largest modulus, `findings` say so. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short.
 
     **Raises:** `DefinitionError` for too few cycles or signals.
     """
     result = _estimate(data, order, seed)
+    findings = list(about_natural_multipliers(result))
     try:
         larger = _estimate(data, order + 1, seed)
     except DefinitionError:
-        return result
-    pair = [(abs(x.multipliers[0]), x.interval()[0]) for x in (result, larger)]
-    agree = any(low <= z <= high for (z, _), (_, (low, high)) in (pair, pair[::-1]))
-    text = f"{order + 1} multipliers give {pair[1][0]:.3f} for the largest modulus: raise `order`"
-    text += ", or, if outputs drift, take them `without_drift`."
-    return result if agree else dataclasses.replace(result, doubt=text)
+        larger = None
+    if larger is not None and not (
+        _contains(result, larger) or _contains(larger, result)
+    ):
+        findings.append(
+            Finding(
+                "order",
+                f"{order + 1} multipliers give {abs(larger.multipliers[0]):.3f} for the largest "
+                "modulus: raise `order`, or, if outputs drift, take them `without_drift`.",
+            )
+        )
+    return dataclasses.replace(result, findings=tuple(findings))
+
+
+def _contains(result: NaturalMultipliers, other: NaturalMultipliers) -> bool:
+    """Return whether the interval of the largest modulus contains that of another result."""
+    low, high = result.interval()[0]
+    return bool(low <= abs(other.multipliers[0]) <= high)
 
 
 def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     """Estimate so many multipliers, without a second number of them."""
     moments = _moments(data, order)
     K = len(moments.records)
-    counts = np.unique(moments.records, return_counts=True)[1]
-    length, block = K / len(counts), max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
+    _, counts = np.unique(moments.records, return_counts=True)
+    block = max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
     if np.median(counts) < _SHORTEST_BLOCK * block and len(counts) >= _SHORTEST_BLOCK:
         block = int(counts.max())
     rng = np.random.default_rng(seed)
@@ -161,18 +174,22 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     state, forward, square, cross, ahead = (
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
     )
-    first = np.linalg.pinv(square, hermitian=True) @ np.swapaxes(cross, 2, 3)
-    by_instruments = _corrected(
-        _multipliers(ahead @ first @ np.linalg.pinv(cross @ first)), length
-    )
+    first_stage = np.linalg.pinv(square, hermitian=True) @ cross.mT
+    by_instruments = ahead @ first_stage @ np.linalg.pinv(cross @ first_stage)
+    multipliers = _corrected(_multipliers(by_instruments), K / len(counts))
     plain = _multipliers(forward @ np.linalg.inv(state))
-    explained = cross[0] @ np.linalg.solve(square[0], np.swapaxes(cross[0], 1, 2))
-    shares = np.trace(explained, axis1=1, axis2=2) / np.trace(
-        state[0], axis1=1, axis2=2
-    )
-    draws, plain_draws, strength = by_instruments[1:], plain[1:], float(shares.mean())
+    explained = cross[0] @ np.linalg.solve(square[0], cross[0].mT)
+    whole = np.trace(state[0], axis1=1, axis2=2)
+    shares = np.trace(explained, axis1=1, axis2=2) / whole
     return NaturalMultipliers(
-        by_instruments[0], plain[0], draws, plain_draws, strength, K, len(counts), block
+        multipliers=multipliers[0],
+        plain=plain[0],
+        draws=multipliers[1:],
+        plain_draws=plain[1:],
+        strength=float(shares.mean()),
+        cycles=K,
+        records=len(counts),
+        block=block,
     )
 
 
@@ -198,55 +215,78 @@ def _moments(data: SectionData, order: int) -> _Moments:
 
     **Raises:** `DefinitionError` for too few cycles, or signals, for so many.
     """
-    N, before = (
-        data.n_sections,
-        3 * _EACH + 1,
-    )  # of instruments there is one section more
+    N = data.n_sections
     size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
-    y = [r.y / size for r in data.records]
     if order > _EACH * len(size):
         raise DefinitionError(
             f"`order` must be at most {_EACH * len(size)}, the size of a state."
         )
-    rows = np.array(
-        [
-            (s, (r.first_section + k) // N, (r.first_section + k) % N, k)
-            for s, r in enumerate(data.records)
-            for k in range(before - 1, len(r.y) - N)
-        ]
-    ).reshape(-1, 4)
+    rows = _rows(data)
     names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
-    K, needed = len(names), 2 * (_EACH * order + 2)
+    K = len(names)
+    needed = 2 * (_EACH * order + 2)
     if K < needed:
-        text = f"{K} cycles that are followed by another one are too few for {order} multipliers"
-        raise DefinitionError(f"{text}: record {needed} or more.")
-
-    def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
-        return np.array(
-            [y[s][k - shift - np.arange(count)].ravel() for s, _, _, k in rows]
+        raise DefinitionError(
+            f"{K} cycles that are followed by another one are too few for {order} multipliers: "
+            f"record {needed} or more."
         )
 
-    state, after = values(0, _EACH), values(-N, _EACH)
+    def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
+        """Return the outputs of so many sections, the last one `shift` before the state."""
+        return np.array(
+            [
+                (data.records[s].y[k - shift - np.arange(count)] / size).ravel()
+                for s, _, _, k in rows
+            ]
+        )
+
+    state = values(0, _EACH)
+    after = values(-N, _EACH)
     instruments = values(2 * _EACH - 1, _EACH + 1)
-    finite = np.isfinite(np.concatenate([state, after, instruments], axis=1)).all(
-        axis=1
+    known = np.isfinite(np.hstack([state, after, instruments])).all(axis=1)
+    most = min(_EACH * (order + 1), instruments.shape[1])
+    moments = _Moments(
+        state=np.zeros((N, K, order, order)),
+        forward=np.zeros((N, K, order, order)),
+        square=np.zeros((N, K, most, most)),
+        cross=np.zeros((N, K, order, most)),
+        ahead=np.zeros((N, K, order, most)),
+        records=names[:, 0],
     )
-    r = min(_EACH * (order + 1), instruments.shape[1])
-    shapes = ((order, order), (order, order), (r, r), (order, r), (order, r))
-    parts = [np.zeros((N, K, *shape)) for shape in shapes]
     for n in range(N):
-        at = np.flatnonzero(finite & (rows[:, 2] == n))
-        if len(at) <= r + 1:
+        at = np.flatnonzero(known & (rows[:, 2] == n))
+        if len(at) <= most + 1:
             raise DefinitionError(
                 f"section {n} was seen in {len(at)} cycles only: record longer."
             )
         x, z = _principal(state[at], after[at], order)
-        q, _ = _principal(instruments[at], instruments[at], r)
-        for part, (a, b) in zip(
-            parts, ((x, x), (z, x), (q, q), (x, q), (z, q)), strict=True
-        ):
-            part[n, cycle[at]] = a[:, :, None] * b[:, None, :]
-    return _Moments._make([*parts, names[:, 0]])
+        q, _ = _principal(instruments[at], instruments[at], most)
+        place = (n, cycle[at])
+        moments.state[place] = _products(x, x)
+        moments.forward[place] = _products(z, x)
+        moments.square[place] = _products(q, q)
+        moments.cross[place] = _products(x, q)
+        moments.ahead[place] = _products(z, q)
+    return moments
+
+
+def _rows(data: SectionData) -> Int[np.ndarray, "rows 4"]:
+    """Return record, cycle, section and sample of all states that have instruments before them and
+    a next state."""
+    N = data.n_sections
+    before = 3 * _EACH  # (of instruments there is one section more)
+    rows = [np.zeros((0, 4), int)]
+    for s, record in enumerate(data.records):
+        sample = np.arange(before, len(record.y) - N)
+        cycle, section = np.divmod(record.first_section + sample, N)
+        rows.append(np.stack([np.full_like(sample, s), cycle, section, sample], axis=1))
+    return np.concatenate(rows)
+
+
+def _products(
+    a: Float[np.ndarray, "k d"], b: Float[np.ndarray, "k r"]
+) -> Float[np.ndarray, "k d r"]:
+    return a[:, :, None] * b[:, None, :]
 
 
 def _principal(
@@ -255,22 +295,22 @@ def _principal(
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
-    onto = (
-        axes[:count].T / np.maximum(s[:count], 1e-9 * s[0]) * np.sqrt(len(x))
-    )  # below: rounding
+    size = np.maximum(s[:count], 1e-9 * s[0])  # below: rounding
+    onto = axes[:count].T / size * np.sqrt(len(x))
     return (x - mean) @ onto, (other - other.mean(axis=0)) @ onto
 
 
 def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     """Return roots of the mean characteristic polynomial over the sections, the largest first."""
     values = np.linalg.eigvals(maps)
-    c = np.ones((*values.shape[:2], 1), complex)
+    # The coefficients of (z - values[0]) (z - values[1]) ..., the highest power first.
+    polynomial = np.ones((*values.shape[:2], 1), complex)
     for k in range(values.shape[2]):
-        later = np.pad(c, ((0, 0), (0, 0), (1, 0))) * values[..., k, None]
-        c = np.pad(c, ((0, 0), (0, 0), (0, 1))) - later
-    return _largest_first(
-        np.array([np.roots(x) for x in np.real(c).mean(axis=1)], complex)
-    )
+        times_z = np.pad(polynomial, ((0, 0), (0, 0), (0, 1)))
+        times_value = np.pad(polynomial, ((0, 0), (0, 0), (1, 0)))
+        polynomial = times_z - values[..., k, None] * times_value
+    mean = np.real(polynomial).mean(axis=1)
+    return _largest_first(np.array([np.roots(x) for x in mean], complex))
 
 
 def _largest_first(z: Draws) -> Draws:
@@ -281,24 +321,27 @@ def _corrected(z: Draws, length: float) -> Draws:
     """Remove the bias of first order that the unknown mean of each record, and regression on the
     past, make in records of so many cycles (Pope 1990, for disturbances along the eigenvectors; for
     one multiplier Kendall's (1 + 3 z) / length)."""
-    a, b = z[:, :, None], z[:, None, :]
-    ab = np.clip(np.abs(a * b), 0, 0.99) * np.exp(1j * np.angle(a * b))
-    return _largest_first(
-        z + (1 + 2 * z + (b * (1 - a**2) / (1 - ab)).sum(axis=2)) / length
-    )
+    own = z[:, :, None]
+    other = z[:, None, :]
+    product = own * other
+    stable = np.clip(np.abs(product), 0, 0.99) * np.exp(1j * np.angle(product))
+    by_regression = (other * (1 - own**2) / (1 - stable)).sum(axis=2)
+    return _largest_first(z + (1 + 2 * z + by_regression) / length)
 
 
 def _resampled(
     records: Int[np.ndarray, " K"], block: int, rng: np.random.Generator
 ) -> Float[np.ndarray, " K"]:
     """Draw blocks of each record, or whole records, and return how often each cycle was drawn."""
-    weights = np.zeros(len(records))
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
-        return 1.0 * (records[:, None] == rng.choice(names, len(names))).sum(axis=1)
+        chosen = rng.choice(names, len(names))
+        return (records[:, None] == chosen).sum(axis=1).astype(float)
+    weights = np.zeros(len(records))
     for record, count in zip(names, counts, strict=True):
         length = min(block, count)
         starts = rng.integers(0, count - length + 1, -(-count // length))
         drawn = (starts[:, None] + np.arange(length)).ravel()[:count]
-        np.add.at(weights, np.flatnonzero(records == record)[drawn], 1.0)
+        cycles = np.flatnonzero(records == record)
+        np.add.at(weights, cycles[drawn], 1.0)
     return weights

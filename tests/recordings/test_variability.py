@@ -50,20 +50,20 @@ def test_instruments_have_no_bias_by_noise():
     assert "Order: 2 multipliers give 0.5" in repr(single)
     half = hj.recordings.natural_multipliers(variable(0.1, (60, 60), 0.3 + 0.5j, 2))
     assert not any(
-        f.doubt for f in (*found, both, half)
+        x.cause == "order" for f in (*found, both, half) for x in f.findings
     )  # (one of two intervals is enough)
     drifting = [
         hj.recordings.natural_multipliers(variable(0.1, seed=k, drift=1))
         for k in range(3)
     ]
-    assert all("if outputs drift" in f.doubt for f in drifting)
+    assert all("if outputs drift" in f.findings[-1].text for f in drifting)
 
 
 def test_short_records_are_drawn_whole():
     """No interval is narrow because a record holds only one block."""
     found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
     assert np.ptp(found.interval()) > 0.2
-    assert any(text.cause == "few cycles" for text in found.warnings)
+    assert any(text.cause == "few cycles" for text in found.findings)
     assert found.block * found.records == found.cycles
     assert (
         np.ptp(hj.recordings.natural_multipliers(variable(0.1, (11,))).interval()) > 0.2
