@@ -268,7 +268,7 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
                 causes[str(error)] = None
                 continue
             right = result.fit.contains(cycle.multipliers, 0.999).all()
-            doubts = {f.cause for f in result.advice.warnings} - HINTS
+            doubts = {f.cause for f in result.advice.findings} - HINTS
             causes |= dict.fromkeys(sorted(doubts))
             verdict.append(
                 "right" if right else "named" if doubts else "SILENTLY WRONG"

@@ -253,7 +253,7 @@ def summarize(result: Identification) -> dict[str, Any]:
         "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
         "input_band": list(result.advice.band),
-        "warnings": list(map(repr, result.advice.warnings)),
+        "warnings": list(map(repr, result.advice.findings)),
     }
 
 
@@ -277,7 +277,7 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
 
 def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
-    data, recording, warnings = result.data, result.recording, result.advice.warnings
+    data, recording, warnings = result.data, result.recording, result.advice.findings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.reference
     method = (

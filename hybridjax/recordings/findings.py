@@ -38,8 +38,11 @@ class Inspection(eqx.Module):
 
 def untried_orders(order: int, obstacle: str) -> list[Finding]:
     """Return a finding if an obstacle was met to trying larger orders than the chosen one."""
-    text = f"orders above {order} could not be tried, since {obstacle}"
-    return [Finding("order", text)] * bool(obstacle)
+    if not obstacle:
+        return []
+    return [
+        Finding("order", f"orders above {order} could not be tried, since {obstacle}")
+    ]
 
 
 def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> str:
@@ -47,7 +50,8 @@ def places(trials: Iterable[Trial], bad: Iterable[Bool[np.ndarray, " _"]]) -> st
     texts = []
     for trial, rows in zip(trials, bad, strict=True):
         edges = np.flatnonzero(np.diff(rows.astype(int), prepend=0, append=0))
-        texts += [place(trial.name, trial.time[a:b]) for a, b in edges.reshape(-1, 2)]
+        for first, end in edges.reshape(-1, 2):
+            texts.append(place(trial.name, trial.time[first:end]))
     return listed(texts)
 
 

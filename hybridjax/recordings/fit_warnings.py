@@ -4,6 +4,7 @@ Warnings about the signals themselves are made in `inspection/`.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -33,36 +34,45 @@ _FEW = 0.25
 _SAME_OUTPUTS = 0.98
 # Least modulus of a multiplier that may be that of a tone, and what is left of its mode at the end
 # of a record. Larger: hum passes. Smaller: slow modes are called hum.
-_DAMPED, _DECAYED = 0.9, 0.1
+_DAMPED = 0.9
+_DECAYED = 0.1
 # Cycles per record below which there are few. Larger: every result comes with the warning.
 # Smaller: a user trusts biased multipliers.
 _FEW_CYCLES = 50
 # Limits of warnings: correlation of neighboring residuals, and level of the test for a flat curve.
 # Larger (the level: smaller): a user trusts what the data do not support. Smaller: every curve
 # comes with warnings.
-_MEMORY, _LEVEL = 0.2, 0.01
+_MEMORY = 0.2
+_LEVEL = 0.01
+
+
+Multipliers = Complex[np.ndarray, " d"]
 
 
 class Advice(eqx.Module):
-    """Reasons to doubt a fit. Printing it shows the warnings.
+    """Reasons to doubt a fit. Printing it shows the findings.
 
     **Fields:**
 
-    - `warnings`: findings about the data and the fit; none if there is no reason for doubt.
+    - `findings` about the data and the fit; none if there is no reason for doubt.
     - `plain` (d,): the multipliers from plain regression (ARX).
     - `band`: for each input the frequency (cycles per period) up to which it had power.
     - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
       so many strides like these would give.
     """
 
-    warnings: tuple[Finding, ...]
-    plain: Complex[np.ndarray, " d"]
+    findings: tuple[Finding, ...]
+    plain: Multipliers
     band: tuple[float, ...] = eqx.field(static=True)
     strides: tuple[int, ...] = eqx.field(static=True)
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
-        return print_findings(self.warnings) or "Nothing speaks against the fit."
+        return print_findings(self.findings) or "Nothing speaks against the fit."
+
+    def after(self, findings: Sequence[Finding]) -> "Advice":
+        """Return the advice with other findings before its own."""
+        return replace(self, findings=(*findings, *self.findings))
 
 
 @checked
@@ -83,174 +93,260 @@ def advise(
     `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
     of an inspection and of other estimates, which come first. Default: none.
     """
+    prepared = PreparedRecords(data, free_start=True)
+    advice = advice_about(data, prepared, fit, validation)
+    warn_of(advice.findings)
+    return advice.after([*findings, *slow_sampling(data)])
+
+
+def advice_about(
+    data: SectionData,
+    prepared: PreparedRecords,
+    fit: SeriesFit,
+    validation: Validation | None,
+) -> Advice:
+    """Return advice about the fit alone, from data that were prepared for it."""
     N, R, _, nu = fit.numerators.shape
-    d, records = len(fit.multipliers), PreparedRecords(data, free_start=True)
-    problem = OutputErrorProblem.from_data(
-        records, d, R - 1 - fit.lead - d * N, free_start=True
-    )
-    delayed, grid = late_outputs(problem, d), records.whole()
+    d = len(fit.multipliers)
+    overhang = R - 1 - fit.lead - d * N
+    problem = OutputErrorProblem.from_data(prepared, d, overhang, free_start=True)
+    plain = ordinary_least_squares(late_outputs(problem, d))
+    grid = prepared.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
-    unknowns, plain = R * nu + len(grid.y) * (d + 1), ordinary_least_squares(delayed)
-    warnings: list[Finding] = []
-    if sampled - unknowns < _FEW * sampled:
-        text = f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
-        warnings.append(
-            Finding("few strides", f"{text}fewer sections, or excite fewer inputs.")
-        )
-    if fit.doubt:
-        warnings.append(
-            Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}.")
-        )
+    unknowns = R * nu + len(grid.y) * (d + 1)
     band = input_band(data)
-    for name in fit.feedback:
-        text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
-        warnings.append(Finding("feedback", text))
-    warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
-    for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
-        if fit.result == Result.OK and z.imag >= 0 and abs(z) + 2 * error > 1:
-            text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
-            warnings.append(Finding("stability", text))
-    if fit.result != Result.OK:
-        warnings.append(Finding("no convergence", f"{Result(fit.result).message}."))
-    # Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it,
-    # and standard errors allow for it. Nor are residuals below a hundredth of the output, in which
-    # the test sees the distortion of small pushes if there is little noise.
-    p = np.ones(1) if validation is None else validation.independence
-    if validation and not validation.independent and validation.fit[p.argmin()] < 99:
-        text = f"residuals of the held-out strides depend on the input ({p_value(p.min())}): raise "
-        warnings.append(
-            Finding("left over", f"{text}`order`, sample faster, or push less.")
-        )
-    if validation and validation.unexplained:
-        text = f"{listed(validation.unexplained)}: the model predicts held-out strides no better "
-        warnings.append(
-            Finding("no fit", f"{text}than the mean cycle does: it explains nothing.")
-        )
-    if data.missing > _FEW:
-        warnings.append(
-            Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing.")
-        )
-    for name, count in zip(data.signals, data.spikes, strict=True):
-        if count:
-            text = f"isolated outliers of {name} that were left out: {count}."
-            warnings.append(Finding("spikes", text))
+    findings = (
+        *_few_strides(sampled, unknowns),
+        *_order_and_feedback(fit),
+        *_about_excitation(data, fit, band),
+        *_about_outputs(grid, fit),
+        *_about_multipliers(fit),
+        *_about_held_out(validation),
+        *_about_samples(data),
+    )
     # Variances decrease with the number of strides beyond that of the unknowns.
     strides = (100, 300, 1000, 3000)
     later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
     with np.errstate(divide="ignore"):
-        expected = (
-            fit.standard_errors * np.sqrt(max(sampled - unknowns, 1) / later)[:, None]
-        )
-    warn_of(warnings)
-    warnings = [*findings, *slow_sampling(data), *warnings]
-    return Advice(tuple(warnings), plain, tuple(band), strides, expected)
-
-
-def slow_sampling(data: SectionData) -> list[Finding]:
-    """Find outputs of which interpolation between samples loses as much as they deviate."""
-    text = f"without every second sample, outputs would change by {data.unresolved:.2g} times their"
-    finding = Finding(
-        "sampling", f"{text} deviations: multipliers may be wrong. Sample faster."
+        smaller = np.sqrt(max(sampled - unknowns, 1) / later)
+    return Advice(
+        findings=findings,
+        plain=plain,
+        band=tuple(band),
+        strides=strides,
+        expected=fit.standard_errors * smaller[:, None],
     )
-    # (Noise gives up to 1.3, and would be reported below that. Above, wrong fits pass: with 10
-    # samples in a cycle, errors were up to four standard errors at 1.6 to 2.1.)
-    return [finding] if data.unresolved > 1.5 else []
+
+
+def slow_sampling(data: SectionData) -> Iterator[Finding]:
+    """Find outputs of which interpolation between samples loses as much as they deviate."""
+    # Noise gives up to 1.3, and would be reported below that. Above, wrong fits pass: with 10
+    # samples in a cycle, errors were up to four standard errors at 1.6 to 2.1.
+    if data.unresolved > 1.5:
+        yield Finding(
+            "sampling",
+            f"without every second sample, outputs would change by {data.unresolved:.2g} times "
+            "their deviations: multipliers may be wrong. Sample faster.",
+        )
 
 
 def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
     """Find multipliers of modes that decay so little that they may be tones or drift."""
-    cycles = max(len(r.u) for r in data.records) / data.n_sections
+    if fit.result != Result.OK:
+        return
+    cycles = max(len(record.u) for record in data.records) / data.n_sections
     least = max(_DAMPED, _DECAYED ** (1 / cycles))
-    for z in fit.multipliers:
-        if fit.result == Result.OK and z.imag >= 0 and abs(z) > least:
-            text = f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles: look "
+    for z in _upper(fit.multipliers):
+        if abs(z) > least:
             yield Finding(
-                "no decay", f"{text}for hum or drift in the spectra of outputs."
+                "no decay",
+                f"the mode of the multiplier {z:.3g} hardly decays in {cycles:.0f} cycles: look "
+                "for hum or drift in the spectra of outputs.",
             )
+
+
+def _upper(multipliers: Multipliers) -> Multipliers:
+    """Return one multiplier of each pair."""
+    return multipliers[multipliers.imag >= 0]
+
+
+def _few_strides(sampled: int, unknowns: int) -> Iterator[Finding]:
+    if sampled - unknowns < _FEW * sampled:
+        yield Finding(
+            "few strides",
+            f"a section was sampled {sampled} times for {unknowns} unknowns; record more, take "
+            "fewer sections, or excite fewer inputs.",
+        )
+
+
+def _order_and_feedback(fit: SeriesFit) -> Iterator[Finding]:
+    if fit.doubt:
+        cause = "drift" if fit.doubt == MAY_DRIFT else "order"
+        yield Finding(cause, f"{fit.doubt}.")
+    for name in fit.feedback:
+        yield Finding(
+            "feedback",
+            f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}",
+        )
 
 
 def _about_excitation(
-    data: SectionData, fit: SeriesFit, band: list[float]
+    data: SectionData, fit: SeriesFit, band: Sequence[float]
 ) -> Iterator[Finding]:
     f, power = input_spectrum(data)
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
-        for z in (x for x in fit.multipliers if x.imag >= 0):
+        for z in _upper(fit.multipliers):
             at = abs(np.angle(z)) / (2 * np.pi)
-            near = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1) < 0.1
-            if strength[near].max(initial=0) < LEAST_POWER * strength.max():
-                text = f"{name} has next to no power at {at:.2f} + k cycles per period, where the "
-                yield Finding("weak excitation", f"{text}multiplier {z:.3g} is seen.")
-        if edge < WHOLE_BAND * fit.n_sections / 2:
-            text = f"transfer functions are determined up to {edge:.3g} cycles per period, where "
-            text += f"the power of {name} ends."
-            text += " Responses at different phases can hardly be told apart." * (
-                edge < 1
+            distance = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1)
+            near = strength[distance < 0.1].max(initial=0)
+            if near < LEAST_POWER * strength.max():
+                yield Finding(
+                    "weak excitation",
+                    f"{name} has next to no power at {at:.2f} + k cycles per period, where the "
+                    f"multiplier {z:.3g} is seen.",
+                )
+        if edge >= WHOLE_BAND * fit.n_sections / 2:
+            continue
+        determined = (
+            f"transfer functions are determined up to {edge:.3g} cycles per period, where the "
+            f"power of {name} ends."
+        )
+        if edge < 1:
+            yield Finding(
+                "narrow excitation",
+                f"{determined} Responses at different phases can hardly be told apart.",
             )
-            yield Finding("narrow excitation" if edge < 1 else "band", text)
+        else:
+            yield Finding("band", determined)
 
 
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
+    """Find pairs of outputs whose median correlation over the sections is nearly one."""
     N, ny = grid.y.shape[2:]
+    y = np.where(grid.sampled, grid.y, np.nan).reshape(-1, N, ny)
     for i, j in combinations(range(ny), 2):
-        y, sampled = (x[..., [i, j]].reshape(-1, N, 2) for x in (grid.y, grid.sampled))
-        both = np.asarray(sampled.all(axis=2))
-        with np.errstate(
-            invalid="ignore"
-        ):  # of an output that is constant at a section
-            matrices = [np.corrcoef(y[both[:, n], n].T) for n in range(N)]
-        if np.median(np.nan_to_num(np.abs(matrices)[:, 0, 1])) > _SAME_OUTPUTS:
-            text = f"{fit.outputs[i]} and {fit.outputs[j]} carry the same information at sections: "
+        pair = y[..., [i, j]]
+        known = np.isfinite(pair).all(axis=2)
+        # Of an output that is constant at a section.
+        with np.errstate(invalid="ignore"):
+            correlations = [np.corrcoef(pair[known[:, n], n].T)[0, 1] for n in range(N)]
+        if np.median(np.nan_to_num(np.abs(correlations))) > _SAME_OUTPUTS:
             yield Finding(
-                "outputs", f"{text}cycles between crossings may have smaller errors."
+                "outputs",
+                f"{fit.outputs[i]} and {fit.outputs[j]} carry the same information at sections: "
+                "cycles between crossings may have smaller errors.",
+            )
+
+
+def _about_multipliers(fit: SeriesFit) -> Iterator[Finding]:
+    if fit.result != Result.OK:
+        yield Finding("no convergence", f"{Result(fit.result).message}.")
+        return
+    for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
+        if z.imag >= 0 and abs(z) + 2 * error > 1:
+            yield Finding(
+                "stability",
+                f"the interval of the multiplier {z:.3g} reaches the unit circle.",
+            )
+
+
+def _about_held_out(validation: Validation | None) -> Iterator[Finding]:
+    """Find what a validation on held-out strides speaks against.
+
+    Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it, and
+    standard errors allow for it. Nor are residuals below a hundredth of the output, in which the
+    test sees the distortion of small pushes if there is little noise.
+    """
+    if validation is None:
+        return
+    worst = int(validation.independence.argmin())
+    if not validation.independent and validation.fit[worst] < 99:
+        p = validation.independence[worst]
+        yield Finding(
+            "left over",
+            f"residuals of the held-out strides depend on the input ({p_value(p)}): raise `order`, "
+            "sample faster, or push less.",
+        )
+    if validation.unexplained:
+        yield Finding(
+            "no fit",
+            f"{listed(validation.unexplained)}: the model predicts held-out strides no better than "
+            "the mean cycle does: it explains nothing.",
+        )
+
+
+def _about_samples(data: SectionData) -> Iterator[Finding]:
+    if data.missing > _FEW:
+        yield Finding("gaps", f"{100 * data.missing:.0f} % of the samples are missing.")
+    for name, count in zip(data.signals, data.spikes, strict=True):
+        if count:
+            yield Finding(
+                "spikes", f"isolated outliers of {name} that were left out: {count}."
             )
 
 
 def about_natural_multipliers(result: Any) -> Iterator[Finding]:
     """Limits of a result of `natural_multipliers`."""
-    each, high = result.cycles / result.records, result.interval()[0, 1]
+    each = result.cycles / result.records
     if each < _FEW_CYCLES:
-        size = (1 + 3 * abs(result.multipliers[0])) / each
-        bias = f"a bias of about {size:.2f} was corrected to first order only."
+        bias = (1 + 3 * abs(result.multipliers[0])) / each
         yield Finding(
-            "few cycles", f"{each:.3g} in each of {result.records} records; {bias}"
+            "few cycles",
+            f"{each:.3g} in each of {result.records} records; a bias of about {bias:.2f} was "
+            "corrected to first order only.",
         )
     if result.strength < 0.5:
-        text = f"earlier sections explain {100 * result.strength:.0f} % of the states' variance."
-        yield Finding("weak instruments", text)
-    if high >= 1:
-        text = f"the interval of the largest modulus reaches {high:.2f}, beyond 1."
-        yield Finding("stability", text)
+        yield Finding(
+            "weak instruments",
+            f"earlier sections explain {100 * result.strength:.0f} % of the states' variance.",
+        )
+    largest = result.interval()[0, 1]
+    if largest >= 1:
+        yield Finding(
+            "stability",
+            f"the interval of the largest modulus reaches {largest:.2f}, beyond 1.",
+        )
 
 
-def about_phase_response(r: Any) -> Iterator[Finding]:
+def about_phase_response(curve: Any) -> Iterator[Finding]:
     """Limits of a result of `phase_response`."""
-    if r.p_flat > _LEVEL:
+    if curve.p_flat > _LEVEL:
         yield Finding(
-            "shape", f"a flat curve explains the data as well ({p_value(r.p_flat)})."
+            "shape",
+            f"a flat curve explains the data as well ({p_value(curve.p_flat)}).",
         )
-    half = np.ptp(r.interval(r.phase), axis=0) / 2
-    if half.max() > abs(r.coefficients[0]) / 2:
+    low, high = curve.interval(curve.phase)
+    half = (high - low) / 2
+    if half.max() > abs(curve.coefficients[0]) / 2:
         worst = int(np.argmax(half))
-        text = f"at phase {r.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
-        yield Finding("wide", f"{text}either side, more than half of the mean.")
-    finest = max(1, round(1 / (np.pi * max(r.jitter, 1e-6))))
-    text = f"the jitter of {100 * r.jitter:.2g} % of a cycle hides what is finer than harmonic "
-    yield Finding("resolution", f"{text}{finest} at the end of a cycle.")
-    if r.excess > 2:
-        text = f"residuals of a block of intervals add up to {r.excess:.1f} times the variance of "
         yield Finding(
-            "misfit", f"{text}independent errors: the phase model lacks something."
+            "wide",
+            f"at phase {curve.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
+            "either side, more than half of the mean.",
         )
-    if abs(r.memory) > _MEMORY:
-        text = f"residuals of neighboring intervals are correlated by {r.memory:.2f}: the curve "
+    finest = max(1, round(1 / (np.pi * max(curve.jitter, 1e-6))))
+    yield Finding(
+        "resolution",
+        f"the jitter of {100 * curve.jitter:.2g} % of a cycle hides what is finer than harmonic "
+        f"{finest} at the end of a cycle.",
+    )
+    if curve.excess > 2:
+        yield Finding(
+            "misfit",
+            f"residuals of a block of intervals add up to {curve.excess:.1f} times the variance of "
+            "independent errors: the phase model lacks something.",
+        )
+    if abs(curve.memory) > _MEMORY:
         yield Finding(
             "memory",
-            f"{text}shows the effect of a push on its own interval, not later.",
+            f"residuals of neighboring intervals are correlated by {curve.memory:.2f}: the curve "
+            "shows the effect of a push on its own interval, not later.",
         )
-    if r.miscounted:
-        text = f"{r.miscounted} of {r.intervals} intervals miss the model by half a cycle or more"
+    if curve.miscounted:
         yield Finding(
-            "miscounted", f"{text}, as if an event had been missed; they are not used."
+            "miscounted",
+            f"{curve.miscounted} of {curve.intervals} intervals miss the model by half a cycle or "
+            "more, as if an event had been missed; they are not used.",
         )
-    if r.result != Result.OK:
-        yield Finding("no convergence", f"{Result(r.result).message}.")
+    if curve.result != Result.OK:
+        yield Finding("no convergence", f"{Result(curve.result).message}.")

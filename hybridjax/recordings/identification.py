@@ -1,6 +1,7 @@
 """All steps from a recording to multipliers, in one call."""
 
 import textwrap
+from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -14,12 +15,12 @@ from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
-from ..identify.series.records import SLOW
+from ..identify.series.records import SLOW, PreparedRecords
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import untried_orders
-from .fit_warnings import Advice, advise, undamped
-from .held_out import HeldOut, split
+from .fit_warnings import Advice, advice_about, slow_sampling, undamped
+from .held_out import HeldOut, Split, split
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import inspect, inspect_cycles
 from .phase import Phase
@@ -59,10 +60,16 @@ class Identification(eqx.Module):
     advice: Advice
 
     def __repr__(self) -> str:
-        parts = (self.phase, self.data, self.fit, self.held_out.validation, self.advice)
-        prints = list(map(repr, parts))
-        prints[3:3] = (textwrap.fill(x, 100) for x in MEANING)
-        return "\n".join(prints)
+        meaning = [textwrap.fill(text, 100) for text in MEANING]
+        results = [
+            repr(self.phase),
+            repr(self.data),
+            repr(self.fit),
+            *meaning,
+            repr(self.held_out.validation),
+            repr(self.advice),
+        ]
+        return "\n".join(results)
 
 
 @checked
@@ -99,22 +106,12 @@ def identify_recording(
     require_x64()
     say("inspection")
     outside = None if reference is None else tuple(reference)
-    if both := [x for x in outside or () if x in (*inputs, *outputs)]:
-        text = f"other signals than `inputs` and `outputs`, not {listed(both)}"
-        raise DefinitionError(f"`reference` must name {text}.")
+    _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
     inspection = inspect(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
-    recording = inspection.recording
     say("phase")
-    definition = None if isinstance(phase, Phase) else phase
-    phase = phase if isinstance(phase, Phase) else estimate_phase(recording, phase)
-    if drift is not None:
-        drifting = set(outputs) | (
-            set() if definition is None else signals_of(definition)
-        )
-        recording = without_drift(recording, phase, sorted(drifting), drift)
-        phase = phase if definition is None else estimate_phase(recording, definition)
+    recording, phase = _phase_without_drift(inspection.recording, phase, outputs, drift)
     say("data at the sections")
     whole = section_data(
         recording,
@@ -125,51 +122,122 @@ def identify_recording(
         bandwidth=bandwidth,
         timing=timing,
     )
-    whole = whole if drift is None else whole.with_drift(drift)
+    if drift is not None:
+        whole = whole.with_drift(drift)
+    data = whole.of_inputs(inputs)
     # In a loop all that happens begins at the reference.
-    driving = whole if outside is None else whole.of_inputs(outside)
-    findings = (*inspection.findings, *inspect_cycles(recording, phase, driving))
-    refuse(findings)
+    driving = data if outside is None else whole.of_inputs(outside)
+    findings = inspect_cycles(recording, phase, driving)
+    refuse([*inspection.findings, *findings])
     say("order")
-    data, parts, most = (
-        whole.of_inputs(inputs),
-        split(whole),
-        4 if order is None else order + 2,
-    )
-    best, obstacle = (
-        best_order(whole, outside, most) if outside else parts.best_order(most)
-    )
-    if order is None:
-        order, findings = best, (*findings, *untried_orders(best, obstacle))
-    elif best > order:
-        text = (
-            "the reference determines"
-            if outside
-            else "held-out strides are predicted better by"
-        )
-        text = f"{text} {best} multipliers, not {order}: "
-        text += f"{order} may be biased, and their intervals too narrow. Compare order={best}"
-        slow = (
-            outside is None
-            and split(whole.with_drift(SLOW)).best_order(most)[0] <= order
-        )
-        text += (
-            f", and drift={SLOW:g}, with which {order} are as good." if slow else "."
-        )
-        findings = (*findings, Finding("drift" if slow else "order", text))
+    parts = split(whole)
+    if outside is None:
+        order, doubts = _order(order, whole, parts)
+    else:
+        order, doubts = _order_in_loop(order, whole, outside)
+    findings += doubts
     say("fit to the first three quarters")
-    held = parts.fit(order, outside)
+    held_out = parts.fit(order, outside)
     say("fit to all")
-    fit = fit_series(whole, order, check=False, reference=outside)
-    findings = (*findings, *undamped(data, fit))
+    prepared = PreparedRecords(data, free_start=True)
+    fit = fit_series(
+        prepared if outside is None else whole, order, check=False, reference=outside
+    )
+    findings += undamped(data, fit)
     curve = None
     of_events = all(w.linear for parts in phase.stretches for w in parts)
     if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
         curve = phase_response(recording, phase, input=data.inputs[0])
-        findings = (*findings, *curve.warnings)
-    responses = impulse_responses(fit, data)
-    warn_of(findings[len(inspection.findings) :])
-    advice = advise(data, fit, held.validation, findings)
+        findings += curve.findings
+    advice = advice_about(data, prepared, fit, held_out.validation)
+    warn_of([*findings, *advice.findings])
+    findings = [*inspection.findings, *findings]
     return Identification(
-        recording, findings, phase, data, fit, held, responses, curve, advice
+        recording=recording,
+        findings=tuple(findings),
+        phase=phase,
+        data=data,
+        fit=fit,
+        held_out=held_out,
+        responses=impulse_responses(fit, data),
+        curve=curve,
+        advice=advice.after([*findings, *slow_sampling(data)]),
     )
+
+
+def _require_outside(reference: Sequence[str], signals: Sequence[str]) -> None:
+    """**Raises:** `DefinitionError` for a reference that is an input or an output."""
+    inside = [name for name in reference if name in signals]
+    if inside:
+        raise DefinitionError(
+            "`reference` must name other signals than `inputs` and `outputs`, not "
+            f"{listed(inside)}."
+        )
+
+
+def _phase_without_drift(
+    recording: Recording,
+    phase: Phase | PhaseDefinition,
+    outputs: Sequence[str],
+    drift: float | None,
+) -> tuple[Recording, Phase]:
+    """Return the recording without drift, and its phase.
+
+    The phase of the drifting signals tells where cycles begin; where a definition is given, the
+    phase is estimated again from signals without drift.
+    """
+    definition = None if isinstance(phase, Phase) else phase
+    if definition is not None:
+        phase = estimate_phase(recording, definition)
+    if drift is None:
+        return recording, phase
+    drifting = set(outputs)
+    if definition is not None:
+        drifting |= signals_of(definition)
+    recording = without_drift(recording, phase, sorted(drifting), drift)
+    if definition is not None:
+        phase = estimate_phase(recording, definition)
+    return recording, phase
+
+
+def _order(
+    order: int | None, data: SectionData, parts: Split
+) -> tuple[int, list[Finding]]:
+    """Return the order that predicts held-out strides best, or the given one, and doubts about
+    it."""
+    if order is None:
+        best, obstacle = parts.best_order()
+        return best, untried_orders(best, obstacle)
+    most = order + 2
+    best, _ = parts.best_order(most)
+    if best <= order:
+        return order, []
+    too_few = (
+        f"held-out strides are predicted better by {best} multipliers, not {order}: {order} may be "
+        f"biased, and their intervals too narrow. Compare order={best}"
+    )
+    best_with_drift, _ = split(data.with_drift(SLOW)).best_order(most)
+    if best_with_drift <= order:
+        text = f"{too_few}, and drift={SLOW:g}, with which {order} are as good."
+        return order, [Finding("drift", text)]
+    return order, [Finding("order", f"{too_few}.")]
+
+
+def _order_in_loop(
+    order: int | None, data: SectionData, reference: Sequence[str]
+) -> tuple[int, list[Finding]]:
+    """Return the largest order that the reference determines, or the given one, and doubts about
+    it."""
+    if order is None:
+        best, obstacle = best_order(data, reference, most=4)
+        return best, untried_orders(best, obstacle)
+    best, _ = best_order(data, reference, most=order + 2)
+    if best <= order:
+        return order, []
+    return order, [
+        Finding(
+            "order",
+            f"the reference determines {best} multipliers, not {order}: {order} may be biased, and "
+            f"their intervals too narrow. Compare order={best}.",
+        )
+    ]

@@ -122,7 +122,7 @@ def test_events_alone_are_identified(noisy, tmp_path):
         found.fit.outputs == ("duration",) and np.isfinite(found.fit.numerators).all()
     )
     assert (hj.write_report(tmp_path, found).parent / "figures" / "curve.png").exists()
-    assert any("Resolution: the jitter" in repr(x) for x in found.advice.warnings)
+    assert any("Resolution: the jitter" in repr(x) for x in found.advice.findings)
 
 
 def test_what_is_refused(noisy):

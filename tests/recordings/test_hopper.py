@@ -26,7 +26,7 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     by_angle, by_apex = (
-        hj.recordings.advise(*x).warnings for x in zip(data, fits, strict=True)
+        hj.recordings.advise(*x).findings for x in zip(data, fits, strict=True)
     )
     said = "Outputs: yM and vM carry the same information at sections"
     assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(
@@ -48,7 +48,7 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     assert any(
-        w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).warnings
+        w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).findings
     )
 
 

@@ -154,7 +154,7 @@ def test_an_order_that_is_too_low_is_named():
     ):
         result = hj.identify_recording(recording, TOP, **names)
         assert (
-            len([x for x in result.advice.warnings if "Compare order=2" in x.text])
+            len([x for x in result.advice.findings if "Compare order=2" in x.text])
             == named
         )
     names |= {"order": None, "n_sections": 32}
@@ -176,7 +176,7 @@ def test_an_order_that_is_too_low_is_named():
     with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
-    assert f"since {text} more, or take 21 sections." in untried.advice.warnings[1].text
+    assert f"since {text} more, or take 21 sections." in untried.advice.findings[1].text
     with pytest.warns(
         hj.errors.FindingWarning, match="orders above 1 could not be tried"
     ):
@@ -201,7 +201,7 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
         )
         causes = [
             x.cause
-            for x in hj.recordings.advise(result.data, result.fit, worse).warnings
+            for x in hj.recordings.advise(result.data, result.fit, worse).findings
         ]
         assert ("left over" in causes) == ("no fit" in causes) == named
     # So many strides as give no finite standard error are left out of the report.

@@ -89,7 +89,7 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
         )
         data = sample(thin, inputs="force")
         advice = hj.recordings.advise(data, hj.fit_series(data, 1, check=False))
-        assert any(w.cause == "sampling" for w in advice.warnings) == few
+        assert any(w.cause == "sampling" for w in advice.findings) == few
 
 
 def test_gaps_are_masked_and_cut(wave):

@@ -23,6 +23,9 @@ from .estimation import WAVES, CurveFit, accuracy_of, fit_curve
 from .model import Intervals, basis, intervals_of
 
 
+Waves = Float[np.ndarray, "n p"]
+
+
 @checked_methods
 class PhaseResponse(PhaseCurve):
     r"""The curve Z of the phase model $\dot\varphi = w + Z(\varphi)\,I(t)$, with its accuracy.
@@ -67,7 +70,7 @@ class PhaseResponse(PhaseCurve):
     result: Result = eqx.field(static=True)
 
     @property
-    def warnings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Finding, ...]:
         """Limits of what the data support."""
         return tuple(about_phase_response(self))
 
@@ -81,16 +84,17 @@ class PhaseResponse(PhaseCurve):
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
         the phases: they are too narrow where it changes faster than elsewhere."""
         waves = self._waves(phase)
-        error = np.sqrt(np.einsum("ni,ij,nj->n", waves, self.covariance, waves))
+        error = _errors(waves, self.covariance)
         reach = float(stats.t.ppf((1 + level) / 2, self.freedom)) * error
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
-    def _waves(self, phase: Vector) -> Float[np.ndarray, "n p"]:
+    def _waves(self, phase: Vector) -> Waves:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
 
     def __repr__(self) -> str:
-        mean, error = self.coefficients[0], np.sqrt(self.covariance[0, 0])
+        mean = self.coefficients[0]
+        error = np.sqrt(self.covariance[0, 0])
         return (
             f"PhaseResponse({self.detail:.1f} effective parameters, {self.intervals} intervals of "
             f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
@@ -99,7 +103,7 @@ class PhaseResponse(PhaseCurve):
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
             f"{100 * self.jitter:.2g} % of a cycle\n"
             f"  R2 left out  {self.left_out:.3f}; of a flat curve {self.left_out_flat:.3f}\n"
-            + print_findings(self.warnings, "  ")
+            + print_findings(self.findings, "  ")
         )
 
 
@@ -135,29 +139,29 @@ def phase_response(
     intervals = intervals_of(recording, phase, input)
     total = len(intervals.start)
     if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
-        text = (
-            f"{total} intervals are too few for a curve and the rates of their trials"
+        raise DefinitionError(
+            f"{total} intervals are too few for a curve and the rates of their trials: record more."
         )
-        raise DefinitionError(f"{text}: record more.")
     say("flat")
     flat = fit_curve(intervals, 0)
+    _, left_flat, _ = accuracy_of(intervals, flat)
     say("smooth")
     fit = fit_curve(intervals, WAVES, flat)
-    covariance, left_out, detail = accuracy_of(intervals, fit)
-    matrix, x = covariance.matrix, np.arange(200) / 200
+    covariance, left, detail = accuracy_of(intervals, fit)
+    x = np.arange(200) / 200
     waves = basis(x, WAVES)
     return PhaseResponse(
         coefficients=fit.coefficients,
-        covariance=matrix,
+        covariance=covariance.matrix,
         freedom=max(covariance.freedom, 1.0),
         detail=detail,
         phase=x,
         values=waves @ fit.coefficients,
-        errors=np.sqrt(np.einsum("ni,ij,nj->n", waves, matrix, waves)),
+        errors=_errors(waves, covariance.matrix),
         rates=fit.rates,
         jitter=fit.jitter,
-        left_out=_explained(intervals, fit, left_out),
-        left_out_flat=_explained(intervals, flat, accuracy_of(intervals, flat)[1]),
+        left_out=_explained(intervals, fit, left),
+        left_out_flat=_explained(intervals, flat, left_flat),
         p_flat=float(stats.chi2.sf(fit.smoothness.evidence, 1) / 2),
         excess=fit.smoothness.excess,
         intervals=total,
@@ -168,19 +172,28 @@ def phase_response(
     )
 
 
+def _errors(waves: Waves, covariance: Float[np.ndarray, "p p"]) -> Series:
+    """Return standard errors of a curve at the phases of some waves."""
+    return np.sqrt(np.einsum("ni,ij,nj->n", waves, covariance, waves))
+
+
 def _explained(intervals: Intervals, fit: CurveFit, left: float) -> float:
     """Return R2: the explained fraction of the variance of durations within trials."""
     count = np.maximum(intervals.sums(1.0 * fit.used), 1)
     mean = intervals.sums(intervals.duration * fit.used) / count
-    whole = ((intervals.duration - mean[intervals.trial])[fit.used] ** 2).sum()
+    deviation = intervals.duration - mean[intervals.trial]
+    whole = (deviation[fit.used] ** 2).sum()
     return float(1 - left / whole) if whole > 0 else 0.0
 
 
 def _memory(intervals: Intervals, fit: CurveFit) -> float:
     """Return the correlation of the residuals of successive intervals."""
-    missed, end = fit.residual * fit.forecast.rate, intervals.start + intervals.duration
+    end = intervals.start + intervals.duration
+    pause = np.abs(intervals.start[1:] - end[:-1])
     follows = fit.used[1:] & fit.used[:-1] & (np.diff(intervals.trial) == 0)
-    follows &= np.abs(intervals.start[1:] - end[:-1]) < 1e-6 * intervals.duration[1:]
+    follows &= pause < 1e-6 * intervals.duration[1:]
     if follows.sum() < 3:
         return 0.0
-    return float(np.corrcoef(missed[1:][follows], missed[:-1][follows])[0, 1])
+    later = fit.missed[1:][follows]
+    earlier = fit.missed[:-1][follows]
+    return float(np.corrcoef(later, earlier)[0, 1])
