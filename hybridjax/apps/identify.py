@@ -231,7 +231,7 @@ def summarize(result: Identification) -> dict[str, Any]:
             float(1 / np.median(np.diff(t.time))) for t in result.recording.trials
         ],
         "left_out": _left_out(result),
-        "notes": list(result.recording.notes),
+        "notes": [finding.text for finding in result.recording.findings],
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
         "references": list(fit.reference),
@@ -286,7 +286,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         else "output-error fit"
     )
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
-    notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
+    notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
     expected = zip(result.advice.strides, result.advice.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "

@@ -8,11 +8,12 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, SignalNames
+from .._core.findings import Finding
 from ..errors import DefinitionError, FileFormatError
 from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read_npz
 from .formats.bag import read_bag
 from .formats.c3d import read_c3d
-from .formats.columns import Columns, Wanted, parse_table, time_unit
+from .formats.columns import Columns, Wanted, assumed, parse_table, time_unit
 from .formats.layouts import read_text
 from .recording import Recording, check_events
 
@@ -50,7 +51,7 @@ def read_recording(
     of events. Events outside of the recording are left out.
 
     Times are converted to seconds from s, ms, us, ns, min or h; times without a unit are taken as
-    seconds, with a remark in `notes` of the recording.
+    seconds, with one of the recording's `findings`.
 
     **Arguments:** `time`: name of the column with the times. Default: "time". `signals`: names of
     the signals to be read, or of groups, structs, markers and topics; only these take memory.
@@ -61,7 +62,9 @@ def read_recording(
     the recording, packages that are not installed, and as `Recording`; `FileFormatError` for files
     that cannot be read, with the line.
     """
-    files = [x for y in paths for x in ([y] if isinstance(y, str | os.PathLike) else y)]
+    files: list[str | os.PathLike[str]] = []
+    for path in paths:
+        files += [path] if isinstance(path, str | os.PathLike) else path
     if not files:
         raise DefinitionError("`read_recording` needs the name of one file or more.")
     wanted = Wanted(time, None if signals is None else tuple(signals))
@@ -108,35 +111,40 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
     events: dict[str, np.ndarray] = {}
     for columns in read_tables(path, wanted):
         table = parse_table(f"'{path}'", columns, wanted.time)
-        notes = list(columns.notes)
-        if not time_unit(table.clock):
-            notes.append(f"the times in '{table.clock}' have no unit: taken as seconds")
         events |= table.events
         names += table.signals
-        signals = {
-            x: values for x, values in table.signals.items() if wanted.includes(x)
-        }
-        given = {x: unit for x, unit in table.units.items() if x in signals}
-        if signals:
-            parts.append(
-                Recording(table.time, signals, units=given, name=path.stem, notes=notes)
-            )
+        signals = {x: y for x, y in table.signals.items() if wanted.includes(x)}
+        if not signals:
+            continue
+        findings = list(columns.findings)
+        if not time_unit(table.clock):
+            text = f"the times in '{table.clock}' have no unit: taken as seconds."
+            findings.append(assumed(text))
+        part = Recording(
+            table.time,
+            signals,
+            units={x: unit for x, unit in table.units.items() if x in signals},
+            name=path.stem,
+            findings=findings,
+        )
+        parts.append(part)
     wanted.require(path, names)
     if not parts:
         raise DefinitionError(f"'{path}' has no signals beside its times: export some.")
     whole = Recording.beside(parts)
-    (trial,), notes = whole.trials, list(whole.notes)
+    trial = whole.trials[0]
+    findings = list(whole.findings)
     for name, at in events.items():
         events[name] = check_events(f"'{path}'", name, at, trial.time)
-        if lost := int(np.isfinite(at).sum()) - len(events[name]):
-            notes.append(
-                f"{lost} events '{name}' outside of the recording were left out"
-            )
+        lost = int(np.isfinite(at).sum()) - len(events[name])
+        if lost:
+            text = f"{lost} events '{name}' outside of the recording were left out."
+            findings.append(Finding("events outside", text, "left out"))
     return Recording(
         trial.time,
         dict(zip(whole.signals, trial.values.T, strict=True)),
         events=events,
         units=dict(zip(whole.signals, whole.units, strict=True)) | units,
         name=path.stem,
-        notes=notes,
+        findings=findings,
     )

@@ -1,22 +1,30 @@
 """What a laboratory recorded: sampled signals, events, units, in one or several trials."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 from scipy.optimize.elementwise import find_root
 
 from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
+from .._core.findings import Finding, print_findings
 from .._core.signal import with_unit
 from .._core.text import folded
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
-from .formats.columns import Columns, numbers, parse_table, require_aligned
+from .formats.columns import (
+    Columns,
+    assumed,
+    numbers,
+    parse_table,
+    require_aligned,
+)
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
@@ -45,13 +53,13 @@ class Recording(eqx.Module):
 
     - `trials`: one or several `Trial`s with the same signals.
     - `signals`: names of the signals. `units`: a unit for each, "" where none was given.
-    - `notes`: assumptions made while files were read.
+    - `findings`: assumptions made while files were read.
     """
 
     trials: tuple[Trial, ...]
     signals: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    findings: tuple[Finding, ...]
 
     def __init__(
         self,
@@ -61,7 +69,7 @@ class Recording(eqx.Module):
         events: Mapping[str, Any] | None = None,
         units: Mapping[str, str] | None = None,
         name: str = "trial",
-        notes: Sequence[str] = (),
+        findings: Sequence[Finding] = (),
     ):
         """Make a recording of one trial; `join` combines several.
 
@@ -71,58 +79,40 @@ class Recording(eqx.Module):
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing. Series
           of pandas must have the same index, and their samples the same order.
         - `events`: times of events by name, such as foot strikes.
-        - `units`: units by name. `name`: name of the trial. `notes`: remarks on the data.
+        - `units`: units by name. `name`: name of the trial. `findings` about the data.
 
         **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
         backwards, and infinite values, with the sample.
         """
-        where, units = f"trial '{name}'", dict(units or {})
+        where = f"trial '{name}'"
+        units = dict(units or {})
         require_aligned(where, [time, *signals.values()])
         time = numbers(where, "time", time)
         if not signals:
             raise DefinitionError(f"{where} has no signals.")
         columns = {key: numbers(where, key, values) for key, values in signals.items()}
+        for key, values in columns.items():
+            require_equal(f"{where}: {key} and time", "lengths", len(values), len(time))
         happened = {
             key: numbers(where, key, values) for key, values in (events or {}).items()
         }
-        for key, values in columns.items():
-            require_equal(f"{where}: {key} and time", "lengths", len(values), len(time))
         for key, values in (happened | columns).items():
-            if np.isinf(values).any():
-                text = f"{key} is infinite at sample {int(np.argmax(np.isinf(values)))}"
-                raise DefinitionError(
-                    f"{where}: {text}; put NaN where a sample is bad."
-                )
-        if len(time) < 2:
-            raise DefinitionError(
-                f"{where} has {len(time)} samples, but two or more are needed."
-            )
-        if not (later := np.diff(np.where(np.isinf(time), np.nan, time)) > 0).all():
-            bad = 1 + int(np.argmin(later))
-            a, b = time[bad - 1 : bad + 1]
-            advice = (
-                "sort, or make a trial of each part"
-                if b < a
-                else "leave out such samples"
-            )
-            text = f"time does not increase at sample {bad} ({a:.10g}, then {b:.10g})"
-            raise DefinitionError(f"{where}: {text}: {advice}.")
+            _require_finite(where, key, values)
+        _require_increasing(where, time)
         require_among("signal", units, columns, f"{where}, `units`: ")
-        if both := set(happened) & set(columns):
+        both = set(happened) & set(columns)
+        if both:
             raise DefinitionError(
                 f"{where}: '{min(both)}' is a signal and an event: rename one."
             )
-        happened = {
-            key: np.sort(values[~np.isnan(values)]) for key, values in happened.items()
-        }
         for key, values in happened.items():
-            check_events(where, key, values, time)
-        self.trials = (
-            Trial(time, np.stack(list(columns.values()), axis=1), happened, name),
-        )
+            happened[key] = np.sort(values[~np.isnan(values)])
+            check_events(where, key, happened[key], time)
+        values = np.stack(list(columns.values()), axis=1)
+        self.trials = (Trial(time, values, happened, name),)
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
-        self.notes = tuple(notes)
+        self.findings = tuple(findings)
 
     @classmethod
     def from_frame(
@@ -146,11 +136,13 @@ class Recording(eqx.Module):
         keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
         columns = Columns({str(key): frame[key] for key in keys})
         table = parse_table(f"trial '{name}'", columns, time)
-        events, units = (
-            table.events | dict(events or {}),
-            table.units | dict(units or {}),
+        return cls(
+            table.time,
+            table.signals,
+            events=table.events | dict(events or {}),
+            units=table.units | dict(units or {}),
+            name=name,
         )
-        return cls(table.time, table.signals, events=events, units=units, name=name)
 
     @staticmethod
     def join(recordings: Iterable["Recording"]) -> "Recording":
@@ -162,23 +154,26 @@ class Recording(eqx.Module):
         if not recordings:
             raise DefinitionError("`recordings` must be one recording or more.")
         first = recordings[0]
-        units = dict(zip(first.signals, first.units, strict=True))
         trials: list[Trial] = []
+        findings: dict[Finding, None] = {}
         for other in recordings:
             pair = f"trials '{first.trials[0].name}' and '{other.trials[0].name}'"
-            require_equal(pair, "signals", sorted(units), sorted(other.signals))
-            column = {key: k for k, key in enumerate(other.signals)}
-            for key, unit in units.items():
-                require_equal(pair, f"units of {key}", unit, other.units[column[key]])
-            order = [column[key] for key in units]
-            for t in other.trials:  # (signals in the same order are not copied)
-                same = order == sorted(order)
-                trials.append(t if same else replace(t, values=t.values[:, order]))
-        notes = dict.fromkeys(note for other in recordings for note in other.notes)
-        signals = dict(zip(units, trials[0].values.T, strict=True))
-        return Recording(
-            trials[0].time, signals, units=units, notes=[*notes]
-        ).with_trials(trials)
+            signals = sorted(first.signals)
+            require_equal(pair, "signals", signals, sorted(other.signals))
+            # (Not `other.column(name)`: a recording may have thousands of signals.)
+            column = {name: k for k, name in enumerate(other.signals)}
+            columns = [column[name] for name in first.signals]
+            for name, unit, k in zip(first.signals, first.units, columns, strict=True):
+                require_equal(pair, f"units of {name}", unit, other.units[k])
+            findings |= dict.fromkeys(other.findings)
+            if columns == sorted(columns):  # (nothing is copied)
+                trials += other.trials
+            else:
+                trials += [
+                    replace(t, values=t.values[:, columns]) for t in other.trials
+                ]
+        whole = eqx.tree_at(lambda r: r.findings, first, tuple(findings))
+        return whole.with_trials(trials)
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
@@ -196,42 +191,17 @@ class Recording(eqx.Module):
             raise DefinitionError(
                 "`recordings` must have the same number of trials each."
             )
-        names = [name for x in recordings for name in x.signals]
-        units = dict(
-            zip(names, (unit for x in recordings for unit in x.units), strict=True)
-        )
-        notes = [note for x in recordings for note in x.notes]
-        if len(units) < len(names):
-            twice = next(x for x in names if names.count(x) > 1)
-            raise DefinitionError(
-                f"two recordings have a signal '{twice}': rename one."
-            )
-        out = []
-        for trials in zip(*(x.trials for x in recordings), strict=True):
-            name = trials[0].name
-            time = np.unique(np.concatenate([t.time for t in trials]))
-            if len(time) * len(names) > limits.RECORDED:
-                text = (
-                    f"{len(names)} signals at {len(time)} times are too many together"
+        units: dict[str, str] = {}
+        for recording in recordings:
+            twice = set(recording.signals) & set(units)
+            if twice:
+                raise DefinitionError(
+                    f"two recordings have a signal '{min(twice)}': rename one."
                 )
-                raise DefinitionError(f"trial '{name}': {text}: choose `signals`.")
-            if any(len(t.time) < len(time) for t in trials):
-                notes.append(
-                    "signals have different rates or clocks: they are missing in between"
-                )
-            values: list[np.ndarray] = []
-            events: dict[str, np.ndarray] = {}
-            for t in trials:
-                values.append(np.full((len(time), t.values.shape[1]), np.nan))
-                values[-1][np.searchsorted(time, t.time)] = t.values
-                events |= t.events
-            signals = dict(zip(names, np.concatenate(values, axis=1).T, strict=True))
-            out.append(
-                Recording(
-                    time, signals, events=events, units=units, name=name, notes=notes
-                )
-            )
-        return Recording.join(out)
+            units |= dict(zip(recording.signals, recording.units, strict=True))
+        findings = [finding for x in recordings for finding in x.findings]
+        together = zip(*(x.trials for x in recordings), strict=True)
+        return Recording.join([_beside(trials, units, findings) for trials in together])
 
     def mark(
         self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf
@@ -251,20 +221,24 @@ class Recording(eqx.Module):
         **Raises:** `DefinitionError` for an unknown signal, one that never crosses the level, and a
         crossing of a function or in charts, which recordings do not have.
         """
-        signal, level, trials = signal_of(crossing), float(crossing.value), []
-        sign = 1.0 if crossing.direction == "rising" else -1.0
+        signal = signal_of(crossing)
+        level = float(crossing.value)
+        trials = []
         for trial, x in self.samples(signal):
             curve = spline(trial.time, without_spikes(x), bandwidth)
-            t, y = curve.x, sign * (curve(curve.x) - level)
-            longest = bridgeable(t, 0.5 / bandwidth)
-            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & (np.diff(t) <= longest))
+            t = curve.x
+            y = curve(t) - level
+            if crossing.direction != "rising":
+                y = -y
+            known = np.diff(t) <= bridgeable(t, 0.5 / bandwidth)
+            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & known)
             if not len(at):
-                text = f"{signal} is never seen to cross {level:g}, {crossing.direction}: choose a "
-                text += f"`value` between {np.nanmin(x):.4g} and {np.nanmax(x):.4g}."
-                raise DefinitionError(f"trial '{trial.name}': {text}")
-            crossed = find_root(
-                lambda t, curve=curve: curve(t) - level, (t[at], t[at + 1])
-            ).x
+                raise DefinitionError(
+                    f"trial '{trial.name}': {signal} is never seen to cross {level:g}, "
+                    f"{crossing.direction}: choose a `value` between {np.nanmin(x):.4g} and "
+                    f"{np.nanmax(x):.4g}."
+                )
+            crossed = find_root(_minus(curve, level), (t[at], t[at + 1])).x
             trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
@@ -291,20 +265,89 @@ class Recording(eqx.Module):
     def __repr__(self) -> str:
         names = ", ".join(map(with_unit, self.signals, self.units))
         lines = [folded(f"Recording({len(self.trials)} trials: {names})")]
-        for t in self.trials:
-            step = np.diff(t.time)
-            middle = float(np.median(step))
-            missing = int(np.isnan(t.values).any(axis=1).sum())
-            lines.append(
-                folded(
-                    f"  {t.name}: {len(t.time)} samples in {t.time[-1] - t.time[0]:.4g} s, every "
-                    f"{middle:.4g} s ({1 / middle:.4g} Hz, longest {step.max():.4g} s)"
-                    + (f"; {missing} with gaps" if missing else "")
-                    + "".join(f"; {len(at)} {name}" for name, at in t.events.items()),
-                    "  ",
-                )
-            )
-        return "\n".join([*lines, *(f"  ({note})" for note in self.notes)])
+        lines += [_summary(trial) for trial in self.trials]
+        if self.findings:
+            lines.append(print_findings(self.findings, "  "))
+        return "\n".join(lines)
+
+
+def _summary(trial: Trial) -> str:
+    """Return length, rate, gaps and events of a trial on one line, or folded."""
+    step = np.diff(trial.time)
+    usual = float(np.median(step))
+    parts = [
+        f"  {trial.name}: {len(trial.time)} samples in {np.ptp(trial.time):.4g} s, every "
+        f"{usual:.4g} s ({1 / usual:.4g} Hz, longest {step.max():.4g} s)"
+    ]
+    missing = int(np.isnan(trial.values).any(axis=1).sum())
+    if missing:
+        parts.append(f"{missing} with gaps")
+    parts += [f"{len(at)} {name}" for name, at in trial.events.items()]
+    return folded("; ".join(parts), "  ")
+
+
+def _minus(curve: CubicSpline, level: float) -> Callable[[Series], Series]:
+    return lambda t: curve(t) - level
+
+
+def _beside(
+    trials: Sequence[Trial],
+    units: Mapping[str, str],
+    findings: Sequence[Finding],
+) -> Recording:
+    """Return one trial with the signals of several, on a common time axis."""
+    name = trials[0].name
+    time = np.unique(np.concatenate([t.time for t in trials]))
+    if len(time) * len(units) > limits.RECORDED:
+        raise DefinitionError(
+            f"trial '{name}': {len(units)} signals at {len(time)} times are too many together: "
+            "choose `signals`."
+        )
+    values = []
+    events: dict[str, Series] = {}
+    for trial in trials:
+        columns = np.full((len(time), trial.values.shape[1]), np.nan)
+        columns[np.searchsorted(time, trial.time)] = trial.values
+        values.append(columns)
+        events |= trial.events
+    if any(len(t.time) < len(time) for t in trials):
+        text = "signals have different rates or clocks: they are missing in between."
+        findings = [*findings, assumed(text)]
+    signals = dict(zip(units, np.concatenate(values, axis=1).T, strict=True))
+    return Recording(
+        time, signals, events=events, units=units, name=name, findings=findings
+    )
+
+
+def _require_finite(where: str, name: str, values: Series) -> None:
+    """**Raises:** `DefinitionError` for an infinite value."""
+    infinite = np.flatnonzero(np.isinf(values))
+    if len(infinite):
+        raise DefinitionError(
+            f"{where}: {name} is infinite at sample {infinite[0]}; put NaN where a sample is bad."
+        )
+
+
+def _require_increasing(where: str, time: Series) -> None:
+    """**Raises:** `DefinitionError` for less than two samples, and time that does not increase."""
+    if len(time) < 2:
+        raise DefinitionError(
+            f"{where} has {len(time)} samples, but two or more are needed."
+        )
+    finite = np.where(np.isinf(time), np.nan, time)
+    later = np.diff(finite) > 0
+    if later.all():
+        return
+    bad = 1 + int(np.argmin(later))
+    before = time[bad - 1]
+    after = time[bad]
+    remedy = "leave out such samples"
+    if after < before:
+        remedy = "sort, or make a trial of each part"
+    raise DefinitionError(
+        f"{where}: time does not increase at sample {bad} ({before:.10g}, then {after:.10g}): "
+        f"{remedy}."
+    )
 
 
 def signal_of(crossing: Crossing) -> str:
@@ -326,11 +369,12 @@ def check_events(
 
     **Raises:** `DefinitionError` if all events lie outside.
     """
-    at, margin = at[np.isfinite(at)], float(np.median(np.diff(time)))
+    at = at[np.isfinite(at)]
+    margin = float(np.median(np.diff(time)))
     within = (at >= time[0] - margin) & (at <= time[-1] + margin)
     if len(at) and not within.any():
-        text = f"are outside of the recording ({time[0]:.6g} to {time[-1]:.6g} s): check their unit"
         raise DefinitionError(
-            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) {text}."
+            f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "
+            f"({time[0]:.6g} to {time[-1]:.6g} s): check their unit."
         )
     return at[within]

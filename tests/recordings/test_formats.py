@@ -190,7 +190,7 @@ def test_excel(tmp_path):
     t, x = samples(found, "x")
     np.testing.assert_allclose(x, np.delete(X, 4), rtol=1e-15)
     np.testing.assert_allclose(t, np.delete(SLOW, 4), rtol=1e-15)
-    assert "of 2 sheets the first one, 'walk', was read" in found.notes
+    assert "of 2 sheets the first one, 'walk', was read" in found.findings[0].text
     book.active["B9"] = "high"
     book.save(path)
     refused("line 9: column 'x' holds 'high'", path)
@@ -278,8 +278,8 @@ def test_c3d(tmp_path):
     write_c3d(tmp_path / "late.c3d", first=10)
     found = hj.read_recording(tmp_path / "late.c3d")
     np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)
-    assert (
-        "1 events 'Left Strike' outside of the recording were left out" in found.notes
+    assert found.findings[-1].text == (
+        "1 events 'Left Strike' outside of the recording were left out."
     )
     write_c3d(tmp_path / "late.c3d", first=50)
     refused(
@@ -350,7 +350,8 @@ def test_bags(tmp_path, version):
         samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12
     )
     np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
-    assert any("times of count are those of arrival" in note for note in found.notes)
+    texts = [finding.text for finding in found.findings]
+    assert any("times of count are those of arrival" in text for text in texts)
     assert "image.data.0" not in hj.read_recording(path).signals
     refused(
         "no signal 'imu.x'; it has body, count",

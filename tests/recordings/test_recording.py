@@ -138,7 +138,7 @@ def test_opensim(tmp_path, blanks):
     path.write_text(OPENSIM.replace("\t", blanks))
     found = hj.read_recording(path)
     assert found.signals == ("pelvis_ty", "force_vx")
-    assert found.notes == ("angles are in degrees",)
+    assert [x.text for x in found.findings] == ["angles are in degrees."]
     np.testing.assert_array_equal(found.trials[0].values, [[1, 2], [-0.25, 3]])
     path.write_text(OPENSIM.replace("nRows=2", "nRows=3"))
     with pytest.raises(FileFormatError, match="2 rows, its header 3"):
@@ -157,7 +157,7 @@ def test_vicon(tmp_path, separator):
     np.testing.assert_allclose(found.trials[0].time, [0, 0.001, 0.002, 0.003])
     expected = [[1, 2, 3, 4], [10, np.nan, 11, np.nan]]
     np.testing.assert_array_equal(found.trials[0].values[:, 1:3].T, expected)
-    assert any("different rates" in note for note in found.notes)
+    assert any("different rates" in x.text for x in found.findings)
     path.write_text(VICON.replace("500", "400"))
     with pytest.raises(FileFormatError, match="of different rates"):
         hj.read_recording(path)
@@ -167,7 +167,7 @@ def test_vicon(tmp_path, separator):
     ):
         hj.read_recording(path)
     path.write_text(VICON[: VICON.index("\n\n")])
-    assert hj.read_recording(path).notes == ()
+    assert hj.read_recording(path).findings == ()
 
 
 @pytest.mark.parametrize(
@@ -211,8 +211,8 @@ def test_the_unit_of_time(tmp_path):
     )
     (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
     both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
-    assert "(the times in 'frame' have no unit: taken as seconds)" in repr(both)
-    assert "every 1 s (1 Hz, longest 1 s)" in repr(both) and len(both.notes) == 1
+    assert "the times in 'frame' have no unit: taken as seconds" in repr(both)
+    assert "every 1 s (1 Hz, longest 1 s)" in repr(both) and len(both.findings) == 1
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
     with pytest.raises(hj.DefinitionError, match="are in 'samples': convert them"):
         hj.read_recording(tmp_path / "y.csv")

@@ -6,7 +6,7 @@ import io
 import itertools
 import math
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,15 @@ from ..._core.archive import read_arrays
 from ..._core.arguments import package
 from ..._core.signal import with_unit
 from ...errors import DefinitionError, FileFormatError
-from .columns import EVENT, Columns, Wanted, check_declared, reading, split_header
+from .columns import (
+    EVENT,
+    Columns,
+    Wanted,
+    assumed,
+    check_declared,
+    reading,
+    split_header,
+)
 from .matlab_sizes import declared
 from .text import read_plain
 
@@ -53,27 +61,29 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
                 f"'{path}' has groups in more than {limits.NESTED} others: copy their arrays into "
                 "fewer."
             )
-        if not isinstance(node, h5py.Dataset) or name.startswith(
-            "#"
-        ):  # MATLAB's own data
+        is_of_matlab = name.startswith("#")  # MATLAB's own data
+        if not isinstance(node, h5py.Dataset) or is_of_matlab:
             return
-        if h5py.check_ref_dtype(node.dtype) and "MATLAB_class" not in node.attrs:
+        kind = node.attrs.get("MATLAB_class")
+        if h5py.check_ref_dtype(node.dtype) and kind is None:
             _refuse_structs(path, separator.join(place[:-1]), wanted)
         # Letters of MATLAB are numbers; its empty arrays hold their shape.
-        text = "MATLAB_empty" in node.attrs or node.attrs.get("MATLAB_class") == b"char"
-        if node.dtype.kind in "fiu" and not text:
-            if node.external or node.is_virtual:
-                raise FileFormatError(
-                    f"'{path}': '{name}' lies in other files: copy it into this."
-                )
-            unit = node.attrs.get("units", "")
-            leaves[place] = Leaf(
-                node, unit.decode() if isinstance(unit, bytes) else str(unit)
+        is_text = "MATLAB_empty" in node.attrs or kind == b"char"
+        if node.dtype.kind not in "fiu" or is_text:
+            return
+        if node.external or node.is_virtual:
+            raise FileFormatError(
+                f"'{path}': '{name}' lies in other files: copy it into this."
             )
+        unit = node.attrs.get("units", "")
+        if isinstance(unit, bytes):
+            unit = unit.decode()
+        leaves[place] = Leaf(node, str(unit))
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
-        check_declared(path, 8 * sum(math.prod(x.array.shape) for x in leaves.values()))
+        numbers = sum(math.prod(leaf.array.shape) for leaf in leaves.values())
+        check_declared(path, 8 * numbers)
         return _read_tree(path, leaves, separator, wanted)
 
 
@@ -90,19 +100,26 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
         if version == 2:
             return read_hdf5(path, wanted, ".")
         # (`whosmat` unpacks whole arrays of version 5. Version 4 does not pack.)
-        for size in itertools.accumulate(declared(path) if version == 1 else ()):
-            check_declared(path, size)
+        if version == 1:
+            for size in itertools.accumulate(declared(path)):
+                check_declared(path, size)
         shapes = {name: shape for name, shape, _ in whosmat(path)}
         if version == 0:
             check_declared(path, 8 * sum(map(math.prod, shapes.values())))
-        # (If a name is wrong, all are read, for the message.)
-        wrong = not {x.split(".")[0] for x in wanted.signals or ()} <= set(shapes)
-        chosen = [x for x in shapes if wrong or wanted.includes(x) or wanted.reaches(x)]
+        chosen = _chosen(list(shapes), wanted)
         content = loadmat(path, simplify_cells=True, variable_names=chosen)
     variables = {
         name: value for name, value in content.items() if not name.startswith("__")
     }
     return _read_tree(path, dict(_leaves(path, (), variables, wanted)), ".", wanted)
+
+
+def _chosen(names: Sequence[str], wanted: Wanted) -> list[str]:
+    """Return the variables to be read; if a wanted name is wrong, all, for the message."""
+    first_names = {name.split(".")[0] for name in wanted.signals or ()}
+    if not first_names <= set(names):
+        return list(names)
+    return [name for name in names if wanted.includes(name) or wanted.reaches(name)]
 
 
 def _leaves(
@@ -133,46 +150,55 @@ def _read_tree(
     names = {place: separator.join(place) for place in leaves}
     wanted.require(path, list(names.values()), groups=True)
     clocks = {place[:-1]: place for place in leaves if wanted.is_time(place[-1])}
-    if wanted.time in names.values():
-        clocks[()] = next(place for place, name in names.items() if name == wanted.time)
+    for place, name in names.items():
+        if name == wanted.time:
+            clocks[()] = place
     tables: dict[Place, Columns] = {}
     for place, leaf in leaves.items():
-        name, is_event = names[place], place[-2:-1] == ("events",)
+        name = names[place]
+        is_event = place[-2:-1] == ("events",)
         is_signal = np.prod(leaf.array.shape) > 1 and wanted.reaches(name)
         if place in clocks.values() or not (is_event or is_signal):
             continue
-        around = next(
-            (place[:k] for k in range(len(place), -1, -1) if place[:k] in clocks), None
-        )
-        if around is None:
-            text = "in its group or one around it: add or name them (`time`), or choose `signals`."
+        group = _nearest(place, clocks)
+        if group is None:
             raise DefinitionError(
-                f"'{path}' has no times '{wanted.time}' for '{name}' {text}"
+                f"'{path}' has no times '{wanted.time}' for '{name}' in its group or one around "
+                "it: add or name them (`time`), or choose `signals`."
             )
-        if around not in tables:
-            clock = leaves[clocks[around]]
+        if group not in tables:
+            clock = leaves[clocks[group]]
             times = np.atleast_1d(np.squeeze(clock.array[()]))
-            tables[around] = Columns(
-                {with_unit(wanted.time, clock.unit): times}, events={}
-            )
+            header = with_unit(wanted.time, clock.unit)
+            tables[group] = Columns({header: times}, events={})
+        table = tables[group]
         if is_event:
-            tables[around].events[place[-1]] = np.ravel(leaf.array[()])
+            table.events[place[-1]] = np.ravel(leaf.array[()])
         else:
-            tables[around].values.update(_columns(path, name, leaf, tables[around]))
+            table.values.update(_columns(path, name, leaf, table))
     return list(tables.values())
 
 
+def _nearest(place: Place, clocks: Mapping[Place, Place]) -> Place | None:
+    """Return the innermost group around an array, or the array itself, that has times."""
+    for depth in range(len(place), -1, -1):
+        if place[:depth] in clocks:
+            return place[:depth]
+    return None
+
+
 def _columns(
-    path: Path, name: str, leaf: Leaf, out: Columns
+    path: Path, name: str, leaf: Leaf, table: Columns
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    times = next(iter(out.values.values()))
+    """Return an array, or the columns of a matrix, with a row for each of the table's times."""
+    times = next(iter(table.values.values()))
     values = np.atleast_1d(np.squeeze(leaf.array[()]))
     if values.ndim == 2 and len(values) != len(times):
         values = values.T
     if values.ndim > 2 or len(values) != len(times):
-        text = f"has the shape {leaf.array.shape}, but its group {times.size} times"
         raise FileFormatError(
-            f"'{path}': '{name}' {text}: add its own, or choose `signals`."
+            f"'{path}': '{name}' has the shape {leaf.array.shape}, but its group {times.size} "
+            "times: add its own, or choose `signals`."
         )
     if values.ndim == 1:
         return {with_unit(name, leaf.unit): values}
@@ -181,8 +207,10 @@ def _columns(
 
 def _refuse_structs(path: Path, name: str, wanted: Wanted) -> None:
     if wanted.reaches(name):
-        text = "is an array of structs: save each in its own file, or choose other `signals`."
-        raise FileFormatError(f"'{path}': '{name}' {text}")
+        raise FileFormatError(
+            f"'{path}': '{name}' is an array of structs: save each in its own file, or choose "
+            "other `signals`."
+        )
 
 
 def read_arrow(path: Path, wanted: Wanted) -> list[Columns]:
@@ -219,8 +247,10 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
     width = max(map(len, rows), default=0)
     check_declared(path, width * sum(map(bool, rows)))
     table = read_plain(path, [_line(row, width) for row in rows])
-    note = f"of {len(names)} sheets the first one, '{names[0]}', was read"
-    return [table._replace(notes=(*table.notes, note)) if len(names) > 1 else table]
+    if len(names) > 1:
+        text = f"of {len(names)} sheets the first one, '{names[0]}', was read."
+        table = table.after(assumed(text))
+    return [table]
 
 
 def _rows(path: Path, sheet: Any) -> list[list[str]]:
@@ -251,8 +281,8 @@ def _line(cells: list[str], width: int) -> str:
     """Join cells with tabs, in quotes where necessary, as many in each row that is not empty."""
     if not cells:
         return ""
-    text = io.StringIO()
     filled = [*cells, *[""] * (width - len(cells))]
+    text = io.StringIO()
     csv.writer(text, delimiter="\t", lineterminator="").writerow(filled)
     return text.getvalue()
 
@@ -262,10 +292,11 @@ def read_npz(path: Path, wanted: Wanted) -> list[Columns]:
 
     **Raises:** as `read_arrays`.
     """
-    arrays = read_arrays(path)
-    events = {
-        x.removeprefix(EVENT): arrays.pop(x)
-        for x in list(arrays)
-        if x.startswith(EVENT)
-    }
-    return [Columns(arrays, events=events)]
+    values = {}
+    events = {}
+    for name, array in read_arrays(path).items():
+        if name.startswith(EVENT):
+            events[name.removeprefix(EVENT)] = array
+        else:
+            values[name] = array
+    return [Columns(values, events=events)]

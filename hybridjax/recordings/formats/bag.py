@@ -10,7 +10,7 @@ import numpy as np
 
 from ..._core.arguments import package
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, reading
+from .columns import Columns, Wanted, assumed, reading
 
 
 # Longest array in a message whose numbers become signals. Longer: scans and images become thousands
@@ -27,32 +27,48 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
     file, and arrays whose length changes.
     """
-    reader, typesys = package("rosbags.highlevel").AnyReader, package("rosbags.typesys")
+    highlevel = package("rosbags.highlevel")
+    typesys = package("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.LATEST)
-    with reading(path, "bag of ROS"), reader([path], default_typestore=store) as bag:
-        wanted.require(
-            path, sorted({x.topic.lstrip("/") for x in bag.connections}), groups=True
-        )
-        chosen = [x for x in bag.connections if wanted.reaches(x.topic.lstrip("/"))]
-        topics = {x.topic: _Topic(x.topic.lstrip("/")) for x in chosen}
-        for connection, arrival, data in bag.messages(chosen) if chosen else ():
+    with (
+        reading(path, "bag of ROS"),
+        highlevel.AnyReader([path], default_typestore=store) as bag,
+    ):
+        names = {x.topic: x.topic.lstrip("/") for x in bag.connections}
+        wanted.require(path, sorted(names.values()), groups=True)
+        chosen = [x for x in bag.connections if wanted.reaches(names[x.topic])]
+        topics = {x.topic: _Topic(names[x.topic]) for x in chosen}
+        if not chosen:
+            return []
+        for connection, arrival, data in bag.messages(chosen):
             message = bag.deserialize(data, connection.msgtype)
             topics[connection.topic].add(path, message, arrival, wanted)
-        return [x.columns(bag.start_time) for x in topics.values() if x.names]
+        return [
+            topic.columns(bag.start_time) for topic in topics.values() if topic.names
+        ]
 
 
 class _Topic:
     """The numbers of one topic, message by message."""
 
     def __init__(self, name: str):
-        self.name, self.names = name, tuple[str, ...]()
-        self.values, self.stamps, self.arrivals = array("d"), array("q"), array("q")
+        self.name = name
+        self.names: tuple[str, ...] = ()
+        self.values = array("d")
+        self.stamps = array("q")
+        self.arrivals = array("q")
 
     def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:
-        numbers = {x: v for x, v in _numbers(message, self.name) if wanted.includes(x)}
+        numbers = {
+            name: value
+            for name, value in _numbers(message, self.name)
+            if wanted.includes(name)
+        }
         if self.arrivals and tuple(numbers) != self.names:
-            text = f"arrays in messages of '{self.name}' differ in length: choose other `signals`."
-            raise FileFormatError(f"'{path}': {text}")
+            raise FileFormatError(
+                f"'{path}': arrays in messages of '{self.name}' differ in length: choose other "
+                "`signals`."
+            )
         self.names = tuple(numbers)
         self.values.extend(numbers.values())
         self.arrivals.append(arrival)
@@ -61,23 +77,31 @@ class _Topic:
 
     def columns(self, start: int) -> Columns:
         """Return the columns in the order of their times, in s since the start of the bag (ns)."""
-        stamps, notes = np.array(self.stamps), ()
+        stamps = np.array(self.stamps)
+        findings = ()
         if not stamps.all():
-            note = f"the times of {self.name} are those of arrival: its messages have no stamps"
-            stamps, notes = np.array(self.arrivals), (note,)
+            stamps = np.array(self.arrivals)
+            findings = (
+                assumed(
+                    f"the times of {self.name} are those of arrival: its messages have no stamps."
+                ),
+            )
         order = np.argsort(stamps, kind="stable")
         rows = np.array(self.values).reshape(len(order), -1)[order]
-        values = dict(zip(self.names, rows.T, strict=True))
-        return Columns({"time (s)": (stamps[order] - start) / 10**9} | values, notes)
+        values = {"time (s)": (stamps[order] - start) / 10**9}
+        values |= dict(zip(self.names, rows.T, strict=True))
+        return Columns(values, findings)
 
 
 def _numbers(message: Any, name: str) -> Iterator[tuple[str, float]]:
     """Yield numbers by the names of their fields, without headers and long arrays."""
     for field in dataclasses.fields(message):
-        value, path = getattr(message, field.name), f"{name}.{field.name}"
+        value = getattr(message, field.name)
+        path = f"{name}.{field.name}"
         if isinstance(value, bool | int | float | np.number):
             yield path, float(value)
         elif isinstance(value, np.ndarray) and value.size <= _LONGEST:
-            yield from ((f"{path}.{k}", float(x)) for k, x in enumerate(value))
+            for k, x in enumerate(value):
+                yield f"{path}.{k}", float(x)
         elif dataclasses.is_dataclass(value) and field.name != "header":
             yield from _numbers(value, path)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from ..._core import limits
 from ..._core.boundary.values import unmasked
+from ..._core.findings import Finding
 from ..._core.signal import SECONDS
 from ...errors import DefinitionError, FileFormatError, HybridJaxError
 
@@ -33,10 +34,19 @@ class Columns(NamedTuple):
     """Columns of one table by their headers: signals, and the times at which all were sampled."""
 
     values: dict[str, Float[np.ndarray, " n"]]
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     """Assumptions made while reading."""
     events: dict[str, Float[np.ndarray, " _"]] = {}
     """Times of events by name, in the unit of the table's times."""
+
+    def after(self, *findings: Finding) -> "Columns":
+        """Return the columns with more findings."""
+        return self._replace(findings=(*self.findings, *findings))
+
+
+def assumed(text: str) -> Finding:
+    """Return a finding about an assumption that a reader makes."""
+    return Finding("assumption", text)
 
 
 class Table(NamedTuple):
@@ -63,22 +73,12 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
     """
     require_aligned(where, columns.values.values())
     headers = {x: split_header(x) for x in columns.values}
-    exact = [x for x, (name, _) in headers.items() if time in (x, name)]
-    clocks = exact or [
-        x for x, (name, _) in headers.items() if name.lower() == time.lower()
-    ]
-    if len(clocks) > 1:
-        raise FileFormatError(f"{where} has two columns '{time}': rename one.")
-    if not clocks:
-        names = ", ".join(name for name, _ in headers.values())
-        text = f"choose `time` from {names}, or add a column of times."
-        raise DefinitionError(f"{where} has no column '{time}': {text}")
-    clock = clocks[0]
+    clock = _clock(where, headers, time)
     unit = time_unit(clock) or "s"
     if unit not in SECONDS:
-        text = "convert them to s, ms, us, ns, min or h (divide frames by the sampling rate)"
         raise DefinitionError(
-            f"{where}: the times in '{clock}' are in '{unit}': {text}."
+            f"{where}: the times in '{clock}' are in '{unit}': convert them to s, ms, us, ns, min "
+            "or h (divide frames by the sampling rate)."
         )
     scale = SECONDS[unit]
     times = scale * numbers(where, clock, columns.values[clock])
@@ -89,8 +89,8 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         if header == clock:
             continue
         if name.startswith(EVENT):
-            happened = np.nan_to_num(numbers(where, name, columns.values[header])) != 0
-            events[name.removeprefix(EVENT)] = times[happened]
+            marks = numbers(where, name, columns.values[header])
+            events[name.removeprefix(EVENT)] = times[np.nan_to_num(marks) != 0]
             continue
         if unit.lower() == "nan":
             raise FileFormatError(
@@ -99,8 +99,24 @@ def parse_table(where: str, columns: Columns, time: str) -> Table:
         if name in signals:
             raise FileFormatError(f"{where} has two columns '{name}': rename one.")
         signals[name] = columns.values[header]
-        units |= {name: unit} if unit else {}
+        if unit:
+            units[name] = unit
     return Table(times, signals, units, events, clock)
+
+
+def _clock(where: str, headers: dict[str, tuple[str, str]], time: str) -> str:
+    """Return the header of the times."""
+    exact = [x for x, (name, _) in headers.items() if time in (x, name)]
+    alike = [x for x, (name, _) in headers.items() if name.lower() == time.lower()]
+    clocks = exact or alike
+    if len(clocks) > 1:
+        raise FileFormatError(f"{where} has two columns '{time}': rename one.")
+    if not clocks:
+        names = ", ".join(name for name, _ in headers.values())
+        raise DefinitionError(
+            f"{where} has no column '{time}': choose `time` from {names}, or add a column of times."
+        )
+    return clocks[0]
 
 
 def require_aligned(where: str, columns: Iterable[Any]) -> None:
@@ -139,7 +155,7 @@ class Wanted(NamedTuple):
 
     def includes(self, header: str) -> bool:
         """Return whether a column is a wanted signal, the times, or an event."""
-        name = split_header(header)[0]
+        name, _ = split_header(header)
         if self.signals is None or name.startswith(EVENT) or self.is_time(header):
             return True
         return not _with_groups(name).isdisjoint(_set(self.signals))
@@ -153,31 +169,30 @@ class Wanted(NamedTuple):
 
     def is_time(self, header: str) -> bool:
         """Return whether a column may hold the times."""
-        return (
-            header == self.time or split_header(header)[0].lower() == self.time.lower()
-        )
+        name, _ = split_header(header)
+        return header == self.time or name.lower() == self.time.lower()
 
     def require(self, path: Path, names: Sequence[str], groups: bool = False) -> None:
         """Check that each wanted signal exists; `groups`: `names` may be groups of signals.
 
         **Raises:** `DefinitionError` that lists up to 20 names.
         """
-        known, with_groups = _set(tuple(names)), _set_with_groups(tuple(names))
+        known = _set(tuple(names))
+        with_groups = _set_with_groups(tuple(names))
         for name in self.signals or ():
             within = groups and not _with_groups(name).isdisjoint(known)
             if not (within or name in with_groups):
-                listed = (
-                    ", ".join([*names[:20], *["..."][: len(names) // 21]]) or "none"
-                )
+                shown = [*names[:20], "..."] if len(names) > 20 else names
                 raise DefinitionError(
-                    f"'{path}' has no signal '{name}'; it has {listed}."
+                    f"'{path}' has no signal '{name}'; it has {', '.join(shown) or 'none'}."
                 )
 
 
 def _with_groups(name: str) -> set[str]:
     """The name of a signal, and those of the groups that it is in: `imu.gyro.x`, `imu.gyro` and
     `imu`."""
-    return {name, *(name[:k] for k, letter in enumerate(name) if letter in "./")}
+    groups = {name[:k] for k, letter in enumerate(name) if letter in "./"}
+    return {name, *groups}
 
 
 # Names are compared as sets, since a file may have thousands, and a user want as many.
@@ -204,8 +219,11 @@ def is_unit(text: str) -> bool:
 
 def time_unit(header: str) -> str:
     """Return the unit of times: `time (ms)`, `time_ms`, `t / ms` -> `ms`; "" if there is none."""
+    _, unit = split_header(header)
     trailing = _TRAILING.fullmatch(header.strip())
-    return split_header(header)[1] or (trailing[2] if trailing else "")
+    if not unit and trailing is not None:
+        return trailing[2]
+    return unit
 
 
 def two_columns(path: Path, names: Sequence[str]) -> None:

@@ -1,6 +1,7 @@
 """Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
 
-`read_text` recognizes a layout by its first lines; those of other makers (Noraxon) belong here.
+`read_text` recognizes a layout by its first lines. A layout of another maker is a function here
+that returns its tables, and a line in `read_text`.
 """
 
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, check_rows
+from .columns import Columns, Wanted, assumed, check_rows
 from .text import read_lines, read_plain, read_table, split_line, split_names, to_number
 
 
@@ -26,30 +27,35 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
         return [_opensim(path, lines, head.index("endheader"))]
     if head[0].startswith("pathfiletype"):
         return [_trc(path, lines)]
-    blocks = any(x.startswith(("frame", '"frame')) for x in head) and list(
-        _vicon(path, lines)
-    )
-    return blocks or [read_plain(path, lines)]
+    if any(x.startswith(("frame", '"frame')) for x in head):
+        blocks = list(_vicon(path, lines))
+        if blocks:
+            return blocks
+    return [read_plain(path, lines)]
 
 
 def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     """Read a motion or storage file: `key=value` up to `endheader`, then names, then numbers."""
-    facts = dict(
-        x.replace(" ", "").lower().split("=", 1) for x in lines[:end] if "=" in x
-    )
-    if (
-        start := next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)
-    ) is None:
+    facts = {}
+    for line in lines[:end]:
+        key, is_fact, value = line.replace(" ", "").lower().partition("=")
+        if is_fact:
+            facts[key] = value
+    filled = [k for k in range(end + 1, len(lines)) if lines[k].strip()]
+    if not filled:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
+    start = filled[0]
     separator = "\t" if "\t" in lines[start] else ""
-    names = split_names(lines[start], separator)
+    # Times of OpenSim are seconds.
     names = [
-        "time (s)" if x == "time" else x for x in names
-    ]  # times of OpenSim are seconds
+        "time (s)" if name == "time" else name
+        for name in split_names(lines[start], separator)
+    ]
     table = read_table(path, names, lines, start + 1, separator)
     check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
-    degrees = ("angles are in degrees",) if facts.get("indegrees") == "yes" else ()
-    return Columns(table.values, table.notes + degrees)
+    if facts.get("indegrees") == "yes":
+        table = table.after(assumed("angles are in degrees."))
+    return table
 
 
 def _trc(path: Path, lines: list[str]) -> Columns:
@@ -60,13 +66,15 @@ def _trc(path: Path, lines: list[str]) -> Columns:
         raise FileFormatError(
             f"'{path}' does not name 'Frame#', 'Time' and its markers in line 4."
         )
-    facts = dict(zip((x.lower() for x in head[1]), head[2], strict=False))
+    keys = [x.lower() for x in head[1]]
+    facts = dict(zip(keys, head[2], strict=False))
     unit = facts.get("units", "")
-    columns = [
-        with_unit(f"{marker}.{axis}", unit) for marker in names[2::3] for axis in "xyz"
-    ]
-    table = read_table(path, ["frame#", "time (s)", *columns], lines, 5, "\t")
-    check_rows(path, len(table.values.pop("frame#")), facts.get("numframes"), "frames")
+    columns = ["frame#", "time (s)"]
+    for marker in names[2::3]:
+        columns += [with_unit(f"{marker}.{axis}", unit) for axis in "xyz"]
+    table = read_table(path, columns, lines, 5, "\t")
+    frames = table.values.pop("frame#")
+    check_rows(path, len(frames), facts.get("numframes"), "frames")
     return table
 
 
@@ -76,13 +84,13 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
     A block has a title, a rate, the devices, their components, units, and then a row for each
     sample. Columns are named by device, or marker, and component, such as `Plate 1.Fx`.
     """
-    ends = [k for k in range(len(lines)) if not lines[k].strip(" ,;\t")] + [len(lines)]
+    ends = [k for k, line in enumerate(lines) if not line.strip(" ,;\t")]
+    ends.append(len(lines))
     rates = set()
     for start in range(len(lines) - 4):
         separator = max("\t;,", key=lines[start + 3].count)
-        names = _names(
-            *(split_names(x, separator) for x in lines[start + 2 : start + 5])
-        )
+        header = [split_names(x, separator) for x in lines[start + 2 : start + 5]]
+        names = _names(*header)
         rate = to_number(lines[start + 1].strip(" ,;\t")) or 0
         if not (rate > 0 and names and names[0].lower() == "frame"):
             continue
@@ -90,19 +98,15 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
         table = read_table(path, names, lines[:stop], start + 5, separator)
         columns = {name.lower(): name for name in table.values}
         frame = table.values.pop(columns["frame"])
-        sub = table.values.pop(columns.get("sub frame", ""), np.zeros(len(frame)))
-        parts = int(np.nan_to_num(sub).max()) + 1
-        if (
-            not np.isfinite(frame + sub).all()
-            or (np.diff(frame + sub / parts) <= 0).any()
-        ):
+        sub_frame = table.values.pop(columns.get("sub frame", ""), np.zeros(len(frame)))
+        per_frame = int(np.nan_to_num(sub_frame).max()) + 1
+        sample = (frame - 1) * per_frame + sub_frame
+        if not np.isfinite(sample).all() or (np.diff(sample) <= 0).any():
             raise FileFormatError(
                 f"'{path}' has frames that are missing, or not in order."
             )
-        yield Columns(
-            {"time (s)": ((frame - 1) * parts + sub) / rate} | table.values, table.notes
-        )
-        rates.add(rate / parts)
+        yield table._replace(values={"time (s)": sample / rate} | table.values)
+        rates.add(rate / per_frame)
     if len(rates) > 1:
         raise FileFormatError(
             f"'{path}' has blocks of different rates: export them one by one."
@@ -111,9 +115,12 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
 
 def _names(devices: list[str], components: list[str], units: list[str]) -> list[str]:
     """Return `device.component (unit)` for each column."""
-    device, names = "", []
+    device = ""
+    names = []
     for above, component, unit in zip_longest(devices, components, units, fillvalue=""):
         # A name stands above the first of its columns; of `subject:marker` the marker counts.
-        device = above.split(":")[-1] if above else device
-        names.append(with_unit(f"{device}.{component}" if device else component, unit))
+        if above:
+            device = above.split(":")[-1]
+        name = f"{device}.{component}" if device else component
+        names.append(with_unit(name, unit))
     return names[: len(components)]

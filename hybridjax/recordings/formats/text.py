@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, is_unit, split_header, two_columns
+from .columns import Columns, assumed, is_unit, split_header, two_columns
 
 
 # Bytes that no text holds, in any encoding with one byte for each ASCII character.
@@ -51,32 +51,62 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
     content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
-    whole, content = content, _from_names(lines, content)
+    above = content[0]
+    content = _from_names(lines, content)
     first = content[0]
     below = lines[content[1]] if len(content) > 1 else ""
     separator = _separator(lines[first], below)
     names = split_names(lines[first], separator)
     if all(to_number(x) is not None for x in names):
-        # As `numpy.savetxt` writes it: the names are the last comment.
-        before = [lines[k].lstrip().lstrip("#%/").strip() for k in filled if k < first]
-        separator = _separator(before[-1], lines[first]) if before else separator
-        width, names = len(names), split_names(before[-1], separator) if before else []
-        if len(names) != width or any(to_number(x) is not None for x in names):
-            raise FileFormatError(
-                f"'{path}' begins with numbers: its first line must be names."
-            )
-        return read_table(path, names, lines, first, separator)
-    start, fields = first + 1, split_line(below, separator)
-    units = [x for x in fields if x]
-    if units and all(map(is_unit, units)) and any(to_number(x) is None for x in fields):
-        below_names = zip_longest(names, fields[: len(names)], fillvalue="")
-        names = [
-            with_unit(x, split_header(y)[1] or y) if x else "" for x, y in below_names
+        comments = [
+            lines[k].lstrip().lstrip("#%/").strip() for k in filled if k < first
         ]
+        return _with_names_in_comment(path, lines, first, comments, len(names))
+    start = first + 1
+    fields = split_line(below, separator)
+    if _are_units(fields):
+        names = _with_units(names, fields)
         start = content[1] + 1
     table = read_table(path, names, lines, start, separator)
-    skipped = ("lines above the names were left out",) * (content != whole)
-    return table._replace(notes=table.notes + skipped)
+    if first != above:
+        table = table.after(assumed("lines above the names were left out."))
+    return table
+
+
+def _with_names_in_comment(
+    path: Path,
+    lines: list[str],
+    first: int,
+    comments: Sequence[str],
+    width: int,
+) -> Columns:
+    """Read numbers from a line on, whose names are the last comment above: `numpy.savetxt`.
+
+    **Raises:** `FileFormatError` if there is no such comment.
+    """
+    separator = _separator(comments[-1], lines[first]) if comments else ""
+    names = split_names(comments[-1], separator) if comments else []
+    if len(names) != width or any(to_number(x) is not None for x in names):
+        raise FileFormatError(
+            f"'{path}' begins with numbers: its first line must be names."
+        )
+    return read_table(path, names, lines, first, separator)
+
+
+def _are_units(fields: Sequence[str]) -> bool:
+    """Return whether the fields below names are units; numbers may look like units, too."""
+    units = [x for x in fields if x]
+    are_numbers = all(to_number(x) is not None for x in fields)
+    return bool(units) and all(map(is_unit, units)) and not are_numbers
+
+
+def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Return headers of names and the fields below; columns without a name have no unit."""
+    headers = []
+    for name, field in zip_longest(names, units[: len(names)], fillvalue=""):
+        _, bracketed = split_header(field)
+        headers.append(with_unit(name, bracketed or field) if name else "")
+    return headers
 
 
 def _from_names(lines: Sequence[str], content: list[int]) -> list[int]:
@@ -84,28 +114,33 @@ def _from_names(lines: Sequence[str], content: list[int]) -> list[int]:
     recording may stand above them."""
     for separator in "\t;,":
         fields = [split_names(lines[k], separator) for k in content[:100]]
-        n = int(np.argmax([len(x) for x in fields]))
-        if len(fields[-1]) > 1:
-            is_data = any(
-                x and to_number(x.replace(",", ".")) is not None for x in fields[n]
-            )
-            return content if is_data else content[n:]
+        if len(fields[-1]) < 2:
+            continue
+        widest = int(np.argmax([len(x) for x in fields]))
+        numbers = [to_number(x.replace(",", ".")) for x in fields[widest] if x]
+        is_data = any(number is not None for number in numbers)
+        return content if is_data else content[widest:]
     return content
 
 
 def _separator(names: str, below: str) -> str:
     """Return what separates names and numbers alike, or else is most frequent between the names."""
     counts = {x: len(split_line(names, x)) for x in ("\t", ";", ",", "")}
-    alike = [x for x, n in counts.items() if n > 1 and n == len(split_line(below, x))]
-    return alike[0] if alike else max("\t;,"[::-1], key=lambda x: counts[x])
+    for separator, count in counts.items():
+        if count > 1 and count == len(split_line(below, separator)):
+            return separator
+    return max(",;\t", key=lambda x: counts[x])
 
 
 def split_line(line: str, separator: str) -> list[str]:
     """Return the fields of a line, stripped; "" separates at blanks, but not before a unit."""
+    is_empty = not line if separator else not line.strip()
+    if is_empty:
+        return []
     if not separator:
-        return re.split(r"\s+(?![(\[])", line.strip()) if line.strip() else []
+        return re.split(r"\s+(?![(\[])", line.strip())
     if '"' not in line:
-        return [x.strip() for x in line.split(separator)] if line else []
+        return [x.strip() for x in line.split(separator)]
     try:
         return [x.strip() for x in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:  # a field of more than 100 kB
@@ -119,8 +154,10 @@ def split_names(line: str, separator: str) -> list[str]:
 
 def to_number(text: str) -> float | None:
     """Return the number that a field holds, NaN for a missing sample, None for other text."""
+    if text.strip().lower() in _MISSING:
+        return np.nan
     try:
-        return np.nan if text.strip().lower() in _MISSING else float(text)
+        return float(text)
     except ValueError:
         return None
 
@@ -137,17 +174,11 @@ def read_table(
     line.
     """
     two_columns(path, [x for x in headers if x])
-    notes = []
+    findings = []
     lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
     if sep != "," and any("," in x for x in lines):
-        notes.append("decimal commas were read as such")
-        if (
-            mixed := next((k for k, x in enumerate(lines) if "." in x), None)
-        ) is not None:
-            text = f"'{path}', line {start + mixed + 1}: there are points beside decimal commas; "
-            raise FileFormatError(
-                f"{text}export one of the two, and no separators of thousands."
-            )
+        findings.append(assumed("decimal commas were read as such."))
+        _require_no_points(path, lines, start)
         lines = [x.replace(",", ".") for x in lines]
     values = np.zeros((0, 0))
     with suppress(ValueError), warnings.catch_warnings():  # a number in every field
@@ -160,29 +191,43 @@ def read_table(
     if not values.size:
         raise FileFormatError(f"'{path}' has a header, but no samples.")
     if not all(headers):
-        notes.append("columns without a name were left out")
-    columns = zip(headers, values.T, strict=True)
-    return Columns({name: column for name, column in columns if name}, tuple(notes))
+        findings.append(assumed("columns without a name were left out."))
+    columns = dict(zip(headers, values.T, strict=True))
+    columns.pop("", None)
+    return Columns(columns, tuple(findings))
+
+
+def _require_no_points(path: Path, lines: Sequence[str], start: int) -> None:
+    """**Raises:** `FileFormatError` for a decimal point in a table with decimal commas."""
+    for number, line in enumerate(lines, start + 1):
+        if "." in line:
+            raise FileFormatError(
+                f"'{path}', line {number}: there are points beside decimal commas; export one of "
+                "the two, and no separators of thousands."
+            )
 
 
 def _by_line(
     path: Path, headers: Sequence[str], lines: Sequence[str], start: int, separator: str
 ) -> Float[np.ndarray, "n k"]:
     """Read files with missing fields, or with an error whose line is to be reported."""
-    rows, count = [], len(headers)
+    rows = []
+    count = len(headers)
     for number, line in enumerate(lines, start + 1):
         fields = split_line(line, separator)
         if not any(fields):
             continue
         if len(fields) < count or any(fields[count:]):
-            text = f"'{path}', line {number}: {len(fields)} fields, but the header names {count} "
             raise FileFormatError(
-                f"{text}columns (decimal commas need another separator)."
+                f"'{path}', line {number}: {len(fields)} fields, but the header names {count} "
+                "columns (decimal commas need another separator)."
             )
         row = [to_number(x) for x in fields[:count]]
         if None in row:
             k = row.index(None)
-            text = f"column '{headers[k]}' holds '{fields[k][:40]}', which is not a number."
-            raise FileFormatError(f"'{path}', line {number}: {text}")
+            raise FileFormatError(
+                f"'{path}', line {number}: column '{headers[k]}' holds '{fields[k][:40]}', which "
+                "is not a number."
+            )
         rows.append(row)
     return np.array(rows, float).reshape(-1, count)
