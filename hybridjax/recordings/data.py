@@ -84,30 +84,29 @@ class SectionData(eqx.Module):
 
     def rms(self) -> tuple[Float[np.ndarray, " nu"], Float[np.ndarray, " ny"]]:
         """Return root mean squares of the deviations of inputs and outputs."""
-        size, nu = (
-            np.sqrt(np.nanmean(self._deviations() ** 2, axis=0)),
-            len(self.inputs),
-        )
+        nu = len(self.inputs)
+        size = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0))
         return size[:nu], size[nu:]
 
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
         columns = [self.inputs.index(name) for name in names]
-        inputs, cycle = (
-            tuple(self.inputs[k] for k in columns),
-            self.cycle_inputs[:, columns],
+        inputs = tuple(self.inputs[k] for k in columns)
+        of_inputs = [self.spikes[k] for k in columns]
+        of_outputs = self.spikes[len(self.inputs) :]
+        return replace(
+            self,
+            records=tuple(
+                replace(r, u=r.u[:, columns], inputs=inputs) for r in self.records
+            ),
+            cycle_inputs=self.cycle_inputs[:, columns],
+            spikes=(*of_inputs, *of_outputs),
         )
-        records = tuple(
-            replace(r, u=r.u[:, columns], inputs=inputs) for r in self.records
-        )
-        spikes = (*(self.spikes[k] for k in columns), *self.spikes[len(self.inputs) :])
-        return replace(self, records=records, cycle_inputs=cycle, spikes=spikes)
 
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
-        return replace(
-            self, records=tuple(replace(r, drift=float(cycles)) for r in self.records)
-        )
+        records = tuple(replace(r, drift=float(cycles)) for r in self.records)
+        return replace(self, records=records)
 
     @checked
     def experiments(self, periods: PeriodCount) -> ExperimentData:
@@ -122,22 +121,26 @@ class SectionData(eqx.Module):
         N = self.n_sections
         parts = [r.part(-r.first_section % N, len(r.u)) for r in self.records]
         n = min(len(r.u) for r in parts) // N * N
-        u, y = np.stack([r.u[:n] for r in parts]), np.stack([r.y[:n] for r in parts])
-        names = {"inputs": self.inputs, "outputs": self.outputs}
-        return ExperimentData(u, y, n_sections=N, periods=periods, **names)
+        return ExperimentData(
+            np.stack([r.u[:n] for r in parts]),
+            np.stack([r.y[:n] for r in parts]),
+            n_sections=N,
+            periods=periods,
+            inputs=self.inputs,
+            outputs=self.outputs,
+        )
 
     def _repr_html_(self) -> str:
         phase = np.arange(self.n_sections) / self.n_sections
         cycles = np.concatenate([self.cycle_inputs, self.cycle_outputs], axis=1)
+        columns = zip(self.signals[:4], self.units, cycles.T, COLORS, strict=False)
         drawn = [
             picture(
                 [Curve(phase, x, "average cycle", color)],
                 "phase (cycles)",
-                with_unit(*name),
+                with_unit(name, unit),
             )
-            for *name, x, color in zip(
-                self.signals[:4], self.units, cycles.T, COLORS, strict=False
-            )
+            for name, unit, x, color in columns
         ]
         return card("SectionData", "", text(repr(self)), *drawn)
 
@@ -145,10 +148,9 @@ class SectionData(eqx.Module):
         values = zip(self.signals, np.concatenate(self.rms()), self.units, strict=True)
         sizes = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
         lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
-        struck = [
-            f"{n} {k}" for n, k in zip(self.signals, self.spikes, strict=True) if k
-        ]
-        spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
+        counts = zip(self.signals, self.spikes, strict=True)
+        struck = ", ".join(f"{name} {count}" for name, count in counts if count)
+        spikes = f"; spikes left out: {struck}" if struck else ""
         return folded(
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
             f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
@@ -161,19 +163,23 @@ def input_spectrum(
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:
     """Return frequencies in cycles per period, and power spectral densities of the inputs (Welch
     1967) from windows of up to 16 cycles."""
-    records, N = uninterrupted_records(data), data.n_sections
-    length = N * max(1, min(16, max(len(r.u) for r in records) // (2 * N)))
-    f = np.fft.rfftfreq(length, 1 / N)
-    total, weight = np.zeros((len(f), len(data.inputs))), 0
+    N = data.n_sections
+    records = uninterrupted_records(data)
+    longest = max(len(r.u) for r in records)
+    window = N * max(1, min(16, longest // (2 * N)))
+    f = np.fft.rfftfreq(window, 1 / N)
+    total = np.zeros((len(f), len(data.inputs)))
+    samples = 0
     for r in records:
-        if len(r.u) >= length:
-            _, power = signal.welch(r.u, N, nperseg=length, axis=0)
-            total, weight = total + len(r.u) * power, weight + len(r.u)
-    return f, total / max(weight, 1)
+        if len(r.u) >= window:
+            _, power = signal.welch(r.u, N, nperseg=window, axis=0)
+            total += len(r.u) * power
+            samples += len(r.u)
+    return f, total / max(samples, 1)
 
 
 def input_band(data: SectionData) -> list[float]:
     """Return the frequency (cycles per period) above which an input has next to no power."""
     f, power = input_spectrum(data)
     strong = power > LEAST_POWER * power.max(axis=0)
-    return [float(f[np.flatnonzero(s)[-1]]) if s.any() else 0.0 for s in strong.T]
+    return [float(f[s].max(initial=0.0)) for s in strong.T]

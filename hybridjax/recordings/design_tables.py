@@ -48,21 +48,22 @@ def write_design(
             "a table against time needs both the period and the rate."
         )
     u = np.asarray(design.inputs(cycles or design.periods))
-    S, n, _ = u.shape
+    n = u.shape[1]
     N = design.n_sections
     if period is None or rate is None:
-        header, k = _BY_PHASE, np.arange(n)
-        place = np.stack([k // N, k % N, (k % N) / N], axis=1)
+        header = _BY_PHASE
+        cycle, section = np.divmod(np.arange(n), N)
+        place = np.stack([cycle, section, section / N], axis=1)
     elif period * rate < N:
         raise DefinitionError(
             f"`rate` must be {N / period:g} or more: a sample for each section."
         )
     else:
         header = ("experiment", "time")
-        time = np.arange(np.ceil(n / N * period * rate - 1e-6)) / rate
-        u = u[
-            :, np.minimum((time * N / period + 1e-9).astype(int), n - 1)
-        ]  # (rounding)
+        rounding = 1e-6
+        time = np.arange(np.ceil(n / N * period * rate - rounding)) / rate
+        held = (time * N / period + 1e-9).astype(int)
+        u = u[:, np.minimum(held, n - 1)]
         place = time[:, None]
     with (
         replacing(Path(path)) as new,
@@ -70,9 +71,9 @@ def write_design(
     ):
         table = csv.writer(file)
         table.writerow([*header, *design.input_names])
-        for s in range(S):
-            for row in np.concatenate([place, u[s]], axis=1):
-                table.writerow([s, *(f"{x:.10g}" for x in row)])
+        for experiment, inputs in enumerate(u):
+            for row in np.concatenate([place, inputs], axis=1):
+                table.writerow([experiment, *(f"{x:.10g}" for x in row)])
 
 
 @checked
@@ -93,30 +94,33 @@ def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording
         raise FileFormatError(
             f"'{path}' must be a table by phase: leave out `period` and `rate`."
         )
-    experiment, N = columns["experiment"], int(columns["section"].max()) + 1
-    count = np.unique(experiment, return_counts=True)[1]
-    if (count != count[0]).any() or (np.diff(experiment) < 0).any():
+    experiment = columns["experiment"]
+    N = int(columns["section"].max()) + 1
+    _, counts = np.unique(experiment, return_counts=True)
+    if (counts != counts[0]).any() or (np.diff(experiment) < 0).any():
         raise FileFormatError(
             f"'{path}' must have experiments of one length, in order."
         )
     require_equal(
-        "recording and table", "numbers of trials", len(recording.trials), len(count)
+        "recording and table", "numbers of trials", len(recording.trials), len(counts)
     )
-    names = [k for k in columns if k not in _BY_PHASE]
-    command = np.stack([columns[k].reshape(len(count), -1) for k in names], axis=2)
-    command = np.pad(
-        command, ((0, 0), (1, 1), (0, 0))
-    )  # zero before and after the experiment
+    names = [name for name in columns if name not in _BY_PHASE]
+    command = np.stack(
+        [columns[name].reshape(len(counts), -1) for name in names], axis=2
+    )
+    # Zero before and after the experiment.
+    command = np.pad(command, ((0, 0), (1, 1), (0, 0)))
     trials = []
     for s, (trial, stretches) in enumerate(phase.by_trial(recording)):
         added = np.full((len(trial.time), len(names)), np.nan)
-        for w in stretches[:1]:
-            now = w.at(trial.time)
+        if stretches:
+            first = stretches[0]
+            now = first.at(trial.time)
             during = np.isfinite(now)
-            k = np.floor((now[during] - np.ceil(w.phase[0])) * N).astype(int)
-            added[during] = command[s][np.clip(k + 1, 0, command.shape[1] - 1)]
-        told = Recording(
-            trial.time, dict(zip(names, added.T, strict=True)), name=trial.name
-        )
-        trials.append(Recording.beside([recording.with_trials([trial]), told]))
+            section = np.floor((now[during] - np.ceil(first.phase[0])) * N).astype(int)
+            added[during] = command[s, np.clip(section + 1, 0, command.shape[1] - 1)]
+        signals = dict(zip(names, added.T, strict=True))
+        commanded = Recording(trial.time, signals, name=trial.name)
+        measured = recording.with_trials([trial])
+        trials.append(Recording.beside([measured, commanded]))
     return Recording.join(trials)

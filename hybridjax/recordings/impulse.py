@@ -1,6 +1,6 @@
 """Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import equinox as eqx
 import numpy as np
@@ -25,6 +25,8 @@ _SPECTRUM_REACH = 2.5
 # Fewer: the push has edges.
 _PUSH_REACH = 3
 
+Responses = Float[np.ndarray, "N lags ny nu"]
+
 
 class ImpulseResponses(eqx.Module):
     r"""Outputs after a brief push of area 1, for each phase at which it acts.
@@ -42,8 +44,8 @@ class ImpulseResponses(eqx.Module):
     - `durations` (N,): mean time from each section to the next. `inputs`, `outputs`.
     """
 
-    values: Float[np.ndarray, "N lags ny nu"]
-    errors: Float[np.ndarray, "N lags ny nu"]
+    values: Responses
+    errors: Responses
     phase: Float[np.ndarray, " N"]
     lag: Float[np.ndarray, " lags"]
     width: float = eqx.field(static=True)
@@ -54,17 +56,17 @@ class ImpulseResponses(eqx.Module):
     n_sections = property(lambda self: len(self.phase))
 
     @checked
-    def of_model(self, model: LDTP) -> Float[np.ndarray, "N lags ny nu"]:
+    def of_model(self, model: LDTP) -> Responses:
         """Return the responses of a model to pushes that are held from each section to the next.
 
         **Raises:** `DefinitionError` if the model has other sections or names.
         """
         require_same("model and responses", model, self)
         N, lags = self.values.shape[:2]
-        weights = _push(self.width * N)
-        h = np.asarray(model.impulse_response(lags + len(weights) // 2)).swapaxes(0, 1)
-        h = ndimage.correlate1d(h, weights, axis=0, mode="constant")[:lags]
-        return _by_push(h, self.durations, weights)
+        push = _push(self.width * N)
+        h = np.asarray(model.impulse_response(lags + len(push) // 2))
+        h = _smeared(h.swapaxes(0, 1), push)[:lags]
+        return _by_push(h, self.durations, push)
 
 
 ResponseCycles = Annotated[
@@ -103,9 +105,8 @@ def impulse_responses(
     N, R = fit.numerators.shape[:2]
     if width is None:
         edge = min(input_band(data))
-        width = (
-            _SPECTRUM_REACH / (2 * np.pi * edge) if edge < WHOLE_BAND * N / 2 else 0.0
-        )
+        is_narrow = edge < WHOLE_BAND * N / 2
+        width = _SPECTRUM_REACH / (2 * np.pi * edge) if is_narrow else 0.0
     if cycles is None:
         cycles = max(3.0, 2 * _PUSH_REACH * width)
     lags = round(cycles * N) + 1
@@ -113,55 +114,89 @@ def impulse_responses(
         raise DefinitionError(
             f"`cycles` must hold one section or more, but is {cycles:g}."
         )
-    weights = _push(width * N)
-    reach = len(weights) // 2
+    push = _push(width * N)
+    reach = len(push) // 2
     if reach >= lags:
-        text = f"responses of {cycles:g} cycles: lower it, or raise `cycles`"
-        raise DefinitionError(f"`width` {width:g} is too large for {text}.")
+        raise DefinitionError(
+            f"`width` {width:g} is too large for responses of {cycles:g} cycles: lower it, or "
+            "raise `cycles`."
+        )
     # Responses to inputs of one section continue by the recursion from cycle to cycle.
     recursion = np.zeros(len(fit.coefficients) * N + 1)
     recursion[::N] = [1.0, *fit.coefficients]
     longest = max(fit.lead + lags + reach, R)
 
-    def whole(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "longest ..."]:
-        x = np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1))
-        return np.asarray(signal.lfilter([1.0], recursion, x, axis=0))
+    def whole(x: np.ndarray) -> np.ndarray:
+        """Return a response, given up to lag R, for all lags, which come first."""
+        longer = np.zeros((longest, *x.shape[1:]))
+        longer[: len(x)] = x
+        return np.asarray(signal.lfilter([1.0], recursion, longer, axis=0))
 
-    def pushed(x: Float[np.ndarray, "r ..."]) -> Float[np.ndarray, "lags ..."]:
+    def pushed(x: np.ndarray) -> np.ndarray:
         """Return responses to a push, which begins some sections before its middle."""
-        x = ndimage.correlate1d(whole(x), weights, axis=0, mode="constant")
-        return x[fit.lead : fit.lead + lags]
+        return _smeared(whole(x), push)[fit.lead : fit.lead + lags]
 
-    h = fit.numerators.swapaxes(0, 1)
-    response = whole(h)
-    slope = np.zeros((longest, len(fit.coefficients), *h.shape[1:]))
+    numerators = fit.numerators.swapaxes(0, 1)
+    values = pushed(numerators)
+    slope = pushed(_slopes(fit, whole(numerators)))
+    by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
+    root = pushed(fit.roots.transpose(2, 0, 1, 3, 4))
+    by_numerators = (root**2).sum(axis=4) * fit.noise[:, None] ** 2
+    errors = np.sqrt(by_numerators + by_coefficients)
+    durations = _durations(data)
+    return ImpulseResponses(
+        values=_by_push(values, durations, push),
+        errors=_by_push(errors, durations, push),
+        phase=np.arange(N) / N,
+        lag=np.arange(lags) / N,
+        width=float(width),
+        durations=durations,
+        inputs=fit.inputs,
+        outputs=fit.outputs,
+    )
+
+
+def _slopes(
+    fit: SeriesFit, response: Float[np.ndarray, "longest N ny nu"]
+) -> Float[np.ndarray, "longest d N ny nu"]:
+    """Return the derivatives of a recursion's right-hand side with respect to c."""
+    N, R = fit.numerators.shape[:2]
+    longest = len(response)
+    slope = np.zeros((longest, len(fit.coefficients), *response.shape[1:]))
     slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
     for j in range(slope.shape[1]):
-        slope[(j + 1) * N :, j] -= response[: max(longest - (j + 1) * N, 0)]
-    slope, root = pushed(slope), pushed(fit.roots.transpose(2, 0, 1, 3, 4))
-    by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
-    std = np.sqrt((root**2).sum(axis=4) * fit.noise[:, None] ** 2 + by_coefficients)
+        delay = (j + 1) * N
+        slope[delay:, j] -= response[: max(longest - delay, 0)]
+    return slope
+
+
+def _durations(data: SectionData) -> Series:
+    """Return the mean time from each section to the next."""
+    N = data.n_sections
     section = [x.first_section + np.arange(len(x.u) - 1) for x in data.records]
     steps = np.concatenate([np.diff(t) for t in data.times])
-    durations = average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
-    values, std = (_by_push(x, durations, weights) for x in (pushed(h), std))
-    phase, lag, width = np.arange(N) / N, np.arange(lags) / N, float(width)
-    return ImpulseResponses(
-        values, std, phase, lag, width, durations, fit.inputs, fit.outputs
-    )
+    return average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
+
+
+def _smeared(h: np.ndarray, push: Series) -> np.ndarray:
+    """Return responses to a push of several sections, from those to one; lags come first."""
+    return np.asarray(ndimage.correlate1d(h, push, axis=0, mode="constant"))
 
 
 def _push(width: float) -> Series:
     """A Gaussian of this standard deviation in sections, as weights of sum 1 around its middle."""
     reach = int(np.ceil(_PUSH_REACH * width))
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(width, 1e-9)) ** 2)
+    distance = np.arange(-reach, reach + 1) / max(width, 1e-9)
+    weights = np.exp(-0.5 * distance**2)
     return weights / weights.sum()
 
 
 def _by_push(
-    h: Float[np.ndarray, "lags N ..."], durations: Series, weights: Series
-) -> Any:
+    h: Float[np.ndarray, "lags N ny nu"], durations: Series, push: Series
+) -> Responses:
     """Responses to a push of area 1 by its section, from those by the section of the response."""
-    N, area = len(durations), ndimage.correlate1d(durations, weights, mode="wrap")
-    m, r = np.arange(N)[:, None], np.arange(len(h))
+    N = len(durations)
+    area = ndimage.correlate1d(durations, push, mode="wrap")
+    m = np.arange(N)[:, None]
+    r = np.arange(len(h))
     return h[r, (m + r) % N] / area[:, None, None, None]

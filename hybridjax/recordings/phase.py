@@ -42,9 +42,9 @@ class Winding(eqx.Module):
 
     def edges(self) -> Float[np.ndarray, " c1"]:
         """Return the times at which the phase is a whole number."""
-        return self.when(
-            np.arange(np.ceil(self.phase[0]), np.floor(self.phase[-1]) + 1)
-        )
+        first = np.ceil(self.phase[0])
+        last = np.floor(self.phase[-1])
+        return self.when(np.arange(first, last + 1))
 
     def at(self, time: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return the phase at some times; NaN outside of the stretch."""
@@ -82,10 +82,11 @@ class Phase(eqx.Module):
 
     @remembered
     def periods(self) -> tuple[Float[np.ndarray, " _"], ...]:
-        return tuple(
-            np.concatenate([np.zeros(0), *(np.diff(w.edges()) for w in parts)])
-            for parts in self.stretches
-        )
+        periods = []
+        for parts in self.stretches:
+            each = [np.diff(part.edges()) for part in parts]
+            periods.append(np.concatenate([np.zeros(0), *each]))
+        return tuple(periods)
 
     @property
     def period(self) -> float:
@@ -96,8 +97,12 @@ class Phase(eqx.Module):
 
         **Raises:** `DefinitionError` for a recording with another number of trials.
         """
-        numbers = len(self.stretches), len(recording.trials)
-        require_equal("phase and recording", "numbers of trials", *numbers)
+        require_equal(
+            "phase and recording",
+            "numbers of trials",
+            len(self.stretches),
+            len(recording.trials),
+        )
         return list(zip(recording.trials, self.stretches, strict=True))
 
     @property
@@ -108,32 +113,34 @@ class Phase(eqx.Module):
     @property
     def drift(self) -> float:
         """Relative change of the period per cycle: a straight line through each trial."""
-        long = [
-            (np.arange(len(p)) - (len(p) - 1) / 2, p)
-            for p in self.periods
-            if len(p) > 2
-        ]
-        weight = sum(k @ k for k, _ in long)
-        return float(sum(k @ p for k, p in long) / max(weight, 1.0) / self.period)
+        square = 0.0
+        product = 0.0
+        for period in self.periods:
+            if len(period) > 2:
+                k = np.arange(len(period)) - (len(period) - 1) / 2
+                square += k @ k
+                product += k @ period
+        return float(product / max(square, 1.0) / self.period)
 
     @property
     def jitter(self) -> float:
         """Relative standard deviation of the periods of each trial about their line."""
-        off = [signal.detrend(p) for p in self.periods if len(p) > 2]
-        freedom = sum(len(x) - 2 for x in off)
-        return float(np.sqrt(sum(x @ x for x in off) / max(freedom, 1))) / self.period
+        residuals = [signal.detrend(p) for p in self.periods if len(p) > 2]
+        freedom = sum(len(x) - 2 for x in residuals)
+        square = sum(x @ x for x in residuals) / max(freedom, 1)
+        return float(np.sqrt(square)) / self.period
 
     def __repr__(self) -> str:
-        notes = f"; {100 * self.backwards:.2g} % of samples ran backwards" * bool(
-            self.backwards
-        )
-        notes += f"; {self.dropped} doubled events left out" * bool(self.dropped)
-        notes += f"; {self.missed} cycles with missed events left out" * bool(
-            self.missed
-        )
         pieces = sum(len(s) for s in self.stretches)
-        return folded(
+        text = (
             f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
             f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
-            f"{100 * self.drift:.2g} % per cycle{notes})"
+            f"{100 * self.drift:.2g} % per cycle"
         )
+        if self.backwards:
+            text += f"; {100 * self.backwards:.2g} % of samples ran backwards"
+        if self.dropped:
+            text += f"; {self.dropped} doubled events left out"
+        if self.missed:
+            text += f"; {self.missed} cycles with missed events left out"
+        return folded(text + ")")
