@@ -50,42 +50,54 @@ class Split(NamedTuple):
     def best_order(self, most: int = 4) -> tuple[int, str]:
         """Choose an order; see `choose_order`. Return it and, if it is the largest that could be
         tried, the obstacle to a larger one."""
-        ends, N, obstacle = uninterrupted_records(self.late), self.early.n_sections, ""
+        ends = uninterrupted_records(self.late)
         fits: list[SeriesFit] = []
-        for d in range(1, most + 1):
-            try:
-                problem = OutputErrorProblem.from_data(
-                    self.early, d, N, free_start=True
-                )
-                solution = linearize(
-                    problem, total_least_squares(late_outputs(problem, d))
-                )
-                missing = missing_cycles(problem, solution, 2 * d + 1)
-            except TooFewCycles as error:
-                missing = error.missing + d
-            if missing:
-                have = int(self.early.sampled.max())
-                # (A quarter of the cycles is for unknowns whose number does not grow with N.)
-                fewer = f", or take {max(0.75 * N * have / (have + missing), 1):.0f} sections"
-                obstacle = f"{have} cycles (a quarter is held out) are too few for order {d} with "
-                obstacle += f"{N} sections: record {-(-4 * missing // 3)} more{fewer * (N > 1)}."
+        obstacle = ""
+        for order in range(1, most + 1):
+            fit, obstacle = self._rough_fit(order)
+            if fit is None:
                 break
-            fit = assemble(problem, solution, Covariance.unknown(d), False)
             long = [r for r in ends if can_be_compared(fit, r, free_start=True)]
             if not long:
-                obstacle = f"{max(len(r.u) for r in ends) / N:.3g} cycles, the longest held-out "
-                obstacle += f"record, are too few to test order {d}: record longer without gaps."
+                cycles = max(len(r.u) for r in ends) / self.early.n_sections
+                obstacle = (
+                    f"{cycles:.3g} cycles, the longest held-out record, are too few to test order "
+                    f"{order}: record longer without gaps."
+                )
                 break
-            fits, ends = [*fits, fit], long
+            fits.append(fit)
+            ends = long
         if not fits:
             raise DefinitionError(obstacle)
-        grid, misfits = CycleGrid.from_records(ends), []
-        for fit in fits:
-            error = (fit.predict(grid, free_start=True) - grid.y) * grid.sampled
-            square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
-            misfits.append(float(np.log(square).mean()) / 2)
-        best = 1 + int(np.argmax(np.array(misfits) <= min(misfits) + _AS_GOOD))
+        grid = CycleGrid.from_records(ends)
+        misfits = np.array([_misfit(fit, grid) for fit in fits])
+        best = 1 + int(np.argmax(misfits <= misfits.min() + _AS_GOOD))
         return best, obstacle if best == len(fits) else ""
+
+    def _rough_fit(self, order: int) -> tuple[SeriesFit | None, str]:
+        """Return a fit to the early part by total least squares or, if it has too few cycles, the
+        obstacle."""
+        N = self.early.n_sections
+        try:
+            problem = OutputErrorProblem.from_data(
+                self.early, order, N, free_start=True
+            )
+            start = total_least_squares(late_outputs(problem, order))
+            solution = linearize(problem, start)
+            missing = missing_cycles(problem, solution, 2 * order + 1)
+        except TooFewCycles as error:
+            missing = error.missing + order
+        if not missing:
+            unknown = Covariance.unknown(order)
+            return assemble(problem, solution, unknown, False), ""
+        cycles = int(self.early.sampled.max())
+        # A quarter of the cycles is for unknowns whose number does not grow with N.
+        sections = max(0.75 * N * cycles / (cycles + missing), 1)
+        fewer = f", or take {sections:.0f} sections" if N > 1 else ""
+        return None, (
+            f"{cycles} cycles (a quarter is held out) are too few for order {order} with {N} "
+            f"sections: record {-(-4 * missing // 3)} more{fewer}."
+        )
 
     def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
@@ -130,10 +142,25 @@ def split(data: SectionData) -> Split:
     ends = [round(len(r.u) * min(1.0, _ENOUGH / data.cycles)) for r in data.records]
     short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * data.n_sections]
     held_out = short[3::4]
+    # If all records are short, but too few to hold one out, all are cut.
     fitted = short if held_out or len(short) < len(ends) else []
-    early, late = [], []
-    for k, (r, end) in enumerate(zip(data.records, ends, strict=True)):
-        cut = 0 if k in held_out else end if k in fitted else round(end * 0.75)
-        early += [r.part(0, cut)] if cut else []
-        late += [r.part(cut, end)] if cut < end else []
+    early = []
+    late = []
+    for k, (record, end) in enumerate(zip(data.records, ends, strict=True)):
+        cut = round(end * 0.75)
+        if k in held_out:
+            cut = 0
+        elif k in fitted:
+            cut = end
+        if cut > 0:
+            early.append(record.part(0, cut))
+        if cut < end:
+            late.append(record.part(cut, end))
     return Split(PreparedRecords(early), late)
+
+
+def _misfit(fit: SeriesFit, grid: CycleGrid) -> float:
+    """Return the mean logarithm of the rms errors of the outputs."""
+    error = (fit.predict(grid, free_start=True) - grid.y) * grid.sampled
+    square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
+    return float(np.log(square).mean()) / 2

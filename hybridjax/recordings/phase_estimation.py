@@ -1,7 +1,7 @@
 """From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +11,6 @@ from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
 from ..sections.families import KinematicPhase
-from . import smoothing
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .recording import Recording, signal_of
 from .smoothing import (
@@ -21,6 +20,7 @@ from .smoothing import (
     bridgeable,
     gaps,
     inside,
+    require_passing,
     spline,
     without_spikes,
 )
@@ -73,22 +73,27 @@ def estimate_phase(
     cycles.
     """
     if isinstance(definition, KinematicPhase):
-        return _from_angles(
-            _angles(recording, definition, bandwidth), definition.n_sections
-        )
+        angles = _angles(recording, definition, bandwidth)
+        return _from_angles(angles, definition.n_sections)
     if isinstance(definition, Crossing):
-        name = str(definition)
-        if bandwidth is None:  # noise adds crossings of the samples themselves
-            rough = _from_events(recording.mark(name, definition), name)
-            bandwidth = HARMONICS / 2 / rough.period
-        phase = _from_events(
-            recording.mark(name, definition, bandwidth=bandwidth), name
-        )
-        smoothing.require_passing(bandwidth, 1 / phase.period)
-        return phase
+        return _from_crossings(recording, definition, bandwidth)
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
     return _from_events(recording, definition.name)
+
+
+def _from_crossings(
+    recording: Recording, crossing: Crossing, bandwidth: float | None
+) -> Phase:
+    """Return a phase with one cycle per crossing of a smooth signal."""
+    name = str(crossing)
+    if bandwidth is None:  # noise adds crossings of the samples themselves
+        rough = _from_events(recording.mark(name, crossing), name)
+        bandwidth = HARMONICS / 2 / rough.period
+    marked = recording.mark(name, crossing, bandwidth=bandwidth)
+    phase = _from_events(marked, name)
+    require_passing(bandwidth, 1 / phase.period)
+    return phase
 
 
 def signals_of(definition: PhaseDefinition) -> set[str]:
@@ -109,27 +114,26 @@ _Angle = tuple[Series, Series]
 def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
     """Return the phase of all trials: their angles in the sense in which they turn."""
     rate = _turns_per_time(angles)
-    backwards, total = 0, 0
-    stretches: list[tuple[Winding, ...]] = []
+    backwards = 0
+    total = 0
+    stretches = []
     for time, angle in angles:
-        stretches.append(())
-        edges = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
-        for part in np.split(np.arange(len(time)), edges):
+        ends = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
+        of_trial = []
+        for part in np.split(np.arange(len(time)), ends):
             phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
-            low = np.maximum.accumulate(phase)
-            high = np.minimum.accumulate(phase[::-1])[::-1]
-            rising = (
-                np.diff((low + high) / 2, prepend=-np.inf) > 1e-12
-            )  # more than rounding
+            from_below = np.maximum.accumulate(phase)
+            from_above = np.minimum.accumulate(phase[::-1])[::-1]
+            mean = (from_below + from_above) / 2
+            rising = np.diff(mean, prepend=-np.inf) > 1e-12  # more than rounding
             if len(part) < FEWEST or rising.sum() < 2:
                 continue
             backwards += int((np.diff(phase) < 0).sum())
             total += len(part)
             t = time[part]
             unseen = gaps(t, bridgeable(t))[1:-1]
-            stretches[-1] += (
-                Winding(t[rising], ((low + high) / 2)[rising], False, unseen),
-            )
+            of_trial.append(Winding(t[rising], mean[rising], False, unseen))
+        stretches.append(tuple(of_trial))
     return Phase(
         tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1)
     )
@@ -140,35 +144,36 @@ def _angles(
 ) -> list[_Angle]:
     """Return the angle of two signals about a center in each trial; `bandwidth` of the splines in
     Hz."""
-    names = family.position, family.velocity
+    position = recording.samples(family.position)
+    velocity = recording.samples(family.velocity)
     center, scale = _plane(recording, family)
     samples = []
-    for trial in recording.trials:
-        columns = [without_spikes(trial.values[:, recording.column(x)]) for x in names]
-        signals = _at_common_times(trial.time, np.stack(columns, axis=1))
+    for (trial, x), (_, v) in zip(position, velocity, strict=True):
+        columns = np.stack([without_spikes(x), without_spikes(v)], axis=1)
+        signals = _at_common_times(trial.time, columns)
         both = np.isfinite(signals).all(axis=1)
         if both.sum() < FEWEST:
-            text = f"{int(both.sum())} samples of {' and '.join(names)}: too few: leave it out."
-            raise DefinitionError(f"trial '{trial.name}' has {text}")
+            raise DefinitionError(
+                f"trial '{trial.name}' has {int(both.sum())} samples of {family.position} and "
+                f"{family.velocity}: too few: leave it out."
+            )
         samples.append((trial.time[both], (signals[both] - center) / scale))
     anchor = family.anchor
-    turn = 1.0 if isinstance(anchor, Crossing) else np.exp(-1j * float(anchor))
+    first = 0.0 if isinstance(anchor, Crossing) else float(anchor)
 
-    def angle_of(time: np.ndarray, z: np.ndarray) -> _Angle:
-        return time, np.angle((z[:, 0] + 1j * z[:, 1]) * turn)
+    def angle_of(x: Series, v: Series) -> Series:
+        return np.angle((x + 1j * v) * np.exp(-1j * first))
 
-    rate = abs(_turns_per_time([angle_of(*sample) for sample in samples]))
+    rate = abs(_turns_per_time([(time, angle_of(*z.T)) for time, z in samples]))
     bandwidth = bandwidth or HARMONICS * rate
-    smoothing.require_passing(bandwidth, rate)
+    require_passing(bandwidth, rate)
     angles = []
     for time, z in samples:
         smooth = [spline(time, x, bandwidth)(time) for x in z.T]
-        angles.append(angle_of(time, np.stack(smooth, axis=1)))
+        angles.append((time, angle_of(*smooth)))
     if isinstance(anchor, Crossing):
-        first = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [
-            (time, np.angle(np.exp(1j * (angle - first)))) for time, angle in angles
-        ]
+        at_anchor = _angle_at(recording, anchor, bandwidth, angles)
+        angles = [(time, np.angle(np.exp(1j * (a - at_anchor)))) for time, a in angles]
     return angles
 
 
@@ -184,8 +189,9 @@ def _at_common_times(
     signals = signals.copy()
     for k, mine in enumerate(finite.T):
         holes = gaps(time[mine], bridgeable(time[mine]))
-        at = finite.any(axis=1) & ~mine & ~inside(holes, time, time)
-        signals[at, k] = spline(time, signals[:, k], np.inf)(time[at])
+        missing = finite.any(axis=1) & ~mine & ~inside(holes, time, time)
+        curve = spline(time, signals[:, k], np.inf)
+        signals[missing, k] = curve(time[missing])
     return signals
 
 
@@ -200,23 +206,28 @@ def _plane(
             raise DefinitionError(
                 f"{name} is missing at every sample: define the phase by others."
             )
-        limits.append(np.quantile(values, [0.01, 0.99]))
-        if family.scale is None and limits[-1][0] == limits[-1][1]:
+        low, high = np.quantile(values, [0.01, 0.99])
+        if family.scale is None and low == high:
             raise DefinitionError(
                 f"{name} is constant: define the phase by a signal that varies."
             )
+        limits.append((low, high))
     low, high = np.transpose(limits)
-    center = (low + high) / 2 if family.center is None else np.asarray(family.center)
-    return center, (high - low) / 2 if family.scale is None else np.asarray(
-        family.scale
-    )
+    center = (low + high) / 2
+    scale = (high - low) / 2
+    if family.center is not None:
+        center = np.asarray(family.center)
+    if family.scale is not None:
+        scale = np.asarray(family.scale)
+    return center, scale
 
 
 def _angle_at(
     recording: Recording, crossing: Crossing, bandwidth: float, angles: Sequence[_Angle]
 ) -> float:
     """Return the mean angle at which a signal crosses a level."""
-    name, crossed = str(crossing), []
+    name = str(crossing)
+    crossed = []
     marked = recording.mark(name, crossing, bandwidth=bandwidth)
     for trial, (time, angle) in zip(marked.trials, angles, strict=True):
         at = trial.events[name]
@@ -224,10 +235,10 @@ def _angle_at(
         crossed.append(np.interp(at, time, np.unwrap(angle)))
     mean = np.exp(1j * np.concatenate(crossed)).mean()
     if not abs(mean) > 0.5:
-        text = (
-            "happens all around the cycle: choose a crossing that comes once in each."
+        raise DefinitionError(
+            f"{name}, the anchor of section 0, happens all around the cycle: choose a crossing "
+            "that comes once in each."
         )
-        raise DefinitionError(f"{name}, the anchor of section 0, {text}")
     return float(np.angle(mean))
 
 
@@ -236,9 +247,9 @@ def _turns_per_time(angles: Sequence[_Angle]) -> float:
     turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
     span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
-        text = "the center must lie within the loop of the signals, and two cycles are needed."
         raise DefinitionError(
-            f"the phase does not wind: {turns:.2g} turns in {span:.4g}; {text}"
+            f"the phase does not wind: {turns:.2g} turns in {span:.4g}; the center must lie within "
+            "the loop of the signals, and two cycles are needed."
         )
     return turns / span
 
@@ -254,34 +265,52 @@ def _from_events(recording: Recording, name: str) -> Phase:
         raise DefinitionError(
             f"two cycles need three events '{name}' in a trial: record more."
         )
-    common, dropped, missed, stretches = _period(intervals), 0, 0, []
+    usual = _Rhythm(_period(intervals), doubled=0.5, missed=1.5)
+    dropped = 0
+    missed = 0
+    stretches = []
     for trial, t in zip(recording.trials, times, strict=True):
-        period, doubled, longest = common, 0.5, 1.5
-        if (np.diff(t) > common / 4).sum() >= _ENOUGH:
-            period, doubled, longest = _rhythm(np.diff(t))
-        kept: list[float] = []
-        for x in t:
-            if not kept or x - kept[-1] >= doubled * period:
-                kept.append(x)
+        intervals = np.diff(t)
+        is_long = (intervals > usual.period / 4).sum() >= _ENOUGH
+        rhythm = _rhythm(intervals) if is_long else usual
+        kept = _without_doubled(t, rhythm.doubled * rhythm.period)
         dropped += len(t) - len(kept)
-        t = np.array(kept)
-        pauses = gaps(trial.time, bridgeable(trial.time, LONGEST_GAP * period))
-        wide = (
-            np.flatnonzero(
-                (np.diff(t) > longest * period) | inside(pauses, t[:-1], t[1:])
-            )
-            + 1
-        )
-        missed += sum(max(round(float(t[k] - t[k - 1]) / period), 1) for k in wide)
-        parts = [part for part in np.split(t, wide) if len(part) > 1]
+        pauses = gaps(trial.time, bridgeable(trial.time, LONGEST_GAP * rhythm.period))
+        lengths = np.diff(kept) / rhythm.period
+        is_wide = lengths > rhythm.missed
+        is_wide |= inside(pauses, kept[:-1], kept[1:])
+        wide = np.flatnonzero(is_wide)
+        missed += sum(max(round(float(length)), 1) for length in lengths[wide])
+        parts = np.split(kept, wide + 1)
         stretches.append(
-            tuple(Winding(p, 1.0 * np.arange(len(p)), True) for p in parts)
+            tuple(
+                Winding(part, np.arange(len(part), dtype=float), True)
+                for part in parts
+                if len(part) > 1
+            )
         )
     return Phase(tuple(stretches), dropped=dropped, missed=missed, lead=1)
 
 
-def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """Return the period of a trial and, in periods, the limits of doubled and missed events.
+def _without_doubled(events: Series, shortest: float) -> Series:
+    """Return events that follow the one before by `shortest` or more."""
+    kept: list[float] = []
+    for t in events:
+        if not kept or t - kept[-1] >= shortest:
+            kept.append(t)
+    return np.array(kept)
+
+
+class _Rhythm(NamedTuple):
+    """The period of a trial and, in periods, the limits of doubled and missed events."""
+
+    period: float
+    doubled: float
+    missed: float
+
+
+def _rhythm(intervals: Series) -> _Rhythm:
+    """Return the rhythm of a trial.
 
     Irregular rhythms have intervals of all lengths: the limits lie at the first gap in their
     distribution on either side of the median (0.25 periods above, 0.1 below).
@@ -289,20 +318,23 @@ def _rhythm(intervals: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
     period = _period(intervals)
     length = np.sort(intervals / period)
     middle = int(np.searchsorted(length, 1.0))
-    up, down = length[middle:], length[middle::-1]
-    longest = up[np.argmax(np.diff(up, append=np.inf) > 0.25)]
-    shortest = down[np.argmax(np.diff(down, append=-np.inf) < -0.1)]
-    missed, doubled = max(1.5, 1.01 * float(longest)), min(0.5, 0.99 * float(shortest))
+    longer = length[middle:]
+    shorter = length[middle::-1]
+    longest = longer[np.argmax(np.diff(longer, append=np.inf) > 0.25)]
+    shortest = shorter[np.argmax(np.diff(shorter, append=-np.inf) < -0.1)]
+    missed = max(1.5, 1.01 * float(longest))
+    doubled = min(0.5, 0.99 * float(shortest))
     if (length > missed).mean() > _COMMON:
         missed = np.inf
     if (length < doubled).mean() > 2 * _COMMON:
         doubled = 0.5  # most events are doubled
-    return period, doubled, missed
+    return _Rhythm(period, doubled, missed)
 
 
-def _period(intervals: Float[np.ndarray, " n"]) -> float:
+def _period(intervals: Series) -> float:
     """Return the median of the intervals without short ones, of which a doubled event makes one:
     less than a quarter of the interval that half of the time is spent below."""
-    longer = np.sort(intervals)
-    usual = longer[np.searchsorted(np.cumsum(longer), longer.sum() / 2)]
+    ascending = np.sort(intervals)
+    spent = np.cumsum(ascending)
+    usual = ascending[np.searchsorted(spent, spent[-1] / 2)]
     return float(np.median(intervals[intervals > usual / 4]))
