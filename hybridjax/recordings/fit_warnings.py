@@ -191,7 +191,9 @@ def _order_and_feedback(fit: SeriesFit) -> Iterator[Finding]:
 
 
 def _about_excitation(
-    data: SectionData, fit: SeriesFit, band: Sequence[float]
+    data: SectionData,
+    fit: SeriesFit,
+    band: Sequence[float],
 ) -> Iterator[Finding]:
     f, power = input_spectrum(data)
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):

@@ -201,7 +201,9 @@ def _phase_without_drift(
 
 
 def _order(
-    order: int | None, data: SectionData, parts: Split
+    order: int | None,
+    data: SectionData,
+    parts: Split,
 ) -> tuple[int, list[Finding]]:
     """Return the order that predicts held-out strides best, or the given one, and doubts about
     it."""
@@ -224,7 +226,9 @@ def _order(
 
 
 def _order_in_loop(
-    order: int | None, data: SectionData, reference: Sequence[str]
+    order: int | None,
+    data: SectionData,
+    reference: Sequence[str],
 ) -> tuple[int, list[Finding]]:
     """Return the largest order that the reference determines, or the given one, and doubts about
     it."""

@@ -157,7 +157,8 @@ def impulse_responses(
 
 
 def _slopes(
-    fit: SeriesFit, response: Float[np.ndarray, "longest N ny nu"]
+    fit: SeriesFit,
+    response: Float[np.ndarray, "longest N ny nu"],
 ) -> Float[np.ndarray, "longest d N ny nu"]:
     """Return the derivatives of a recursion's right-hand side with respect to c."""
     N, R = fit.numerators.shape[:2]
@@ -192,7 +193,9 @@ def _push(width: float) -> Series:
 
 
 def _by_push(
-    h: Float[np.ndarray, "lags N ny nu"], durations: Series, push: Series
+    h: Float[np.ndarray, "lags N ny nu"],
+    durations: Series,
+    push: Series,
 ) -> Responses:
     """Responses to a push of area 1 by its section, from those by the section of the response."""
     N = len(durations)

@@ -71,7 +71,10 @@ class NaturalMultipliers(eqx.Module):
     findings: tuple[Finding, ...] = ()
 
     def interval(
-        self, level: Probability = 0.95, *, plain: bool = False
+        self,
+        level: Probability = 0.95,
+        *,
+        plain: bool = False,
     ) -> Float[np.ndarray, "d 2"]:
         """Return bounds that hold the modulus of each multiplier with this probability, in the
         order of moduli; `plain`: those of least squares.
@@ -107,7 +110,10 @@ def _printed(name: str, multipliers: Draws, bounds: np.ndarray) -> Iterator[str]
 @checked
 @working("natural_multipliers")
 def natural_multipliers(
-    data: SectionData, order: MultiplierCount = 1, *, seed: Seed = 0
+    data: SectionData,
+    order: MultiplierCount = 1,
+    *,
+    seed: Seed = 0,
 ) -> NaturalMultipliers:
     r"""Estimate Floquet multipliers from variability alone: output-only identification.
 
@@ -284,13 +290,16 @@ def _rows(data: SectionData) -> Int[np.ndarray, "rows 4"]:
 
 
 def _products(
-    a: Float[np.ndarray, "k d"], b: Float[np.ndarray, "k r"]
+    a: Float[np.ndarray, "k d"],
+    b: Float[np.ndarray, "k r"],
 ) -> Float[np.ndarray, "k d r"]:
     return a[:, :, None] * b[:, None, :]
 
 
 def _principal(
-    x: Float[np.ndarray, "k p"], other: Float[np.ndarray, "k p"], count: int
+    x: Float[np.ndarray, "k p"],
+    other: Float[np.ndarray, "k p"],
+    count: int,
 ) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, "k d"]]:
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
@@ -330,7 +339,9 @@ def _corrected(z: Draws, length: float) -> Draws:
 
 
 def _resampled(
-    records: Int[np.ndarray, " K"], block: int, rng: np.random.Generator
+    records: Int[np.ndarray, " K"],
+    block: int,
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, " K"]:
     """Draw blocks of each record, or whole records, and return how often each cycle was drawn."""
     names, counts = np.unique(records, return_counts=True)

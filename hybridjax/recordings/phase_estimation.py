@@ -83,7 +83,9 @@ def estimate_phase(
 
 
 def _from_crossings(
-    recording: Recording, crossing: Crossing, bandwidth: float | None
+    recording: Recording,
+    crossing: Crossing,
+    bandwidth: float | None,
 ) -> Phase:
     """Return a phase with one cycle per crossing of a smooth signal."""
     name = str(crossing)
@@ -140,7 +142,9 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
 
 
 def _angles(
-    recording: Recording, family: KinematicPhase, bandwidth: float | None
+    recording: Recording,
+    family: KinematicPhase,
+    bandwidth: float | None,
 ) -> list[_Angle]:
     """Return the angle of two signals about a center in each trial; `bandwidth` of the splines in
     Hz."""
@@ -178,7 +182,8 @@ def _angles(
 
 
 def _at_common_times(
-    time: Series, signals: Float[np.ndarray, "n 2"]
+    time: Series,
+    signals: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n 2"]:
     """Interpolate two signals with clocks of their own, each at the times of the other, not in
     gaps."""
@@ -196,7 +201,8 @@ def _at_common_times(
 
 
 def _plane(
-    recording: Recording, family: KinematicPhase
+    recording: Recording,
+    family: KinematicPhase,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return center and scale, by default from the middle 98 % of the signals over all trials."""
     limits = []
@@ -223,7 +229,10 @@ def _plane(
 
 
 def _angle_at(
-    recording: Recording, crossing: Crossing, bandwidth: float, angles: Sequence[_Angle]
+    recording: Recording,
+    crossing: Crossing,
+    bandwidth: float,
+    angles: Sequence[_Angle],
 ) -> float:
     """Return the mean angle at which a signal crosses a level."""
     name = str(crossing)

@@ -204,7 +204,11 @@ class Recording(eqx.Module):
         return Recording.join([_beside(trials, units, findings) for trials in together])
 
     def mark(
-        self, event: str, crossing: Crossing, *, bandwidth: Bandwidth = np.inf
+        self,
+        event: str,
+        crossing: Crossing,
+        *,
+        bandwidth: Bandwidth = np.inf,
     ) -> "Recording":
         """Add an event at each time at which a signal crosses a level.
 
@@ -363,7 +367,10 @@ def signal_of(crossing: Crossing) -> str:
 
 
 def check_events(
-    where: str, name: str, at: Series, time: Float[np.ndarray, " m"]
+    where: str,
+    name: str,
+    at: Series,
+    time: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, " k"]:
     """Return the events within the recording, or one sample outside of it.
 

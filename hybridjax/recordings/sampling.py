@@ -208,7 +208,9 @@ def _require_signals(recording: Recording, names: Sequence[str]) -> None:
 
 
 def _sample_trials(
-    recording: Recording, phase: Phase, plan: _Plan
+    recording: Recording,
+    phase: Phase,
+    plan: _Plan,
 ) -> tuple[list[_Sections], Int[np.ndarray, " nuy"]]:
     """Return the samples of all stretches as deviations from the average cycle of their trial, and
     the number of samples of each signal that were left out as spikes."""
@@ -251,7 +253,10 @@ def _unresolved(parts: list[_Sections], plan: _Plan) -> float:
 
 
 def _without_spikes(
-    trial: Trial, columns: Sequence[int], stretches: Sequence[Winding], nu: int
+    trial: Trial,
+    columns: Sequence[int],
+    stretches: Sequence[Winding],
+    nu: int,
 ) -> tuple[Signals, Int[np.ndarray, " nuy"]]:
     """Return signals (nu inputs, then outputs) without isolated spikes, and their numbers."""
     signals = trial.values[:, columns]
@@ -282,7 +287,9 @@ def _counted_through(stretches: Sequence[Winding]) -> tuple[Series, Series]:
 
 
 def _require_changes(
-    parts: list[_Sections], cycle: Float[np.ndarray, "N nuy"], plan: _Plan
+    parts: list[_Sections],
+    cycle: Float[np.ndarray, "N nuy"],
+    plan: _Plan,
 ) -> None:
     """**Raises:** `DefinitionError` for an output that most cycles repeat, but no input."""
     steps = []
@@ -434,7 +441,9 @@ def _with_times(parts: list[_Sections], plan: _Plan) -> list[_Sections]:
 
 
 def _after_clock(
-    parts: list[_Sections], times: list[Series], plan: _Plan
+    parts: list[_Sections],
+    times: list[Series],
+    plan: _Plan,
 ) -> list[Series]:
     """Return times minus those of the clock: a line through the times of each section,
     t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
@@ -456,7 +465,10 @@ def _after_clock(
 
 @checked
 def without_drift(
-    recording: Recording, phase: Phase, signals: SignalNames, cycles: DriftCycles
+    recording: Recording,
+    phase: Phase,
+    signals: SignalNames,
+    cycles: DriftCycles,
 ) -> Recording:
     """Remove the slow drift of some signals, such as that of sensors.
 
@@ -484,7 +496,10 @@ def without_drift(
 
 
 def cycle_means(
-    trial: Trial, x: Series, stretches: Sequence[Winding], period: float
+    trial: Trial,
+    x: Series,
+    stretches: Sequence[Winding],
+    period: float,
 ) -> tuple[Series, Series]:
     """Return the middle of each cycle without a long gap, and the mean of a signal over it."""
     holes = gaps(trial.time[np.isfinite(x)], LONGEST_GAP * period)

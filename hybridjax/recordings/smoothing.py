@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.linalg import solveh_banded
+from scipy.sparse import diags_array
 
 from .._core.boundary.values import Number
 from ..errors import DefinitionError
@@ -66,40 +67,33 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     values = values[finite]
     step = np.median(np.diff(time))
     weight = (2 * np.pi * max(bandwidth * step, _STRAIGHT)) ** -4.0
-    curvature, differences = _curvature(np.diff(time) / step, values, weight)
-    smooth = values.copy()
-    for k, row in enumerate(differences):
-        smooth[k : k + len(curvature)] -= weight * row * curvature
+    smooth = _smoothed(np.diff(time) / step, values, weight)
     return CubicSpline(time, smooth, bc_type="natural")
 
 
-def _curvature(
-    h: Float[np.ndarray, " n1"], values: Series, weight: float
-) -> tuple[Float[np.ndarray, " n2"], Float[np.ndarray, "3 n2"]]:
-    """Return the second derivatives of a smoothing spline at its inner samples, and the diagonals
-    of Q, whose columns are second divided differences.
+def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Series:
+    r"""Return a smoothing spline at its samples.
 
-    The curvature solves (R + weight Q'Q) curvature = Q' values. (`make_smoothing_spline` of scipy
-    takes 30 times as long, and is off by several percent at the bandwidths of slow drift.)
+    With $R c$ and $Q^T f$ as second derivatives c of the spline and second divided differences of
+    its samples f, $(R + \gamma Q^T Q) c = Q^T y$ and $f = y - \gamma Q c$. (`make_smoothing_spline`
+    of scipy takes ten times as long, and is off by several percent at the bandwidths of slow drift.)
 
-    **Arguments:** `h`: distances between the samples, in units of about 1.
+    **Arguments:** `h`: distances between the samples, in units of about 1. `weight`: $\gamma$.
     """
     before = h[:-1]
     after = h[1:]
-    inner = len(before)
-    left = 1 / before
-    middle = -1 / before - 1 / after
-    right = 1 / after
-    band = np.zeros((3, inner))
-    band[0] = (before + after) / 3 + weight * (left**2 + middle**2 + right**2)
-    coupling = middle[:-1] * left[1:] + right[:-1] * middle[1:]
-    band[1, :-1] = after[:-1] / 6 + weight * coupling
-    band[2, :-2] = weight * right[:-2] * left[2:]
-    differences = left * values[:-2] + middle * values[1:-1] + right * values[2:]
-    curvature = solveh_banded(
-        band, differences, lower=True, overwrite_ab=True, check_finite=False
+    shape = (len(values), len(before))
+    Q = diags_array(
+        (1 / before, -1 / before - 1 / after, 1 / after),
+        offsets=(0, -1, -2),
+        shape=shape,
     )
-    return curvature, np.stack([left, middle, right])
+    coupling = after[:-1] / 6
+    R = diags_array((coupling, (before + after) / 3, coupling), offsets=(-1, 0, 1))
+    matrix = R + weight * (Q.T @ Q)
+    band = [np.pad(matrix.diagonal(k), (0, k)) for k in range(3)]
+    curvature = solveh_banded(band, Q.T @ values, lower=True, check_finite=False)
+    return values - weight * (Q @ curvature)
 
 
 def require_passing(bandwidth: float, rate: float) -> None:
@@ -125,7 +119,9 @@ def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
 
 
 def inside(
-    parts: Float[np.ndarray, "g 2"], start: Series, end: Series
+    parts: Float[np.ndarray, "g 2"],
+    start: Series,
+    end: Series,
 ) -> Bool[np.ndarray, " n"]:
     """Return which intervals from start to end touch any of the given ones (disjoint, sorted)."""
     begun = np.searchsorted(parts[:, 0], end, side="left")
@@ -134,7 +130,9 @@ def inside(
 
 
 def means(
-    time: Series, values: Series, edges: Float[np.ndarray, " m1"]
+    time: Series,
+    values: Series,
+    edges: Float[np.ndarray, " m1"],
 ) -> Float[np.ndarray, " m"]:
     """Return means of a signal between successive edges; it is linear between its samples."""
     finite = np.isfinite(values)
@@ -189,7 +187,8 @@ def _candidates(x: Series) -> Series:
 
 
 def _ranges_nearby(
-    x: Series, samples: Int[np.ndarray, " k"]
+    x: Series,
+    samples: Int[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
     """Return for some samples the range of the closest half of their neighbors."""
     half = _NEIGHBORHOOD // 2

@@ -97,7 +97,9 @@ class CurveFit(NamedTuple):
 
 
 def fit_curve(
-    intervals: Intervals, waves: int, start: CurveFit | None = None
+    intervals: Intervals,
+    waves: int,
+    start: CurveFit | None = None,
 ) -> CurveFit:
     """Return the curve of so many half waves that forecasts durations best (least squares), as
     smooth as the marginal likelihood suggests.
@@ -201,7 +203,8 @@ def _cost(fit: CurveFit) -> float:
 
 
 def projected(
-    intervals: Intervals, fit: CurveFit
+    intervals: Intervals,
+    fit: CurveFit,
 ) -> tuple[Slopes, Float[np.ndarray, "trials p1"]]:
     """Return derivatives with respect to the coefficients, without the part that the rates of the
     trials explain (zero for miscounted intervals), and what rates explain of the residuals, and of

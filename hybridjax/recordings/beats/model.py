@@ -105,7 +105,10 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
 
 
 def _of_trial(
-    time: Lanes, x: Lanes, stretches: Sequence[Winding], number: int
+    time: Lanes,
+    x: Lanes,
+    stretches: Sequence[Winding],
+    number: int,
 ) -> Intervals | None:
     """Return the intervals of a trial during which its input x was sampled, if there are any."""
     start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in stretches)])
@@ -151,7 +154,10 @@ class Forecast(NamedTuple):
 
 
 def forecast(
-    intervals: Intervals, table: Table, coefficients: Curve, rates: Curve
+    intervals: Intervals,
+    table: Table,
+    coefficients: Curve,
+    rates: Curve,
 ) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
     rate = rates[intervals.trial]
@@ -260,7 +266,10 @@ class _PhaseModel:
         return forecast
 
     def _runge_kutta(
-        self, now: _Running, middle: Lanes, end: Lanes
+        self,
+        now: _Running,
+        middle: Lanes,
+        end: Lanes,
     ) -> tuple[Lanes, Lanes, Lanes]:
         """Return the phase after a step, and its rates per step at both ends.
 
@@ -277,7 +286,11 @@ class _PhaseModel:
         return now.phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6, k1, k4
 
     def _derivatives(
-        self, now: _Running, phase: Lanes, u: Lanes, part: Lanes
+        self,
+        now: _Running,
+        phase: Lanes,
+        u: Lanes,
+        part: Lanes,
     ) -> _Running:
         """Return the state after a step, or, where an interval ends, after a part of it."""
         force = self._force(phase, u)
@@ -294,7 +307,11 @@ class _PhaseModel:
 
 
 def _end(
-    before: Lanes, after: Lanes, first: Lanes, last: Lanes, own: Lanes
+    before: Lanes,
+    after: Lanes,
+    first: Lanes,
+    last: Lanes,
+    own: Lanes,
 ) -> tuple[Lanes, Lanes]:
     """Return the part of a step at whose end the phase is 1, and the rate there per step.
 

@@ -79,7 +79,9 @@ class PhaseResponse(PhaseCurve):
         return self._waves(phase) @ self.coefficients
 
     def interval(
-        self, phase: Vector, level: Probability = 0.95
+        self,
+        phase: Vector,
+        level: Probability = 0.95,
     ) -> tuple[Series, Series]:
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
         the phases: they are too narrow where it changes faster than elsewhere."""
@@ -110,7 +112,10 @@ class PhaseResponse(PhaseCurve):
 @checked
 @working("phase_response")
 def phase_response(
-    recording: Recording, phase: Phase | AtEvent | Crossing, *, input: str
+    recording: Recording,
+    phase: Phase | AtEvent | Crossing,
+    *,
+    input: str,
 ) -> PhaseResponse:
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.
 

@@ -123,7 +123,10 @@ def _chosen(names: Sequence[str], wanted: Wanted) -> list[str]:
 
 
 def _leaves(
-    path: Path, place: Place, value: Any, wanted: Wanted
+    path: Path,
+    place: Place,
+    value: Any,
+    wanted: Wanted,
 ) -> Iterator[tuple[Place, Leaf]]:
     """Yield arrays of numbers in a struct (a dictionary); an array of structs is a list."""
     if isinstance(value, dict):
@@ -136,7 +139,10 @@ def _leaves(
 
 
 def _read_tree(
-    path: Path, leaves: Mapping[Place, Leaf], separator: str, wanted: Wanted
+    path: Path,
+    leaves: Mapping[Place, Leaf],
+    separator: str,
+    wanted: Wanted,
 ) -> list[Columns]:
     """Return a table for each array of times.
 
@@ -188,7 +194,10 @@ def _nearest(place: Place, clocks: Mapping[Place, Place]) -> Place | None:
 
 
 def _columns(
-    path: Path, name: str, leaf: Leaf, table: Columns
+    path: Path,
+    name: str,
+    leaf: Leaf,
+    table: Columns,
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Return an array, or the columns of a matrix, with a row for each of the table's times."""
     times = next(iter(table.values.values()))

@@ -163,7 +163,11 @@ def to_number(text: str) -> float | None:
 
 
 def read_table(
-    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, sep: str
+    path: Path,
+    headers: Sequence[str],
+    lines: Sequence[str],
+    start: int,
+    sep: str,
 ) -> Columns:
     """Read the numbers in `lines[start:]`, with one field for each header.
 
@@ -208,7 +212,11 @@ def _require_no_points(path: Path, lines: Sequence[str], start: int) -> None:
 
 
 def _by_line(
-    path: Path, headers: Sequence[str], lines: Sequence[str], start: int, separator: str
+    path: Path,
+    headers: Sequence[str],
+    lines: Sequence[str],
+    start: int,
+    separator: str,
 ) -> Float[np.ndarray, "n k"]:
     """Read files with missing fields, or with an error whose line is to be reported."""
     rows = []

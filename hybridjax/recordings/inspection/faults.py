@@ -196,7 +196,8 @@ def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Find
 
 
 def repeated_rows(
-    recording: Recording, names: Sequence[str]
+    recording: Recording,
+    names: Sequence[str],
 ) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
@@ -268,7 +269,9 @@ def _same_rows(
 
 
 def other_settings(
-    recording: Recording, names: list[str], outputs: tuple[str, ...]
+    recording: Recording,
+    names: list[str],
+    outputs: tuple[str, ...],
 ) -> Iterator[Finding]:
     """Find trials in which a signal has another unit or zero, or two outputs changed places."""
     if len(recording.trials) < 2:
@@ -403,7 +406,9 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
 
 
 def other_cycles(
-    recording: Recording, phase: Phase, outputs: tuple[str, ...]
+    recording: Recording,
+    phase: Phase,
+    outputs: tuple[str, ...],
 ) -> Iterator[Finding]:
     """Find trials with another period, sign of an output, or start of the cycles."""
     names = [trial.name for trial in recording.trials]
@@ -453,7 +458,10 @@ def _average_cycles(recording: Recording, phase: Phase, name: str) -> Cycles:
 
 
 def _difference(
-    mean: Cycles, usual: Cycles, name: str, outputs: Sequence[str]
+    mean: Cycles,
+    usual: Cycles,
+    name: str,
+    outputs: Sequence[str],
 ) -> Iterator[Finding]:
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
@@ -490,7 +498,10 @@ def _difference(
 
 
 def slow_changes(
-    recording: Recording, phase: Phase, outputs: tuple[str, ...], removed: float
+    recording: Recording,
+    phase: Phase,
+    outputs: tuple[str, ...],
+    removed: float,
 ) -> Iterator[Finding]:
     """Find means over cycles that change much more slowly than they scatter, where changes slower
     than some cycles have been `removed`."""

@@ -163,7 +163,9 @@ def _trials_with_samples(
 
 
 def inspect_cycles(
-    recording: Recording, phase: Phase, data: SectionData
+    recording: Recording,
+    phase: Phase,
+    data: SectionData,
 ) -> list[Finding]:
     """Return the findings that need the phase and the data at the sections."""
     outputs = tuple(x for x in data.outputs if x in recording.signals)
@@ -181,7 +183,9 @@ def inspect_cycles(
 
 
 def _masked(
-    recording: Recording, names: list[str], bad: list[Bool[np.ndarray, " _"]]
+    recording: Recording,
+    names: list[str],
+    bad: list[Bool[np.ndarray, " _"]],
 ) -> Recording:
     """Return the recording with NaN for some samples of some signals."""
     columns = np.array([recording.column(name) for name in names], int)

@@ -103,7 +103,11 @@ class PopulationMaps:
         return f"PopulationMaps({count} subjects, {len(self.values)} maps: {' x '.join(self.axes)})"
 
     def mean(
-        self, label: str | None = None, *, draws: Count = 10_000, seed: Seed = 0
+        self,
+        label: str | None = None,
+        *,
+        draws: Count = 10_000,
+        seed: Seed = 0,
     ) -> MapResult:
         """Return the mean of a group or condition with a simultaneous 95 % band.
 
@@ -125,7 +129,12 @@ class PopulationMaps:
         return self._result(y, np.ones(len(y)), y - y.mean(axis=0), draws, seed, text)
 
     def difference(
-        self, a: str, b: str, *, draws: Count = 10_000, seed: Seed = 0
+        self,
+        a: str,
+        b: str,
+        *,
+        draws: Count = 10_000,
+        seed: Seed = 0,
     ) -> MapResult:
         """Test the difference a - b of two conditions (sign flips of paired differences) or two
         groups (permutations of labels), with a family-wise error of 5 % over all points.

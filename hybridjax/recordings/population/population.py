@@ -85,7 +85,9 @@ class Population:
 
     @classmethod
     def from_fits(
-        cls, fits: Sequence[MultiplierEstimate], table: Columns
+        cls,
+        fits: Sequence[MultiplierEstimate],
+        table: Columns,
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
@@ -158,7 +160,12 @@ class Population:
         )
 
     def difference(
-        self, quantity: str, a: str, b: str, *, covariates: OptionalNames = ()
+        self,
+        quantity: str,
+        a: str,
+        b: str,
+        *,
+        covariates: OptionalNames = (),
     ) -> Any:
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
@@ -373,7 +380,10 @@ class Population:
         return frame.assign(cell=cells_of(frame), y=y, v=v)
 
     def _merged(
-        self, quantity: str, covariates: Sequence[str], rows: Any = None
+        self,
+        quantity: str,
+        covariates: Sequence[str],
+        rows: Any = None,
     ) -> Any:
         """Return a row for each subject in each group and condition; trials are averaged."""
         slopes = {_SLOPE + name: self._numbers(name) for name in covariates}
@@ -439,7 +449,8 @@ class Population:
 
 
 def _require_comparable(
-    fits: Sequence[MultiplierEstimate], subjects: Sequence[str]
+    fits: Sequence[MultiplierEstimate],
+    subjects: Sequence[str],
 ) -> None:
     """**Raises:** `DefinitionError` for a fit without covariance, and other outputs."""
     for subject, fit in zip(subjects, fits, strict=True):
