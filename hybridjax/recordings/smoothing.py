@@ -75,8 +75,10 @@ def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Ser
     r"""Return a smoothing spline at its samples.
 
     With $R c$ and $Q^T f$ as second derivatives c of the spline and second divided differences of
-    its samples f, $(R + \gamma Q^T Q) c = Q^T y$ and $f = y - \gamma Q c$. (`make_smoothing_spline`
-    of scipy takes ten times as long, and is off by several percent at the bandwidths of slow drift.)
+    its samples f, $(R + \gamma Q^T Q) c = Q^T y$ and $f = y - \gamma Q c$.
+
+    `make_smoothing_spline` of scipy takes ten times as long, and is off by several percent at the
+    bandwidths of slow drift.
 
     **Arguments:** `h`: distances between the samples, in units of about 1. `weight`: $\gamma$.
     """
