@@ -11,7 +11,7 @@ from scipy import signal
 
 import hybridjax as hj
 from hybridjax.apps.identify import _page
-from hybridjax.recordings.inspection.faults import slow_changes
+from hybridjax.recordings.inspection.differences import slow_changes
 
 from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, scaled, signals
 

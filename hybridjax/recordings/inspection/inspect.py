@@ -20,7 +20,7 @@ from ..findings import CLEAR, NAME_REFERENCE, Inspection, place, places
 from ..phase import Phase
 from ..recording import Recording, Trial
 from ..smoothing import FEWEST
-from . import faults
+from . import differences, failures
 
 
 # Numbers of outputs per cycle that are predicted: the first for which there are `_ENOUGH` cycles
@@ -39,8 +39,8 @@ _DISTURBED = 9.0
 _SHIFTED = 0.7
 
 _NOT_MEASURED = {
-    "no value": faults.placeholders,
-    "frozen": faults.frozen,
+    "no value": failures.placeholders,
+    "frozen": failures.frozen,
 }
 _TEXTS = {
     "no value": "{} has samples that stand for no value, such as -9999 ({}): taken for missing.",
@@ -95,20 +95,22 @@ def inspect(
     for name in names:
         clean, more = _without_failures(clean, name, periods, name in inputs)
         findings += more
-        findings += faults.clipped(clean, name)
+        findings += failures.clipped(clean, name)
         if name not in inputs:
-            findings += faults.wrapped(clean, name)
-    findings += faults.silent_inputs(clean, [name for name in names if name in inputs])
-    findings += faults.doubled_signals(clean, names)
-    copies, more = faults.repeated_rows(clean, names)
+            findings += failures.wrapped(clean, name)
+    findings += failures.silent_inputs(
+        clean, [name for name in names if name in inputs]
+    )
+    findings += failures.doubled_signals(clean, names)
+    copies, more = failures.repeated_rows(clean, names)
     findings += more
     clean = _masked(clean, names, copies)
     trials, more = _trials_with_samples(clean, copies, outputs)
     findings += more
     if trials:
         clean = clean.with_trials(trials)
-        findings += faults.other_settings(clean, names, outputs)
-        findings += faults.clocks(clean)
+        findings += differences.other_settings(clean, names, outputs)
+        findings += differences.clocks(clean)
     else:
         findings.append(
             Finding(
@@ -171,10 +173,10 @@ def inspect_cycles(
     outputs = tuple(x for x in data.outputs if x in recording.signals)
     removed = data.records[0].drift or np.inf
     findings = [
-        *faults.odd_cycles(recording, phase),
+        *differences.odd_cycles(recording, phase),
         *inexact_events(data),
-        *faults.other_cycles(recording, phase, outputs),
-        *faults.slow_changes(recording, phase, outputs, removed),
+        *differences.other_cycles(recording, phase, outputs),
+        *differences.slow_changes(recording, phase, outputs, removed),
     ]
     if outputs:
         findings += unanswered(data, [trial.name for trial in recording.trials])

@@ -1,43 +1,20 @@
-"""Samples that were not measured (placeholders, frozen, clipped and wrapped signals, copies), and
-trials that differ from the others in units, columns, clocks or cycles."""
+"""Trials that differ from the others in units, columns, clocks or cycles, and slow changes."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import fft, stats
 
 from ..._core.findings import Finding, listed
-from ..findings import CLEAR, places
+from ..findings import CLEAR
 from ..phase import HARMONICS, Phase
 from ..recording import Recording
 from ..sampling import cycle_means
-from ..smoothing import RANGES, Series
+from ..smoothing import Series
 
 
-# Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
-# plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
-_FROZEN_CYCLES = 0.25
-_FROZEN_SAMPLES = 10
-_FROZEN_PLATEAUS = 4
-# Least fraction of samples on plateaus at an extreme that is clipping, and its ratio to those on
-# other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are reported.
-_CLIPPED = 0.005
-_MOSTLY = 5
-# Relative difference of the number of levels from a power of two that is an overflow. Larger:
-# impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
-_ALL_LEVELS = 0.01
-# Fraction of equal samples that makes two signals, or two trials, copies. Larger: copies with a few
-# edited samples pass. Smaller: signals that rest at zero together are copies.
-_EQUAL = 0.99
-# Difference of equal samples in standard deviations. Larger: similar cycles of a regular rhythm
-# match. Smaller: copies written with fewer digits pass.
-_SAME = 1e-3
-
-# Samples in a window, and windows, that two copies share at least. More: short copies pass. Fewer:
-# equal samples by chance are copies.
-_WINDOW = 8
 # Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
 # gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
 _ALIKE = 1.2
@@ -62,210 +39,6 @@ _COSINES = 24
 _RATIO = 20.0
 
 Cycles = Float[np.ndarray, "k P"]
-Samples = Float[np.ndarray, "n k"]
-Rows = Bool[np.ndarray, " n"]
-
-
-def placeholders(x: Series, period: float, is_input: bool) -> Rows:
-    """Find numbers such as -9999, far from all other samples."""
-    whole = np.unique(x[x == np.round(x)])
-    marks = [value for value in whole if _is_placeholder(abs(float(value)))]
-    marked = np.isin(x, marks)
-    usual = x[np.isfinite(x) & ~marked]
-    if not marked.any() or not len(usual) or not np.ptp(usual):
-        return np.zeros(len(x), bool)
-    distance = np.maximum(usual.min() - x, x - usual.max())
-    return marked & (distance > RANGES * np.ptp(usual))
-
-
-def _is_placeholder(size: float) -> bool:
-    """Return whether programs write this number for "no value": 999, 8888, 32768, 1e20, ..."""
-    largest_integers = {2.0**15, 2.0**15 - 1, 2.0**16 - 1, 2.0**31, 2.0**31 - 1}
-    if size in largest_integers or size >= 1e15:
-        return True
-    digits = f"{size:.0f}"
-    return len(digits) >= 3 and set(digits) in ({"9"}, {"8"})
-
-
-def frozen(x: Series, period: float, is_input: bool) -> Rows:
-    """Find a sensor that stays at one value for longer than its rhythm allows.
-
-    `period`: rough duration of a cycle, in samples. Inputs may rest at zero, and inputs that rest
-    in most cycles are held.
-    """
-    first, length = _runs(x)
-    plateaus = length[length >= 3]
-    limit = max(_FROZEN_CYCLES * period, _FROZEN_SAMPLES)
-    # Plateaus in most cycles belong to the rhythm, as those of a foot on the ground.
-    in_most_cycles = len(plateaus) > 0.5 * len(x) / period
-    if in_most_cycles and is_input:
-        return np.zeros(len(x), bool)
-    if in_most_cycles:
-        limit = max(limit, _FROZEN_PLATEAUS * float(np.median(plateaus)))
-    failed = length > limit
-    if is_input:
-        failed &= x[first] != 0
-    return np.repeat(failed, length)
-
-
-def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
-    """Return first samples and lengths of the runs of equal values; each NaN is its own run."""
-    first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
-    return first, np.diff(np.append(first, len(x)))
-
-
-def clipped(recording: Recording, name: str) -> Iterator[Finding]:
-    """Find plateaus at the largest or least value, and nowhere else; one at 0 is no clipping."""
-    for trial, x in recording.samples(name):
-        first, length = _runs(x)
-        plateau = length >= 3
-        value = x[first[plateau]]
-        length = length[plateau]
-        if not len(value):
-            continue
-        extremes = [v for v in (np.nanmin(x), np.nanmax(x)) if v != 0]
-        ends = [v for v in extremes if (value == v).sum() > 1]
-        at_ends = np.isin(value, ends)
-        count = length[at_ends].sum()
-        elsewhere = length[~at_ends].sum()
-        if count >= max(1, _CLIPPED * len(x), _MOSTLY * elsewhere):
-            levels = " and ".join(f"{v:.4g}" for v in ends)
-            yield Finding(
-                "clipped", f"{name} is cut off at {levels} in trial '{trial.name}'."
-            )
-            return
-
-
-def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
-    """Find integers that overflow: jumps up and down by half of their levels, a power of two."""
-    for trial, x in recording.samples(name):
-        levels = np.unique(x[np.isfinite(x)])
-        if len(levels) < 2:
-            continue
-        step = float(np.diff(levels).min())
-        count = (x - levels[0]) / step
-        # Whole numbers, but for rounding.
-        if np.nanmax(np.abs(count - np.round(count))) >= 1e-3:
-            continue
-        whole = 1 + round(float(np.nanmax(count)))
-        # (Of many levels, the outermost are not met.)
-        bits = round(np.log2(whole))
-        jumps = np.diff(count) / 2.0**bits
-        up_and_down = (jumps > 0.5).any() and (jumps < -0.5).any()
-        if up_and_down and abs(whole / 2.0**bits - 1) < _ALL_LEVELS:
-            yield Finding(
-                "overflow",
-                f"{name} jumps by its whole range in trial '{trial.name}': undo it (`numpy.unwrap` "
-                f"with period={2**bits * step:.6g}).",
-                "refused",
-            )
-            return
-
-
-def silent_inputs(recording: Recording, names: Iterable[str]) -> Iterator[Finding]:
-    """Find inputs that are constant in some trials only."""
-    for name in names:
-        silent = []
-        for trial, x in recording.samples(name):
-            x = x[np.isfinite(x)]
-            if not len(x) or not np.ptp(x):
-                silent.append(f"'{trial.name}'")
-        if 0 < len(silent) < len(recording.trials):
-            yield Finding(
-                "a silent input",
-                f"{name} does not change in trial {listed(silent)}: if it acted there and was not "
-                "recorded, leave the trial out.",
-            )
-
-
-def doubled_signals(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
-    """Find two columns with the same numbers."""
-    for a, b in combinations(names, 2):
-        pairs = zip(recording.samples(a), recording.samples(b), strict=True)
-        for (trial, x), (_, y) in pairs:
-            both = np.isfinite(x) & np.isfinite(y)
-            if not both.any() or not np.ptp(x[both]):
-                continue
-            if (x == y)[both].mean() > _EQUAL:
-                yield Finding(
-                    "a signal twice",
-                    f"{a} and {b} are the same numbers in trial '{trial.name}': leave one out.",
-                    "refused",
-                )
-                break
-
-
-def repeated_rows(
-    recording: Recording,
-    names: Sequence[str],
-) -> tuple[list[Rows], list[Finding]]:
-    """Return for each trial the samples that an earlier trial holds already.
-
-    Windows of successive samples are compared first. If most of those that two trials share are at
-    the same distance, both trials are compared sample by sample.
-    """
-    columns = [recording.column(name) for name in names]
-    trials = recording.trials
-    values = [trial.values[:, columns] for trial in trials]
-    deviation = np.ma.masked_invalid(np.concatenate(values)).std(axis=0)
-    tolerance = _SAME * deviation.filled(0.0)
-    keys = [_keys(x / np.where(tolerance > 0, tolerance, 1.0)) for x in values]
-    repeated = [np.zeros(len(x), bool) for x in values]
-    findings = []
-    for i, j in combinations(range(len(trials)), 2):
-        shift = _shift(keys[i], keys[j])
-        if shift is None:
-            continue
-        same = _same_rows(values[i], values[j], shift, tolerance)
-        if (same & ~repeated[j]).any():
-            repeated[j] |= same
-            where = places([trials[j]], [same])
-            findings.append(
-                Finding(
-                    "a trial twice",
-                    f"{where}: these samples are in trial '{trials[i].name}' too, and count once.",
-                    "left out",
-                )
-            )
-    return repeated, findings
-
-
-def _keys(values: Samples) -> Float[np.ndarray, " m"]:
-    """Return a number for each window of successive rows of rounded values (exactly: integers)."""
-    shape = (_WINDOW, values.shape[1])
-    weights = np.random.default_rng(0).integers(1, 2**20, shape).astype(float)
-    rows = np.round(values)
-    last = max(len(values) - _WINDOW + 1, 0)
-    return np.sum([rows[k : k + last] @ weights[k] for k in range(_WINDOW)], axis=0)
-
-
-def _shift(x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> int | None:
-    """Return the distance at which two trials share most of their common windows, if they do."""
-    _, first, second = np.intersect1d(x, y, return_indices=True)
-    if not len(first):
-        return None
-    shifts, counts = np.unique(first - second, return_counts=True)
-    if counts.max() < max(_WINDOW, len(first) / 2):
-        return None
-    return int(shifts[np.argmax(counts)])
-
-
-def _same_rows(
-    x: Samples,
-    y: Samples,
-    shift: int,
-    tolerance: Float[np.ndarray, " k"],
-) -> Rows:
-    """Return the rows of y that are in x, so many rows later; all, if nearly all are."""
-    same = np.zeros(len(y), bool)
-    first = max(0, shift)
-    last = min(len(x), len(y) + shift)
-    shared = slice(first - shift, last - shift)
-    differs = np.abs(x[first:last] - y[shared]) > tolerance
-    same[shared] = ~differs.any(axis=1)
-    if same.mean() > _EQUAL:
-        same[:] = True
-    return same
 
 
 def other_settings(
@@ -340,7 +113,7 @@ def _is_unit(ratio: float, is_output: bool) -> bool:
     return bool(distance.min() < np.log(_ALIKE))
 
 
-def _levels(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "3"]:
+def _levels(x: Series) -> Float[np.ndarray, "3"]:
     """Return the quantiles 10, 50 and 90 % of a signal; NaN if it has no sample."""
     x = x[np.isfinite(x)]
     return np.quantile(x, [0.1, 0.5, 0.9]) if len(x) else np.full(3, np.nan)
