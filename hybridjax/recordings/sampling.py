@@ -96,8 +96,6 @@ def section_data(
     inputs = tuple(inputs)
     outputs = tuple(outputs)
     _require_signals(recording, (*inputs, *outputs))
-    if not outputs and timing is None:
-        timing = "duration"
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     if n_sections is not None and phase.n_sections is not None:
@@ -108,7 +106,15 @@ def section_data(
     if bandwidth is None:
         bandwidth = N / phase.period
     require_passing(bandwidth, 1 / phase.period)
-    plan = _Plan(inputs, outputs, N, phase.period, float(bandwidth), sampled, timing)
+    plan = _Plan(
+        inputs=inputs,
+        outputs=outputs,
+        n_sections=N,
+        period=phase.period,
+        bandwidth=float(bandwidth),
+        sampled=sampled,
+        timing=timing if outputs or timing else "duration",
+    )
     parts, spikes = _sample_trials(recording, phase, plan)
     if not parts:
         raise DefinitionError(
@@ -117,39 +123,22 @@ def section_data(
     lengths = [len(part.k) for part in parts]
     cycle = np.average([part.cycle for part in parts], axis=0, weights=lengths)
     _require_changes(parts, cycle, plan)
-    if timing is not None:
+    if plan.timing is not None:
         longest = parts[int(np.argmax(lengths))]
         time = recording.trials[longest.trial].time
         _require_times(longest, N, float(np.median(np.diff(time))))
-    nu = len(inputs)
-    names = [Signal(name, recording.unit(name)) for name in plan.signals]
-    if timing is not None:
-        names.append(Signal("time" if timing == "clock" else "duration", "s"))
-        spikes = np.append(spikes, 0)
     # A smoothing spline averages over neighbors on both sides.
     smoothed = 0 if np.isinf(bandwidth) else 1
-    records = [
-        Record(
-            part.values[:, :nu],
-            part.values[:, nu:],
-            n_sections=N,
-            first_section=int(part.k[0]) % N,
-            inputs=tuple(names[:nu]),
-            outputs=tuple(names[nu:]),
-            lead=phase.lead * N + smoothed,
-            drift=np.inf,
-        )
-        for part in parts
-    ]
+    nu = len(inputs)
     data = SectionData(
-        records=tuple(records),
+        records=_records(recording, parts, plan, phase.lead * N + smoothed),
         times=tuple(part.t for part in parts),
         trials=tuple(part.trial for part in parts),
         cycle_inputs=cycle[:, :nu],
         cycle_outputs=cycle[:, nu:],
         period=phase.period,
         bandwidth=plan.bandwidth,
-        spikes=tuple(spikes.tolist()),
+        spikes=spikes,
         unresolved=_unresolved(parts, plan),
     )
     warn_of(slow_sampling(data))
@@ -211,7 +200,7 @@ def _sample_trials(
     recording: Recording,
     phase: Phase,
     plan: _Plan,
-) -> tuple[list[_Sections], Int[np.ndarray, " nuy"]]:
+) -> tuple[list[_Sections], tuple[int, ...]]:
     """Return the samples of all stretches as deviations from the average cycle of their trial, and
     the number of samples of each signal that were left out as spikes."""
     N = plan.n_sections
@@ -239,7 +228,35 @@ def _sample_trials(
         for x in sections:
             deviations = x.values - cycle[x.k % N]
             parts.append(x._replace(values=deviations, cycle=cycle))
-    return parts, spikes
+    if plan.timing is not None:
+        spikes = np.append(spikes, 0)
+    return parts, tuple(spikes.tolist())
+
+
+def _records(
+    recording: Recording,
+    parts: list[_Sections],
+    plan: _Plan,
+    lead: int,
+) -> tuple[Record, ...]:
+    """Return a record of each stretch, which allows for a constant that remains."""
+    names = [Signal(name, recording.unit(name)) for name in plan.signals]
+    if plan.timing is not None:
+        names.append(Signal("time" if plan.timing == "clock" else "duration", "s"))
+    nu = len(plan.inputs)
+    return tuple(
+        Record(
+            part.values[:, :nu],
+            part.values[:, nu:],
+            n_sections=plan.n_sections,
+            first_section=int(part.k[0]) % plan.n_sections,
+            inputs=tuple(names[:nu]),
+            outputs=tuple(names[nu:]),
+            lead=lead,
+            drift=np.inf,
+        )
+        for part in parts
+    )
 
 
 def _unresolved(parts: list[_Sections], plan: _Plan) -> float:

@@ -71,18 +71,19 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     missing or constant, and too few intervals during which it is finite.
     """
     stretches = phase.by_trial(recording)
-    if not all(part.linear for _, parts in stretches for part in parts):
-        raise DefinitionError(
-            "`phase` must be of events or a Crossing, not a KinematicPhase."
-        )
+    for _, parts in stretches:
+        if not all(part.linear for part in parts):
+            raise DefinitionError(
+                "`phase` must be of events or a Crossing, not a KinematicPhase."
+            )
     trials: list[Intervals] = []
     for (trial, x), (_, parts) in zip(recording.samples(name), stretches, strict=True):
-        finite = np.isfinite(x)
-        if finite.sum() < 2:
+        known = np.isfinite(x)
+        if known.sum() < 2:
             raise DefinitionError(
                 f"trial '{trial.name}' has no samples of {name}: leave it out."
             )
-        found = _of_trial(trial.time[finite], x[finite], parts, len(trials))
+        found = _of_trial(trial.time[known], x[known], parts, len(trials))
         if found is not None:
             trials.append(found)
     if not trials:
@@ -91,6 +92,11 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
         raise DefinitionError(
             f"the input {name} is constant: name the signal that acted."
         )
+    return _joined(trials)
+
+
+def _joined(trials: Sequence[Intervals]) -> Intervals:
+    """Return the intervals of all trials; inputs that are shorter keep their last value."""
     longest = max(len(x.inputs) for x in trials)
     inputs = [
         np.pad(x.inputs, ((0, longest - len(x.inputs)), (0, 0)), "edge") for x in trials

@@ -3,6 +3,7 @@
 import itertools
 import struct
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from .columns import Columns, Wanted, check_rows, reading, two_columns
 
 
 Named = list[tuple[str, Float[np.ndarray, " n"]]]
+"""Columns by their headers."""
+Rows = Float[np.ndarray, "channels n"]
 
 
 def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
@@ -29,24 +32,26 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     with reading(path, "C3D file"):
         file = ezc3d.c3d(str(path))
         declared = _declared_frames(path)
-    header = file["header"]["points"]
-    parameters = file["parameters"]
     data = file["data"]
-    first = header["first_frame"]
     frames = data["points"].shape[2]
     check_rows(path, frames, declared, "frames")
+    header = file["header"]["points"]
+    parameters = file["parameters"]
     tables = []
-    points = _points(parameters["POINT"], data)
-    analogs = _analogs(parameters["ANALOG"], data)
-    for columns in (points, analogs):
+    for columns in (
+        _points(parameters["POINT"], data),
+        _analogs(parameters["ANALOG"], data["analogs"][0]),
+    ):
         two_columns(path, [name for name, _ in columns])
         if columns:
             per_frame = len(columns[0][1]) // frames
-            ticks = np.arange(first * per_frame, (first + frames) * per_frame)
-            time = ticks / (header["frame_rate"] * per_frame)
+            first = header["first_frame"] * per_frame
+            rate = header["frame_rate"] * per_frame
+            time = (np.arange(frames * per_frame) + first) / rate
             tables.append(Columns({"time (s)": time} | dict(columns)))
     if tables:
-        tables[0] = tables[0]._replace(events=_events(parameters.get("EVENT", {})))
+        events = _events(parameters.get("EVENT", {}))
+        tables[0] = tables[0]._replace(events=events)
     return tables
 
 
@@ -61,46 +66,49 @@ def _declared_frames(path: Path) -> int | None:
     return last - first + 1 if last < 2**16 - 1 else None
 
 
-def _points(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
+def _points(
+    parameters: Mapping[str, Any],
+    data: Mapping[str, Any],
+) -> Named:
     """Return markers; a negative residual marks a sample at which a marker was not visible."""
     residuals = data["meta_points"]["residuals"][0]
     points = np.where(residuals < 0, np.nan, data["points"][:3])
+    markers = np.moveaxis(points, 1, 0)
     labels = _texts(parameters, "LABELS")
-    usual = _unit(parameters, "UNITS", "")
+    usual = (_texts(parameters, "UNITS") or [""])[0]
     units = dict.fromkeys(labels, usual)
     # Modeled quantities stand among the markers, with units of their own.
     for kind in ("ANGLE", "FORCE", "MOMENT", "POWER", "SCALAR"):
-        for label in _texts(parameters, f"{kind}S"):
-            units[label] = _unit(parameters, f"{kind}_UNITS", usual)
+        unit = (_texts(parameters, f"{kind}_UNITS") or [usual])[0]
+        units |= dict.fromkeys(_texts(parameters, f"{kind}S"), unit)
     columns = []
-    for label, rows in zip(labels, np.moveaxis(points, 1, 0), strict=False):
-        if label:
-            for axis, row in zip("xyz", rows, strict=True):
-                columns.append((with_unit(f"{label}.{axis}", units[label]), row))
+    for label, marker in zip(labels, markers, strict=False):
+        if not label:
+            continue
+        for axis, row in zip("xyz", marker, strict=True):
+            header = with_unit(f"{label}.{axis}", units[label])
+            columns.append((header, row))
     return columns
 
 
-def _unit(parameters: Mapping[str, Any], name: str, otherwise: str) -> str:
-    texts = _texts(parameters, name)
-    return texts[0] if texts else otherwise
-
-
-def _analogs(parameters: Mapping[str, Any], data: Mapping[str, Any]) -> Named:
-    units = _texts(parameters, "UNITS")
-    columns = []
+def _analogs(parameters: Mapping[str, Any], channels: Rows) -> Named:
     labels = _texts(parameters, "LABELS")
-    for k, (label, row) in enumerate(zip(labels, data["analogs"][0], strict=False)):
+    units = _texts(parameters, "UNITS")
+    names = zip_longest(labels, units[: len(labels)], fillvalue="")
+    columns = []
+    for (label, unit), row in zip(names, channels, strict=False):
         if label:
-            unit = units[k] if k < len(units) else ""
             columns.append((with_unit(label, unit), row))
     return columns
 
 
 def _texts(parameters: Mapping[str, Any], name: str) -> list[str]:
     """Return the texts of a parameter, which continues in another one beyond 255 texts."""
-    texts = []
-    keys = itertools.chain([name], (f"{name}{k}" for k in itertools.count(2)))
-    for key in itertools.takewhile(parameters.__contains__, keys):
+    texts: list[str] = []
+    for number in itertools.count(1):
+        key = name if number == 1 else f"{name}{number}"
+        if key not in parameters:
+            break
         texts += [str(x).strip() for x in parameters[key]["value"]]
     return texts
 
@@ -111,10 +119,10 @@ def _events(parameters: Mapping[str, Any]) -> dict[str, Float[np.ndarray, " _"]]
     if not labels:
         return {}
     contexts = _texts(parameters, "CONTEXTS")
+    names = zip_longest(contexts[: len(labels)], labels, fillvalue="")
     times = np.reshape(parameters["TIMES"]["value"], (2, -1))
     events: dict[str, list[float]] = {}
-    for k, (label, (minutes, seconds)) in enumerate(zip(labels, times.T, strict=False)):
-        context = contexts[k] if k < len(contexts) else ""
-        name = f"{context} {label}".strip()
-        events.setdefault(name, []).append(60.0 * minutes + seconds)
+    for (context, label), (minutes, seconds) in zip(names, times.T, strict=False):
+        at = events.setdefault(f"{context} {label}".strip(), [])
+        at.append(60.0 * minutes + seconds)
     return {name: np.array(at) for name, at in events.items()}

@@ -9,6 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
@@ -60,14 +61,14 @@ def _opensim(path: Path, lines: list[str], end: int) -> Columns:
 
 def _trc(path: Path, lines: list[str]) -> Columns:
     """Read columns `MARKER.x`, `MARKER.y` and `MARKER.z`; empty fields are missing samples."""
-    head = [split_line(x, "\t") for x in lines[:5]]
-    names = split_names(lines[3], "\t") if len(head) == 5 else []
+    names = split_names(lines[3], "\t") if len(lines) >= 5 else []
     if [x.lower() for x in names[:2]] != ["frame#", "time"]:
         raise FileFormatError(
             f"'{path}' does not name 'Frame#', 'Time' and its markers in line 4."
         )
-    keys = [x.lower() for x in head[1]]
-    facts = dict(zip(keys, head[2], strict=False))
+    keys = split_line(lines[1].lower(), "\t")
+    values = split_line(lines[2], "\t")
+    facts = dict(zip(keys, values, strict=False))
     unit = facts.get("units", "")
     columns = ["frame#", "time (s)"]
     for marker in names[2::3]:
@@ -88,29 +89,36 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
     ends.append(len(lines))
     rates = set()
     for start in range(len(lines) - 4):
-        separator = max("\t;,", key=lines[start + 3].count)
-        header = [split_names(x, separator) for x in lines[start + 2 : start + 5]]
-        names = _names(*header)
         rate = to_number(lines[start + 1].strip(" ,;\t")) or 0
+        header = lines[start + 2 : start + 5]
+        separator = max("\t;,", key=header[1].count)
+        names = _names(*(split_names(line, separator) for line in header))
         if not (rate > 0 and names and names[0].lower() == "frame"):
             continue
         stop = next(k for k in ends if k >= start + 5)
         table = read_table(path, names, lines[:stop], start + 5, separator)
-        columns = {name.lower(): name for name in table.values}
-        frame = table.values.pop(columns["frame"])
-        sub_frame = table.values.pop(columns.get("sub frame", ""), np.zeros(len(frame)))
-        per_frame = int(np.nan_to_num(sub_frame).max()) + 1
-        sample = (frame - 1) * per_frame + sub_frame
-        if not np.isfinite(sample).all() or (np.diff(sample) <= 0).any():
-            raise FileFormatError(
-                f"'{path}' has frames that are missing, or not in order."
-            )
-        yield table._replace(values={"time (s)": sample / rate} | table.values)
+        per_frame, sample = _place(path, table)
+        time = {"time (s)": sample / rate}
+        yield table._replace(values=time | table.values)
         rates.add(rate / per_frame)
     if len(rates) > 1:
         raise FileFormatError(
             f"'{path}' has blocks of different rates: export them one by one."
         )
+
+
+def _place(path: Path, table: Columns) -> tuple[int, Float[np.ndarray, " n"]]:
+    """Take the numbers of frames out of a table; return samples in a frame, and since the first."""
+    columns = {name.lower(): name for name in table.values}
+    frame = table.values.pop(columns["frame"])
+    within = np.zeros(len(frame))
+    if "sub frame" in columns:
+        within = table.values.pop(columns["sub frame"])
+    per_frame = int(np.nan_to_num(within).max()) + 1
+    sample = (frame - 1) * per_frame + within
+    if not np.isfinite(sample).all() or (np.diff(sample) <= 0).any():
+        raise FileFormatError(f"'{path}' has frames that are missing, or not in order.")
+    return per_frame, sample
 
 
 def _names(devices: list[str], components: list[str], units: list[str]) -> list[str]:

@@ -48,8 +48,9 @@ class Mixed(NamedTuple):
         value = float(w @ self.coefficients)
         error = float(np.sqrt(w @ self.covariance @ w))
         slope = np.einsum("i,kij,j->k", w, self.slopes, w)
+        square = w @ self.plain @ w
         scatter = max(slope @ self.uncertainty @ slope, 1e-300)
-        freedom = 2 * (w @ self.plain @ w) ** 2 / scatter
+        freedom = 2 * square**2 / scatter
         return value, error, float(np.clip(freedom, 1, self.most))
 
 
@@ -68,8 +69,9 @@ def mixed(
     cell = np.eye(cells.max() + 1)[cells]
     row, column = np.nonzero(np.tril(cell.T @ same @ cell))
     scale = max(float(np.std(y)), float(np.sqrt(v.mean())), 1e-300)
+    square = scale**2
     y = y / scale
-    v = v / scale**2
+    v = v / square
 
     def squares(free):
         """Return a factor of Psi and, for generalized least squares, the covariance of the
@@ -108,8 +110,7 @@ def mixed(
     lower, _, plain, weights, projection = squares(free)
     # Derivatives of the covariance of all estimates by the elements of Psi, (k, N, N).
     both = np.einsum("nk,mk->knm", cell[:, row], cell[:, column])
-    either = np.maximum(both, np.swapaxes(both, 1, 2))
-    change = same * either
+    change = same * np.maximum(both, both.mT)
     moved = projection @ change
     information = np.einsum("kij,lji->kl", moved, moved) / 2
     uncertainty = np.linalg.pinv(information, hermitian=True)
@@ -127,11 +128,11 @@ def mixed(
     freedom = len(sums) - np.linalg.matrix_rank(sums)
     return Mixed(
         coefficients=weights.T @ y * scale,
-        covariance=(plain + 2 * correction) * scale**2,
-        between=lower @ lower.T * scale**2,
-        plain=plain * scale**2,
+        covariance=(plain + 2 * correction) * square,
+        between=lower @ lower.T * square,
+        plain=plain * square,
         slopes=weights.T @ effect,
-        uncertainty=uncertainty * scale**4,
+        uncertainty=uncertainty * square**2,
         most=max(freedom, 1),
     )
 
@@ -186,7 +187,8 @@ def moderated(v: Reals, freedom: Reals, trend: Design) -> Reals:
     surplus = len(v) - trend.shape[1]
     if surplus < 3 or half.min() > 1e6:
         return v
-    log = np.log(v) - special.digamma(half) + np.log(half)
+    bias = special.digamma(half) - np.log(half)
+    log = np.log(v) - bias
     mean = trend @ np.linalg.lstsq(trend, log)[0]
     scatter = np.sum((log - mean) ** 2) / surplus
     excess = scatter - special.polygamma(1, half).mean()
