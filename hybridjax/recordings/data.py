@@ -145,17 +145,23 @@ class SectionData(eqx.Module):
         return card("SectionData", "", text(repr(self)), *drawn)
 
     def __repr__(self) -> str:
-        values = zip(self.signals, np.concatenate(self.rms()), self.units, strict=True)
-        sizes = ", ".join(f"{name} {x:.3g} {unit}".rstrip() for name, x, unit in values)
-        lost = f", {100 * self.missing:.2g} % missing" if self.missing else ""
-        counts = zip(self.signals, self.spikes, strict=True)
-        struck = ", ".join(f"{name} {count}" for name, count in counts if count)
-        spikes = f"; spikes left out: {struck}" if struck else ""
-        return folded(
+        sizes = []
+        for name, unit, x in zip(
+            self.signals, self.units, np.concatenate(self.rms()), strict=True
+        ):
+            sizes.append(f"{name} {x:.3g} {unit}".rstrip())
+        summary = (
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
-            f"{sizes}{spikes})"
+            f"{len(self.records)} records"
         )
+        if self.missing:
+            summary += f", {100 * self.missing:.2g} % missing"
+        summary += f"; period {self.period:.6g}; rms deviations: {', '.join(sizes)}"
+        counts = zip(self.signals, self.spikes, strict=True)
+        spikes = [f"{name} {count}" for name, count in counts if count]
+        if spikes:
+            summary += f"; spikes left out: {', '.join(spikes)}"
+        return folded(summary + ")")
 
 
 def input_spectrum(

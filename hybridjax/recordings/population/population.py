@@ -105,14 +105,9 @@ class Population:
         values = {kind: np.full(len(fits), np.nan) for kind in kinds}
         errors = {kind: np.full(len(fits), np.nan) for kind in kinds}
         for row, fit in enumerate(fits):
-            z = complex(fit.multipliers[0])
-            angle = abs(np.angle(z)) if z.imag else np.nan
-            # Derivatives of modulus and angle with respect to real and imaginary part.
-            radial = np.array([z.real, z.imag]) / abs(z)
-            polar = np.stack([radial, np.array([-z.imag, z.real]) / abs(z) ** 2])
-            of_polar = polar @ fit.multiplier_covariances[0] @ polar.T
-            numbers = (abs(z), angle, *fit.coefficients)
-            squares = (*np.diag(of_polar), *np.diag(fit.covariance))
+            modulus, angle, squares = _polar(fit)
+            numbers = (modulus, angle, *fit.coefficients)
+            squares = (*squares, *np.diag(fit.covariance))
             for kind, number, square in zip(kinds, numbers, squares, strict=False):
                 values[kind][row] = number
                 errors[kind][row] = np.sqrt(square)
@@ -446,6 +441,19 @@ class Population:
         )
         frame.loc[0, ["spread", "spread_low", "spread_high"]] = spread
         return frame
+
+
+def _polar(fit: MultiplierEstimate) -> tuple[float, float, list[float]]:
+    """Return modulus and angle of the leading multiplier, and their variances. The angle of a real
+    one is NaN."""
+    z = complex(fit.multipliers[0])
+    covariance = fit.multiplier_covariances[0]
+    # Derivatives of modulus and angle with respect to real and imaginary part.
+    radial = np.array([z.real, z.imag]) / abs(z)
+    angular = np.array([-z.imag, z.real]) / abs(z) ** 2
+    variances = [float(slope @ covariance @ slope) for slope in (radial, angular)]
+    angle = abs(np.angle(z)) if z.imag else np.nan
+    return abs(z), float(angle), variances
 
 
 def _require_comparable(
