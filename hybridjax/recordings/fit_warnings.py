@@ -70,7 +70,7 @@ class Advice(eqx.Module):
     def __repr__(self) -> str:
         return print_findings(self.findings) or "Nothing speaks against the fit."
 
-    def after(self, findings: Sequence[Finding]) -> "Advice":
+    def with_earlier(self, findings: Sequence[Finding]) -> "Advice":
         """Return the advice with other findings before its own."""
         return replace(self, findings=(*findings, *self.findings))
 
@@ -96,7 +96,7 @@ def advise(
     prepared = PreparedRecords(data, free_start=True)
     advice = advice_about(data, prepared, fit, validation)
     warn_of(advice.findings)
-    return advice.after([*findings, *slow_sampling(data)])
+    return advice.with_earlier([*findings, *slow_sampling(data)])
 
 
 def advice_about(

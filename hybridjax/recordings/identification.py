@@ -1,5 +1,6 @@
 """All steps from a recording to multipliers, in one call."""
 
+import itertools
 import textwrap
 from collections.abc import Sequence
 from typing import Literal
@@ -145,8 +146,7 @@ def identify_recording(
     )
     findings += undamped(data, fit)
     curve = None
-    of_events = all(w.linear for parts in phase.stretches for w in parts)
-    if data.outputs == ("duration",) and len(data.inputs) == 1 and of_events:
+    if _is_of_events_alone(data, phase):
         curve = phase_response(recording, phase, input=data.inputs[0])
         findings += curve.findings
     advice = advice_about(data, prepared, fit, held_out.validation)
@@ -161,8 +161,15 @@ def identify_recording(
         held_out=held_out,
         responses=impulse_responses(fit, data),
         curve=curve,
-        advice=advice.after([*findings, *slow_sampling(data)]),
+        advice=advice.with_earlier([*findings, *slow_sampling(data)]),
     )
+
+
+def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:
+    """Return whether one input acts on a rhythm of which only the times of events are known."""
+    stretches = itertools.chain.from_iterable(phase.stretches)
+    of_events = all(stretch.linear for stretch in stretches)
+    return data.outputs == ("duration",) and len(data.inputs) == 1 and of_events
 
 
 def _require_outside(reference: Sequence[str], signals: Sequence[str]) -> None:

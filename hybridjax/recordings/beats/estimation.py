@@ -166,8 +166,12 @@ def _look(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
 
 
 def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
-    """Gauss-Newton iteration over curve and rates."""
+    """Minimize the penalized sum of squares over curve and rates: Gauss-Newton steps, which are
+    halved until the sum decreases.
 
+    Rates are eliminated from each step. (In scipy's `least_squares`, those of hundreds of trials
+    would be most of the unknowns.)
+    """
     cost = _cost(fit)
     for _ in range(_STEPS):
         across, along = projected(intervals, fit)

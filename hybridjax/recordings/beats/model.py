@@ -166,11 +166,11 @@ def forecast(
     rates: Curve,
 ) -> Forecast:
     """Return durations of all intervals, and their derivatives."""
+    phase_model = _PhaseModel(table, coefficients)
     rate = rates[intervals.trial]
 
     def of_chunk(first: int) -> Forecast:
         rows = slice(first, first + _CHUNK)
-        phase_model = _PhaseModel(table, coefficients)
         return phase_model.integrate(
             intervals.inputs[:, rows], intervals.step[rows], rate[rows]
         )
@@ -233,7 +233,7 @@ class _PhaseModel:
         derivatives by the trapezoidal rule."""
         L = len(step)
         p = self.table.shape[1] + 1
-        forecast = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p)))
+        result = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p)))
         phase = np.zeros(L)
         u = inputs[0]
         now = _Running(
@@ -263,13 +263,13 @@ class _PhaseModel:
             )
             after = self._derivatives(now, phase, end, np.minimum(part, 1.0))
             rows = now.rows[ended]
-            forecast.duration[rows] = (j + part[ended]) * now.step[ended]
-            forecast.rate[rows] = per_step / now.step[ended]
-            forecast.slopes[rows] = -after.drift[ended] / forecast.rate[rows, None]
+            result.duration[rows] = (j + part[ended]) * now.step[ended]
+            result.rate[rows] = per_step / now.step[ended]
+            result.slopes[rows] = -after.drift[ended] / result.rate[rows, None]
             if ended.all():
                 break
             now = after.of(~ended)
-        return forecast
+        return result
 
     def _runge_kutta(
         self,
@@ -298,7 +298,11 @@ class _PhaseModel:
         u: Lanes,
         part: Lanes,
     ) -> _Running:
-        """Return the state after a step, or, where an interval ends, after a part of it."""
+        r"""Return the state after a step, or, where an interval ends, after a part of it.
+
+        The derivatives d of the phase obey $\dot d = Z'(\varphi)\, u\, d + F$, with $Z' u$ the
+        `growth` and F the `force`.
+        """
         force = self._force(phase, u)
         growth = self._at(self.slope, phase) * u
         half = part * now.step / 2

@@ -258,7 +258,7 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
     table = read_plain(path, [_line(row, width) for row in rows])
     if len(names) > 1:
         text = f"of {len(names)} sheets the first one, '{names[0]}', was read."
-        table = table.after(assumed(text))
+        table = table.with_finding(assumed(text))
     return [table]
 
 

@@ -21,13 +21,21 @@ from ...errors import DefinitionError, FileFormatError, HybridJaxError
 
 # Prefix of the names of columns that mark events.
 EVENT = "event "
+# `force (N)`, `force [N]`.
 _BRACKETED = re.compile(r"(.*?)\s*[(\[]([^)\]]*)[)\]]")
+# `time_ms`, `t / ms`: units of time only.
 _TRAILING = re.compile(rf"(.+?)(?:\s*/\s*|[\s_]+)({'|'.join(SECONDS)})")
+# `N`, `m/s^2`, `kg·m²`, `-`, and anything in brackets.
 _FACTOR = (
     r"(?:[nuµμmckMG]?(?:s|m|g|N|V|A|Pa|W|J|Hz|K|T|L|l|bar|rad)|sec|min|h|deg|°C?|%|in|ft|lb|BW|1)"
     r"\^?[-⁻]?[0-9²³¹]*"
 )
 _UNIT = re.compile(rf"[(\[].*[)\]]|-|{_FACTOR}(?:[ */·.]?{_FACTOR})*")
+
+
+def assumed(text: str) -> Finding:
+    """Return a finding about an assumption that a reader makes."""
+    return Finding("assumption", text)
 
 
 class Columns(NamedTuple):
@@ -39,14 +47,9 @@ class Columns(NamedTuple):
     events: dict[str, Float[np.ndarray, " _"]] = {}
     """Times of events by name, in the unit of the table's times."""
 
-    def after(self, *findings: Finding) -> "Columns":
-        """Return the columns with more findings."""
-        return self._replace(findings=(*self.findings, *findings))
-
-
-def assumed(text: str) -> Finding:
-    """Return a finding about an assumption that a reader makes."""
-    return Finding("assumption", text)
+    def with_finding(self, finding: Finding) -> "Columns":
+        """Return the columns with one finding more."""
+        return self._replace(findings=(*self.findings, finding))
 
 
 class Table(NamedTuple):

@@ -55,7 +55,7 @@ def _opensim(path: Path, lines: list[str], end: int) -> Columns:
     table = read_table(path, names, lines, start + 1, separator)
     check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
     if facts.get("indegrees") == "yes":
-        table = table.after(assumed("angles are in degrees."))
+        table = table.with_finding(assumed("angles are in degrees."))
     return table
 
 

@@ -69,7 +69,7 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         start = content[1] + 1
     table = read_table(path, names, lines, start, separator)
     if first != above:
-        table = table.after(assumed("lines above the names were left out."))
+        table = table.with_finding(assumed("lines above the names were left out."))
     return table
 
 

@@ -40,7 +40,7 @@ class Mixed(NamedTuple):
     uncertainty: Float[np.ndarray, "k k"]
     """Covariance of the elements of Psi."""
     most: int
-    """Degrees of freedom of a t test."""
+    """Degrees of freedom of a t test: subjects beyond the number of coefficients."""
 
     def contrast(self, w: Float[np.ndarray, " p"]) -> tuple[float, float, float]:
         """Return value, standard error and degrees of freedom of a contrast (of a single one, those
@@ -65,8 +65,10 @@ def mixed(
 
     Psi is free between cells that some subject shares, and zero between others (Welch's case).
     """
+    # Whether two estimates are of one subject, (N, N), and which cell each is in, (N, q).
     same = subjects[:, None] == subjects
     cell = np.eye(cells.max() + 1)[cells]
+    # The elements of a lower triangular factor of Psi that are not zero.
     row, column = np.nonzero(np.tril(cell.T @ same @ cell))
     scale = max(float(np.std(y)), float(np.sqrt(v.mean())), 1e-300)
     square = scale**2
