@@ -331,9 +331,9 @@ def too_low(first: int, count: int) -> None:
                 whole = time.process_time() - began
                 with (
                     mock.patch.object(
-                        series_fit.SeriesFit, "contradiction", lambda *_: ""
+                        series_fit.SeriesFit, "contradicted_by", lambda *_: None
                     ),
-                    mock.patch.object(series_fit, "_about_drift", lambda *_: ""),
+                    mock.patch.object(series_fit, "_about_drift", lambda *_: []),
                 ):
                     began = time.process_time()
                     hj.fit_series(data, order, reference=reference)
@@ -351,7 +351,7 @@ def too_low(first: int, count: int) -> None:
                 if error.max() > 5
                 else "near"
             )
-            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.doubt))})
+            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.findings))})
     for kind, values in counts.items():
         for name, value in values.items():
             print(f"in_loop.orders.{kind}.{name} {value}", flush=True)

@@ -266,7 +266,7 @@ def _summary(
         unit * root @ root.T,
         residuals,
         best.cost,
-        freedom,
+        float(freedom),
         identified,
         guesses,
         best.result,

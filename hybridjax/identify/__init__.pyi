@@ -1,3 +1,4 @@
+from .fit import Fit as Fit
 from .joint.fit import ldtp_bound as ldtp_bound
 from .joint.realization import realize as realize
 from .loops import loop as loop

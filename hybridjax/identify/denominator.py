@@ -45,7 +45,7 @@ class Covariance(NamedTuple):
     """A covariance matrix, infinite where nothing is known, and how well it is known."""
 
     matrix: Float[np.ndarray, "d d"]
-    freedom: float
+    dof: float
     """Degrees of freedom that it was estimated with; infinite where it is exact."""
 
     @classmethod

@@ -17,7 +17,7 @@ from .._core.results import Result
 from .._core.text import listed, p_value
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
+from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
@@ -97,21 +97,15 @@ def advise(
         warnings.append(
             Finding("few strides", f"{text}fewer sections, or excite fewer inputs.")
         )
-    if fit.doubt:
-        warnings.append(
-            Finding("drift" if fit.doubt == MAY_DRIFT else "order", f"{fit.doubt}.")
-        )
+    warnings += fit.findings
+    if any(finding.cause == "feedback" for finding in fit.findings):
+        warnings.append(Finding("feedback", NAME_REFERENCE))
     band = input_band(data)
-    for name in fit.feedback:
-        text = f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}"
-        warnings.append(Finding("feedback", text))
     warnings += [*_about_excitation(data, fit, band), *_about_outputs(grid, fit)]
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
         if fit.result == Result.OK and z.imag >= 0 and abs(z) + 2 * error > 1:
             text = f"the interval of the multiplier {z:.3g} reaches the unit circle."
             warnings.append(Finding("stability", text))
-    if fit.result != Result.OK:
-        warnings.append(Finding("no convergence", f"{Result(fit.result).message}."))
     # Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it,
     # and standard errors allow for it. Nor are residuals below a hundredth of the output, in which
     # the test sees the distortion of small pushes if there is little noise.

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -20,6 +20,7 @@ from ..._core.boundary.kinds import (
     Vector,
 )
 from ..._core.execution import one_blas_thread
+from ..._core.findings import Finding, refuse, warn_of
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
@@ -31,8 +32,9 @@ from ...linear.ldtp import LDTP
 from .. import denominator
 from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
 from ..descent import Coefficients
+from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, RoughFit, warned
+from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..multipliers import NoiseRatios, unsupported
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
@@ -47,6 +49,7 @@ from .linearization import (
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     MAY_DRIFT,
+    OF_DRIFT,
     CycleGrid,
     PreparedRecords,
     divide_by_chi,
@@ -54,14 +57,14 @@ from .records import (
     start_responses,
     with_drift,
 )
-from .residuals import about_answering, answering
+from .residuals import about_answers
 from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
 _BIASED = "the fit is biased; name their `reference`"
 
 
-class SeriesFit(MultiplierEstimate):
+class SeriesFit(MultiplierFit):
     r"""A periodic system with one denominator in $q^{-N}$, fitted to recorded time series.
 
     $$\chi(q^{-N})\, y[n] = \sum_{r=0}^{R-1} b_{n \bmod N}[r]\, u[n-r], \qquad
@@ -69,38 +72,39 @@ class SeriesFit(MultiplierEstimate):
 
     This is exact for a periodic system with d non-zero multipliers, if R is large enough.
 
-    **Fields:**
+    **Fields** beside those of every `Fit`:
 
     - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d.
-    - `covariance` (d, d): covariance of the coefficients, estimated with `covariance_freedom`
-      degrees of freedom. `standard_errors`, `contains` and `ellipse` follow from it.
+    - `covariance` (d, d): covariance of the coefficients. `standard_errors`, `contains` and
+      `ellipse` follow from it.
     - `numerators` (N, R, ny, nu): b at each section. Combinations of inputs that were not
       excited are zero.
     - `slopes` (d, N, R, ny, nu): their derivatives with respect to c.
     - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
     - `noise` (ny,): standard deviation of the residuals.
-    - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `doubt`: a sentence if drift of the outputs (in the first 1000 cycles), or one more multiplier
-      or two, give multipliers outside of each other's confidence regions. Otherwise empty.
-    - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
       standard deviation of $\chi y$.
+    - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
+      more multiplier or two, give multipliers outside of each other's confidence regions;
+      "feedback" if inputs answer earlier residuals, as by a controller: the fit is then biased;
+      "undetermined"; "no convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
     slopes: Float[np.ndarray, "d N R ny nu"]
     roots: Float[np.ndarray, "N ny R nu r"]
     noise: Float[np.ndarray, " ny"]
-    result: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
-    doubt: str = eqx.field(static=True, default="")
-    feedback: tuple[str, ...] = eqx.field(static=True, default=())
     reference: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def model(self) -> None:
+        return None
 
     @checked
     def impulse_response(
@@ -163,12 +167,11 @@ class SeriesFit(MultiplierEstimate):
         )
 
     def _about(self) -> str:
-        noise = signal_values(self.outputs, self.noise)
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
-        about = f"{loop}noise {noise}; {self.n_sections} sections, "
-        about += f"{self.numerators.shape[1]} lags"
-        feedback = about_answering(self.feedback, _BIASED)
-        return "; ".join(filter(None, [about, self.doubt, feedback]))
+        return (
+            f"{loop}noise {signal_values(self.outputs, self.noise)}; "
+            f"{self.n_sections} sections, {self.numerators.shape[1]} lags"
+        )
 
     @property
     def free_cycles(self) -> int:
@@ -242,7 +245,7 @@ def fit_series(
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
-      `doubt` as a `FindingWarning`. Default: True.
+      `findings` as warnings (`FindingWarning`). Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` has no
@@ -253,83 +256,119 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    if reference is not None:
-        plant, drive = in_loop(data, reference)
-        fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
-        fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
-        more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
-        return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
-    records = (
-        data
-        if isinstance(data, PreparedRecords)
-        else PreparedRecords(data, start == "free")
-    )
+    if reference is None:
+        fit = _fit_open_loop(data, order, overhang, start == "free", check)
+    else:
+        fit = _fit_in_loop(data, order, overhang, reference, check)
+    if check:
+        warn_of(fit.findings, wrappers=2)
+    return fit
+
+
+def _fit_in_loop(
+    data: RecordedData,
+    order: int,
+    overhang: int | None,
+    reference: SignalNames,
+    check: bool,
+) -> SeriesFit:
+    plant, drive = in_loop(data, reference)
+    fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
+    fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
+    higher = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
+    return dataclasses.replace(fit, findings=tuple(fit.order_doubts(higher)))
+
+
+class _Weighted(NamedTuple):
+    """A fit with the weights that its residuals suggest."""
+
+    problem: OutputErrorProblem
+    solution: Linearization
+    converged: bool
+    ratios: NoiseRatios
+
+
+def _fit_open_loop(
+    data: RecordedData | PreparedRecords,
+    order: int,
+    overhang: int | None,
+    free_start: bool,
+    check: bool,
+) -> SeriesFit:
+    records = data
+    if not isinstance(records, PreparedRecords):
+        records = PreparedRecords(records, free_start)
     overhang = records.n_sections if overhang is None else overhang
 
-    def weighted(order: int):
-        problem = OutputErrorProblem.from_data(
-            records, order, overhang, start == "free"
-        )
+    def weighted(order: int) -> _Weighted:
+        problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
         delayed = late_outputs(problem, order)
         solution, _ = minimize(problem, total_least_squares(delayed))
         _require_freedom(problem, solution)
-        noise = _noise(solution)  # the weights that the residuals suggest
+        noise = _noise(solution)
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
-        return (
-            _noise_ratios(delayed, noise * _noise(solution)),
-            problem,
-            solution,
-            converged,
-        )
+        ratios = _noise_ratios(delayed, noise * _noise(solution))
+        return _Weighted(problem, solution, converged, ratios)
 
-    ratios, problem, solution, converged = weighted(order)
-    fit = assemble(
-        problem, solution, coefficient_covariance(problem, solution), converged
-    )
+    best = weighted(order)
+    covariance = coefficient_covariance(best.problem, best.solution)
+    fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
-    error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
-    feedback = answering(grid, error, records.inputs)
-    drift = _about_drift(fit, records, start == "free")
-    surplus = unsupported(lambda k: ratios if k == order else weighted(k)[0], order)
-    if surplus and check:
-        cause = about_answering(feedback, _BIASED) or drift
-        raise DefinitionError(f"{surplus}, or pass check=False{cause and '; '}{cause}.")
-    # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
-    more = [
-        partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)
-    ]
-    doubt = "; ".join(filter(None, [surplus, drift])) or fit.contradiction(more)
-    return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubt, check))
+    error = np.where(grid.sampled, grid.y - fit.predict(grid, free_start), 0.0)
+    answers = about_answers(grid, error, records.inputs, _BIASED)
+    drift = _about_drift(fit, records, free_start)
+
+    def ratios(k: int) -> NoiseRatios:
+        return best.ratios if k == order else weighted(k).ratios
+
+    surplus = unsupported(ratios, order, check)
+    refuse([*surplus, *(answers or drift)])
+    doubts = [*surplus, *drift]
+    if not doubts:
+        # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
+        higher = [
+            partial(_of_order, order + k, records, fit, free_start) for k in (1, 2)
+        ]
+        doubts = fit.order_doubts(higher)
+    return dataclasses.replace(fit, findings=(*fit.findings, *doubts, *answers))
 
 
-def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:
-    """Return a sentence if slow drift of the outputs may explain multipliers of a fit; else "".
+def _about_drift(
+    fit: SeriesFit, records: PreparedRecords, free_start: bool
+) -> list[Finding]:
+    """Return a finding if slow drift of the outputs may explain multipliers of a fit.
 
     It does if outputs that may drift have other multipliers, or as little noise without the
     multipliers that may be 1, which a constant resembles.
     """
+
     # (It is refused where an input acts later than the records begin, or drift was declared.)
-    slow, order = (
-        (lambda: PreparedRecords(with_drift(records.records))),
-        len(fit.coefficients),
-    )
-    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
+    def slow() -> PreparedRecords:
+        return PreparedRecords(with_drift(records.records))
 
     def drifting() -> RoughFit:
+        order = len(fit.coefficients)
         problem = _problem_like(fit, slow(), order, free_start)
         return _rough(problem, total_least_squares(late_outputs(problem, order)))
 
-    doubt = fit.contradiction([drifting], MAY_DRIFT)
-    if not doubt and may_be_one.any() and not may_be_one.all():
-        fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
-        with suppress(DefinitionError):
-            problem = _problem_like(fit, slow(), len(fewer), free_start)
-            solution, _ = minimize(problem, fewer, rough=True)
-            _require_freedom(problem, solution)
-            spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
-            return MAY_DRIFT if (_noise(solution) < 1 + 3 * spread).all() else ""
-    return doubt
+    unknown = fit.undetermined()
+    if unknown:
+        return unknown
+    if fit.contradicted_by([drifting], OF_DRIFT) is not None:
+        return [MAY_DRIFT]
+    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
+    if not may_be_one.any() or may_be_one.all():
+        return []
+    fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
+    with suppress(DefinitionError):
+        problem = _problem_like(fit, slow(), len(fewer), free_start)
+        solution, _ = minimize(problem, fewer, rough=True)
+        _require_freedom(problem, solution)
+        spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
+        if (_noise(solution) < 1 + 3 * spread).all():
+            return [MAY_DRIFT]
+    return []
 
 
 def _of_order(
@@ -386,16 +425,19 @@ def assemble(
         b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
+    result = int(Result.OK if converged else Result.NOT_CONVERGED)
     return SeriesFit(
         multipliers=multipliers_of(solution.c),
         coefficients=solution.c,
         covariance=covariance.matrix,
-        covariance_freedom=covariance.freedom,
+        covariance_dof=covariance.dof,
         numerators=by_input(numerators),
         slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
-        result=Result.OK if converged else Result.NOT_CONVERGED,
+        dof=float(solution.freedom.sum() - d),
+        result=result,
+        findings=tuple(not_converged(result)),
         **problem.records.about,
     )
 
@@ -460,7 +502,7 @@ def coefficient_covariance(
         multipliers_of(solution.c), problem.records.cycles
     )
     gradient = gradient_covariance(problem, solution, lags + 1)
-    return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
+    return sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
 
 
 def gradient_covariance(

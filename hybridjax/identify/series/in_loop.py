@@ -207,8 +207,9 @@ class LoopEquations:
             slopes=np.moveaxis(b[..., 1:], -1, 0),
             roots=roots,
             noise=noise,
-            covariance_freedom=covariance.freedom,
-            result=Result.OK,
+            covariance_dof=covariance.dof,
+            dof=float(sum(x.freedom for x in self.sections) * ny - len(c)),
+            result=int(Result.OK),
             **self.records.about,
             reference=self.reference,
         )

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
+from ..._core.findings import Finding
 from ...errors import DefinitionError
 from ...experiments.record import (
     Record,
@@ -21,7 +22,13 @@ from ..descent import Coefficients
 # Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
 # faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
 SLOW = 20.0
-MAY_DRIFT = f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers"
+MAY_DRIFT = Finding(
+    "drift",
+    f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers.",
+)
+# Level of the confidence regions of multipliers that a drift must leave (drift moves them further
+# than a missing multiplier does). Lower: right fits are doubted; higher: drifts pass.
+OF_DRIFT = 0.999
 
 
 Signals = Float[np.ndarray, "S T N ny"]

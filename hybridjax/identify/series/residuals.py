@@ -1,12 +1,13 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import compress, repeat
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import special, stats
 
+from ..._core.findings import Finding
 from ..descent import ROUNDING
 from .output_error import RANK
 from .records import CycleGrid, Signals, lagged_inputs
@@ -26,16 +27,19 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
-# Advice where inputs answer residuals: for white noise, for innovations with D, and without.
-REMEDIES = (
-    "the fit is biased; name their `reference`, or pass noise='innovations'",
-    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
-    "with D = 0",
-    "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
+# Advice where inputs answer residuals.
+FOR_WHITE_NOISE = (
+    "the fit is biased; name their `reference`, or pass noise='innovations'"
 )
-UNSEEN = (
+FOR_GIVEN_D = (
+    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
+    "with D = 0"
+)
+FOR_ZERO_D = "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`"
+UNSEEN = Finding(
+    "feedback",
     "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
-    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
+    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0).",
 )
 
 
@@ -148,42 +152,36 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
 
 def about_misfit(
     outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool
-) -> str:
-    """Return a sentence about residuals that depend on inputs of the period before them; empty if
-    there are none.
+) -> list[Finding]:
+    """Return a finding if residuals depend on inputs of the period before them.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled.
     """
     N, ny = error.shape[2:]
     late = np.where((grid.age > N)[..., None], error, np.nan)
-    p = independence_test(outside.u, late, N, ANSWER)[1]
+    _, p, _ = independence_test(outside.u, late, N, ANSWER)
     if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
-        return ""
-    remedies = (
-        "more dimensions" if innovations else "more dimensions, noise='innovations'"
-    )
-    return (
+        return []
+    noise = "" if innovations else ", noise='innovations'"
+    text = (
         "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
-        f"errors: give {remedies}, or another guess"
+        f"errors: give more dimensions{noise}, or another guess."
     )
+    return [Finding("left over", text)]
 
 
-def answering(
-    grid: CycleGrid, error: Signals, inputs: tuple[str, ...]
-) -> tuple[str, ...]:
-    """Return the inputs that answer earlier residuals, as by a controller."""
-    answers = feedback_test(grid, error) < ANSWER * ~is_exact(grid, error).all()
-    return tuple(compress(inputs, answers))
-
-
-def about_answering(inputs: Iterable[str], remedy: str) -> str:
-    """Return a sentence about inputs that answer earlier residuals; empty if there are none."""
-    names = ", ".join(inputs)
-    return (
-        names
-        and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
-    )
+def about_answers(
+    grid: CycleGrid, error: Signals, inputs: tuple[str, ...], remedy: str
+) -> list[Finding]:
+    """Return a finding if inputs answer earlier residuals, as by a controller."""
+    if is_exact(grid, error).all():
+        return []
+    names = ", ".join(compress(inputs, feedback_test(grid, error) < ANSWER))
+    if not names:
+        return []
+    text = f"inputs answer earlier residuals, as by a controller ({names}): {remedy}."
+    return [Finding("feedback", text)]
 
 
 def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:

@@ -12,7 +12,7 @@ from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
 from ..._core.text import folded
 from ...errors import DefinitionError
-from ...identify.multiplier_estimate import MultiplierEstimate
+from ...identify.multiplier_estimate import MultiplierFit
 from ...scale.draws import monte_carlo
 from .reml import Mixed, meta, mixed, moderated, spread_interval
 from .tables import Columns, cells_of, factors_of, require, rows_with, signed, table_of
@@ -83,9 +83,7 @@ class Population:
         )
 
     @classmethod
-    def from_fits(
-        cls, fits: Sequence[MultiplierEstimate], table: Columns
-    ) -> "Population":
+    def from_fits(cls, fits: Sequence[MultiplierFit], table: Columns) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
         Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, and
@@ -121,7 +119,7 @@ class Population:
             values,
             errors,
             {"angle": "rad"},
-            [x.covariance_freedom for x in fits],
+            [x.covariance_dof for x in fits],
         )
 
     def __repr__(self) -> str:
