@@ -24,6 +24,7 @@ from .descent import (
     ROUGH,
     ROUNDING,
     Coefficients,
+    Gradient,
     least_squares,
 )
 from .weights import check_values, error_weights
@@ -96,8 +97,6 @@ def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"
 
 
 Groups = Sequence[HTFGroup]
-Gradient = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]
-"""Residuals, and their Jacobian."""
 
 
 class Misfit(NamedTuple):

@@ -25,7 +25,7 @@ from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import weights
 from ..denominator import Covariance, multipliers_of
-from ..descent import FIRST_DAMPING, Spread, descend
+from ..descent import Spread
 from ..fit import not_converged
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
@@ -46,7 +46,8 @@ from ..series.records import (
     with_drift,
 )
 from ..series.subspace import answers_at_once, default_horizon, subspace_model
-from .frequency import FrequencyProblem, ModelPoint, transfer, transfer_slopes
+from .descent import ModelPoint, descend
+from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .realization import given_dims, realize
 
 
@@ -318,14 +319,14 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
         raise DefinitionError(
             "`guess` has an infinite response at a frequency: give a stable one."
         )
-    point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
+    point, converged = descend(ModelPoint(problem, model, direct))
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
         size = np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)
         problem = problem._replace(weight=problem.weight / size[:, None])
         start = ModelPoint(problem, point.model, direct)
-        point, converged = descend(start, FIRST_DAMPING)
+        point, converged = descend(start)
     if check:
         _require_answer(point)
     fit = _finished(point, converged, htf, scale, dof)
@@ -459,7 +460,7 @@ def _fit_to_series(
             "the responses of `guess` are infinite: give a stable model."
         )
     start = ModelPoint(problem.reweighted(model), model, direct)
-    point, converged = descend(start, FIRST_DAMPING)
+    point, converged = descend(start)
     if how.check and not how.innovations:
         _require_answer(point)
     fit = _finished(point, converged, records, records.scale, dof)
@@ -552,7 +553,7 @@ def _surplus(
     with suppress(DefinitionError):
         start = ModelPoint(point.problem, smaller(dims), point.direct)
         # (Ten steps are enough to come near.)
-        fewer, _ = descend(start, FIRST_DAMPING, max_steps=10)
+        fewer, _ = descend(start, max_steps=10)
         unit = 1.0 if np.isinf(fit.covariance_dof) else point.cost / fit.dof
         rise = (point.problem.cost(fewer.model) - point.cost) / unit
         lost = point.coordinates.size - fewer.coordinates.size

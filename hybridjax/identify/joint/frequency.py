@@ -1,4 +1,4 @@
-r"""Residuals of harmonic transfer functions, their derivatives in closed form, and the descent.
+r"""Residuals of harmonic transfer functions, and their derivatives in closed form.
 
 With $z = e^{2 \pi i f / N}$ and periodic $\tilde x$, the response to $u[n] = z^n$ is
 $z^n \tilde x[n]$ and
@@ -16,22 +16,14 @@ $\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from ...linear.htf import HTF
-from ..descent import NormalEquations, Point
-from ..periodic import (
-    LocalCoordinates,
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-)
-from ..series.prediction import SeriesProblem
+from ..descent import NormalEquations
+from ..periodic import LocalCoordinates, PeriodicModel
 
 
 # Numbers of a Jacobian that are held at once, 32 MB. Larger: memory; smaller: loops in Python.
@@ -175,70 +167,3 @@ def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *res
     """Return the product with a real matrix, (a, *rest)."""
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
     return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
-
-
-Problem = FrequencyProblem | SeriesProblem
-
-# Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
-# Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
-_SETTLED_GAIN = 1e-2
-# Expected squared change of the characteristic polynomial's coefficients there, in units of their
-# variance. Larger: multipliers miss the minimum, at 1e-3 by 3 % of their standard errors.
-_SETTLED_SHIFT = 1e-3
-# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
-# rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
-# converged; smaller: minima of exact data do not.
-_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
-
-
-class ModelPoint(Point):
-    """A model of a descent."""
-
-    def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
-        self.problem, self.direct, self.model = problem, direct, model
-        # A resonant model stays as it is; one that overflows has no finite cost.
-        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-            self.model = model.refined(direct, problem.linearize)
-        self.cost = problem.cost(self.model)
-
-    @cached_property
-    def coordinates(self) -> LocalCoordinates:
-        return local_coordinates(self.model, self.direct)
-
-    @cached_property
-    def equations(self) -> NormalEquations:
-        return self.problem.linearize(self.coordinates)
-
-    def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
-        return self.equations.step(damping)
-
-    def moved(self, step: Float[np.ndarray, " P"]) -> "ModelPoint":
-        return ModelPoint(self.problem, self.coordinates.moved(step), self.direct)
-
-    def accepted(self) -> "ModelPoint":
-        """Return the point with new weights.
-
-        The log determinant of the errors' covariance is concave, so that a step that lowers the
-        cost with the old weights raises the likelihood, where no sample is missing. With gaps the
-        covariance is that of the pairs that are sampled, which is nearly the likelihood's.
-        """
-        if isinstance(self.problem, SeriesProblem):
-            self.problem = self.problem.reweighted(self.model)
-            self.cost = self.problem.cost(self.model)
-        return self
-
-    def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        size = self.coordinates.size
-        unit = min(1.0, self.cost / max(self.problem.residuals - size, 1))
-        if gain > _SETTLED_GAIN * size * unit:
-            return False
-        _, slopes = characteristic_slopes(self.coordinates)
-        change = np.linalg.lstsq(slopes @ self.equations.spread().root, slopes @ step)[
-            0
-        ]
-        return bool(change @ change <= _SETTLED_SHIFT * unit * len(slopes))
-
-    def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        return bool(
-            gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP
-        )
