@@ -115,10 +115,8 @@ class NormalEquations:
 
     def spread(self, unit: float = 1.0) -> "Spread":
         """Return the uncertainty of the solution, for errors of this variance."""
-        vectors, least = (
-            self._vectors / self._size[:, None],
-            ROUNDING * self._values[-1],
-        )
+        vectors = self._vectors / self._size[:, None]
+        least = ROUNDING * self._values[-1]
         root = vectors * np.sqrt(unit / np.maximum(self._values, least))
         return Spread(root[:, self._shown], root[:, ~self._shown])
 

@@ -86,14 +86,16 @@ def estimate_htf(
         return htf if harmonics is None else htf.select(harmonics)
     sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())
-    setup, (tried, ran) = sums.setup, sums.experiments
+    setup = sums.setup
+    (tried, ran) = sums.experiments
     if len(rows) == 0:
         raise DefinitionError(
             f"no frequency can be estimated from {ran} experiments ({tried - ran} failed): excite "
             f"each frequency by each of the {len(setup.inputs)} inputs, and multiples of 1/2 with "
             "two phases."
         )
-    f, lines = sums.f[rows], _solve_lines(sums, rows)
+    f = sums.f[rows]
+    lines = _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)
     if variance == "total" and why_not:
         raise DefinitionError(why_not)
@@ -102,9 +104,12 @@ def estimate_htf(
             f"a single realization, as at f = {f[lines.realizations < 1][0]:.10g}, does not show "
             "distortion: apply several (`Design.realizations`), or pass variance='noise'."
         )
-    total, noise, scatter = lines.noise, None, None
+    total = lines.noise
+    noise = None
+    scatter = None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
-        total, noise = lines.total, lines.noise
+        total = lines.total
+        noise = lines.noise
         shared = lines.realizations.sum()
         freedom = np.where(lines.realizations < 1, shared, lines.realizations).astype(
             float
@@ -149,9 +154,11 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     variance of H is their mean square times the diagonal of the inverse of the normal matrix. The
     noise of each experiment, from repeated windows, is propagated in the same way.
     """
-    nu, shape = len(sums.setup.inputs), sums.energy.shape[1:]
+    nu = len(sums.setup.inputs)
+    shape = sums.energy.shape[1:]
     H = np.zeros((len(rows), nu, *shape), complex)
-    spread, residual = np.zeros((len(rows), nu)), np.zeros((len(rows), *shape))
+    spread = np.zeros((len(rows), nu))
+    residual = np.zeros((len(rows), *shape))
     for mirrored, unknowns in ((False, nu), (True, 2 * nu)):
         entries = np.flatnonzero(sums.mirrored[rows] == mirrored)
         lines = rows[entries]

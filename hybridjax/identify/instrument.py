@@ -78,9 +78,11 @@ def in_loop(
     roles = Roles.of(names, reference)
     require_loop(roles, [r.u for r in records], names)
     inputs, references = (tuple(names[i] for i in columns) for columns in roles)
-    plant, drive = [], []
+    plant = []
+    drive = []
     for r in records:
-        u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
+        u = r.u[:, roles.inputs]
+        ref = r.u[:, roles.references]
         plant.append(dataclasses.replace(r, u=u, inputs=inputs))
         drive.append(
             dataclasses.replace(r, u=ref, y=u, inputs=references, outputs=inputs)
@@ -124,7 +126,8 @@ class Sums(NamedTuple):
 def spectral_products(
     data: ExperimentData, repeats: int, like: Sums | None = None
 ) -> Sums:
-    N, P = data.n_sections, data.periods
+    N = data.n_sections
+    P = data.periods
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]
     size = np.linalg.norm(z, axis=(0, 1))
     unit = like.unit if like else np.where(size > 0, size, 1.0)
@@ -217,8 +220,10 @@ def solve(
     y, u, r = map(sums.rows, (outputs, inputs, references))
     unit = np.tile(sums.unit, sums.setup.n_sections)
     unit = unit[y][:, None] / unit[u]
-    classes, (N, P, *_) = excited_classes(sums, r, threshold), sums.setup
-    G, (repeats, kind) = sums.total[classes], how
+    classes = excited_classes(sums, r, threshold)
+    (N, P, *_) = sums.setup
+    G = sums.total[classes]
+    (repeats, kind) = how
 
     def block(rows, columns, G=G):
         return G[:, rows[:, None], columns]
@@ -270,7 +275,8 @@ def solve(
             "several realizations (`Design.realizations`), or pass variance='noise'."
         )
     if total is None:
-        total, noise = noise, None
+        total = noise
+        noise = None
         freedom[:] = sums.experiments * (repeats - 1)
 
     f = (classes[:, None] + P * np.arange(N)) / P

@@ -72,7 +72,8 @@ def loop(
     too few of them, equal to an input, or those that excite too little.
     """
     require_x64()
-    r, d = at_input or (), at_output or ()
+    r = at_input or ()
+    d = at_output or ()
     if not (r or d):
         raise DefinitionError(
             "`loop` needs references: name those that enter at the plant's input "
@@ -80,7 +81,8 @@ def loop(
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)
     require_loop(roles, [data.u], data.inputs)
-    u, y = [data.inputs[i] for i in roles.inputs], data.outputs
+    u = [data.inputs[i] for i in roles.inputs]
+    y = data.outputs
     for what, given, needed in (("at_input", r, u), ("at_output", d, y)):
         if given and len(given) < len(needed):
             raise DefinitionError(

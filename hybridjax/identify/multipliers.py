@@ -151,12 +151,14 @@ def fit_multipliers(
             "errors='variance' needs HTFs with variances: take 'residuals'."
         )
     solution = _solve(htf, rms, order, overhang)
-    groups, c = solution.groups, solution.c
+    groups = solution.groups
+    c = solution.c
     covariance, cost, dof = varpro.summarize(groups, c, errors)
     numerators = varpro.unfold(
         htf, groups, [varpro.numerators_of(group, c) for group in groups]
     )
-    f, H = np.asarray(htf.f), np.asarray(htf.H)
+    f = np.asarray(htf.f)
+    H = np.asarray(htf.H)
     misfit = _evaluate(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
@@ -458,7 +460,8 @@ def unsupported(
 
     **Arguments:** `ratios(k)`: those of a fit of order k. `refused`: whether such a fit is refused.
     """
-    most, weakest = order, 0.0
+    most = order
+    weakest = 0.0
     while most:
         values, spread = ratios(most)
         sizes = (values - 1) / spread

@@ -129,7 +129,8 @@ class LocalCoordinates(NamedTuple):
 
     def blocks(self, n: int) -> list[tuple[str, tuple[int, int]]]:
         """Return the names and shapes of the free blocks at section n, in order."""
-        (after, d), (ny, nu) = self.model.A[n].shape, self.model.D[n].shape
+        (after, d) = self.model.A[n].shape
+        (ny, nu) = self.model.D[n].shape
         free = [("Y", (self.to_A[n].shape[1], d)), ("B", (after, nu))]
         free.append(("K", (after, self.model.K[n].shape[1])))
         return free + ([("D", (ny, nu))] if self.direct else [])
@@ -137,7 +138,8 @@ class LocalCoordinates(NamedTuple):
     @property
     def places(self) -> list[dict[str, slice]]:
         """The entries of each block in a vector of coordinates, for each section."""
-        out, first = [], 0
+        out = []
+        first = 0
         for n in range(self.model.n_sections):
             places = {}
             for name, (rows, columns) in self.blocks(n):
@@ -157,7 +159,9 @@ class LocalCoordinates(NamedTuple):
         A and B follow from F and B - K D, so that steps go straight where A and K C nearly cancel.
         """
         A, B, C, D, K = map(list, self.model)
-        places, F, gain = self.places, self.model.F, self.model.gain
+        places = self.places
+        F = self.model.F
+        gain = self.model.gain
         for n in range(self.model.n_sections):
             change = {
                 name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)
@@ -178,7 +182,8 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
 
     **Raises:** `DefinitionError` for unobservable states.
     """
-    N, predictor = model.n_sections, model._replace(A=model.F)
+    N = model.n_sections
+    predictor = model._replace(A=model.F)
     largest = np.abs(np.linalg.eigvals(predictor.monodromy())).max()
     rho = float((_LARGEST_MODULUS / max(largest, _LARGEST_MODULUS)) ** (1 / N))
     roots, back = zip(
@@ -192,7 +197,8 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         model.D,
         [after[n].T @ model.K[n] for n in range(N)],
     )
-    to_A, to_C = [], []
+    to_A = []
+    to_C = []
     for F, K, C in zip(model.F, model.gain, model.C, strict=True):
         left = np.linalg.qr(np.concatenate([rho * F, C]), mode="complete")[0][
             :, F.shape[1] :
@@ -213,11 +219,13 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
         return out[::-1]
 
     d = model.dims[0]
-    P, phi = around(np.zeros((d, d)))[0], rho**model.n_sections * model.monodromy()
+    P = around(np.zeros((d, d)))[0]
+    phi = rho**model.n_sections * model.monodromy()
     for _ in range(
         6
     ):  # periods are doubled until the remainder, 0.5^(2^6), is rounding
-        P, phi = P + phi.T @ P @ phi, phi @ phi
+        P = P + phi.T @ P @ phi
+        phi = phi @ phi
     return around(P)
 
 
@@ -227,7 +235,7 @@ def _root(n: int, gramian: Float[np.ndarray, "d d"]) -> tuple[np.ndarray, np.nda
     if not values[0] > ROUNDING * values[-1]:
         raise DefinitionError(
             f"a state at section {n} of the model has no effect on the outputs: give a minimal "
-            "model (`hj.identify.realize`)."
+            "model."
         )
     return vectors * np.sqrt(values), vectors / np.sqrt(values)
 
@@ -240,10 +248,15 @@ def characteristic_slopes(
     They are computed at the section with the smallest dimension d (recursion of Faddeev and
     Leverrier).
     """
-    model, places = coordinates.model, coordinates.places
-    N, first = model.n_sections, int(np.argmin(model.dims))
-    phi, d = model.monodromy(first), min(model.dims)
-    M, c, by_phi = np.eye(d), [], []
+    model = coordinates.model
+    places = coordinates.places
+    N = model.n_sections
+    first = int(np.argmin(model.dims))
+    phi = model.monodromy(first)
+    d = min(model.dims)
+    M = np.eye(d)
+    c = []
+    by_phi = []
     for k in range(1, d + 1):
         by_phi.append(-M.T)
         c.append(-np.trace(phi @ M) / k)

@@ -180,7 +180,8 @@ def _sums_of_part(
 
 def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
     """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
-    N, P = data.n_sections, data.periods
+    N = data.n_sections
+    P = data.periods
     output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
     Y = np.stack(
         [np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows]
@@ -252,6 +253,7 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
     common = ("setup", "harmonics", "line", "repeats")
     both: dict[str, Any] = {}
     for name in set(SpectralSums._fields).difference(common):
-        x, y = getattr(a, name), getattr(b, name)
+        x = getattr(a, name)
+        y = getattr(b, name)
         both[name] = (x[0] + y[0], x[1] + y[1]) if isinstance(x, tuple) else add(x, y)
     return a._replace(line=line, **both)

@@ -75,7 +75,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
     and if no experiment ran well.
     """
-    N, P = data.n_sections, data.periods
+    N = data.n_sections
+    P = data.periods
     S, n, ny = data.y.shape
     cycles = n // N - 1
     if order is not None and order > cycles // 2:
@@ -135,7 +136,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     c = min(fits, key=lambda fit: fit[0])[1]
 
     basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
-    clean, removed = data.y[:, N:].copy(), np.full((S, ny), np.nan)
+    clean = data.y[:, N:].copy()
+    removed = np.full((S, ny), np.nan)
     for Q, z, s in zip(free, left, good, strict=True):
         transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
         transient = transient.reshape(-1, ny) * size
@@ -158,7 +160,8 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
 
 def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
     """Solve the equation of the decay, which `y` obeys but for sinusoids, by least squares."""
-    normal, right = np.zeros((d, d)), np.zeros(d)
+    normal = np.zeros((d, d))
+    right = np.zeros(d)
     cycles = y.shape[1]
     for Q, record in zip(free, y, strict=True):
         # The same sinusoids, d periods fewer.
@@ -177,7 +180,8 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
-        basis, out = start_responses(c, np.zeros(1, int), cycles, len(c))[0], []
+        basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
+        out = []
         for Q, z in blocks:
             q = np.linalg.qr(Q @ basis)[0]
             out.append((z - q @ (q.T @ z)).ravel())

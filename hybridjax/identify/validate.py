@@ -40,7 +40,8 @@ def can_be_compared(
     model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
 ) -> bool:
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
-    N, ny = record.n_sections, record.y.shape[1]
+    N = record.n_sections
+    ny = record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
     if isinstance(model, SeriesFit):
         unknown += N * ny * model.free_cycles * free_start
@@ -212,20 +213,24 @@ def validate(
     unstable = (
         not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any()
     )
-    records, drive = uninterrupted_records(data), None
+    records = uninterrupted_records(data)
+    drive = None
     if reference is not None:
         records, drive = in_loop(data, reference)
     require_same("model and data", model, records[0])
     kept = [can_be_compared(tested, r, free_start) for r in records]
     compared = list(itertools.compress(records, kept))
-    N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
+    N = records[0].n_sections
+    outputs = records[0].outputs
+    ny = len(records[0].outputs)
     if not compared:
         raise DefinitionError(
             f"{max(len(r.u) for r in records) / N:.3g} cycles without gaps are too few for an "
             "unknown initial state: record longer without gaps, or use `validate(start='cycle')`."
         )
     prepared = PreparedRecords(compared)
-    grid, sampled = prepared.whole(), prepared.sampled
+    grid = prepared.whole()
+    sampled = prepared.sampled
     y = np.where(grid.sampled, grid.y, np.nan)
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:

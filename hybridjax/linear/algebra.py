@@ -44,11 +44,15 @@ def static_gain(
 
     **Raises:** `DefinitionError` for another shape.
     """
-    xp, N, (ny, nu) = namespace(gain), n_sections, shape
+    xp = namespace(gain)
+    N = n_sections
+    (ny, nu) = shape
     one = {"inputs": ny, "outputs": nu}  # of the plant that it controls
     require_axes("a gain", gain, one, {"sections": N} | one)
     D = xp.broadcast_to(gain, (N, ny, nu))
-    A, B, C = xp.zeros((N, 0, 0)), xp.zeros((N, 0, nu)), xp.zeros((N, ny, 0))
+    A = xp.zeros((N, 0, 0))
+    B = xp.zeros((N, 0, nu))
+    C = xp.zeros((N, ny, 0))
     return Matrices(A, B, C, D, xp.zeros(N, int))
 
 
@@ -67,7 +71,8 @@ def connect(
     xp = namespace(a.A)
 
     def beside(x, y):
-        (_, a, b), (_, c, d) = x.shape, y.shape
+        (_, a, b) = x.shape
+        (_, c, d) = y.shape
         return xp.pad(x, ((0, 0), (0, c), (0, d))) + xp.pad(y, ((0, 0), (a, 0), (b, 0)))
 
     A, B, C, D = (beside(x, y) for x, y in zip(a[:4], b[:4], strict=True))
@@ -75,11 +80,13 @@ def connect(
         xp.eye(len(K)) - K @ D,
         xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2),
     )
-    by_state, by_input = to_inputs[..., : C.shape[2]], to_inputs[..., C.shape[2] :]
+    by_state = to_inputs[..., : C.shape[2]]
+    by_input = to_inputs[..., C.shape[2] :]
     place = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
     size = C.shape[2]
     order = xp.argsort(xp.concatenate(place, axis=1) * size + xp.arange(size), axis=1)
-    rows, after = order[:, None, :], xp.roll(order, -1, axis=0)[:, :, None]
+    rows = order[:, None, :]
+    after = xp.roll(order, -1, axis=0)[:, :, None]
     A = xp.take_along_axis(xp.take_along_axis(A + B @ by_state, after, 1), rows, 2)
     B = xp.take_along_axis(B @ by_input, after, 1)
     C = xp.take_along_axis(M @ (C + D @ by_state), rows, 2)
@@ -123,10 +130,8 @@ class Lines(NamedTuple):
         wanted = start[:, None] + np.arange(N)
         size = np.abs((f - wanted[..., None] + N / 2) % N - N / 2)
         opposite = np.abs((f + wanted[..., None] + N / 2) % N - N / 2)
-        there, mirrored = (
-            size.min(axis=2) < SAME_FREQUENCY,
-            opposite.min(axis=2) < SAME_FREQUENCY,
-        )
+        there = size.min(axis=2) < SAME_FREQUENCY
+        mirrored = opposite.min(axis=2) < SAME_FREQUENCY
         if not (there | mirrored).all():
             lost = (wanted[~(there | mirrored)][0] + N / 2) % N - N / 2
             raise DefinitionError(
@@ -139,7 +144,8 @@ class Lines(NamedTuple):
 
     def matrices(self, x: Array) -> Complex[Array, "K Nny Nnu"]:
         """Return the harmonic matrices of values (N, F, ny, nu), in the order of all harmonics."""
-        (K, N), xp = self.row.shape, namespace(x)
+        (K, N) = self.row.shape
+        xp = namespace(x)
         m = np.arange(N)[:, None] - np.arange(N)
         sign = np.where(self.mirrored, -1, 1)[:, None]
         values = x[(sign * m + N // 2) % N, self.row[:, None]]  # (K, a, b, ny, nu)
@@ -150,11 +156,13 @@ class Lines(NamedTuple):
 
     def entries(self, matrices: Array) -> Complex[Array, "N F ny nu"]:
         """Return the values of all lines, whose harmonic matrices these are."""
-        (K, N), xp = self.row.shape, namespace(matrices)
+        (K, N) = self.row.shape
+        xp = namespace(matrices)
         values = matrices.reshape(K, N, matrices.shape[1] // N, N, -1).swapaxes(2, 3)
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
-        mirrored, m = self.mirrored[k, b], np.arange(N)[:, None] - N // 2
+        mirrored = self.mirrored[k, b]
+        m = np.arange(N)[:, None] - N // 2
         values = values[k, (b + np.where(mirrored, -m, m)) % N, b]
         return xp.where(mirrored[:, None, None], xp.conj(values), values)
 

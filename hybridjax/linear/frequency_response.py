@@ -63,12 +63,11 @@ def _derived(compiled: Callable) -> Callable:
     def rule(arguments, tangents):
         if not must_be_on_host():
             return eqx.filter_jvp(compiled, arguments, tangents)
-        value, pairs = (
-            harmonic_transfer(*arguments),
-            zip(arguments, tangents[:4], strict=False),
-        )
+        value = harmonic_transfer(*arguments)
+        pairs = zip(arguments, tangents[:4], strict=False)
         along = [jnp.zeros_like(x) if t is None else t for x, t in pairs]
-        shape, each = jax.ShapeDtypeStruct(value.shape, value.dtype), "broadcast_all"
+        shape = jax.ShapeDtypeStruct(value.shape, value.dtype)
+        each = "broadcast_all"
         return value, jax.pure_callback(
             _along, shape, *arguments, *along, vmap_method=each
         )
@@ -84,7 +83,9 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     dA, dB, dC, dD = (
         np.asarray(x).reshape(-1, *x.shape[-3:])[:, :, None] for x in arrays[5:]
     )
-    z, (P, N, _, d, _), nu = _unit_roots(A, f), dA.shape, B.shape[-1]
+    z = _unit_roots(A, f)
+    (P, N, _, d, _) = dA.shape
+    nu = B.shape[-1]
     X = _states(A, z * B[:, None], f)
     # (Directions are further columns.)
     forcing = np.moveaxis(dA @ X + z * dB, 0, -2).reshape(N, f.size, d, P * nu)

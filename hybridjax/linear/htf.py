@@ -181,11 +181,14 @@ class HTF(eqx.Module):
             _optional("scatter.roundness", scatter.roundness, shape)
 
     def __repr__(self) -> str:
-        count, span = self.f.shape[-1], ""
+        count = self.f.shape[-1]
+        span = ""
         if count and not is_traced(self.f):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
-        low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
+        low = self.harmonics[0]
+        high = self.harmonics[-1]
+        number = len(self.harmonics)
         sections = (
             f"{self.n_sections} sections" if self.n_sections else "continuous time"
         )
@@ -204,9 +207,11 @@ class HTF(eqx.Module):
         """The first input's, as functions of frequency."""
         if is_traced(self) or self.H.ndim != 4 or not self.H.size:
             return None
-        f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
+        f = np.asarray(self.f)
+        H = np.abs(np.asarray(self.H))[..., 0]
         order = np.argsort(f)
-        u, drawn = self.inputs[0], []
+        u = self.inputs[0]
+        drawn = []
         largest = np.argsort(-np.nanmax(H, axis=(1, 2)), kind="stable")[:_SHOWN]
         for j, y in enumerate(self.outputs[:_SHOWN]):
             curves = [
@@ -334,7 +339,9 @@ class HTF(eqx.Module):
         symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
         """
         self.require_sampled("`predict`")
-        (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
+        (n, nu) = u.shape
+        N = self.n_sections
+        u = np.asarray(u)
         if n == 0 or n % N or nu != len(self.inputs):
             raise DefinitionError(
                 f"`u` has shape {u.shape}, but needs a multiple of {N} samples and "
@@ -343,9 +350,11 @@ class HTF(eqx.Module):
         # A real system responds to -f with the conjugate of its response to f.
         mirror = np.array([self._index(-m) for m in self.harmonics])
         f = np.concatenate([self.f, -np.asarray(self.f)])
-        H, xp = to_host(self.H), namespace(to_host(self.H))
+        H = to_host(self.H)
+        xp = namespace(to_host(self.H))
         H = xp.concatenate([H, H[mirror].conj()], axis=1)
-        U, periods = np.fft.fft(u, axis=0), n // N
+        U = np.fft.fft(u, axis=0)
+        periods = n // N
         lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
         distance = np.abs(self._circle(lines[:, None] / periods - f))
         lost = distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY
@@ -441,7 +450,8 @@ def _combined(
     """Return the result of an operation on harmonic matrices, with its variances."""
     first = terms[0]
     first.require_sampled("the algebra of HTFs")
-    N, every = first.n_sections, check_harmonics(None, first.n_sections)
+    N = first.n_sections
+    every = check_harmonics(None, first.n_sections)
     for x in terms:
         _require_same_lines(first, x)
         if x.harmonics != every:

@@ -91,7 +91,8 @@ class LDTP(eqx.Module):
             dims = np.zeros(len(A), int)
         A, B, C = from_host(_with_a_coordinate(A, B, C))
         n_sections, d = A.shape[:2]
-        ny, nu = C.shape[1], B.shape[2]
+        ny = C.shape[1]
+        nu = B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         matrices = {"A": A, "B": B, "C": C, "D": through}
         for name, sizes in {
@@ -100,7 +101,8 @@ class LDTP(eqx.Module):
             "C": (ny, d),
             "D": (ny, nu),
         }.items():
-            array, shape = matrices[name], (n_sections, *sizes)
+            array = matrices[name]
+            shape = (n_sections, *sizes)
             if array.shape != shape or 0 in shape:
                 raise DefinitionError(
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
@@ -111,12 +113,13 @@ class LDTP(eqx.Module):
             require_equal(
                 "`A` and `coordinates`", "lengths", n_sections, len(coordinates)
             )
-        self.A, self.B, self.C, self.D = A, B, C, through
+        self.A = A
+        self.B = B
+        self.C = C
+        self.D = through
         self.dims = _dimensions(dims, n_sections, d)
-        self.inputs, self.outputs = (
-            names("inputs", inputs, nu),
-            names("outputs", outputs, ny),
-        )
+        self.inputs = names("inputs", inputs, nu)
+        self.outputs = names("outputs", outputs, ny)
         self.coordinates = (
             None if coordinates is None else tuple(map(tuple, coordinates))
         )
@@ -146,12 +149,15 @@ class LDTP(eqx.Module):
                 f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks)
             )
         dims = [np.shape(block)[1] for block in A]
-        after, d = [*dims[1:], dims[0]], max(dims)
-        ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
+        after = [*dims[1:], dims[0]]
+        d = max(dims)
+        ny = np.shape(C[0])[0]
+        nu = np.shape(B[0])[1]
         padded: dict[str, Any] = {}
         xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
-            full, parts = (d if name in "AB" else ny, d if name in "AC" else nu), []
+            full = (d if name in "AB" else ny, d if name in "AC" else nu)
+            parts = []
             for n, block in enumerate(map(xp.asarray, blocks)):
                 shape = (
                     after[n] if name in "AB" else ny,
@@ -188,7 +194,9 @@ class LDTP(eqx.Module):
         if is_traced(self.dims):
             return "traced"
         dims = np.asarray(self.dims)
-        low, high, batch = dims.min(), dims.max(), self.A.ndim > 3
+        low = dims.min()
+        high = dims.max()
+        batch = self.A.ndim > 3
         lost = 0 if batch or is_traced(self) else int(low) - self.rank()
         besides = f" (multipliers zero or below resolution: {lost})" if lost else ""
         return f"{low}{'' if low == high else f' to {high}'}{besides}"
@@ -260,12 +268,11 @@ class LDTP(eqx.Module):
         """
         require_chain("@", other.outputs, self.inputs, self, other)
         (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
-        K, L, M = (
-            np.zeros((nu + nr, ny + inner)),
-            np.zeros((nu + nr, nr)),
-            np.eye(ny, ny + inner),
-        )
-        K[:nu, ny:], L[nu:] = np.eye(nu), np.eye(nr)
+        K = np.zeros((nu + nr, ny + inner))
+        L = np.zeros((nu + nr, nr))
+        M = np.eye(ny, ny + inner)
+        K[:nu, ny:] = np.eye(nu)
+        L[nu:] = np.eye(nr)
         return self._connected(other.matrices, K, L, M, other.inputs, self.outputs)
 
     def __add__(self, other: "LDTP") -> "LDTP":
@@ -275,7 +282,8 @@ class LDTP(eqx.Module):
         """
         require_same("terms of a sum", self, other)
         ny, nu = np.shape(self.D)[1:]
-        L, M = np.tile(np.eye(nu), (2, 1)), np.tile(np.eye(ny), (1, 2))
+        L = np.tile(np.eye(nu), (2, 1))
+        M = np.tile(np.eye(ny), (1, 2))
         K = np.zeros((2 * nu, 2 * ny))
         return self._connected(other.matrices, K, L, M, self.inputs, self.outputs)
 
@@ -321,8 +329,10 @@ class LDTP(eqx.Module):
         else:
             F = algebra.static_gain(to_host(controller), self.n_sections, (nu, ny))
         algebra.require_well_posed(self.D, F.D)
-        K, L = np.zeros((nu + ny, ny + nu)), np.eye(nu + ny, nu)
-        K[:nu, ny:], K[nu:, :ny] = -np.eye(nu), np.eye(ny)
+        K = np.zeros((nu + ny, ny + nu))
+        L = np.eye(nu + ny, nu)
+        K[:nu, ny:] = -np.eye(nu)
+        K[nu:, :ny] = np.eye(ny)
         return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
 
     @property
@@ -400,7 +410,8 @@ class LDTP(eqx.Module):
         return time_response.periodic_states(self.A, self.B, by_period)
 
     def _response(self, u, x0, first_section):
-        u, x0 = self._input(u), self._state(x0, first_section)
+        u = self._input(u)
+        x0 = self._state(x0, first_section)
         sections = (first_section + np.arange(len(u))) % self.n_sections
         return time_response.response(self.matrices, u, x0, sections)
 
@@ -437,7 +448,8 @@ class LDTP(eqx.Module):
             raise DefinitionError(
                 f"`{method}` takes one LDTP at a time, not a batch of them."
             )
-        A, dims = np.asarray(self.A), np.asarray(self.dims)
+        A = np.asarray(self.A)
+        dims = np.asarray(self.dims)
         return [
             factor[:rows, :columns]
             for factor, rows, columns in zip(A, np.roll(dims, -1), dims, strict=True)
@@ -446,7 +458,8 @@ class LDTP(eqx.Module):
     def _refuse_resonance(self, f):
         if is_traced(self.A, self.dims, f):
             return
-        multipliers, f = self.multipliers, np.asarray(f)
+        multipliers = self.multipliers
+        f = np.asarray(f)
         distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)

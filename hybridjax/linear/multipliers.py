@@ -115,10 +115,14 @@ def _regular_part(factors, rtol):
 def _diagonal_blocks(factors):
     """Yield for each block on the diagonal its part of each factor, all unitarily and periodically
     similar to the given square ones."""
-    d, stalls = len(factors[0]), 0
-    basis, below = np.eye(d), np.full(d - 1, np.inf)
+    d = len(factors[0])
+    stalls = 0
+    basis = np.eye(d)
+    below = np.full(d - 1, np.inf)
     for _ in range(_MOST_SWEEPS):
-        start, before, triangles = basis, below, []
+        start = basis
+        before = below
+        triangles = []
         for factor in factors:
             basis, triangle = np.linalg.qr(factor @ basis)
             triangles.append(triangle)
@@ -136,10 +140,12 @@ def _diagonal_blocks(factors):
 
 def _eigenvalues(factors):
     """The eigenvalues of a product, which may be too small or too large for a number on its way."""
-    product, exponent = np.eye(len(factors[0])), 0
+    product = np.eye(len(factors[0]))
+    exponent = 0
     for factor in factors:
         product = factor @ product
         digits = int(np.frexp(np.abs(product).max())[1])
-        product, exponent = np.ldexp(product, -digits), exponent + digits
+        product = np.ldexp(product, -digits)
+        exponent = exponent + digits
     values = np.linalg.eigvals(product).astype(complex)
     return np.ldexp(values.view(float), exponent).view(complex)

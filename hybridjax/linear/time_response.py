@@ -45,7 +45,8 @@ def response(
         return m.A[n] @ x + m.B[n] @ u, x
 
     last, x = jax.lax.scan(advance, x0, (sections, u))
-    C, D = m.C[sections], m.D[sections]
+    C = m.C[sections]
+    D = m.D[sections]
     y = jnp.einsum("nij,nj->ni", C, x) + jnp.einsum("nij,nj->ni", D, u)
     return jnp.concatenate([x, last[None]]), y
 
@@ -70,7 +71,9 @@ def periodic_states(
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.
     """
-    xp, periods, identity = namespace(A), u.shape[1], np.eye(A.shape[-1])
+    xp = namespace(A)
+    periods = u.shape[1]
+    identity = np.eye(A.shape[-1])
     # What enters at a section reaches the end of the period through the factors after it.
     phi, after = scan(lambda P, factor: (P @ factor, P), xp.asarray(identity), A[::-1])
     w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
@@ -88,7 +91,8 @@ def characteristic_polynomial(
     """Coefficients of det(x I - matrix), highest power first (Faddeev-LeVerrier recursion)."""
     d = matrix.shape[0]
     identity = jnp.eye(d)
-    coefficients, adjugate = [jnp.ones(())], identity
+    coefficients = [jnp.ones(())]
+    adjugate = identity
     for k in range(1, d + 1):
         step = matrix @ adjugate
         coefficients.append(-jnp.trace(step) / k)

@@ -36,6 +36,7 @@ from ..periodic import (
     characteristic_slopes,
     local_coordinates,
 )
+from ..realization import default_horizon, given_dims, realized
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import (
@@ -45,10 +46,10 @@ from ..series.records import (
     PreparedRecords,
     with_drift,
 )
-from ..series.subspace import answers_at_once, default_horizon, subspace_model
+from ..series.subspace import answers_at_once, subspace_model
 from .descent import ModelPoint, descend
 from .frequency import FrequencyProblem, transfer, transfer_slopes
-from .realization import given_dims, realize
+from .realization import realized_htf
 
 
 Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
@@ -211,7 +212,7 @@ class LDTPFit(MultiplierFit):
 @checked
 def fit_ldtp(
     data: HTF | RecordedData,
-    guess: Guess,
+    guess: Guess | None = None,
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
@@ -247,7 +248,8 @@ def fit_ldtp(
       entries of the matrices. Without variances each output is weighted by its residuals. Or time
       series, as for `fit_series`.
     - `guess`: dimensions of the state at each section (or one for all): the fit starts from
-      `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
+      a realization of HTFs (states below the noise are left out by default, which may bias a
+      multiplier), and from a subspace method for time series, which need this. Alternatively, an
       observable initial model with these dimensions; if its D is zero, D stays zero. Too few
       dimensions bias the multipliers: compare `cost` with `dof` where variances are known;
       for time series, see `findings`. The iteration finds a local minimum; the same checks reveal a
@@ -276,6 +278,10 @@ def fit_ldtp(
     require_x64()
     free_start = start == "free"
     if not isinstance(data, HTF):
+        if guess is None:
+            raise DefinitionError(
+                "fit_ldtp: give the dimensions of the state as `guess`, which time series need."
+            )
         how = _How(noise == "innovations" or reference is not None, free_start, check)
         fit = _fit_to_records(data, guess, how, reference)
     elif reference is None and noise == "output" and free_start:
@@ -300,11 +306,11 @@ class _How(NamedTuple):
     check: bool
 
 
-def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
+def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     scale = weights.check_values(htf)
     direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
-        guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
+        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "guess"))
     require_same("guess and data", guess, htf)
     problem = FrequencyProblem.of(htf, weights.error_weights(htf, scale), scale)
     model = PeriodicModel.of(guess, scale)
@@ -334,7 +340,7 @@ def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
         return fit
 
     def smaller(dims: Sequence[int]) -> PeriodicModel:
-        return PeriodicModel.of(realize(htf, np.array(dims)), scale)
+        return PeriodicModel.of(realized_htf(htf, dims), scale)
 
     return _with_findings(fit, _surplus(fit, point, smaller))
 
@@ -585,7 +591,7 @@ def _about_point(fit: LDTPFit) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _is_direct(guess: Guess) -> bool:
+def _is_direct(guess: Guess | None) -> bool:
     """Return whether outputs may depend on the input at their own section."""
     return not isinstance(guess, LDTP) or bool(np.asarray(guess.D).any())
 
@@ -657,9 +663,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
     exact = exact_htf(model, htf)
-    minimal = realize(
-        np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1))
-    )
+    lags = 2 * default_horizon(model.n_sections) + 1
+    minimal = realized(np.asarray(model.impulse_response(lags)))
     scale = weights.check_values(exact)
     problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
     direct = bool(np.asarray(model.D).any())

@@ -73,8 +73,10 @@ class FrequencyProblem(NamedTuple):
             return np.inf
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
-        P, error = coordinates.size, self.errors(coordinates.model)
-        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        P = coordinates.size
+        error = self.errors(coordinates.model)
+        gram = np.zeros((P, P))
+        gradient = np.zeros(P)
         pieces = transfer_slopes(coordinates, self.f, self.harmonics, self.weight)
         for rows, slopes in pieces:
             J = slopes.reshape(P, -1).view(float)
@@ -103,8 +105,11 @@ def transfer_slopes(
     weight: Float[np.ndarray, "M F ny nu"] | None = None,
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
     """Iterate over derivatives of the HTFs, times weights, by groups of frequencies."""
-    model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
-    N, (ny, nu) = model.n_sections, model.D[0].shape
+    model = coordinates.model
+    places = coordinates.places
+    m = np.array(harmonics)
+    N = model.n_sections
+    (ny, nu) = model.D[0].shape
     weight = np.ones((len(m), len(f), ny, nu)) if weight is None else weight
     # Derivatives by later states are those of the transposed system, in the other order.
     dual = model._replace(
@@ -112,7 +117,8 @@ def transfer_slopes(
     )
     step = max(_HELD // (coordinates.size * len(m) * ny * nu), 1)
     for rows in (slice(k, min(k + step, len(f))) for k in range(0, len(f), step)):
-        w, states = weight[:, rows], states_at(model, f[rows])
+        w = weight[:, rows]
+        states = states_at(model, f[rows])
         later = states_at(dual, np.add.outer(m, f[rows]).ravel())[::-1]
         J = np.zeros((coordinates.size, *w.shape), complex)
         for n, at in enumerate(places):
@@ -146,7 +152,9 @@ def states_at(
     model: PeriodicModel, f: Float[np.ndarray, " F"]
 ) -> list[Complex[np.ndarray, "_ F nu"]]:
     r"""Return $\tilde x$ at each section, (d, F, nu)."""
-    N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
+    N = model.n_sections
+    nu = model.B[0].shape[1]
+    phi = model.monodromy()
     back = np.exp(-2j * np.pi / N * f)[:, None]
 
     def around(x):

@@ -21,6 +21,7 @@ from ..._core.boundary.kinds import (
 )
 from ..._core.execution import one_blas_thread
 from ..._core.findings import Finding, refuse, warn_of
+from ..._core.memo import remembered
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
@@ -36,6 +37,7 @@ from ..fit import not_converged
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..multipliers import NoiseRatios, unsupported
+from ..realization import default_horizon, realized
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
@@ -102,9 +104,18 @@ class SeriesFit(MultiplierFit):
     lead: int = eqx.field(static=True, default=0)
     reference: tuple[str, ...] = eqx.field(static=True, default=())
 
-    @property
-    def model(self) -> None:
-        return None
+    @remembered
+    def model(self) -> LDTP:
+        """A minimal state-space model with the fitted responses, without states below the noise."""
+        markov = self.impulse_response(2 * default_horizon(self.n_sections) + 1)
+        spread = (self.roots**2).sum(axis=4).mean(axis=(0, 2))
+        return realized(
+            markov,
+            noise=spread * self.noise[:, None] ** 2,
+            order=len(self.multipliers),
+            inputs=self.inputs,
+            outputs=self.outputs,
+        )
 
     @checked
     def impulse_response(
@@ -192,7 +203,8 @@ class SeriesFit(MultiplierFit):
     ) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
         N, R, ny, nu = self.numerators.shape
-        v, T = divide_by_chi(self.coefficients, grid.u), grid.u.shape[1]
+        v = divide_by_chi(self.coefficients, grid.u)
+        T = grid.u.shape[1]
         # As in the fit, earlier inputs act on so many cycles without a model.
         free = min(self.free_cycles, T) if free_start else 0
         out = np.zeros(grid.y.shape)
@@ -201,14 +213,13 @@ class SeriesFit(MultiplierFit):
                 n, :, i
             ].reshape(-1, 1)
             starts = start_responses(self.coefficients, grid.first[:, n], T, free)
-            unknown, none = (
-                np.concatenate([starts, grid.drift], axis=2),
-                grid.drift[:, :, :0],
-            )
+            unknown = np.concatenate([starts, grid.drift], axis=2)
+            none = grid.drift[:, :, :0]
             regression = SectionRegression.make(
                 forced, unknown, none, grid.sampled[:, :, n, i]
             )
-            y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
+            y = grid.y[:, :, n, i]
+            sampled = grid.sampled[:, :, n, i]
             error = regression.residual(np.ones(1), y).reshape(y.shape)
             out[:, :, n, i] = np.where(
                 sampled, y - error, regression.response(np.ones(1), y)
@@ -407,9 +418,11 @@ def assemble(
 ) -> SeriesFit:
     """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
-    d, columns = len(solution.c), problem.lags * nu  # lags, then inputs
+    d = len(solution.c)
+    columns = problem.lags * nu  # lags, then inputs
     widest = max(fit.root.shape[1] for section in solution.fits for fit in section)
-    numerators, slopes = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
+    numerators = np.zeros((N, columns, ny))
+    slopes = np.zeros((d, N, columns, ny))
     roots = np.zeros((N, ny, columns, widest))
     for n, (section, to_lags) in enumerate(
         zip(solution.fits, problem.to_lags, strict=True)
@@ -492,10 +505,8 @@ def coefficient_covariance(
         return white * sampled
 
     noise = linearize(problem, solution.c, draws).curvature / _WHITE_DRAWS
-    curvature, whole = (
-        (solution.curvature - noise).sum(axis=0),
-        solution.curvature.sum(axis=0),
-    )
+    curvature = (solution.curvature - noise).sum(axis=0)
+    whole = solution.curvature.sum(axis=0)
     if not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
     lags = denominator.correlated_cycles(
@@ -518,7 +529,8 @@ def gradient_covariance(
     white noise, and noise filtered by 1 / chi, as process noise is. The amounts of both follow from
     two sums of squares of the residuals (variance components: Rao 1971).
     """
-    d, memory = len(solution.c), fading(solution.c)
+    d = len(solution.c)
+    memory = fading(solution.c)
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
@@ -579,7 +591,8 @@ def gradient_covariance(
         share = np.linalg.inv(np.linalg.cholesky(by_white.sum(axis=0)))
     except np.linalg.LinAlgError:  # nothing is left of any block
         return Covariance.unknown(d)
-    scaled, share = score[:, 0] @ half.T, share @ by_white @ share.T
+    scaled = score[:, 0] @ half.T
+    share = share @ by_white @ share.T
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
     matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)

@@ -129,13 +129,12 @@ class LoopEquations:
     def __init__(
         self, plant: list[Record], drive: list[Record], order: int, overhang: int | None
     ):
-        self.records, self.order, self.reference = (
-            PreparedRecords(plant),
-            order,
-            drive[0].inputs,
-        )
+        self.records = PreparedRecords(plant)
+        self.order = order
+        self.reference = drive[0].inputs
         self.grid = self.records.whole()
-        N, z = self.records.n_sections, predicted(plant, drive, order)
+        N = self.records.n_sections
+        z = predicted(plant, drive, order)
         span = N if overhang is None else overhang
         self.lags = self.records.lead + order * N + span + 1
         self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
@@ -143,8 +142,10 @@ class LoopEquations:
     def _section(
         self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
     ) -> SectionEquations:
-        grid, delays = self.grid, range(self.order + 1)
-        (_, T, _, nu), ny = grid.u.shape, grid.y.shape[3]
+        grid = self.grid
+        delays = range(self.order + 1)
+        (_, T, _, nu) = grid.u.shape
+        ny = grid.y.shape[3]
         sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
         used = np.all(sampled, axis=0) & (np.arange(T) >= grid.first[:, n, None] + free)
         signals = [
@@ -222,7 +223,9 @@ class LoopEquations:
     @cached_property
     def solution(self) -> Solution:
         """**Raises:** `DefinitionError` for too few cycles."""
-        d, sections, scale = self.order, self.sections, self.records.scale
+        d = self.order
+        sections = self.sections
+        scale = self.records.scale
         if (least := min(x.freedom for x in sections)) <= d:
             raise DefinitionError(
                 f"a section was sampled {d + 1 - least} times too few for numerators of "
@@ -256,7 +259,8 @@ class LoopEquations:
         **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
         the reference does not determine all multipliers.
         """
-        (c, along, scale, determined), d = self.solution, self.order
+        (c, along, scale, determined) = self.solution
+        d = self.order
         if check and determined < d:
             raise DefinitionError(
                 f"the reference determines {determined} multipliers, not {d}: lower `order`, "

@@ -163,7 +163,8 @@ def linearize(
 
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
-    (N, _, ny), d = problem.shape, len(c)
+    (N, _, ny) = problem.shape
+    d = len(c)
     out = Linearization(
         c=c,
         square=np.zeros((N, ny)),
@@ -203,7 +204,8 @@ def each_fit(
     work: Callable[[int, CycleGrid, int, SectionFit, SectionRegression], Any],
 ) -> list[list[Any]]:
     """Return, for each grid, the results of `work` at all sections and lists of outputs."""
-    parts, regress = problem.parts(), _regressions_at(problem, solution.c)
+    parts = problem.parts()
+    regress = _regressions_at(problem, solution.c)
 
     def section(k: int, n: int) -> list[Any]:
         pairs = zip(solution.fits[n], regress(k, parts[k], n), strict=True)

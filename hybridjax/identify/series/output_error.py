@@ -135,7 +135,9 @@ class OutputErrorProblem(NamedTuple):
 
         **Raises:** `DefinitionError` for too few cycles, and for inputs that depend on each other.
         """
-        N, nu, ny = records.n_sections, len(records.inputs), len(records.outputs)
+        N = records.n_sections
+        nu = len(records.inputs)
+        ny = len(records.outputs)
         lags = records.lead + order * N + overhang + 1
         free = order + -(-overhang // N) if free_start else 0
         if lags > records.cycles * N:
@@ -162,7 +164,8 @@ class OutputErrorProblem(NamedTuple):
         ] == len(rows):
             problem = cls(records, lags, free, [], [], records.scale)
             raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
-        triangles, equal = on_all_cores(triangle, range(N)), np.ones((N, ny, ny), bool)
+        triangles = on_all_cores(triangle, range(N))
+        equal = np.ones((N, ny, ny), bool)
         for grid in records.grids:
             for i in range(ny):
                 equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))

@@ -117,14 +117,16 @@ class SeriesProblem(NamedTuple):
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
         """Return the problem with the covariance of the errors of a model."""
-        square, count = np.zeros(self.S.shape), np.zeros(self.S.shape)
+        square = np.zeros(self.S.shape)
+        count = np.zeros(self.S.shape)
         for part in self.parts:
             for n, e in enumerate(self.path(model, part).error):
                 square[n] += np.einsum("rti,rtj->ij", e, e)
                 sampled = part.sampled[n].astype(float)
                 count[n] += np.einsum("rti,rtj->ij", sampled, sampled)
         if not self.by_section:
-            square[:], count[:] = square.sum(axis=0), count.sum(axis=0)
+            square[:] = square.sum(axis=0)
+            count[:] = count.sum(axis=0)
         values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
         floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * values[:, -1:])
         S = vectors * np.maximum(values, floor)[:, None] @ vectors.swapaxes(1, 2)
@@ -132,7 +134,8 @@ class SeriesProblem(NamedTuple):
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P = coordinates.size
-        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        gram = np.zeros((P, P))
+        gradient = np.zeros(P)
         for part in self.parts:
             path = self.path(coordinates.model, part)
             R, _ = part.shape
@@ -172,8 +175,11 @@ class SeriesProblem(NamedTuple):
                 gain[n], y[n] * part.sampled[n]
             )
 
-        states, left, starts = [], [], []
-        gram, along = np.zeros((R, s, s)), np.zeros((R, s, 1))
+        states = []
+        left = []
+        starts = []
+        gram = np.zeros((R, s, s))
+        along = np.zeros((R, s, 1))
         for n, x in enumerate(
             recursion(F, (R, T, 1 + s), enter, drive, [1 + s] * len(F))
         ):
@@ -199,7 +205,8 @@ class SeriesProblem(NamedTuple):
     def _weights(self, part: SeriesPart, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrix of the mean of all errors, given the sampled ones, and the matrix that
         whitens the sampled ones."""
-        S, lost = self.S[n], part.lost[n]
+        S = self.S[n]
+        lost = part.lost[n]
         if not lost.any():
             return np.eye(len(S))[None, None], np.linalg.inv(np.linalg.cholesky(S))[
                 None, None
@@ -233,16 +240,15 @@ def recursion(
     - `filled`: number of columns that are not zero in the first cycle after each section.
     """
     R, T, columns = shape
-    x, phi = (
-        np.zeros((R, T, F[0].shape[-1], columns)),
-        np.eye(F[0].shape[-1])[None, None],
-    )
+    x = np.zeros((R, T, F[0].shape[-1], columns))
+    phi = np.eye(F[0].shape[-1])[None, None]
     for n, step in enumerate(F):
         enter(n, x)
         later = np.zeros((R, T, step.shape[-2], columns))
         later[..., : filled[n]] = step @ x[..., : filled[n]]
         drive(n, later)
-        x, phi = later, step @ phi
+        x = later
+        phi = step @ phi
     starts = np.zeros_like(x)
     for k in range(T - 1):
         starts[:, k + 1] = phi[:, min(k, phi.shape[1] - 1)] @ starts[:, k] + x[:, k]
@@ -258,10 +264,13 @@ def slopes_of(
     coordinates: LocalCoordinates, part: SeriesPart, path: Path
 ) -> Iterator[Columns]:
     """Iterate over the derivatives of the predictions at each section."""
-    model, places = coordinates.model, coordinates.places
+    model = coordinates.model
+    places = coordinates.places
 
     def drive(n: int, later: Columns) -> None:
-        place, gain, u = places[n], path.gain[n], part.u[n]
+        place = places[n]
+        gain = path.gain[n]
+        u = part.u[n]
         left = coordinates.to_A[n] - gain @ coordinates.to_C[n]
         later[..., place["Y"]] += _outer(left, path.x[n])
         unit = np.eye(later.shape[2])[None, None]
@@ -360,7 +369,8 @@ def noise_model(
     D = [scale[:, None] * root for root in L]
     if not model.K[0].shape[1]:
         zero = np.zeros((len(S), 1, 1))
-        B, C = zero * np.ones(len(outputs)), np.zeros((len(S), len(outputs), 1))
+        B = zero * np.ones(len(outputs))
+        C = np.zeros((len(S), len(outputs), 1))
         return LDTP(zero, B, C, D, None, names, outputs)
     B = [K @ root for K, root in zip(model.K, L, strict=True)]
     return LDTP.from_blocks(

@@ -53,19 +53,27 @@ class CycleGrid(NamedTuple):
     @classmethod
     def from_records(cls, records: Sequence[Record]) -> "CycleGrid":
         """Put records of one kind, without unknown inputs, on one grid."""
-        S, T, about = len(records), max(map(count_cycles, records)), records[0]
-        N, nu, ny = about.n_sections, len(about.inputs), len(about.outputs)
-        u, y = np.zeros((S, T * N, nu)), np.full((S, T * N, ny), np.nan)
+        S = len(records)
+        T = max(map(count_cycles, records))
+        about = records[0]
+        N = about.n_sections
+        nu = len(about.inputs)
+        ny = len(about.outputs)
+        u = np.zeros((S, T * N, nu))
+        y = np.full((S, T * N, ny), np.nan)
         inside = np.zeros((S, T * N), bool)
         waves = [drift_waves(r) for r in records]
         drift = np.zeros((S, T, max(w.shape[1] for w in waves)))
         for s, (r, w) in enumerate(zip(records, waves, strict=True)):
             rows = slice(r.first_section, r.first_section + len(r.u))
-            u[s, rows], y[s, rows], inside[s, rows] = r.u, r.y, True
+            u[s, rows] = r.u
+            y[s, rows] = r.y
+            inside[s, rows] = True
             drift[s, : len(w), : w.shape[1]] = w
         y = y.reshape(S, T, N, ny)
         sampled = np.isfinite(y)
-        u, y = u.reshape(S, T, N, nu), np.where(sampled, y, 0.0)
+        u = u.reshape(S, T, N, nu)
+        y = np.where(sampled, y, 0.0)
         return cls(u, y, sampled, inside.reshape(S, T, N), drift)
 
     @property
@@ -150,10 +158,8 @@ def with_drift(records: Sequence[Record]) -> list[Record]:
 
     Records that may drift as fast already are left out.
     """
-    slower, n = (
-        [r for r in records if (r.drift or np.inf) > SLOW],
-        1000 * records[0].n_sections,
-    )
+    slower = [r for r in records if (r.drift or np.inf) > SLOW]
+    n = 1000 * records[0].n_sections
     return [dataclasses.replace(r.part(0, n), drift=SLOW) for r in slower]
 
 
@@ -165,7 +171,8 @@ def _pieces(record: Record) -> list[Record]:
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
-    left, grids = sorted(records, key=count_cycles, reverse=True), []
+    left = sorted(records, key=count_cycles, reverse=True)
+    grids = []
     while left:
         alike = [r for r in left if 2 * count_cycles(r) >= count_cycles(left[0])]
         grids.append(CycleGrid.from_records(alike))
@@ -181,7 +188,8 @@ def lagged_inputs(
     Inputs outside of the grid are zero. Columns are ordered by r, then by input.
     """
     S, T, N, nu = u.shape
-    before, after = np.zeros((S, lags - 1 - lead, nu)), np.zeros((S, lead, nu))
+    before = np.zeros((S, lags - 1 - lead, nu))
+    after = np.zeros((S, lead, nu))
     row = np.concatenate([before, u.reshape(S, T * N, nu), after], axis=1)
     windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)[:, section::N]
     return windows[..., ::-1].swapaxes(2, 3).reshape(S, T, lags * nu)

@@ -67,7 +67,8 @@ def whiteness_test(
     S, T, N, ny = error.shape
     size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
     scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
-    z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
+    z = np.zeros((N, lags, ny))
+    tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
         product = np.full(scaled.shape, np.nan)
         product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
@@ -76,7 +77,8 @@ def whiteness_test(
         z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
         tested[:, k] = count >= FEWEST_SAMPLES
     # The mean over the sections of each lag, and the deviations from it: independent.
-    z, count = z * tested, tested.sum(axis=0)
+    z = z * tested
+    count = tested.sum(axis=0)
     pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
     deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
     degrees = (count > 0).sum(axis=0)
@@ -107,15 +109,20 @@ def independence_test(
     """
     S, T, N, ny = error.shape
     nu = u.shape[3]
-    z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
-    degrees, by_fits = np.zeros((2, ny)), np.zeros(ny)
+    z = np.zeros((N, lags, ny, nu))
+    deviates = np.zeros(ny)
+    tested = np.zeros(ny)
+    degrees = np.zeros((2, ny))
+    by_fits = np.zeros(ny)
     for n, root in zip(
         range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False
     ):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
             present = np.isfinite(error[:, :, n, i])
-            U, r, count = past[present], error[:, :, n, i][present], int(present.sum())
+            U = past[present]
+            r = error[:, :, n, i][present]
+            count = int(present.sum())
             if count < FEWEST_SAMPLES or not r.any():
                 continue
             size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
@@ -128,9 +135,11 @@ def independence_test(
             left, s, _ = np.linalg.svd(U, full_matrices=False)
             left = left[:, s > RANK * s[0]][:, : count // 2]
             # Explained against unexplained part: an F ratio, as its Gaussian deviate.
-            a, b = left.shape[1], count - left.shape[1]
+            a = left.shape[1]
+            b = count - left.shape[1]
             inside = ((left.T @ rows) ** 2).sum(axis=0)
-            outside, by_fit = (rows**2).sum(axis=0) - inside, inside[1:].sum()
+            outside = (rows**2).sum(axis=0) - inside
+            by_fit = inside[1:].sum()
             p = stats.f.sf(
                 inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b
             )
@@ -199,9 +208,7 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
         rows = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
-        past, u = (
-            lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:],
-            grid.u[:, :, n][rows],
-        )
+        past = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:]
+        u = grid.u[:, :, n][rows]
         new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
     return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]

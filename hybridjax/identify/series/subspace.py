@@ -11,25 +11,19 @@ from ...errors import DefinitionError
 from ..denominator import SLOWEST, multipliers_of
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients
 from ..periodic import PeriodicModel
+from ..realization import default_horizon
 from .linearization import sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, PreparedRecords, Signals, delay_cycles, lagged_inputs
 from .residuals import ANSWER
 
 
-# Sections in which a state is observed, at least, by default. Smaller: less averaging.
-_SHORTEST_HORIZON = 8
 # Samples of a section for each coefficient of the regression on its past. Larger: a short past,
 # which states outlast; smaller: noise.
 _ROWS = 3
 # Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
 # combinations that are hardly excited.
 _SHRINKAGE = 1e-6
-
-
-def default_horizon(N: int) -> int:
-    """Return the number of sections in which a state is observed; twice as many lags are needed."""
-    return max(_SHORTEST_HORIZON, 2 * N)
 
 
 def subspace_model(
@@ -47,15 +41,18 @@ def subspace_model(
 
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
-    N, ny, most = len(dims), len(records.outputs), int(max(dims))
-    sections, columns = _sections(records), len(records.inputs) + ny
+    N = len(dims)
+    ny = len(records.outputs)
+    most = int(max(dims))
+    sections = _sections(records)
+    columns = len(records.inputs) + ny
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
             f"{samples} cycles are too few to begin with {most} dimensions: record about "
-            f"{_ROWS * columns * needed}, or give a model as `guess`: `realize(fit_series(...))`."
+            f"{_ROWS * columns * needed}, or give a model as `guess`: `fit_series(...).model`."
         )
     rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
     # The effect of the past of each section on its outputs.
@@ -93,8 +90,13 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
-    N, ny, nr = records.n_sections, len(records.outputs), len(drive.inputs)
-    columns, statistic, left, whole = nr + len(records.inputs) + ny, 0.0, 0.0, 0.0
+    N = records.n_sections
+    ny = len(records.outputs)
+    nr = len(drive.inputs)
+    columns = nr + len(records.inputs) + ny
+    statistic = 0.0
+    left = 0.0
+    whole = 0.0
     age = records.whole().age.reshape(len(records.records), -1)
     for section in _sections(records, without_drift(drive.whole()).u):
         length = max(min(len(section.y) // (_ROWS * columns), default_horizon(N)), 1)
@@ -105,7 +107,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         past, y, inputs = (
             x[later] for x in (section.past(length), section.y, section.u)
         )
-        r, u = inputs[:, :nr], inputs[:, nr:]
+        r = inputs[:, :nr]
+        u = inputs[:, nr:]
         rows = np.concatenate([past, r], axis=1)
         errors = [y - x @ _regress(x, y) for x in (past, rows)]
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
@@ -134,7 +137,8 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
     Offsets of inputs drive a drift of outputs, which a controller answers: without the drift of all
     signals, the rest is the response to the rest.
     """
-    none, make = grid.drift[..., :0], SectionRegression.make
+    none = grid.drift[..., :0]
+    make = SectionRegression.make
 
     def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
         pairs = zip(np.moveaxis(x, 2, 0), np.moveaxis(weight, 2, 0), strict=True)
@@ -151,7 +155,8 @@ def _sections(
     records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]
 ) -> "list[_Section]":
     """Return the samples of more signals, the inputs and the outputs at each section."""
-    grid, ny = without_drift(records.whole()), len(records.outputs)
+    grid = without_drift(records.whole())
+    ny = len(records.outputs)
     z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
     sampled = np.asarray(grid.sampled.all(axis=3))
     return [_Section(z, sampled, n, ny) for n in range(records.n_sections)]
@@ -191,8 +196,13 @@ def _from_states(
     innovations: bool,
     direct: bool,
 ) -> PeriodicModel:
-    N, nu = len(sections), sections[0].u.shape[1]
-    C, D, A, B, K = [], [], [], [], []
+    N = len(sections)
+    nu = sections[0].u.shape[1]
+    C = []
+    D = []
+    A = []
+    B = []
+    K = []
     for n, section in enumerate(sections):
         x = section.past(past) @ to_state[n]
         rows = np.concatenate([x, section.u], axis=1)
@@ -256,7 +266,8 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
             for alike in problem.alike[n]
         ]
 
-    gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
+    gram = np.zeros((ny, order + 1, order + 1))
+    freedom = 0
     for section in sum_up(problem, np.zeros(0), past, regress):
         for each in section:
             gram[each.outputs] += each.products
