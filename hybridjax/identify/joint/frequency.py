@@ -124,7 +124,7 @@ def transfer_slopes(
         for n, at in enumerate(places):
             wave = (np.exp(-2j * np.pi / N * n * m) / N)[:, None, None]
             after = later[n].reshape(-1, *w.shape[:3]) * wave  # (d, M, F, ny)
-            shapes = dict(coordinates.blocks(n))
+            shapes = coordinates.blocks(n)
             left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
             left += coordinates.to_C[n].T[:, None, None, :] * wave
             Y, B, K = (

@@ -1,7 +1,8 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
 from collections.abc import Sequence
-from itertools import compress, repeat
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -52,11 +53,11 @@ def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
     error = error.copy()
     for n, root in enumerate(spread):
         for i in range(error.shape[3]):
-            at = np.isfinite(error[:, :, n, i])
-            left, s, _ = np.linalg.svd(root[:, :, i][at], full_matrices=False)
-            error[at, n, i] -= left @ (
-                (left.T @ error[at, n, i]) * (1 - 1 / np.sqrt(1 + s**2))
-            )
+            sampled = np.isfinite(error[:, :, n, i])
+            left, size, _ = np.linalg.svd(root[:, :, i][sampled], full_matrices=False)
+            along = left.T @ error[sampled, n, i]
+            excess = 1 - 1 / np.sqrt(1 + size**2)
+            error[sampled, n, i] -= left @ (along * excess)
     return error
 
 
@@ -72,20 +73,22 @@ def whiteness_test(
     for k in range(lags):
         product = np.full(scaled.shape, np.nan)
         product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
-        product = product.reshape(error.shape)
-        count = np.isfinite(product).sum(axis=(0, 1))
-        z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
-        tested[:, k] = count >= FEWEST_SAMPLES
+        by_section = product.reshape(error.shape)
+        samples = np.isfinite(by_section).sum(axis=(0, 1))
+        total = np.nansum(by_section, axis=(0, 1))
+        tested[:, k] = samples >= FEWEST_SAMPLES
+        z[:, k] = tested[:, k] * total / np.sqrt(np.maximum(samples, 1))
     # The mean over the sections of each lag, and the deviations from it: independent.
-    z = z * tested
-    count = tested.sum(axis=0)
-    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
-    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
-    degrees = (count > 0).sum(axis=0)
-    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
+    sections = tested.sum(axis=0)
+    by_lag = z.sum(axis=0) ** 2 / np.maximum(sections, 1)
+    pooled = by_lag.sum(axis=0)
+    deviations = (z**2).sum(axis=(0, 1)) - pooled
+    degrees = (sections > 0).sum(axis=0)
+    p = stats.chi2.sf(pooled, degrees)
     if N > 1:
-        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
-        p = -np.expm1(2 * np.log1p(-p))
+        p_deviations = stats.chi2.sf(deviations, sections.sum(axis=0) - degrees)
+        # The smaller of two, as a p-value.
+        p = -np.expm1(2 * np.log1p(-np.minimum(p, p_deviations)))
     return z, p
 
 
@@ -108,54 +111,74 @@ def independence_test(
     degrees of freedom of all sections, which is 1 to 4 % too optimistic.
     """
     S, T, N, ny = error.shape
-    nu = u.shape[3]
-    z = np.zeros((N, lags, ny, nu))
+    z = np.zeros((N, lags, ny, u.shape[3]))
     deviates = np.zeros(ny)
     tested = np.zeros(ny)
     degrees = np.zeros((2, ny))
     by_fits = np.zeros(ny)
-    for n, root in zip(
-        range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False
-    ):
+    roots = spread or [np.zeros((S, T, ny, 0))] * N
+    for n, root in enumerate(roots):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
             present = np.isfinite(error[:, :, n, i])
-            U = past[present]
-            r = error[:, :, n, i][present]
-            count = int(present.sum())
-            if count < FEWEST_SAMPLES or not r.any():
+            residual = error[:, :, n, i][present]
+            if len(residual) < FEWEST_SAMPLES or not residual.any():
                 continue
-            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
-            U = U / np.where(size > 0, size, 1.0)  # inputs have units of their own
-            rows = np.column_stack([r, root[:, :, i][present]])
-            along, *by_fit = (U.T @ rows).T
-            variance = 1 + np.sum(np.square(by_fit), axis=0) * (r @ r) / count
-            variance /= 1 + (rows[:, 1:] ** 2).sum() / count
-            z[n, :, i] = (along / np.sqrt(variance)).reshape(lags, nu)
-            left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > RANK * s[0]][:, : count // 2]
-            # Explained against unexplained part: an F ratio, as its Gaussian deviate.
-            a = left.shape[1]
-            b = count - left.shape[1]
-            inside = ((left.T @ rows) ** 2).sum(axis=0)
-            outside = (rows**2).sum(axis=0) - inside
-            by_fit = inside[1:].sum()
-            p = stats.f.sf(
-                inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b
-            )
-            by_fits[i] += by_fit
-            deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
-            degrees[:, i] += a, b
+            test = _regressed(past[present], residual, root[:, :, i][present])
+            z[n, :, i] = test.correlation.reshape(lags, u.shape[3])
+            deviates[i] += test.deviate
+            degrees[:, i] += test.degrees
+            by_fits[i] += test.by_fit
             tested[i] += 1
     p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
-    shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
+    critical = special.fdtri(*degrees, 1 - level)
+    shift = special.ncfdtrinc(*degrees, 1 - _POWER, critical)
     shift *= 1 + by_fits / np.maximum(degrees[0], 1)
-    return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
+    samples = np.maximum(degrees.sum(axis=0), 1)
+    return z, p, np.sqrt(shift / samples)
+
+
+class _Regressed(NamedTuple):
+    """Residuals at a section, regressed on inputs."""
+
+    correlation: Float[np.ndarray, " columns"]
+    deviate: float
+    """The Gaussian deviate of the F ratio of the explained to the unexplained part."""
+    degrees: tuple[int, int]
+    """Degrees of freedom of both parts."""
+    by_fit: float
+    """The explained part of errors of a fit to other data."""
+
+
+def _regressed(
+    inputs: Float[np.ndarray, "samples columns"],
+    residual: Float[np.ndarray, " samples"],
+    root: Float[np.ndarray, "samples r"],
+) -> _Regressed:
+    samples = len(residual)
+    variance = residual @ residual / samples
+    size = np.sqrt((inputs**2).sum(axis=0) * variance)
+    inputs = inputs / np.where(size > 0, size, 1.0)  # inputs have units of their own
+    along_fit = inputs.T @ root
+    spread = 1 + (along_fit**2).sum(axis=1) * variance
+    spread /= 1 + (root**2).sum() / samples
+    correlation = inputs.T @ residual / np.sqrt(spread)
+    left, values, _ = np.linalg.svd(inputs, full_matrices=False)
+    left = left[:, values > RANK * values[0]][:, : samples // 2]
+    explained = ((left.T @ residual) ** 2).sum()
+    by_fit = ((left.T @ root) ** 2).sum()
+    unexplained = (residual**2).sum() - explained
+    degrees = left.shape[1], samples - left.shape[1]
+    left_by_fit = (root**2).sum() - by_fit
+    ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
+    p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
+    return _Regressed(correlation, float(stats.norm.isf(p)), degrees, float(by_fit))
 
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     """Return whether the residuals of each output are only rounding, and tell nothing."""
-    left, size = (np.sqrt(np.nansum(x**2, axis=(0, 1, 2))) for x in (error, grid.y))
+    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)))
+    size = np.sqrt((grid.y**2).sum(axis=(0, 1, 2)))
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
 
 
@@ -203,12 +226,13 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     """
     S, T, N, nu = grid.u.shape
     lags = 2
-    late = np.zeros((S, T * N, error.shape[3]))
-    late[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
+    earlier = np.zeros((S, T * N, error.shape[3]))
+    earlier[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
-        rows = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
-        past = lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:]
-        u = grid.u[:, :, n][rows]
-        new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
-    return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]
+        whole = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
+        past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
+        u = grid.u[:, :, n][whole]
+        new[:, :, n][whole] = u - past @ np.linalg.lstsq(past, u)[0]
+    _, p, _ = independence_test(earlier.reshape(error.shape), new, lags, ANSWER)
+    return p
