@@ -35,9 +35,8 @@ def chi(
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by decreasing modulus, of each pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
-    roots = np.pad(
-        roots, (0, len(coefficients) - len(roots))
-    )  # numpy drops roots at zero
+    at_zero = len(coefficients) - len(roots)  # numpy drops these
+    roots = np.pad(roots, (0, at_zero))
     return roots[np.lexsort((-np.imag(roots), -np.abs(roots)))]
 
 
@@ -99,8 +98,9 @@ def in_blocks(
     """Divide the T cycles of each record into blocks, the last one filled up with zeros."""
     S, T, *shape = x.shape
     length = -(-T // count)
-    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(shape)
-    return np.pad(x, padding).reshape(S * count, length, *shape)
+    filled = np.zeros((S, count * length, *shape))
+    filled[:, :T] = x
+    return filled.reshape(S * count, length, *shape)
 
 
 def inverse_of_remainder(

@@ -12,7 +12,7 @@ import dataclasses
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
@@ -77,77 +77,97 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     """
     N = data.n_sections
     P = data.periods
-    S, n, ny = data.y.shape
-    cycles = n // N - 1
+    cycles = data.y.shape[1] // N - 1
     if order is not None and order > cycles // 2:
         raise DefinitionError(
             f"`order` must be at most half of the {cycles} cycles, not {order}."
         )
     if cycles < P:
         raise DefinitionError(
-            f"the record has {n // N} cycles, but to remove a transient it must hold the "
+            f"the record has {cycles + 1} cycles, but to remove a transient it must hold the "
             f"window of P = {P} and the one before it, which is cut off: record some more."
         )
     data.require_ok()
     # Inputs have units of their own.
-    u = data.u[data.ok] / np.maximum(
-        np.abs(data.u[data.ok]).max(axis=(0, 1)), np.finfo(float).tiny
-    )
-    change = np.abs(u[:, N * P :] - u[:, : -N * P]).max(axis=(1, 2))
-    worst = int(np.argmax(change))
-    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
-        raise DefinitionError(
-            f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
-            f"{P} periods over all of the record: cut off the part in which it does not."
-        )
-
+    u = data.u[data.ok]
+    u = u / np.maximum(np.abs(u).max(axis=(0, 1)), np.finfo(float).tiny)
+    _require_repetition(data, u)
     size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
-    good = np.flatnonzero(data.ok).tolist()
-    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(
-        len(good), -1, N * ny
-    )[:, 1:]
+    relative = data.y[data.ok] / np.where(size > 0, size, 1.0)
+    by_cycle = relative[:, N:].reshape(len(u), cycles, -1)
+
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
-        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
+        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(u)
     else:
-        size_of = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
-        excited = map(
-            np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True)
-        )
-        free = [
-            _free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited
-        ]
-    left = [Q @ record for Q, record in zip(free, y, strict=True)]
+        free = [_free(classes, P, cycles) for classes in _excited_classes(data, u)]
+    left = [Q @ record for Q, record in zip(free, by_cycle, strict=True)]
     least = min(map(len, free))
     if least <= (order or 1):
         raise DefinitionError(
             f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
             "from the response: record more, or excite half of the lines (`lines='odd'`)."
         )
-    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
-    # Pairs (Q, z) with no more columns of z than rows, and the same residuals.
+    tried = [order]
+    if order is None:
+        tried = range(1, min(_LARGEST_ORDER, least - 1) + 1)
+    # With everything, all Q are the same.
     whole = [np.concatenate(left, axis=1)] if everything else left
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in whole]
-    blocks = list(
-        zip(free, fewer, strict=False)
-    )  # (with everything, all Q are the same)
-    count = sum(z.size for z in left)
-    fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
-    c = min(fits, key=lambda fit: fit[0])[1]
+    blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
+    numbers = sum(z.size for z in left)
+    series = by_cycle[:, 0].size
+    fits = [_fit(blocks, _start(by_cycle, free, d), numbers, series) for d in tried]
+    _, c = min(fits, key=lambda fit: fit[0])
 
-    basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
+    basis = _decay(c, cycles)
     clean = data.y[:, N:].copy()
-    removed = np.full((S, ny), np.nan)
-    for Q, z, s in zip(free, left, good, strict=True):
+    removed = np.full((len(data.y), len(size)), np.nan)
+    for s, Q, z in zip(np.flatnonzero(data.ok), free, left, strict=True):
         transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
-        transient = transient.reshape(-1, ny) * size
+        transient = transient.reshape(-1, len(size)) * size
         clean[s] -= transient
         removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
-    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
-    # Events, some of which lie in the cycles that were cut off, are left out.
-    simulated = None if data.simulated is None else Simulated(failed_at, data.error)
+    simulated = None
+    if data.simulated is not None:
+        # Events, some of which lie in the cycles that were cut off, are left out.
+        failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
+        simulated = Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
+
+
+def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) -> None:
+    """**Raises:** `DefinitionError` for an input that does not repeat after P periods."""
+    length = data.n_sections * data.periods
+    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    worst = int(np.argmax(change))
+    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
+        raise DefinitionError(
+            f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
+            f"{data.periods} periods over all of the record: cut off the part in which it does not."
+        )
+
+
+def _excited_classes(
+    data: ExperimentData, u: Float[np.ndarray, "S n nu"]
+) -> list[Int[np.ndarray, " k"]]:
+    """Return the classes of the lines that each experiment excites, and class 0."""
+    size = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
+    excited = size > SILENT_LINE * size.max(axis=1, keepdims=True)
+    lines = map(np.flatnonzero, excited)
+    return [np.unique(np.append(line_class(x, data.periods), 0)) for x in lines]
+
+
+def _condensed(z: Float[np.ndarray, "rows _"]) -> Float[np.ndarray, "rows _"]:
+    """Return a matrix with no more columns than rows, and the same residuals of regressions."""
+    if z.shape[1] <= len(z):
+        return z
+    return np.linalg.qr(z.T)[1].T
+
+
+def _decay(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
+    """Return a basis of all decays with these multipliers."""
+    return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
@@ -165,8 +185,10 @@ def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
     cycles = y.shape[1]
     for Q, record in zip(free, y, strict=True):
         # The same sinusoids, d periods fewer.
-        signals = np.linalg.svd(Q, full_matrices=True)[2][len(Q) :].T[d:]
-        keep = np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+        _, _, directions = np.linalg.svd(Q, full_matrices=True)
+        signals = directions[len(Q) :].T[d:]
+        orthogonal, _ = np.linalg.qr(signals, mode="complete")
+        keep = orthogonal[:, signals.shape[1] :].T
         lags = np.stack([keep @ record[d - i : cycles - i] for i in range(d + 1)])
         normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
         right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
@@ -180,7 +202,7 @@ def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
-        basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
+        basis = _decay(c, cycles)
         out = []
         for Q, z in blocks:
             q = np.linalg.qr(Q @ basis)[0]

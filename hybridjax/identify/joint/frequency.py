@@ -90,12 +90,16 @@ def transfer(
 ) -> Complex[np.ndarray, "M F ny nu"]:
     """Return the harmonic transfer functions of a model."""
     N = model.n_sections
-    states = zip(states_at(model, f), model.C, model.D, strict=True)
-    G = np.stack(
-        [_real_times(C, x) + D[:, None] for x, C, D in states]
-    )  # (N, ny, F, nu)
+    states = states_at(model, f)
+    responses = [_outputs(model, n, states[n]) for n in range(N)]
     waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
-    return np.tensordot(waves, G, 1).swapaxes(1, 2)
+    return np.tensordot(waves, np.stack(responses), 1).swapaxes(1, 2)
+
+
+def _outputs(
+    model: PeriodicModel, n: int, state: Complex[np.ndarray, "d F nu"]
+) -> Complex[np.ndarray, "ny F nu"]:
+    return _real_times(model.C[n], state) + model.D[n][:, None]
 
 
 def transfer_slopes(
@@ -106,46 +110,70 @@ def transfer_slopes(
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
     """Iterate over derivatives of the HTFs, times weights, by groups of frequencies."""
     model = coordinates.model
-    places = coordinates.places
     m = np.array(harmonics)
-    N = model.n_sections
-    (ny, nu) = model.D[0].shape
-    weight = np.ones((len(m), len(f), ny, nu)) if weight is None else weight
+    if weight is None:
+        weight = np.ones((len(m), len(f), *model.D[0].shape))
     # Derivatives by later states are those of the transposed system, in the other order.
     dual = model._replace(
         A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]]
     )
-    step = max(_HELD // (coordinates.size * len(m) * ny * nu), 1)
-    for rows in (slice(k, min(k + step, len(f))) for k in range(0, len(f), step)):
+    numbers = coordinates.size * weight[:, 0].size
+    step = max(_HELD // numbers, 1)
+    places = coordinates.places
+    for first in range(0, len(f), step):
+        rows = slice(first, first + step)
         w = weight[:, rows]
         states = states_at(model, f[rows])
         later = states_at(dual, np.add.outer(m, f[rows]).ravel())[::-1]
-        J = np.zeros((coordinates.size, *w.shape), complex)
-        for n, at in enumerate(places):
-            wave = (np.exp(-2j * np.pi / N * n * m) / N)[:, None, None]
-            after = later[n].reshape(-1, *w.shape[:3]) * wave  # (d, M, F, ny)
+        slopes = np.zeros((coordinates.size, *w.shape), complex)
+        for n, place in enumerate(places):
             shapes = coordinates.blocks(n)
-            left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
-            left += coordinates.to_C[n].T[:, None, None, :] * wave
-            Y, B, K = (
-                J[at[name]].reshape(*shapes[name], *w.shape) for name in ("Y", "B", "K")
-            )
-            outputs = _real_times(model.C[n], states[n]) + model.D[n][:, None]
-            for j in range(nu):
-                x, y = (
-                    z[None, :, None, :, None, j] for z in (states[n], outputs)
-                )  # (1 d 1 F 1)
-                np.multiply((left * w[..., j])[:, None], x, out=Y[..., j])
-                B[:, j, ..., j] = after * w[..., j]
-                K[..., j] = (after * w[..., j])[:, None] * y[:, : K.shape[1]]
-            if coordinates.direct:
-                D = J[at["D"]].reshape(*shapes["D"], *w.shape)
-                through = _real_times(model.gain[n].T, after)  # (ny, M, F, ny)
-                for j in range(nu):
-                    D[:, j, ..., j] = through * w[..., j]
-                for i, j in np.ndindex(ny, nu):
-                    D[i, j, ..., i, j] += wave[..., 0] * w[..., i, j]
-        yield rows, J
+            blocks = {
+                name: slopes[place[name]].reshape(*shape, *w.shape)
+                for name, shape in shapes.items()
+            }
+            waves = np.exp(-2j * np.pi / model.n_sections * n * m) / model.n_sections
+            after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
+            _fill(blocks, coordinates, n, states[n], after, waves, w)
+        yield rows, slopes
+
+
+def _fill(
+    blocks: dict[str, Complex[np.ndarray, "..."]],
+    coordinates: LocalCoordinates,
+    n: int,
+    state: Complex[np.ndarray, "d F nu"],
+    after: Complex[np.ndarray, "after M F ny"],
+    waves: Complex[np.ndarray, " M"],
+    weight: Float[np.ndarray, "M F ny nu"],
+) -> None:
+    """Write the derivatives by the blocks of section n, each (rows, columns, M, F, ny, nu).
+
+    **Arguments:** `after`: derivatives of the HTFs by the next state, less `waves`.
+    """
+    model = coordinates.model
+    wave = waves[:, None, None]
+    after = after * wave
+    outputs = _outputs(model, n, state)
+    by_C = coordinates.to_C[n].T[:, None, None, :] * wave  # (q, M, F, ny)
+    by_Y = _real_times(coordinates.to_A[n].T, after) + by_C
+    gains = blocks["K"].shape[1]
+    for j in range(weight.shape[3]):
+        w = weight[..., j]
+        x = state[None, :, None, :, None, j]
+        np.multiply((by_Y * w)[:, None], x, out=blocks["Y"][..., j])
+        blocks["B"][:, j, ..., j] = after * w
+        if gains:
+            blocks["K"][..., j] = (after * w)[:, None] * outputs[
+                None, :, None, :, None, j
+            ]
+    if not coordinates.direct:
+        return
+    through = _real_times(model.gain[n].T, after)  # (ny, M, F, ny)
+    for i, j in np.ndindex(model.D[n].shape):
+        D = blocks["D"][i, j, ..., j]
+        D += through[i] * weight[..., j]
+        D[..., i] += wave[..., 0] * weight[..., i, j]
 
 
 def states_at(
@@ -166,9 +194,9 @@ def states_at(
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
     turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
-    return around(
-        np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced)
-    )[0]
+    resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
+    states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))
+    return states
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):

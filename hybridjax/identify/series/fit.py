@@ -1,6 +1,7 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
@@ -8,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
@@ -43,6 +44,7 @@ from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
 from .linearization import (
     Linearization,
+    SectionFit,
     each_fit,
     filtered_response,
     linearize,
@@ -126,9 +128,8 @@ class SeriesFit(MultiplierFit):
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
         h = np.pad(self.numerators, ((0, 0), (0, cycles * N - R), (0, 0), (0, 0)))
-        h = divide_by_chi(self.coefficients, h.reshape(N, cycles, -1)).reshape(
-            N, -1, *shape
-        )
+        by_cycle = h.reshape(N, cycles, -1)
+        h = divide_by_chi(self.coefficients, by_cycle).reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
@@ -142,40 +143,28 @@ class SeriesFit(MultiplierFit):
         """
         f = np.atleast_1d(np.asarray(f, float))
         harmonics = check_harmonics(harmonics, self.n_sections)
-        N, R, ny, nu = self.numerators.shape
-        powers = np.exp(-2j * np.pi / N * f[:, None] * (np.arange(R) - self.lead))
-        period_delay = np.exp(-2j * np.pi * f)
-        below = chi(period_delay, self.coefficients)
-        to_harmonics = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
+        N, R, _, _ = self.numerators.shape
+        delay = np.exp(-2j * np.pi / N * f)
+        powers = delay[:, None] ** (np.arange(R) - self.lead)
+        period_delay = delay**N
+        below = chi(period_delay, self.coefficients)[:, None, None]
+        waves = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
-            G = np.einsum("fr,...nrij->...nfij", powers, b) / below[:, None, None]
-            return np.einsum("mn,...nfij->...mfij", to_harmonics, G)
+            G = np.einsum("fr,...nrij->...nfij", powers, b) / below
+            return np.einsum("mn,...nfij->...mfij", waves, G)
 
         H = sum_up(self.numerators)
-        delays = period_delay ** np.arange(1, len(self.coefficients) + 1)[:, None]
-        slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
-        by_c = np.einsum(
-            "amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()
-        ).real
+        lags = np.arange(1, len(self.coefficients) + 1)
+        by_chi = period_delay[:, None, None] ** lags[:, None, None, None] / below
+        slope = sum_up(self.slopes) - by_chi[:, None] * H
+        by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
-        by_b = (
-            (np.abs(spread) ** 2).sum(axis=(1, 4))
-            / N**2
-            / np.abs(below)[:, None, None] ** 2
-        )
-        variance = by_c + by_b * self.noise[:, None] ** 2
+        by_b = (np.abs(spread / N) ** 2).sum(axis=(1, 4)) / np.abs(below) ** 2
+        variance = by_c.real + by_b * self.noise[:, None] ** 2
         variance = np.where(np.isnan(variance), np.inf, variance)
-        return HTF(
-            f,
-            H,
-            harmonics,
-            N,
-            self.inputs,
-            self.outputs,
-            "series fit",
-            variance=variance,
-        )
+        names = self.inputs, self.outputs
+        return HTF(f, H, harmonics, N, *names, "series fit", variance=variance)
 
     def _about(self) -> str:
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
@@ -202,28 +191,24 @@ class SeriesFit(MultiplierFit):
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
-        N, R, ny, nu = self.numerators.shape
-        v = divide_by_chi(self.coefficients, grid.u)
+        N, R, ny, _ = self.numerators.shape
         T = grid.u.shape[1]
+        v = divide_by_chi(self.coefficients, grid.u)
         # As in the fit, earlier inputs act on so many cycles without a model.
         free = min(self.free_cycles, T) if free_start else 0
+        no_drift = grid.drift[:, :, :0]
         out = np.zeros(grid.y.shape)
         for n, i in np.ndindex(N, ny):
-            forced = lagged_inputs(v, n, R, self.lead) @ self.numerators[
-                n, :, i
-            ].reshape(-1, 1)
+            numerator = self.numerators[n, :, i].reshape(-1, 1)
+            forced = lagged_inputs(v, n, R, self.lead) @ numerator
             starts = start_responses(self.coefficients, grid.first[:, n], T, free)
             unknown = np.concatenate([starts, grid.drift], axis=2)
-            none = grid.drift[:, :, :0]
-            regression = SectionRegression.make(
-                forced, unknown, none, grid.sampled[:, :, n, i]
-            )
             y = grid.y[:, :, n, i]
             sampled = grid.sampled[:, :, n, i]
+            regression = SectionRegression.make(forced, unknown, no_drift, sampled)
             error = regression.residual(np.ones(1), y).reshape(y.shape)
-            out[:, :, n, i] = np.where(
-                sampled, y - error, regression.response(np.ones(1), y)
-            )
+            response = regression.response(np.ones(1), y)
+            out[:, :, n, i] = np.where(sampled, y - error, response)
         return out
 
 
@@ -419,23 +404,21 @@ def assemble(
     """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
     d = len(solution.c)
-    columns = problem.lags * nu  # lags, then inputs
+    lags = problem.lags
+    columns = lags * nu  # lags, then inputs
     widest = max(fit.root.shape[1] for section in solution.fits for fit in section)
     numerators = np.zeros((N, columns, ny))
     slopes = np.zeros((d, N, columns, ny))
     roots = np.zeros((N, ny, columns, widest))
-    for n, (section, to_lags) in enumerate(
-        zip(solution.fits, problem.to_lags, strict=True)
-    ):
-        for fit in section:
+    for n, to_lags in enumerate(problem.to_lags):
+        for fit in solution.fits[n]:
+            by_c = np.moveaxis(fit.slopes[..., 0], 1, 0)
             numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
-            slopes[:, n][..., fit.outputs] = to_lags @ np.moveaxis(
-                fit.slopes[..., 0], 1, 0
-            )
+            slopes[:, n][..., fit.outputs] = to_lags @ by_c
             roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
-        b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
+        b = b.reshape(*b.shape[:-2], lags, nu, ny) * problem.scale
         return np.swapaxes(b, -1, -2)
 
     result = int(Result.OK if converged else Result.NOT_CONVERGED)
@@ -473,7 +456,8 @@ def missing_cycles(
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
     order = len(solution.c)
-    if missing := missing_cycles(problem, solution, order + 1):
+    missing = missing_cycles(problem, solution, order + 1)
+    if missing:
         n, i = np.argwhere(solution.freedom <= order)[0]
         raise TooFewCycles(problem, n, i, missing)
 
@@ -509,11 +493,23 @@ def coefficient_covariance(
     whole = solution.curvature.sum(axis=0)
     if not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
-    lags = denominator.correlated_cycles(
-        multipliers_of(solution.c), problem.records.cycles
-    )
+    cycles = problem.records.cycles
+    lags = denominator.correlated_cycles(multipliers_of(solution.c), cycles)
     gradient = gradient_covariance(problem, solution, lags + 1)
     return sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
+
+
+class _BlockSums(NamedTuple):
+    """Sums over the blocks of a section, for some outputs."""
+
+    score: Float[np.ndarray, "B C d"]
+    """Products of errors and slopes in each block, for the outputs and for drawn noise."""
+    expected: Float[np.ndarray, "B d d"]
+    """Their expected squares, for white noise of variance one."""
+    squares: Float[np.ndarray, "2 C"]
+    """Sums of squares of the errors, and of the errors filtered backward by 1 / chi."""
+    filtered: Float[np.ndarray, "d d"]
+    """Products of the slopes filtered backward."""
 
 
 def gradient_covariance(
@@ -535,48 +531,24 @@ def gradient_covariance(
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
         y = part.y[:, :, n, :, None]
-        draws = np.random.default_rng((k, n)).standard_normal(
-            (*y.shape[:3], _FILTERED_DRAWS)
-        )
+        rng = np.random.default_rng((k, n))
+        draws = rng.standard_normal((*y.shape[:3], _FILTERED_DRAWS))
         return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
 
-    def section(k, part, n, fit, regression):
+    def section(k, part, n, fit, regression) -> _BlockSums:
+        x = outputs(k, part, n)[:, :, fit.outputs]
         count = max(1, part.y.shape[1] // cycles)
         sampled = part.sampled[:, :, n, fit.outputs, None]
-
-        def backward(
-            x,
-        ):  # its product with white noise is that of x with filtered noise
-            return divide_by_chi(memory, (sampled * x)[:, ::-1])
-
-        rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
-        inputs, starts = (in_blocks(basis, count) for basis in (rows, regression.basis))
-        weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
-        x = outputs(k, part, n)[:, :, fit.outputs]
-        error = regression.residual(fit.coefficients, x).reshape(x.shape)
-        a, by_c, y = (v[..., :1] for v in (fit.coefficients, fit.slopes, x))
-        slopes = regression.residual(
-            by_c, filtered_response(a, solution.c, regression, y)
-        )
-        slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], d)
-        square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, backward(error))]
-        late = backward(slopes)
-        slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))
-        score = np.einsum("bkid,bkic->bcd", slopes, in_blocks(error, count))
-        expected = np.einsum("bkid,bkie->bde", slopes, slopes)
-        for basis in (inputs, starts):
-            along = np.einsum("bkr,bkid->brid", basis, slopes)
-            expected -= np.einsum("brid,brie->bde", along, along)
-        return score, expected, square, np.einsum("stid,stie->de", late, late)
+        return _block_sums(x, sampled, fit, regression, solution.c, memory, count)
 
     fits = linearize(problem, solution.c, outputs).fits
-    results = each_fit(problem, solution._replace(fits=fits), section)
-    score, by_white = (
-        np.concatenate([sum(result[i] for result in grid) for grid in results])
-        for i in (0, 1)
-    )
-    squares = np.sum([result[2] for grid in results for result in grid], axis=0)
-    filtered = sum(result[3] for grid in results for result in grid)
+    grids = each_fit(problem, solution._replace(fits=fits), section)
+    # Scores of the same block add, over all sections and outputs.
+    score = np.concatenate([sum(part.score for part in grid) for grid in grids])
+    by_white = np.concatenate([sum(part.expected for part in grid) for grid in grids])
+    parts = list(itertools.chain(*grids))
+    squares = sum(part.squares for part in parts)
+    filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
     white = np.array([[solution.freedom.sum(), first], [first, second]])
@@ -597,3 +569,44 @@ def gradient_covariance(
     taken = np.einsum("bij,bji->", share, share) / d
     matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
     return Covariance(matrix, denominator.block_freedom(scaled, share))
+
+
+def _block_sums(
+    x: Float[np.ndarray, "S T m C"],
+    sampled: Bool[np.ndarray, "S T m 1"],
+    fit: SectionFit,
+    regression: SectionRegression,
+    c: Coefficients,
+    memory: Coefficients,
+    count: int,
+) -> _BlockSums:
+    """Return the sums over so many blocks of each record.
+
+    **Arguments:** `x`: columns for each output, the first measured. `memory`: c, fading.
+    """
+
+    def backward(x):  # its product with white noise is that of x with filtered noise
+        return divide_by_chi(memory, (sampled * x)[:, ::-1])
+
+    rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
+    inputs = in_blocks(rows, count)
+    starts = in_blocks(regression.basis, count)
+    weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
+    error = regression.residual(fit.coefficients, x).reshape(x.shape)
+    measured = fit.coefficients[..., :1]
+    response = filtered_response(measured, c, regression, x[..., :1])
+    slopes = regression.residual(fit.slopes[..., :1], response)
+    slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], len(c))
+    late = backward(slopes)
+    squares = [(e**2).sum(axis=(0, 1, 2)) for e in (error, backward(error))]
+    slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))
+    expected = np.einsum("bkid,bkie->bde", slopes, slopes)
+    for basis in (inputs, starts):
+        along = np.einsum("bkr,bkid->brid", basis, slopes)
+        expected -= np.einsum("brid,brie->bde", along, along)
+    return _BlockSums(
+        score=np.einsum("bkid,bkic->bcd", slopes, in_blocks(error, count)),
+        expected=expected,
+        squares=np.array(squares),
+        filtered=np.einsum("stid,stie->de", late, late),
+    )

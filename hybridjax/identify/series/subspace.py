@@ -43,9 +43,9 @@ def subspace_model(
     """
     N = len(dims)
     ny = len(records.outputs)
+    columns = len(records.inputs) + ny
     most = int(max(dims))
     sections = _sections(records)
-    columns = len(records.inputs) + ny
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
@@ -54,26 +54,29 @@ def subspace_model(
             f"{samples} cycles are too few to begin with {most} dimensions: record about "
             f"{_ROWS * columns * needed}, or give a model as `guess`: `fit_series(...).model`."
         )
-    rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
     # The effect of the past of each section on its outputs.
-    rules = [
-        _regress(x, s.y)[s.u.shape[1] :] for x, s in zip(rows, sections, strict=True)
-    ]
+    rules = []
+    for section in sections:
+        rows = np.concatenate([section.u * direct, section.past(past)], axis=1)
+        rules.append(_regress(rows, section.y)[section.u.shape[1] :])
     horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
         ahead = np.zeros((past * columns, horizon, ny))
         for i in range(min(horizon, past)):
-            ahead[: (past - i) * columns, i] = rules[(n + i) % N][i * columns :]
+            kept = (past - i) * columns
+            ahead[:kept, i] = rules[(n + i) % N][i * columns :]
         ahead = ahead.reshape(len(ahead), -1)
         root = np.linalg.qr(section.past(past), mode="r")
-        _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
-        if dims[n] > len(s):
-            text = f"the data show {len(s)} dimensions of section {n}, not {dims[n]}"
-            raise DefinitionError(f"{text}: lower `guess`.")
-        kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
-        to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
+        _, size, directions = np.linalg.svd(root @ ahead, full_matrices=False)
+        d = dims[n]
+        if d > len(size):
+            raise DefinitionError(
+                f"the data show {len(size)} dimensions of section {n}, not {d}: lower `guess`."
+            )
+        scale = np.maximum(size[:d], _SHRINKAGE * size[0]) / np.sqrt(len(section.y))
+        to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
 
 
@@ -104,18 +107,14 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
             continue
-        past, y, inputs = (
-            x[later] for x in (section.past(length), section.y, section.u)
-        )
-        r = inputs[:, :nr]
-        u = inputs[:, nr:]
+        past = section.past(length)[later]
+        y = section.y[later]
+        r, u = np.split(section.u[later], [nr], axis=1)
         rows = np.concatenate([past, r], axis=1)
-        errors = [y - x @ _regress(x, y) for x in (past, rows)]
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
-        sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
-        statistic += max(len(y) - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (
-            sizes[0] - sizes[1]
-        )
+        gain = _log_size(past, y, floor) - _log_size(rows, y, floor)
+        degrees = len(y) - rows.shape[1] - (ny - nr + 1) / 2
+        statistic += max(degrees, 0.0) * gain
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
@@ -131,24 +130,32 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     return False
 
 
+def _log_size(rows: np.ndarray, y: np.ndarray, floor: np.ndarray) -> float:
+    """Return the log determinant of the errors of a regression."""
+    error = y - rows @ _regress(rows, y)
+    return float(np.linalg.slogdet(error.T @ error + floor)[1])
+
+
 def without_drift(grid: CycleGrid) -> CycleGrid:
     """Return records without the drift of each section, in outputs and inputs.
 
     Offsets of inputs drive a drift of outputs, which a controller answers: without the drift of all
     signals, the rest is the response to the rest.
     """
-    none = grid.drift[..., :0]
-    make = SectionRegression.make
+    no_columns = grid.drift[..., :0]
 
     def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        pairs = zip(np.moveaxis(x, 2, 0), np.moveaxis(weight, 2, 0), strict=True)
-        parts = [
-            (make(none, none, grid.drift, w).reduced(z), z.shape) for z, w in pairs
-        ]
-        return np.stack([z.reshape(shape) for z, shape in parts], axis=2)
+        out = np.zeros(x.shape)
+        for n in range(x.shape[2]):
+            regression = SectionRegression.make(
+                no_columns, no_columns, grid.drift, weight[:, :, n]
+            )
+            z = x[:, :, n]
+            out[:, :, n] = regression.reduced(z).reshape(z.shape)
+        return out
 
-    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
-    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=none)
+    y = left(grid.y, grid.sampled.all(axis=3))
+    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=no_columns)
 
 
 def _sections(
@@ -198,30 +205,30 @@ def _from_states(
 ) -> PeriodicModel:
     N = len(sections)
     nu = sections[0].u.shape[1]
-    C = []
-    D = []
-    A = []
-    B = []
-    K = []
+    blocks: list[tuple] = []
     for n, section in enumerate(sections):
         x = section.past(past) @ to_state[n]
-        rows = np.concatenate([x, section.u], axis=1)
-        output = _regress(np.concatenate([x, section.u * direct], axis=1), section.y)
-        rows = np.concatenate([rows, section.y - rows @ output], axis=1)
-        later = _regress(rows, section.past(past, 1) @ to_state[(n + 1) % N])
         d = x.shape[1]
-        C.append(output[:d].T)
-        D.append(output[d:].T)
-        A.append(later[:d].T)
-        B.append(later[d : d + nu].T)
-        K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
-    size = np.abs(np.linalg.eigvals(PeriodicModel(A, B, C, D, K).monodromy())).max()
-    shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
-    model = PeriodicModel([a * shrunk for a in A], B, C, D, K)
+        seen = np.concatenate([x, section.u * direct], axis=1)
+        output = _regress(seen, section.y)
+        rows = np.concatenate([x, section.u], axis=1)
+        error = section.y - rows @ output
+        later = _regress(
+            np.concatenate([rows, error], axis=1),
+            section.past(past, 1) @ to_state[(n + 1) % N],
+        )
+        A, B, K = np.split(later.T, [d, d + nu], axis=1)
+        blocks.append(
+            (A, B, output[:d].T, output[d:].T, K if innovations else K[:, :0])
+        )
+    model = PeriodicModel(*map(list, zip(*blocks, strict=True)))
+    slowest = np.abs(np.linalg.eigvals(model.monodromy())).max()
+    shrunk = (SLOWEST / max(slowest, SLOWEST)) ** (1 / N)
+    model = model._replace(A=[shrunk * A for A in model.A])
     # (The largest modulus of A may be above SLOWEST by rounding, for any K.)
-    most = max(SLOWEST, _slowest_error(model._replace(K=[0 * k for k in K])))
+    most = max(SLOWEST, _slowest_error(model._replace(K=[0 * K for K in model.K])))
     while innovations and _slowest_error(model) > most:
-        model = model._replace(K=[k / 2 for k in model.K])
+        model = model._replace(K=[K / 2 for K in model.K])
     return model
 
 
@@ -249,38 +256,33 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        inputs = (
-            lagged_inputs(part.u, n, problem.lags, problem.records.lead)
-            @ problem.to_lags[n]
-        )
-        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        columns = lagged_inputs(part.u, n, problem.lags, problem.records.lead)
+        inputs = columns @ problem.to_lags[n]
         sampled = part.sampled[:, :, n]
-        before = np.all(
-            [delay_cycles(sampled, j, not problem.free) for j in delays], axis=0
-        )
-        starts = part.drift[:, :, :0]
+        delayed = [delay_cycles(sampled, j, not problem.free) for j in delays]
+        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        used = np.all(delayed, axis=0) & later[..., None]
+        no_starts = part.drift[:, :, :0]
         return [
-            SectionRegression.make(
-                inputs, starts, part.drift, later & before[..., alike[0]]
-            )
+            SectionRegression.make(inputs, no_starts, part.drift, used[..., alike[0]])
             for alike in problem.alike[n]
         ]
 
     gram = np.zeros((ny, order + 1, order + 1))
     freedom = 0
     for section in sum_up(problem, np.zeros(0), past, regress):
-        for each in section:
-            gram[each.outputs] += each.products
-            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(
-                each.outputs
-            )
+        for fit in section:
+            gram[fit.outputs] += fit.products
+            rows = round(fit.freedom) - fit.root.shape[1]
+            freedom += max(rows, 0) * len(fit.outputs)
     return DelayedOutputs(gram, freedom)
 
 
 def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     """Return c without bias by white noise in the outputs."""
     order = delayed.gram.shape[1] - 1
-    null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
+    _, vectors = np.linalg.eigh(delayed.gram.sum(axis=0))
+    null = vectors[:, 0]
     if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])
