@@ -95,14 +95,9 @@ class LDTP(eqx.Module):
         nu = B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         matrices = {"A": A, "B": B, "C": C, "D": through}
-        for name, sizes in {
-            "A": (d, d),
-            "B": (d, nu),
-            "C": (ny, d),
-            "D": (ny, nu),
-        }.items():
-            array = matrices[name]
-            shape = (n_sections, *sizes)
+        shapes = {"A": (d, d), "B": (d, nu), "C": (ny, d), "D": (ny, nu)}
+        for name, array in matrices.items():
+            shape = (n_sections, *shapes[name])
             if array.shape != shape or 0 in shape:
                 raise DefinitionError(
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
@@ -143,37 +138,37 @@ class LDTP(eqx.Module):
 
         **Raises:** `DefinitionError`, naming the matrix that does not fit.
         """
-        given = {"A": A, "B": B, "C": C} | ({} if D is None else {"D": D})
+        given = {"A": A, "B": B, "C": C}
+        if D is not None:
+            given["D"] = D
         for name, blocks in given.items():
             require_equal(
                 f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks)
             )
         dims = [np.shape(block)[1] for block in A]
         after = [*dims[1:], dims[0]]
-        d = max(dims)
         ny = np.shape(C[0])[0]
         nu = np.shape(B[0])[1]
         padded: dict[str, Any] = {}
         xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
-            full = (d if name in "AB" else ny, d if name in "AC" else nu)
+            rows = after if name in "AB" else [ny] * len(A)
+            columns = dims if name in "AC" else [nu] * len(A)
+            shapes = list(zip(rows, columns, strict=True))
+            full = (max(rows), max(columns))
             parts = []
-            for n, block in enumerate(map(xp.asarray, blocks)):
-                shape = (
-                    after[n] if name in "AB" else ny,
-                    dims[n] if name in "AC" else nu,
-                )
-                if block.shape != shape:
+            for n, (shape, block) in enumerate(zip(shapes, blocks, strict=True)):
+                array = xp.asarray(block)
+                if array.shape != shape:
                     raise DefinitionError(
-                        f"`{name}[{n}]` has shape {block.shape}, but x[{n}] has {dims[n]} and "
+                        f"`{name}[{n}]` has shape {array.shape}, but x[{n}] has {dims[n]} and "
                         f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
                         f"outputs: it should be {shape}."
                     )
-                parts.append(
-                    xp.pad(
-                        block, [(0, p - q) for p, q in zip(full, shape, strict=True)]
-                    )
-                )
+                margins = [
+                    (0, most - size) for most, size in zip(full, shape, strict=True)
+                ]
+                parts.append(xp.pad(array, margins))
             padded[name] = xp.stack(parts)
         return cls(
             **padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates
@@ -196,18 +191,25 @@ class LDTP(eqx.Module):
         dims = np.asarray(self.dims)
         low = dims.min()
         high = dims.max()
-        batch = self.A.ndim > 3
-        lost = 0 if batch or is_traced(self) else int(low) - self.rank()
-        besides = f" (multipliers zero or below resolution: {lost})" if lost else ""
-        return f"{low}{'' if low == high else f' to {high}'}{besides}"
+        shown = f"{low}" if low == high else f"{low} to {high}"
+        if self.A.ndim > 3 or is_traced(self):
+            return shown
+        lost = int(low) - self.rank()
+        if lost:
+            return f"{shown} (multipliers zero or below resolution: {lost})"
+        return shown
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        names = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
-        lines = facts({**names, "dimension": self._dimension()})
-        multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        return card("LDTP", f"{self.n_sections} sections", lines, *multipliers)
+        about = {
+            "inputs": listed(self.inputs),
+            "outputs": listed(self.outputs),
+            "dimension": self._dimension(),
+        }
+        table = multiplier_table(self.multipliers)
+        circle = unit_circle(self.multipliers)
+        return card("LDTP", f"{self.n_sections} sections", facts(about), table, circle)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
@@ -255,9 +257,8 @@ class LDTP(eqx.Module):
         require_x64(self, f)
         f = from_host(to_host(f).reshape(-1))
         self._refuse_resonance(f)
-        H = to_host(harmonic_transfer(*self.matrices[:4], f))[
-            np.array(harmonics) % self.n_sections
-        ]
+        H = to_host(harmonic_transfer(*self.matrices[:4], f))
+        H = H[np.array(harmonics) % self.n_sections]
         return HTF(f, H, harmonics, self.n_sections, self.inputs, self.outputs, "exact")
 
     def __matmul__(self, other: "LDTP") -> "LDTP":
@@ -293,11 +294,11 @@ class LDTP(eqx.Module):
         **Raises:** `DefinitionError` if D is not square and invertible at all sections: an inverse
         then has to know later outputs. The inverse of its HTFs needs no D.
         """
-        if (
-            self.D.shape[1] != self.D.shape[2]
-            or not is_traced(self.D)
-            and (np.linalg.matrix_rank(np.asarray(self.D)) < self.D.shape[1]).any()
-        ):
+        ny, nu = self.D.shape[1:]
+        regular = ny == nu
+        if regular and not is_traced(self.D):
+            regular = (np.linalg.matrix_rank(np.asarray(self.D)) == ny).all()
+        if not regular:
             raise DefinitionError(
                 "an inverse needs a square and invertible D at all sections, since it would have "
                 "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
@@ -342,9 +343,8 @@ class LDTP(eqx.Module):
 
     def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
-        d = (
-            A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
-        )  # without common padding
+        # Without common padding.
+        d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
         return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
@@ -403,8 +403,10 @@ class LDTP(eqx.Module):
         """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
-            text = f"{periods} periods of {self.n_sections} sections, not {u.shape[1]}"
-            raise DefinitionError(f"`u` must have the samples of {text}.")
+            raise DefinitionError(
+                f"`u` must have the samples of {periods} periods of {self.n_sections} sections, "
+                f"not {u.shape[1]}."
+            )
         self._refuse_resonance(np.arange(periods) / periods)
         by_period = u.reshape(len(u), periods, self.n_sections, -1)
         return time_response.periodic_states(self.A, self.B, by_period)

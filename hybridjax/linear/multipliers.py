@@ -5,6 +5,7 @@ in double precision destroys eigenvalues smaller than `1e-16` of the largest; th
 Tolerances are on factors only, never on eigenvalues.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -56,7 +57,8 @@ def product_eigenvalues(
     regular = _regular_part(_balanced(factors), rtol)
     if not regular:
         return np.zeros(0, complex)
-    eigenvalues = np.concatenate([*map(_eigenvalues, _diagonal_blocks(regular))])
+    blocks = [_eigenvalues(block) for block in _diagonal_blocks(regular)]
+    eigenvalues = np.concatenate(blocks)
     return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
 
 
@@ -116,9 +118,9 @@ def _diagonal_blocks(factors):
     """Yield for each block on the diagonal its part of each factor, all unitarily and periodically
     similar to the given square ones."""
     d = len(factors[0])
-    stalls = 0
     basis = np.eye(d)
     below = np.full(d - 1, np.inf)
+    stalls = 0
     for _ in range(_MOST_SWEEPS):
         start = basis
         before = below
@@ -134,7 +136,8 @@ def _diagonal_blocks(factors):
         if settled.all() or stalls == 2:
             break
     edges = [0, *(1 + np.flatnonzero(settled)), d]
-    for block in map(slice, edges[:-1], edges[1:]):
+    for begin, end in itertools.pairwise(edges):
+        block = slice(begin, end)
         yield [x[block, block] for x in (*triangles, turn)]
 
 
@@ -146,6 +149,6 @@ def _eigenvalues(factors):
         product = factor @ product
         digits = int(np.frexp(np.abs(product).max())[1])
         product = np.ldexp(product, -digits)
-        exponent = exponent + digits
+        exponent += digits
     values = np.linalg.eigvals(product).astype(complex)
     return np.ldexp(values.view(float), exponent).view(complex)
