@@ -13,6 +13,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
+from scipy import linalg, optimize
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
@@ -21,6 +22,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
+from .descent import Coefficients
 from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
@@ -92,41 +94,16 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     u = data.u[data.ok]
     u = u / np.maximum(np.abs(u).max(axis=(0, 1)), np.finfo(float).tiny)
     _require_repetition(data, u)
-    size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
-    relative = data.y[data.ok] / np.where(size > 0, size, 1.0)
-    by_cycle = relative[:, N:].reshape(len(u), cycles, -1)
-
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
-        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(u)
+        classes = [np.arange(P // 2 + 1)] * len(u)
     else:
-        free = [_free(classes, P, cycles) for classes in _excited_classes(data, u)]
-    left = [Q @ record for Q, record in zip(free, by_cycle, strict=True)]
-    least = min(map(len, free))
-    if least <= (order or 1):
-        raise DefinitionError(
-            f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
-            "from the response: record more, or excite half of the lines (`lines='odd'`)."
-        )
-    tried = [order]
-    if order is None:
-        tried = range(1, min(_LARGEST_ORDER, least - 1) + 1)
-    # With everything, all Q are the same.
-    whole = [np.concatenate(left, axis=1)] if everything else left
-    blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
-    numbers = sum(z.size for z in left)
-    series = by_cycle[:, 0].size
-    fits = [_fit(blocks, _start(by_cycle, free, d), numbers, series) for d in tried]
-    _, c = min(fits, key=lambda fit: fit[0])
-
-    basis = _decay(c, cycles)
+        classes = _excited_classes(data, u)
+    c, transients = _decays(data, classes, everything, order)
     clean = data.y[:, N:].copy()
-    removed = np.full((len(data.y), len(size)), np.nan)
-    for s, Q, z in zip(np.flatnonzero(data.ok), free, left, strict=True):
-        transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
-        transient = transient.reshape(-1, len(size)) * size
-        clean[s] -= transient
-        removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
+    clean[data.ok] -= transients
+    removed = np.full((len(clean), clean.shape[2]), np.nan)
+    removed[data.ok] = np.sqrt(np.mean(transients[:, -N * P :] ** 2, axis=1))
     simulated = None
     if data.simulated is not None:
         # Events, some of which lie in the cycles that were cut off, are left out.
@@ -134,6 +111,54 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
         simulated = Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
+
+
+def _decays(
+    data: ExperimentData,
+    classes: list[Int[np.ndarray, " k"]],
+    everything: bool,
+    order: int | None,
+) -> tuple[Coefficients, Float[np.ndarray, "S n ny"]]:
+    """Return the coefficients of the multipliers, and the transients of all experiments that ran.
+
+    **Arguments:** `classes`: those that are excited in each experiment; `everything`: or all.
+
+    **Raises:** `DefinitionError` if the transient cannot be told from the response.
+    """
+    N = data.n_sections
+    y = data.y[data.ok]
+    size = np.sqrt(np.mean(y**2, axis=(0, 1)))
+    later = y[:, N:] / np.where(size > 0, size, 1.0)
+    cycles = later.shape[1] // N
+    records = later.reshape(len(y), cycles, -1)
+    free = [_free(excited, data.periods, cycles) for excited in classes]
+    left = [Q @ record for Q, record in zip(free, records, strict=True)]
+    least = min(map(len, free))
+    if least <= (order or 1):
+        raise DefinitionError(
+            f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
+            "from the response: record more, or excite half of the lines (`lines='odd'`)."
+        )
+    # With everything, all Q are the same.
+    whole = [np.concatenate(left, axis=1)] if everything else left
+    blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
+    numbers = sum(z.size for z in left)
+    series = records[:, 0].size
+    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
+    fits = []
+    for d in tried:
+        c, cost = _fit(blocks, _start(records, free, d))
+        parameters = d * (series + 1)
+        mean = max(cost, 1e-300) / numbers
+        length = numbers * np.log(mean) + parameters * np.log(numbers)
+        fits.append((length, c))
+    _, c = min(fits, key=lambda fit: fit[0])
+    basis = _decay(c, cycles)
+    transients = []
+    for Q, z in zip(free, left, strict=True):
+        amplitudes = np.linalg.lstsq(Q @ basis, z)[0]
+        transients.append(basis @ amplitudes)
+    return c, np.reshape(transients, later.shape) * size
 
 
 def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) -> None:
@@ -162,54 +187,49 @@ def _condensed(z: Float[np.ndarray, "rows _"]) -> Float[np.ndarray, "rows _"]:
     """Return a matrix with no more columns than rows, and the same residuals of regressions."""
     if z.shape[1] <= len(z):
         return z
-    return np.linalg.qr(z.T)[1].T
+    return np.linalg.qr(z.T, mode="r").T
 
 
-def _decay(c: Float[np.ndarray, " d"], cycles: int) -> Float[np.ndarray, "cycles d"]:
+def _decay(c: Coefficients, cycles: int) -> Float[np.ndarray, "cycles d"]:
     """Return a basis of all decays with these multipliers."""
     return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
     """Return rows that are orthogonal to the sinusoids of these classes at one section."""
-    angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
+    angle = 2 * np.pi / P * np.outer(np.arange(cycles), classes)
     inner = (classes > 0) & (2 * classes < P)
     signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
-    return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+    return linalg.null_space(signals.T).T
 
 
-def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
-    """Solve the equation of the decay, which `y` obeys but for sinusoids, by least squares."""
+def _start(records, free, d: int) -> Coefficients:
+    """Solve the equation of the decay, which records obey but for sinusoids, by least squares."""
     normal = np.zeros((d, d))
     right = np.zeros(d)
-    cycles = y.shape[1]
-    for Q, record in zip(free, y, strict=True):
+    cycles = records.shape[1]
+    for Q, record in zip(free, records, strict=True):
         # The same sinusoids, d periods fewer.
-        _, _, directions = np.linalg.svd(Q, full_matrices=True)
-        signals = directions[len(Q) :].T[d:]
-        orthogonal, _ = np.linalg.qr(signals, mode="complete")
-        keep = orthogonal[:, signals.shape[1] :].T
-        lags = np.stack([keep @ record[d - i : cycles - i] for i in range(d + 1)])
-        normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
-        right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
-    return np.linalg.lstsq(normal, right, rcond=None)[0]
+        sinusoids = linalg.null_space(Q)[d:]
+        keep = linalg.null_space(sinusoids.T).T
+        now, *earlier = (keep @ record[d - i : cycles - i] for i in range(d + 1))
+        earlier = np.stack(earlier)
+        normal += np.tensordot(earlier, earlier, ((1, 2), (1, 2)))
+        right -= np.tensordot(earlier, now, 2)
+    return np.linalg.lstsq(normal, right)[0]
 
 
-def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
-    """Return the length of the description, and the coefficients."""
-    from scipy.optimize import least_squares  # (a third of a second)
-
+def _fit(blocks, start: Coefficients) -> tuple[Coefficients, float]:
+    """Return the coefficients that leave the smallest sum of squares, and this sum."""
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
         basis = _decay(c, cycles)
-        out = []
+        left = []
         for Q, z in blocks:
-            q = np.linalg.qr(Q @ basis)[0]
-            out.append((z - q @ (q.T @ z)).ravel())
-        return np.concatenate(out)
+            q, _ = np.linalg.qr(Q @ basis)
+            left.append((z - q @ (q.T @ z)).ravel())
+        return np.concatenate(left)
 
-    fit = least_squares(residual, start, x_scale="jac")
-    parameters = len(start) * (series + 1)
-    mean = max(2 * fit.cost, 1e-300) / count
-    return count * np.log(mean) + parameters * np.log(count), fit.x
+    fit = optimize.least_squares(residual, start, x_scale="jac")
+    return fit.x, 2 * fit.cost

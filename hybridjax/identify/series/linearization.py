@@ -99,8 +99,10 @@ def filtered_response(
 ) -> Float[np.ndarray, "S T d m C"]:
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
-    delayed = [delay_cycles(filtered, j + 1) for j in range(len(c))]
-    return np.stack(delayed, axis=2)
+    delayed = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
+    for j in range(len(c)):
+        delayed[:, :, j] = delay_cycles(filtered, j + 1)
+    return delayed
 
 
 class Linearization(NamedTuple):
