@@ -28,6 +28,11 @@ _MUCH_LOWER = 0.5
 ROUGH: dict[str, Any] = {"max_steps": 4, "settled_gain": 5.0}
 
 
+def positive(size: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Return sizes by which one may divide: 1 in place of 0."""
+    return np.where(size > 0, size, 1.0)
+
+
 def least_squares(
     linearize: Callable[[Coefficients], Gradient],
     start: Coefficients,
@@ -95,7 +100,7 @@ class NormalEquations:
     ):
         self.gradient = gradient
         size = np.sqrt(np.maximum(np.diag(gram), 0))
-        self._size = np.where(size > 0, size, 1.0)
+        self._size = positive(size)
         self._values, self._vectors = np.linalg.eigh(
             gram / self._size / self._size[:, None]
         )

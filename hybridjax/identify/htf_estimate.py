@@ -175,7 +175,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
         solution = np.einsum("kij,kjml->kiml", inverse, right)
         explained = np.einsum("kiml,kiml->kml", solution.conj(), right).real
         H[entries] = solution[:, :nu]
-        spread[entries] = np.einsum("kii->ki", inverse).real[:, :nu]
+        spread[entries] = np.linalg.diagonal(inverse).real[:, :nu]
         residual[entries] = np.maximum(sums.energy[lines] - explained, 0)
 
     def variance(square):
@@ -213,7 +213,7 @@ def _roundness(
     shared = (gram * ~np.eye(nu, dtype=bool)).any()
     if shared or sums.mirrored[rows].any() or sums.count.max() > _FEW_REALIZATIONS:
         return None
-    power = np.einsum("kii->ki", gram).real[None, :, None]
+    power = np.linalg.diagonal(gram).real[None, :, None]
     energy = sums.energies[rows].transpose(2, 0, 3, 1)
     turned = sums.turned[rows].transpose(2, 0, 3, 1)
     square = energy - np.abs(H) ** 2 * power
@@ -243,8 +243,8 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     """Return the reason why the scatter over experiments is not that over random phases, if any."""
     nu = len(sums.setup.inputs)
     gram = sums.gram[rows]
-    power = np.einsum("kii->k", gram[:, :nu, :nu])
-    square = np.einsum("kii->k", gram[:, nu:, :nu])
+    power = np.linalg.trace(gram[:, :nu, :nu])
+    square = np.linalg.trace(gram[:, nu:, :nu])
     several = sums.count[rows] > nu
     # |sum of U^2| is the sum of |U|^2 where all phases are the same.
     alike = several & (np.abs(square) > (1 - SILENT_LINE) * power.real)

@@ -23,14 +23,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.arguments import require_among, require_same
+from .._core.arguments import require_among
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.algebra import Lines
 from ..linear.frequency_response import check_harmonics
 from ..linear.htf import HTF, Scatter
-from .spectral_sums import SILENT_LINE, Experiments, Setup
+from .descent import positive
+from .spectral_sums import SILENT_LINE, Experiments, Setup, parts_of
 
 
 # Smallest singular value of the inputs' answer to the references, relative to the largest, with
@@ -123,11 +124,7 @@ class Sums(NamedTuple):
         return np.add.outer(components, columns).ravel()
 
     def plus(self, more: "Sums") -> "Sums":
-        """Return the sums over both sets of experiments.
-
-        **Raises:** `DefinitionError` for other signals.
-        """
-        require_same("experiments", self, more, ("setup",))
+        """Return the sums over both sets of experiments."""
         return self._replace(
             total=self.total + more.total,
             between=self.between + more.between,
@@ -143,7 +140,7 @@ def spectral_products(
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]
     if like is None:
         size = np.linalg.norm(z, axis=(0, 1))
-        unit = np.where(size > 0, size, 1.0)
+        unit = positive(size)
     else:
         unit = like.unit
     bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
@@ -154,12 +151,12 @@ def spectral_products(
     spectra = spectra.reshape(*spectra.shape[:2], -1, spectra.shape[4])
     mean = spectra.sum(axis=0) / repeats
     apart = spectra - mean
-    scatter = (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0)
+    scatter = (apart @ apart.conj().mT).sum(axis=0)
     return Sums(
-        total=mean @ mean.conj().swapaxes(1, 2),
+        total=mean @ mean.conj().mT,
         between=scatter / max(repeats - 1, 1) / repeats,
         experiments=len(z),
-        setup=Setup(N, P, data.inputs, data.outputs),
+        setup=Setup.of(data),
         unit=unit,
     )
 
@@ -177,7 +174,7 @@ def htf_by_reference(
     lines, or the inputs do not answer them.
     """
     total = None
-    for part in [data] if isinstance(data, ExperimentData) else data:
+    for part in parts_of(data):
         roles = Roles.of(part.inputs, reference)
         require_loop(roles, [part.u], part.inputs)
         sums = spectral_products(part, repeats, total)
@@ -201,7 +198,7 @@ def excited_classes(
     **Raises:** `DefinitionError` if there is none.
     """
     power = sums.total[:, r[:, None], r]
-    size = np.sqrt(np.einsum("kii->ki", power).real)
+    size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
     least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
@@ -333,8 +330,8 @@ def _require_answers(
 
 
 def _adjoint(x: Complex[np.ndarray, "k a b"]) -> Complex[np.ndarray, "k b a"]:
-    return x.conj().swapaxes(1, 2)
+    return x.conj().mT
 
 
 def _diagonal(x: Complex[np.ndarray, "k a a"]) -> Float[np.ndarray, "k a"]:
-    return np.einsum("kaa->ka", x).real
+    return np.linalg.diagonal(x).real

@@ -18,7 +18,7 @@ from .._core.results import Result
 from .._core.text import folded
 from ..errors import DefinitionError
 from .denominator import Covariance, multipliers_of
-from .descent import Coefficients
+from .descent import Coefficients, positive
 from .fit import Fit
 
 
@@ -129,21 +129,21 @@ class MultiplierFit(Fit):
         is_real = np.imag(self.multipliers) == 0
         imaginary = np.where(is_real[:, None], 0.0, gradient.imag)
         parts = np.stack([gradient.real, imaginary], axis=1)
-        return parts @ self.covariance @ parts.swapaxes(1, 2)
+        return parts @ self.covariance @ parts.mT
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
         """Root of the expected squared distance of each multiplier from the true one."""
-        return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
+        return np.sqrt(np.linalg.trace(self.multiplier_covariances))
 
     def _estimates(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
         """Return the moduli and their standard errors."""
         modulus = np.abs(self.multipliers)
         if not np.isfinite(self.covariance).all():
             return modulus, np.full(len(modulus), np.inf)
-        along = self.multipliers / np.where(modulus > 0, modulus, 1.0)
+        along = self.multipliers / positive(modulus)
         outward = np.stack([along.real, along.imag], axis=1)[:, :, None]
-        variance = outward.swapaxes(1, 2) @ self.multiplier_covariances @ outward
+        variance = outward.mT @ self.multiplier_covariances @ outward
         return modulus, np.sqrt(variance[:, 0, 0])
 
     @checked

@@ -20,7 +20,7 @@ from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from . import variable_projection as varpro, weights
-from .denominator import chi, multipliers_of
+from .denominator import divided_by_chi, multipliers_of
 from .descent import ROUNDING, Coefficients
 from .fit import not_converged
 from .multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
@@ -84,7 +84,7 @@ class StructuredFit(MultiplierFit):
         """
         f = np.atleast_1d(np.asarray(f, float))
         N = self.n_sections
-        H = _evaluate(self.numerators, self.coefficients, f, N)
+        H = divided_by_chi(self.numerators, self.coefficients, f, N)
         htf = HTF(f, H, self.harmonics, N, self.inputs, self.outputs, "structured fit")
         return htf if harmonics is None else htf.select(harmonics)
 
@@ -95,13 +95,6 @@ class StructuredFit(MultiplierFit):
             f"residual {misfit}; {self.cost / self.dof:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )
-
-
-def _evaluate(numerators, c, f, n_sections: int) -> Complex[np.ndarray, "M F ny nu"]:
-    delay = np.exp(-2j * np.pi / n_sections * f)
-    powers = delay[:, None] ** np.arange(numerators.shape[1])
-    H = np.einsum("fr,mrij->mfij", powers, numerators)
-    return H / chi(delay**n_sections, c)[:, None, None]
 
 
 @checked
@@ -159,7 +152,7 @@ def fit_multipliers(
     )
     f = np.asarray(htf.f)
     H = np.asarray(htf.H)
-    misfit = _evaluate(numerators, c, f, htf.n_sections) - H
+    misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
     exact = htf.variance is None and residual.max() < ROUNDING
@@ -425,7 +418,7 @@ def _largest_of_noise(size: int) -> float:
     matrix of the Gaussian orthogonal ensemble.
     """
     draws = np.random.default_rng(0).normal(size=(_DRAWS, size, size))
-    symmetric = (draws + draws.swapaxes(1, 2)) / 2
+    symmetric = (draws + draws.mT) / 2
     return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from .._core.arguments import require_axes
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
-from .descent import ROUNDING
+from .descent import ROUNDING, positive
 
 
 Matrices = list[Float[np.ndarray, "_ _"]]
@@ -90,11 +90,6 @@ def realized(
         inputs,
         outputs,
     )
-
-
-def positive(scale: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return a scale with 1 for 0."""
-    return np.where(scale > 0, scale, 1.0)
 
 
 def given_dims(dims: Any, N: int, name: str = "dims") -> list[int] | None:

@@ -4,7 +4,7 @@ Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. T
 same memory for any number of experiments, and those of two sets of experiments add.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..experiments.data import ExperimentData
 from ..experiments.design.partition import check_sharing, needs_two_phases, regular
 from ..experiments.record import require_deviations
 from ..linear.frequency_response import Harmonics, check_harmonics
-from .descent import ROUNDING
+from .descent import ROUNDING, positive
 
 
 Experiments = (
@@ -45,6 +45,23 @@ class Setup(NamedTuple):
     periods: int
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+
+    @classmethod
+    def of(cls, data: ExperimentData) -> "Setup":
+        return cls(data.n_sections, data.periods, data.inputs, data.outputs)
+
+
+def parts_of(data: Experiments) -> Iterator[ExperimentData]:
+    """Iterate over experiments, which may come in parts.
+
+    **Raises:** `DefinitionError` for parts that do not belong together.
+    """
+    setup = None
+    for part in [data] if isinstance(data, ExperimentData) else data:
+        found = Setup.of(part)
+        setup = setup or found
+        require_equal("`data`", "sections, periods or signals", setup, found)
+        yield part
 
 
 class SpectralSums(NamedTuple):
@@ -108,12 +125,9 @@ def spectral_sums(
     """
     total = None
     count = 0
-    for part in [data] if isinstance(data, ExperimentData) else data:
-        setup = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
-        expected = setup if total is None else total.setup
-        require_equal("`data`", "sections, periods or signals", expected, setup)
+    for part in parts_of(data):
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
-        sums = _sums_of_part(part, setup, chosen, threshold, repeats, count)
+        sums = _sums_of_part(part, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:
@@ -127,7 +141,6 @@ def spectral_sums(
 
 def _sums_of_part(
     data: ExperimentData,
-    setup: Setup,
     harmonics: tuple[int, ...],
     threshold: float,
     repeats: int,
@@ -137,7 +150,7 @@ def _sums_of_part(
     windows = data.windows(repeats)
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
-    mirrored = needs_two_phases(lines, setup.periods, setup.n_sections)
+    mirrored = needs_two_phases(lines, data.periods, data.n_sections)
     # The limit cycle has power at multiples of f = 1.
     if mirrored.any() and data.ok.any():
         require_deviations(data.records)
@@ -159,7 +172,7 @@ def _sums_of_part(
     if first or len(lines) < len(line):  # lines were measured several times
         tested = _compare_crest_factors(data.u[:, data.window])
     return SpectralSums(
-        setup,
+        Setup.of(data),
         harmonics,
         lines,
         mirrored,
@@ -199,7 +212,7 @@ def _excited(data: ExperimentData, windows: list[slice], threshold: float, first
     unit = np.maximum(np.abs(U).max(axis=(0, 1)), np.finfo(float).tiny)
     size = np.abs(U) / unit
     peak = size.max(axis=(1, 2), keepdims=True)
-    change = np.abs(spectra - U) / unit / np.where(peak > 0, peak, 1)
+    change = np.abs(spectra - U) / unit / positive(peak)
     worst = float(np.max(change))
     if worst > max(threshold, _REPEATS):
         raise DefinitionError(

@@ -22,7 +22,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
-from .descent import Coefficients
+from .descent import Coefficients, positive
 from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
@@ -128,7 +128,7 @@ def _decays(
     N = data.n_sections
     y = data.y[data.ok]
     size = np.sqrt(np.mean(y**2, axis=(0, 1)))
-    later = y[:, N:] / np.where(size > 0, size, 1.0)
+    later = y[:, N:] / positive(size)
     cycles = later.shape[1] // N
     records = later.reshape(len(y), cycles, -1)
     free = [_free(excited, data.periods, cycles) for excited in classes]

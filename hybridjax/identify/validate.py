@@ -16,6 +16,7 @@ from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
+from .descent import positive
 from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .periodic import PeriodicModel
@@ -261,7 +262,7 @@ def validate(
     first = longest.first_section
     # Inputs after the last samples are unknown.
     shown = slice(first, first + len(longest.u) - longest.lead)
-    share = visible * rms / np.where(size > 0, size, 1.0)
+    share = visible * rms / positive(size)
     return Validation(
         fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,

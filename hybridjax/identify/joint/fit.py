@@ -178,7 +178,7 @@ class LDTPFit(MultiplierFit):
         path = SeriesProblem([part], S, True, True, 0).path(
             self._coordinates.model, part
         )
-        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))[:, :, None]
+        sizes = np.sqrt(np.linalg.diagonal(S))[:, :, None]
         slopes = prediction.slopes_of(self._coordinates, part, path)
         for J, size in zip(slopes, sizes, strict=True):
             yield J @ self._spread.root / size
@@ -190,7 +190,7 @@ class LDTPFit(MultiplierFit):
             return None
         D = np.asarray(self.noise_model.D)
         model = self._coordinates.model.times(self._scale)
-        return Predictor(model, D @ D.swapaxes(1, 2))
+        return Predictor(model, D @ D.mT)
 
     @property
     def determines_direct(self) -> bool:

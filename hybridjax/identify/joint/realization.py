@@ -16,13 +16,12 @@ from ...errors import DefinitionError
 from ...linear.frequency_response import all_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
-from ..descent import ROUNDING
+from ..descent import ROUNDING, positive
 from ..periodic import PeriodicModel
 from ..realization import (
     Matrices,
     default_horizon,
     largest_of_noise,
-    positive,
     ranges,
     shifted,
 )

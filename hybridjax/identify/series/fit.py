@@ -32,7 +32,15 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import denominator
-from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
+from ..denominator import (
+    Covariance,
+    chi,
+    divided_by_chi,
+    fading,
+    in_blocks,
+    multipliers_of,
+    sandwich,
+)
 from ..descent import Coefficients
 from ..fit import not_converged
 from ..instrument import in_loop
@@ -143,22 +151,22 @@ class SeriesFit(MultiplierFit):
         """
         f = np.atleast_1d(np.asarray(f, float))
         harmonics = check_harmonics(harmonics, self.n_sections)
-        N, R, _, _ = self.numerators.shape
-        delay = np.exp(-2j * np.pi / N * f)
-        powers = delay[:, None] ** (np.arange(R) - self.lead)
-        period_delay = delay**N
-        below = chi(period_delay, self.coefficients)[:, None, None]
+        N = self.n_sections
+        c = self.coefficients
         waves = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
-            G = np.einsum("fr,...nrij->...nfij", powers, b) / below
-            return np.einsum("mn,...nfij->...mfij", waves, G)
+            by_harmonic = np.einsum("mn,...nrij->...mrij", waves, b)
+            return divided_by_chi(by_harmonic, c, f, N, self.lead)
 
         H = sum_up(self.numerators)
-        lags = np.arange(1, len(self.coefficients) + 1)
-        by_chi = period_delay[:, None, None] ** lags[:, None, None, None] / below
-        slope = sum_up(self.slopes) - by_chi[:, None] * H
+        period_delay = np.exp(-2j * np.pi * f)[:, None, None]
+        below = chi(period_delay, c)
+        lags = np.arange(1, len(c) + 1)[:, None, None, None, None]
+        slope = sum_up(self.slopes) - period_delay**lags / below * H
         by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
+        r = np.arange(self.numerators.shape[1]) - self.lead
+        powers = np.exp(-2j * np.pi / N * np.outer(f, r))
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
         by_b = (np.abs(spread / N) ** 2).sum(axis=(1, 4)) / np.abs(below) ** 2
         variance = by_c.real + by_b * self.noise[:, None] ** 2
@@ -419,7 +427,7 @@ def assemble(
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
         b = b.reshape(*b.shape[:-2], lags, nu, ny) * problem.scale
-        return np.swapaxes(b, -1, -2)
+        return b.mT
 
     result = int(Result.OK if converged else Result.NOT_CONVERGED)
     return SeriesFit(
@@ -591,7 +599,7 @@ def _block_sums(
     rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
     inputs = in_blocks(rows, count)
     starts = in_blocks(regression.basis, count)
-    weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
+    weights = denominator.inverse_of_remainder(inputs @ inputs.mT)
     error = regression.residual(fit.coefficients, x).reshape(x.shape)
     measured = fit.coefficients[..., :1]
     response = filtered_response(measured, c, regression, x[..., :1])

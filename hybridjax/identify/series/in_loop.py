@@ -156,7 +156,7 @@ class LoopEquations:
         instruments = Z @ to_lags
         inputs = U @ to_lags
         inverse = np.linalg.inv(instruments.T @ inputs)
-        late = np.swapaxes(late.reshape(len(late), 2, -1, ny), 2, 3)
+        late = late.reshape(len(late), 2, -1, ny).mT
         predictions = late[:, 0, :, 1:]
         y = late[:, 1]
         fitted = np.tensordot(inverse @ instruments.T, y, 1)
@@ -276,7 +276,7 @@ class LoopEquations:
         error = blocks(section.outputs @ [1.0, *c] / scale)
         instruments = blocks(section.instruments / scale[:, None])
         by_error, by_instrument = map(blocks, section.taken)
-        taken = by_error @ by_instrument.swapaxes(1, 2)
-        symmetric = (taken + taken.swapaxes(1, 2)) / 2
+        taken = by_error @ by_instrument.mT
+        symmetric = (taken + taken.mT) / 2
         error = denominator.inverse_of_remainder(symmetric) @ error
         return np.einsum("bki,bkid->bd", error, instruments)

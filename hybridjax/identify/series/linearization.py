@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..._core.execution import on_all_cores
-from ..descent import ROUGH, Coefficients, least_squares
+from ..descent import ROUGH, Coefficients, least_squares, positive
 from .output_error import OutputErrorProblem, SectionRegression, root_of
 from .records import (
     CycleGrid,
@@ -127,7 +127,7 @@ class Linearization(NamedTuple):
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
-        along = np.where(size > 0, along / np.where(size > 0, size, 1), 0.0)
+        along = np.where(size > 0, along / positive(size), 0.0)
         rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
         jacobian = np.pad(size[:, None] * vectors.T, ((0, 1), (0, 0)))
         return np.append(along, rest), jacobian
@@ -176,7 +176,7 @@ def linearize(
     )
     for n, section in enumerate(out.fits):
         for fit in section:
-            out.square[n, fit.outputs] = np.trace(fit.products, axis1=1, axis2=2)
+            out.square[n, fit.outputs] = np.linalg.trace(fit.products)
             out.gradient[fit.outputs] += fit.gradient
             out.curvature[fit.outputs] += fit.curvature
             out.freedom[n, fit.outputs] = round(fit.freedom) - fit.root.shape[1]

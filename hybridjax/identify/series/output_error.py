@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 from ..._core.execution import on_all_cores
 from ..._core.text import listed
 from ...errors import DefinitionError
-from ..descent import ROUNDING
+from ..descent import ROUNDING, positive
 from .records import Columns, CycleGrid, PreparedRecords, lagged_inputs
 
 
@@ -75,9 +75,9 @@ class SectionRegression(NamedTuple):
         kept = size > RANK * size.max(axis=1, initial=0, keepdims=True)
         basis = basis * kept[:, None]
         inverse = np.where(kept, 1 / np.where(kept, size, 1), 0)[:, None]
-        to_starts = (np.swapaxes(right, 1, 2) * inverse)[:, : starts.shape[2]]
+        to_starts = (right.mT * inverse)[:, : starts.shape[2]]
         weighted = rows * inputs
-        remainder = weighted - basis @ (basis.swapaxes(1, 2) @ weighted)
+        remainder = weighted - basis @ (basis.mT @ weighted)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
         return cls(inputs, starts, rows, basis, to_starts, remainder)
 
@@ -90,7 +90,7 @@ class SectionRegression(NamedTuple):
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)
         for _ in range(2):  # the second time removes rounding errors
-            left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
+            left = left - self.basis @ (self.basis.mT @ left)
         return left.reshape(len(self.remainder), *x.shape[2:])
 
     def residual(self, a: ByInput, x: Columns) -> Rows:
@@ -106,7 +106,7 @@ class SectionRegression(NamedTuple):
         columns = x.reshape(*x.shape[:2], -1)
         forced = self.inputs @ a.reshape(len(a), columns.shape[2])
         left = self.weight * (columns - forced)
-        free = self.to_starts @ (self.basis.swapaxes(1, 2) @ left)
+        free = self.to_starts @ (self.basis.mT @ left)
         return (forced + self.starts @ free).reshape(x.shape)
 
 
@@ -221,7 +221,7 @@ def _require_different_inputs(
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
     # Inputs have units of their own.
     size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)
-    size = np.tile(np.where(size > 0, size, 1.0), triangle.shape[1] // nu)
+    size = np.tile(positive(size), triangle.shape[1] // nu)
     _, values, right = np.linalg.svd(triangle / size, full_matrices=False)
     kept = values > RANK * values.max(initial=0)
     return right[kept].T / values[kept] / size[:, None]

@@ -115,7 +115,7 @@ class SeriesProblem(NamedTuple):
                 except np.linalg.LinAlgError:
                     return np.inf
                 pairs = zip(path.whiten, path.error, strict=True)
-                cost += sum(float((_times(w, e) ** 2).sum()) for w, e in pairs)
+                cost += sum(float((np.matvec(w, e) ** 2).sum()) for w, e in pairs)
         return cost
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
@@ -133,7 +133,7 @@ class SeriesProblem(NamedTuple):
         values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
         floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * values[:, -1:])
         variances = np.maximum(values, floor)[:, None]
-        return self._replace(S=vectors * variances @ vectors.swapaxes(1, 2))
+        return self._replace(S=vectors * variances @ vectors.mT)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P = coordinates.size
@@ -146,10 +146,10 @@ class SeriesProblem(NamedTuple):
             for n, slopes in enumerate(slopes_of(coordinates, part, path)):
                 J = path.whiten[n] @ part.without_drift(n, slopes)
                 flat = J.reshape(-1, P)
-                white = _times(path.whiten[n], path.error[n])
+                white = np.matvec(path.whiten[n], path.error[n])
                 gram += flat.T @ flat
                 gradient += white.ravel() @ flat
-                along += path.starts[n].swapaxes(1, 2) @ J.reshape(R, -1, P)
+                along += path.starts[n].mT @ J.reshape(R, -1, P)
             # Less what the initial states explain.
             taken = _solve_starts(path.start_gram, along)
             gram -= np.tensordot(along, taken, ((0, 1), (0, 1)))
@@ -174,7 +174,7 @@ class SeriesProblem(NamedTuple):
 
         def drive(n: int, later: Columns) -> None:
             later[..., 0] += part.u[n] @ model.B[n].T
-            later[..., 0] += _times(gain[n], y[n] * part.sampled[n])
+            later[..., 0] += np.matvec(gain[n], y[n] * part.sampled[n])
 
         # The first column is driven, the others start from each coordinate of the initial state.
         filled = [1 + starts] * N
@@ -190,8 +190,8 @@ class SeriesProblem(NamedTuple):
             white = whiten[n] @ error
             samples = white.shape[1] * white.shape[2]
             rows = white[..., 1:].reshape(R, samples, starts)
-            gram += rows.swapaxes(1, 2) @ rows
-            along += rows.swapaxes(1, 2) @ white[..., :1].reshape(R, samples, 1)
+            gram += rows.mT @ rows
+            along += rows.mT @ white[..., :1].reshape(R, samples, 1)
             states.append(x)
             errors.append(error)
             responses.append(rows)
@@ -199,7 +199,7 @@ class SeriesProblem(NamedTuple):
         states = [x[..., 0] + (x[..., 1:] @ x0)[..., 0] for x in states]
         errors = [e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in errors]
         entering = [
-            _times(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
+            np.matvec(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
             for n, x in enumerate(states)
         ]
         return Path(F, gain, whiten, states, entering, errors, responses, gram)
@@ -305,11 +305,6 @@ def slopes_of(
             unit = np.eye(len(model.C[n]))[None, None]
             slopes[..., place["D"]] += _outer(unit, part.u[n])
         yield slopes
-
-
-def _times(matrix: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the product with the vector of each sample."""
-    return (matrix @ x[..., None])[..., 0]
 
 
 def _outer(

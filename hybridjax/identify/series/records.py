@@ -208,7 +208,7 @@ def lagged_inputs(
     row = np.pad(u.reshape(S, T * N, nu), margins)
     windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)
     newest_first = windows[:, section::N, :, ::-1]
-    return newest_first.swapaxes(2, 3).reshape(S, T, lags * nu)
+    return newest_first.mT.reshape(S, T, lags * nu)
 
 
 def delay_cycles(x: Columns, cycles: int, fill: float | bool = 0) -> Columns:

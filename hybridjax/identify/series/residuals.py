@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import special, stats
 
 from ..._core.findings import Finding
-from ..descent import ROUNDING
+from ..descent import ROUNDING, positive
 from .output_error import RANK
 from .records import CycleGrid, Signals, lagged_inputs
 
@@ -67,7 +67,7 @@ def whiteness_test(
     """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
     size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
-    scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
+    scaled = (error / positive(size)).reshape(S, T * N, ny)
     z = np.zeros((N, lags, ny))
     tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
@@ -158,7 +158,7 @@ def _regressed(
     samples = len(residual)
     variance = residual @ residual / samples
     size = np.sqrt((inputs**2).sum(axis=0) * variance)
-    inputs = inputs / np.where(size > 0, size, 1.0)  # inputs have units of their own
+    inputs = inputs / positive(size)  # inputs have units of their own
     along_fit = inputs.T @ root
     spread = 1 + (along_fit**2).sum(axis=1) * variance
     spread /= 1 + (root**2).sum() / samples

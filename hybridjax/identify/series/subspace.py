@@ -9,7 +9,7 @@ from scipy import special
 
 from ...errors import DefinitionError
 from ..denominator import SLOWEST, multipliers_of
-from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from ..descent import NO_LEADING_COEFFICIENT, Coefficients, positive
 from ..periodic import PeriodicModel
 from ..realization import default_horizon
 from .linearization import sum_up
@@ -191,9 +191,9 @@ class _Section:
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
     size = np.sqrt(np.square(rows).sum(axis=0))
-    rows = rows / np.where(size > 0, size, 1.0)
+    rows = rows / positive(size)
     x = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
-    return x / np.where(size > 0, size, 1.0)[:, None]
+    return x / positive(size)[:, None]
 
 
 def _from_states(
