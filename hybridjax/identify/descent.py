@@ -33,6 +33,13 @@ def positive(size: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return np.where(size > 0, size, 1.0)
 
 
+def without(
+    basis: Float[np.ndarray, "*b n r"], x: Float[np.ndarray, "*b n k"]
+) -> Float[np.ndarray, "*b n k"]:
+    """Return columns without their part in an orthonormal basis."""
+    return x - basis @ (basis.mT @ x)
+
+
 def least_squares(
     linearize: Callable[[Coefficients], Gradient],
     start: Coefficients,

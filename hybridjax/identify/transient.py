@@ -22,7 +22,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
-from .descent import Coefficients, positive
+from .descent import Coefficients, positive, without
 from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
@@ -228,7 +228,7 @@ def _fit(blocks, start: Coefficients) -> tuple[Coefficients, float]:
         left = []
         for Q, z in blocks:
             q, _ = np.linalg.qr(Q @ basis)
-            left.append((z - q @ (q.T @ z)).ravel())
+            left.append(without(q, z).ravel())
         return np.concatenate(left)
 
     fit = optimize.least_squares(residual, start, x_scale="jac")

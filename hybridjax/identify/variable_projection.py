@@ -26,6 +26,7 @@ from .descent import (
     Coefficients,
     Gradient,
     least_squares,
+    without,
 )
 from .weights import check_values, error_weights
 
@@ -124,8 +125,7 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     delays = group.period_delay[:, None] ** np.arange(1, d + 1)[:, None, None] / below
 
     def filtered(rows):
-        delayed = split(delays * (rows[:E] + 1j * rows[E:]))
-        return delayed - q @ (q.T @ delayed)
+        return without(q, split(delays * (rows[:E] + 1j * rows[E:])))
 
     by_noise = np.zeros((d, d))
     if noise:
@@ -149,7 +149,7 @@ def late_columns(
     columns = []
     for j in range(len(c) + 1):
         rows = group.weighted(c, delay**j * group.data)
-        columns.append((rows - q @ (q.T @ rows)).ravel())
+        columns.append(without(q, rows).ravel())
     left = 2 - (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
     return np.stack(columns, axis=1), left / np.abs(chi(group.period_delay, c)) ** 2
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 from ..._core.execution import on_all_cores
 from ..._core.text import listed
 from ...errors import DefinitionError
-from ..descent import ROUNDING, positive
+from ..descent import ROUNDING, positive, without
 from .records import Columns, CycleGrid, PreparedRecords, lagged_inputs
 
 
@@ -76,8 +76,7 @@ class SectionRegression(NamedTuple):
         basis = basis * kept[:, None]
         inverse = np.where(kept, 1 / np.where(kept, size, 1), 0)[:, None]
         to_starts = (right.mT * inverse)[:, : starts.shape[2]]
-        weighted = rows * inputs
-        remainder = weighted - basis @ (basis.mT @ weighted)
+        remainder = without(basis, rows * inputs)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
         return cls(inputs, starts, rows, basis, to_starts, remainder)
 
@@ -90,7 +89,7 @@ class SectionRegression(NamedTuple):
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)
         for _ in range(2):  # the second time removes rounding errors
-            left = left - self.basis @ (self.basis.mT @ left)
+            left = without(self.basis, left)
         return left.reshape(len(self.remainder), *x.shape[2:])
 
     def residual(self, a: ByInput, x: Columns) -> Rows:
