@@ -109,9 +109,11 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
-    assert "not identified: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(
-        fit
-    )
+    (lost,) = fit.findings
+    assert lost.cause == "not identified" and lost.text.startswith("p and q apart")
+    assert repr(lost) in repr(fit) and "1 of 1 guesses" in repr(fit)
+    np.testing.assert_allclose(fit.multipliers, oscillation.multipliers, atol=1e-8)
+    assert isinstance(fit, hj.identify.Fit)
 
 
 @pytest.mark.slow
