@@ -297,7 +297,7 @@ class ModelFit(Fit):
         misfit = (
             f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
         )
-        expected = f"expected {self.dof:g}" if self.weighted else misfit
+        expected = f"expected {self.dof:.0f}" if self.weighted else misfit
         good = sum(guess.result == Result.OK for guess in self.guesses)
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"

@@ -105,6 +105,16 @@ class PeriodicModel(NamedTuple):
         factors = [*self.A[first:], *self.A[:first]]
         return reduce(lambda product, A: A @ product, factors)
 
+    @property
+    def radius(self) -> float:
+        """The largest modulus of a multiplier."""
+        return float(np.abs(np.linalg.eigvals(self.monodromy())).max())
+
+    @property
+    def of_errors(self) -> "PeriodicModel":
+        """The model whose states are the errors of predictions, A - K C in place of A."""
+        return self._replace(A=self.F)
+
     def refined(
         self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]
     ) -> "PeriodicModel":
@@ -194,10 +204,9 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
     **Raises:** `DefinitionError` for unobservable states.
     """
     N = model.n_sections
-    predictor = model._replace(A=model.F)
-    largest = np.abs(np.linalg.eigvals(predictor.monodromy())).max()
-    rho = float((_LARGEST_MODULUS / max(largest, _LARGEST_MODULUS)) ** (1 / N))
-    pairs = [_root(n, P) for n, P in enumerate(_gramians(predictor, rho))]
+    largest = max(model.of_errors.radius, _LARGEST_MODULUS)
+    rho = (_LARGEST_MODULUS / largest) ** (1 / N)
+    pairs = [_root(n, P) for n, P in enumerate(_gramians(model.of_errors, rho))]
     roots, back = zip(*pairs, strict=True)
     after = (*roots[1:], roots[0])
     normal = PeriodicModel(

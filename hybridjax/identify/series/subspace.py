@@ -222,19 +222,13 @@ def _from_states(
             (A, B, output[:d].T, output[d:].T, K if innovations else K[:, :0])
         )
     model = PeriodicModel(*map(list, zip(*blocks, strict=True)))
-    slowest = np.abs(np.linalg.eigvals(model.monodromy())).max()
-    shrunk = (SLOWEST / max(slowest, SLOWEST)) ** (1 / N)
+    shrunk = (SLOWEST / max(model.radius, SLOWEST)) ** (1 / N)
     model = model._replace(A=[shrunk * A for A in model.A])
     # (The largest modulus of A may be above SLOWEST by rounding, for any K.)
-    most = max(SLOWEST, _slowest_error(model._replace(K=[0 * K for K in model.K])))
-    while innovations and _slowest_error(model) > most:
+    most = max(SLOWEST, model.radius)
+    while innovations and model.of_errors.radius > most:
         model = model._replace(K=[K / 2 for K in model.K])
     return model
-
-
-def _slowest_error(model: PeriodicModel) -> float:
-    """Return the largest modulus of a multiplier of A - K C, for errors of predictions."""
-    return float(np.abs(np.linalg.eigvals(model._replace(A=model.F).monodromy())).max())
 
 
 class DelayedOutputs(NamedTuple):
