@@ -42,6 +42,11 @@ class Fit(eqx.Module):
     findings: eqx.AbstractVar[tuple[Finding, ...]]
 
     @property
+    def modulus(self) -> Float[np.ndarray, " d"]:
+        """The moduli of the multipliers."""
+        return np.abs(self.multipliers)
+
+    @property
     @abstractmethod
     def standard_errors(self) -> Float[np.ndarray, " k"]:
         """Standard error of each estimated number."""

@@ -138,7 +138,7 @@ class MultiplierFit(Fit):
 
     def _estimates(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
         """Return the moduli and their standard errors."""
-        modulus = np.abs(self.multipliers)
+        modulus = self.modulus
         if not np.isfinite(self.covariance).all():
             return modulus, np.full(len(modulus), np.inf)
         along = self.multipliers / positive(modulus)
