@@ -124,12 +124,13 @@ class MultiplierFit(Fit):
             return np.full((d, 2, 2), np.inf)
         powers = self.multipliers[:, None] ** np.arange(d - 1, -1, -1)
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
+        is_real = np.imag(self.multipliers) == 0
+        # The slope is zero where two multipliers coincide.
         with np.errstate(all="ignore"):
             gradient = -powers / slope[:, None]
-        is_real = np.imag(self.multipliers) == 0
-        imaginary = np.where(is_real[:, None], 0.0, gradient.imag)
-        parts = np.stack([gradient.real, imaginary], axis=1)
-        return parts @ self.covariance @ parts.mT
+            imaginary = np.where(is_real[:, None], 0.0, gradient.imag)
+            parts = np.stack([gradient.real, imaginary], axis=1)
+            return parts @ self.covariance @ parts.mT
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
@@ -143,7 +144,8 @@ class MultiplierFit(Fit):
             return modulus, np.full(len(modulus), np.inf)
         along = self.multipliers / positive(modulus)
         outward = np.stack([along.real, along.imag], axis=1)[:, :, None]
-        variance = outward.mT @ self.multiplier_covariances @ outward
+        with np.errstate(all="ignore"):
+            variance = outward.mT @ self.multiplier_covariances @ outward
         return modulus, np.sqrt(variance[:, 0, 0])
 
     @checked
