@@ -13,7 +13,7 @@ variances that realizations show (`htf`) and without (`htf_plain`), and `fit_ser
 
 Printed, as `name value` lines: rms error, rms of the standard errors (`said`), how many of the
 regions held the true multipliers (`held`), and `p` of the binomial test of 95 %; `doubted`: how
-many fits of series doubt themselves (`fit.doubt`).
+many fits of series doubt themselves (`fit.findings`).
 
     python benchmarks/colored.py [--draws 200] [--only white colored sensor drift]
 """
@@ -66,7 +66,7 @@ def found(fit, truth) -> dict[str, float]:
         "error": float(abs(fit.multipliers[k] - truth)),
         "said": float(fit.standard_errors[k]),
         "held": float(fit.contains([truth, truth.conjugate()]).all()),
-        "doubted": float(bool(fit.doubt)),
+        "doubted": float(bool(fit.findings)),
     }
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from second_order import OUTPUTS
 
 import hybridjax as hj
+from hybridjax.identify.joint.realization import realized_htf
+from hybridjax.identify.realization import realized
 
 
 HARMONICS = (-2, -1, 0, 1, 2)
@@ -113,10 +115,8 @@ def deviation(family, draws: int) -> None:
     goal = hj.designs.Multipliers(estimator="fit_ldtp")
     plan = hj.optimal_design(family.model, usual, goal=goal, **about)
     N, truth = family.model.n_sections, family.model.multipliers
-    minimal = hj.identify.realize(np.asarray(family.model.impulse_response(4 * N + 1)))
-    start = hj.identify.realize(
-        family.model.htf(usual.frequencies), np.asarray(minimal.dims)
-    )
+    minimal = realized(np.asarray(family.model.impulse_response(4 * N + 1)))
+    start = realized_htf(family.model.htf(usual.frequencies), np.asarray(minimal.dims))
     start = eqx.tree_at(lambda model: model.D, start, 0 * start.D)  # (and stays so)
     after = family.recorded(plan.design)
 

@@ -133,7 +133,7 @@ def noise(kind: str, data, cycle, draws: int) -> None:
     show(f"{kind}.noise.p", stats.binomtest(inside, draws, 0.95).pvalue)
     ratio = [fit.chi_square(cycle.system) / fit.identifiability.rank for fit in fits]
     show(f"{kind}.noise.mean", np.mean(ratio))
-    cost = [fit.cost / fit.freedom for fit in fits]
+    cost = [fit.cost / fit.dof for fit in fits]
     show(f"{kind}.noise.cost", np.mean(cost))
 
 

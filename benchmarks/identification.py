@@ -70,7 +70,7 @@ def paper(family: Identification) -> None:
     data = family.run(hj.paper_design())
     estimate = hj.estimate_htf(data)
     family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
-    rational, H = hj.fit_rational(estimate), np.asarray(estimate[0])[..., 0]
+    rational, H = hj.identify.fit_rational(estimate), np.asarray(estimate[0])[..., 0]
     z = np.exp(2j * np.pi * np.asarray(estimate.f) / N)
     inner = z.imag > 1e-12
     z, H = np.append(z, z[inner].conj()), np.concatenate([H, H[inner].conj()])
@@ -157,7 +157,7 @@ def white(family: Identification, draws: int) -> None:
     noisy = hj.experiments.add_noise(data, snr=20, seed=SEED[family.name] + 1)
     fits = [hj.fit_series(one(s, noisy.y), 2) for s in range(draws)]
     report(family, "white.20", fits)
-    model = hj.identify.realize(fits[0], order=2)
+    model = fits[0].model
     f = np.arange(0.05, 10, 0.1)
     exact = family.model.htf(f, 0)
     for k, error in enumerate(np.asarray(model.htf(f, 0).error(exact))):

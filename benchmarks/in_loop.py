@@ -44,12 +44,14 @@ from scipy import stats
 import hybridjax as hj
 from hybridjax.identify.denominator import multipliers_of
 from hybridjax.identify.instrument import in_loop
+from hybridjax.identify.joint.realization import realized_htf
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 from hybridjax.identify.periodic import (
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,
 )
+from hybridjax.identify.realization import realized
 from hybridjax.identify.series import fit as series_fit
 from hybridjax.identify.series.prediction import SeriesPart, SeriesProblem
 from hybridjax.identify.series.records import CycleGrid
@@ -63,7 +65,7 @@ def hopper() -> hj.LDTP:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
     exact = hj.linearize(cycle, phase, ("yM", "vM"))
-    minimal = hj.identify.realize(exact.htf(np.arange(1, 128) / 32 + 1 / 77), order=2)
+    minimal = realized_htf(exact.htf(np.arange(1, 128) / 32 + 1 / 77), order=2)
     return eqx.tree_at(lambda x: x.D, minimal, 0 * minimal.D)  # (1e-17)
 
 
@@ -331,9 +333,9 @@ def too_low(first: int, count: int) -> None:
                 whole = time.process_time() - began
                 with (
                     mock.patch.object(
-                        series_fit.SeriesFit, "contradiction", lambda *_: ""
+                        series_fit.SeriesFit, "contradicted_by", lambda *_: None
                     ),
-                    mock.patch.object(series_fit, "_about_drift", lambda *_: ""),
+                    mock.patch.object(series_fit, "_about_drift", lambda *_: []),
                 ):
                     began = time.process_time()
                     hj.fit_series(data, order, reference=reference)
@@ -351,7 +353,7 @@ def too_low(first: int, count: int) -> None:
                 if error.max() > 5
                 else "near"
             )
-            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.doubt))})
+            counts[kind].update({name: 1, f"{name}.doubted": int(bool(fit.findings))})
     for kind, values in counts.items():
         for name, value in values.items():
             print(f"in_loop.orders.{kind}.{name} {value}", flush=True)
@@ -398,7 +400,7 @@ def short_gait() -> dict[str, float]:
     levels = [hj.Crossing("th", "falling", th) for th in (0.1, 0.0, -0.1)]
     phase = hj.SectionList([strike, *levels])
     exact = hj.linearize(cycle, phase, outputs)
-    model = hj.identify.realize(np.asarray(exact.impulse_response(40)))
+    model = realized(np.asarray(exact.impulse_response(40)))
     design = hj.multisine(4, periods=8, band=(0, 2), amplitude=1e-6).realizations(3)
     data = hj.run_experiments(
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30

@@ -24,6 +24,8 @@ from scipy import stats
 from second_order import OUTPUTS, sections
 
 import hybridjax as hj
+from hybridjax.identify.joint.realization import realized_htf
+from hybridjax.identify.realization import realized
 
 
 N = 32
@@ -50,7 +52,7 @@ def with_variances(model: hj.LDTP, snr: float) -> hj.HTF:
 def minimal_dims(model: hj.LDTP) -> np.ndarray:
     """What is known of the structure: how many states there are at each section."""
     response = np.asarray(model.impulse_response(4 * N + 1))
-    return np.asarray(hj.identify.realize(response).dims)
+    return np.asarray(realized(response).dims)
 
 
 def one(
@@ -58,7 +60,7 @@ def one(
 ) -> dict[str, float]:
     error = rng.normal(size=(2, *htf.H.shape)) * np.sqrt(np.asarray(htf.variance) / 2)
     draw = eqx.tree_at(lambda h: h.H, htf, htf.H + error[0] + 1j * error[1])
-    start = hj.identify.realize(draw, dims)
+    start = realized_htf(draw, dims)
     start = eqx.tree_at(lambda model: model.D, start, 0 * start.D)  # (and stays so)
     began = time.process_time()
     fit = hj.fit_ldtp(draw, start)

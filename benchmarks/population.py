@@ -63,12 +63,12 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
                     "strides": strides,
                     "fit": fit.multipliers[0],
                     "covariance": fit.multiplier_covariances[0],
-                    "freedom": fit.covariance_freedom,
+                    "freedom": fit.covariance_dof,
                     "short": short.multipliers[0] if short else np.nan,
                     "short_covariance": short.multiplier_covariances[0]
                     if short
                     else np.eye(2),
-                    "short_freedom": short.covariance_freedom if short else np.nan,
+                    "short_freedom": short.covariance_dof if short else np.nan,
                     "map": fit.impulse_response(LAGS)[:, :, 0, 0],
                 }
             )

@@ -49,7 +49,6 @@ from .identify.multipliers import (
     fit_multipliers as fit_multipliers,
     select_order as select_order,
 )
-from .identify.rational import fit_rational as fit_rational
 from .identify.series.fit import fit_series as fit_series
 from .identify.validate import validate as validate
 from .io import load as load, save as save

@@ -140,7 +140,7 @@ print(f"error {np.max(np.abs(series.multipliers - truth)):.2g}")
 
 # %%
 test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
-report = hj.validate(hj.identify.realize(series), test)
+report = hj.validate(series.model, test)
 report
 
 # %%

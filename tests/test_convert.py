@@ -150,7 +150,9 @@ def test_pandas(model):
     errors = np.hypot(table["real_error"], table["imaginary_error"])
     np.testing.assert_array_equal(errors, fit.standard_errors)
     np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
-    rational = hj.fit_rational(model.htf(np.linspace(0.01, 0.4, 20)), input="u")
+    rational = hj.identify.fit_rational(
+        model.htf(np.linspace(0.01, 0.4, 20)), input="u"
+    )
     table = convert.to_pandas(rational)
     poles = table["pole_real"] + 1j * table["pole_imaginary"]
     np.testing.assert_array_equal(poles, rational.poles[0])

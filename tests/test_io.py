@@ -68,7 +68,10 @@ def things(ldtp, htf):
     data = hj.experiments.simulate_experiments(ldtp, design)
     estimate = hj.estimate_htf(data)
     plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
-    fits = hj.fit_rational(estimate), hj.fit_multipliers(estimate, ldtp, overhang=2)
+    fits = (
+        hj.identify.fit_rational(estimate),
+        hj.fit_multipliers(estimate, ldtp, overhang=2),
+    )
     record = hj.Record(data.u[0], data.y[0], n_sections=2, first_section=1)
     series = hj.fit_series(data, ldtp, overhang=2)
     y = np.ones((2, 6, 1))

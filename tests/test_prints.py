@@ -204,7 +204,7 @@ def test_fits_show_standard_errors():
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1
     htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
-    assert "yM & co: multipliers" in "".join(shown(hj.fit_rational(htf)).texts)
+    assert "yM & co: multipliers" in "".join(shown(hj.identify.fit_rational(htf)).texts)
 
 
 def test_pictures_are_xml_whatever_is_drawn():

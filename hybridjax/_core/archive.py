@@ -98,7 +98,7 @@ def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
 
 def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Static fields and arrays; a module among the fields becomes a dictionary of its own static
-    fields, and arrays with its name before theirs."""
+    fields, and arrays with its name before theirs. Modules in a tuple have static fields only."""
     static: dict[str, Any] = {}
     arrays: dict[str, np.ndarray] = {}
     for field in dataclasses.fields(thing):
@@ -108,6 +108,8 @@ def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray
         elif isinstance(value, eqx.Module):
             static[field.name], inner = taken_apart(value)
             arrays |= {f"{field.name}.{name}": array for name, array in inner.items()}
+        elif isinstance(value, tuple):
+            static[field.name] = [taken_apart(x)[0] for x in value]
         elif value is not None:
             arrays[field.name] = np.asarray(value)
     return static, arrays
@@ -124,7 +126,7 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
         raise other
     static, arrays, values = dict(static), dict(arrays), {}
     for field in dataclasses.fields(kind):
-        name, inner = field.name, _module_in(field.type)
+        name, inner, item = field.name, _module_in(field.type), _item_of(field.type)
         if field.metadata.get("static", False):
             if name in static:
                 values[name] = static.pop(name)
@@ -132,6 +134,10 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
                     raise ValueError(f"{name} is {reprlib.repr(values[name])}")
             elif field.default is dataclasses.MISSING:
                 raise other
+        elif item is not None:
+            values[name] = tuple(
+                put_together(item, x, {}) for x in static.pop(name, ())
+            )
         elif inner is not None and name in static:
             parts = [k for k in arrays if k.startswith(f"{name}.")]
             part = {k.removeprefix(f"{name}."): arrays.pop(k) for k in parts}
@@ -155,6 +161,13 @@ def _module_in(hint: Any) -> type | None:
     """The kind of module that a field of this type may hold."""
     classes = (x for x in options_of(hint) if isinstance(x, type))
     return next((x for x in classes if issubclass(x, eqx.Module)), None)
+
+
+def _item_of(hint: Any) -> type | None:
+    """The kind of module of which a field of this type holds a tuple."""
+    if typing.get_origin(hint) is not tuple:
+        return None
+    return _module_in(typing.get_args(hint)[0])
 
 
 def _read_header(
@@ -233,6 +246,8 @@ def _matches(value: Any, hint: Any) -> bool:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         return _matches(value, arguments[0])
+    if origin is typing.Literal:
+        return value in arguments
     if origin is types.UnionType or origin is typing.Union:
         return any(_matches(value, option) for option in arguments)
     if origin is tuple:  # tuple[X, ...], the only form in use

@@ -45,10 +45,13 @@ def refuse(findings: Iterable[Finding]) -> None:
             raise DefinitionError(finding.text + f" (Found, too: {also})" * bool(also))
 
 
-def warn_of(findings: Iterable[Finding]) -> None:
-    """Emit a `FindingWarning` for each finding."""
+def warn_of(findings: Iterable[Finding], wrappers: int = 1) -> None:
+    """Emit a `FindingWarning` for each finding, at the line that called the public function.
+
+    **Arguments:** `wrappers`: number of decorators around the function. Default: `checked` alone.
+    """
     for finding in findings:
-        warnings.warn(repr(finding), FindingWarning, stacklevel=4)
+        warnings.warn(repr(finding), FindingWarning, stacklevel=3 + wrappers)
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:

@@ -64,12 +64,10 @@ class Study:
     def remarks(self) -> list[str]:
         """Failures, and the fits to doubt, in sentences."""
         fits = zip(self.population.table["report"], self.fits, strict=True)
-        doubts = [
-            f"{name} is doubtful: {fit.doubt}." for name, fit in fits if fit.doubt
-        ]
-        return [
-            f"{name} failed: {text}" for name, text in self.failures.items()
-        ] + doubts
+        remarks = [f"{name} failed: {text}" for name, text in self.failures.items()]
+        for name, fit in fits:
+            remarks += [f"{name} is doubtful: {doubt.text}" for doubt in fit.findings]
+        return remarks
 
     def __repr__(self) -> str:
         lines = [

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from ..identify.multiplier_estimate import MultiplierEstimate
+from ..identify.multiplier_estimate import MultiplierFit
 from ..identify.rational import RationalFit
 from ..linear.htf import HTF
 from ..orbits.continuation import Branch
@@ -17,13 +17,7 @@ from .xarray_datasets import to_xarray
 
 
 Tabular = (
-    Recording
-    | SectionData
-    | HTF
-    | LimitCycles
-    | Branch
-    | MultiplierEstimate
-    | RationalFit
+    Recording | SectionData | HTF | LimitCycles | Branch | MultiplierFit | RationalFit
 )
 
 
@@ -44,7 +38,7 @@ def to_pandas(thing: Tabular) -> Any:
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
     """
     frame = package("pandas").DataFrame
-    if isinstance(thing, MultiplierEstimate):
+    if isinstance(thing, MultiplierFit):
         real, imaginary = np.sqrt(
             np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
         ).T

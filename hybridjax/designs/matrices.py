@@ -13,9 +13,8 @@ from jaxtyping import Float, Int
 from ..errors import DefinitionError
 from ..identify.descent import NormalEquations, Spread
 from ..identify.joint.frequency import transfer, transfer_slopes
-from ..identify.joint.realization import realize
 from ..identify.periodic import LocalCoordinates, PeriodicModel, local_coordinates
-from ..identify.series.subspace import default_horizon
+from ..identify.realization import default_horizon, realized
 from ..identify.weights import check_values, error_weights
 from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
@@ -81,7 +80,7 @@ def ldtp_matrices(
     **Raises:** `DefinitionError` for a model that is no `LDTP`.
     """
     if not isinstance(model, LDTP):
-        text = "needs an `LDTP`: `fit_ldtp(...).model`, or `hj.identify.realize`."
+        text = "needs an `LDTP`: the `model` of a fit of `fit_ldtp` or `fit_series`."
         raise DefinitionError(f"a goal of `fit_ldtp` {text}")
     lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
@@ -90,7 +89,7 @@ def ldtp_matrices(
         np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0)
     )
     direct = bool(response[:, 0].any())
-    coordinates = local_coordinates(PeriodicModel.of(realize(response), scale), direct)
+    coordinates = local_coordinates(PeriodicModel.of(realized(response), scale), direct)
     gram = np.zeros((coordinates.size, coordinates.size))
     for lines, rows in _rows(coordinates, htfs, scale):
         flat = _flat(rows * np.sqrt(power[lines])[:, None, None])

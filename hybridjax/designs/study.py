@@ -207,7 +207,7 @@ class Study(eqx.Module):
             )
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
-        if are_alike(best.fit.correlation, best.fit.freedom):
+        if are_alike(best.fit.correlation, best.fit.dof):
             text = f"the data show more than {self.order} multipliers"
             raise DefinitionError(
                 f"{text}: add the blocks to a study with a larger `order`."
@@ -340,4 +340,4 @@ def _student(fit: StructuredFit) -> float:
     from scipy import special  # (a fifth of a second)
 
     tail = (1 + _LEVEL) / 2
-    return float(special.stdtrit(fit.covariance_freedom, tail) / special.ndtri(tail))
+    return float(special.stdtrit(fit.covariance_dof, tail) / special.ndtri(tail))

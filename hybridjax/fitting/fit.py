@@ -95,13 +95,13 @@ def fit_model(
     with other values of parameters and data reuse it.
     """
     problem, near = _prepare(system, data, free, guess)
-    p = problem.parameters
-    x0 = np.asarray(p.encode(p.read(system, problem.observations)))
-    around = _SPREAD * np.random.default_rng(seed).uniform(
-        -1, 1, (guesses - 1, len(x0))
-    )
+    parameters = problem.parameters
+    x0 = np.asarray(parameters.encode(parameters.read(system, problem.observations)))
+    rng = np.random.default_rng(seed)
+    around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
+    starts = np.concatenate([x0[None], x0 + around])
     ends: list[End] = []
-    for start in counted(np.stack([x0, *(x0 + around)]), "guesses", guesses):
+    for start in counted(starts, "guesses", guesses):
         at_guess = not ends and near.system is system
         cycle = near if at_guess else _cycle_at(problem, system, start, near)
         ends.append(_descend(problem, start, cycle))
@@ -109,11 +109,9 @@ def fit_model(
             break
     best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
     if best.cost == np.inf:
-        why = (
-            "its residuals are not finite"
-            if len(best.residuals)
-            else Result(best.result).message
-        )
+        why = Result(best.result).message
+        if len(best.residuals):
+            why = "its residuals are not finite"
         raise ComputationError(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
             f"({why}): give another system, or more `guesses`."
@@ -145,8 +143,10 @@ def identifiability(
     x = parameters.encode(parameters.read(system, problem.observations))
     residuals, jacobian, _ = evaluate(problem, x, cycle)
     if not np.isfinite(residuals).all():
-        text = "predicts NaN or infinity for these data: change its parameters."
-        raise ComputationError(f"the system has a limit cycle, but {text}")
+        raise ComputationError(
+            "the system has a limit cycle, but predicts NaN or infinity for these data: change its "
+            "parameters."
+        )
     return diagnose(parameters.names, _relative(parameters, x, jacobian))
 
 
@@ -243,32 +243,36 @@ def _summary(
     problem: FitProblem, system: HybridSystem, ends: list[End], best: End
 ) -> ModelFit:
     parameters = problem.parameters
-    decode = lambda x: np.asarray(parameters.decode(jnp.asarray(x)))  # noqa: E731
+
+    def decode(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        return np.asarray(parameters.decode(jnp.asarray(x)))
+
     guesses = tuple(
-        ParameterGuess(decode(e.start), decode(e.x), e.cost, e.steps, e.result)
-        for e in ends
+        ParameterGuess(
+            decode(end.start), decode(end.x), end.cost, end.steps, end.result
+        )
+        for end in ends
     )
     cycle = _cycle_at(problem, system, best.x, best.cycle)
-    values, residuals = decode(best.x), best.residuals
+    values = decode(best.x)
     size = np.asarray(_sizes(jnp.asarray(values)))
     sensitivity = _relative(parameters, jnp.asarray(best.x), best.jacobian)
     identified = diagnose(parameters.names, sensitivity)
     rank = identified.rank
-    freedom = len(residuals) - rank
-    unit = problem.unit(best.cost, freedom)
+    dof = len(best.residuals) - rank
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(
-        cycle.system,
-        cycle,
-        parameters.names,
-        values,
-        unit * root @ root.T,
-        residuals,
-        best.cost,
-        freedom,
-        identified,
-        guesses,
-        best.result,
-        problem,
+        system=cycle.system,
+        cycle=cycle,
+        names=parameters.names,
+        values=values,
+        covariance=problem.unit(best.cost, dof) * root @ root.T,
+        residuals=best.residuals,
+        cost=best.cost,
+        dof=float(dof),
+        identifiability=identified,
+        guesses=guesses,
+        result=best.result,
+        problem=problem,
     )

@@ -8,14 +8,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
-from .._core.html import card, table, text
+from .._core.findings import Finding
+from .._core.html import table, text
 from .._core.results import Result
 from ..errors import DefinitionError
+from ..identify.fit import Fit, not_converged
 from ..orbits.cycle import LimitCycle
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
@@ -140,24 +142,27 @@ class ParameterGuess(NamedTuple):
     """Code of `Result`."""
 
 
-class ModelFit(eqx.Module):
+class ModelFit(Fit):
     r"""A system whose parameters were fitted to data.
 
-    **Fields:**
+    **Fields** beside those of every `Fit` (`noise` is None):
 
-    - `system`: with the fitted parameters. `cycle`: its limit cycle.
+    - `system`, and `model`: with the fitted parameters. `cycle`: its limit cycle, which has the
+        `multipliers`.
     - `names`, `values` (p,): the free parameters.
     - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
         of their standard deviations (estimated from the residuals where the data have none); zero
         along combinations that the data do not identify; NaN without standard deviations if
-        `freedom` is 0.
+        `dof` is 0.
     - `residuals` (r,): weighted, those of all observations one after the other.
-    - `cost`: sum of their squares. `freedom`: r less the number of identified combinations; the
+    - `cost`: sum of their squares. `dof`: r less the number of identified combinations; the
         expected cost where all data have standard deviations.
     - `identifiability`: the combinations of parameters that the data identify.
     - `guesses`: for each guess, in order, its `values` (p,), the `fitted` ones (p,), their `cost`,
         the number of evaluations, `steps`, and the `result`. `result`: code of the best one.
     - `problem`: the minimized function.
+    - `findings`: "not identified", for combinations of parameters; "a bound", for parameters that
+        reach theirs within their standard errors; "no convergence".
     """
 
     system: HybridSystem
@@ -167,11 +172,31 @@ class ModelFit(eqx.Module):
     covariance: Float[np.ndarray, "p p"]
     residuals: Float[np.ndarray, " r"]
     cost: float = eqx.field(static=True)
-    freedom: int = eqx.field(static=True)
+    dof: float = eqx.field(static=True)
     identifiability: Identifiability
     guesses: tuple[ParameterGuess, ...]
     result: int = eqx.field(static=True)
     problem: FitProblem
+
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        return self.cycle.multipliers
+
+    @property
+    def model(self) -> HybridSystem:
+        return self.system
+
+    @property
+    def noise(self) -> None:
+        return None
+
+    @property
+    def covariance_dof(self) -> float:
+        return np.inf if self.weighted else self.dof
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return tuple(self._doubts())
 
     @property
     def weighted(self) -> bool:
@@ -181,7 +206,7 @@ class ModelFit(eqx.Module):
     @property
     def standard_errors(self) -> Float[np.ndarray, " p"]:
         """Standard error of each value; infinite for a parameter that is not identified alone, NaN
-        without standard deviations of the data if `freedom` is 0."""
+        without standard deviations of the data if `dof` is 0."""
         lost = np.any(self.identifiability.unseen != 0, axis=0)
         return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
 
@@ -221,7 +246,7 @@ class ModelFit(eqx.Module):
         r, *_ = evaluate(
             self.problem, self.problem.parameters.encode(values), self.cycle
         )
-        unit = self.problem.unit(self.cost, self.freedom)
+        unit = self.problem.unit(self.cost, self.dof)
         if np.isnan(unit):
             raise DefinitionError(
                 "give `std`: no residual is left to estimate standard errors."
@@ -235,40 +260,44 @@ class ModelFit(eqx.Module):
         """Test whether other values lie in the joint confidence region."""
         rank = max(self.identifiability.rank, 1)
         region = (
-            stats.chi2(rank)
-            if self.weighted
-            else stats.f(rank, self.freedom, scale=rank)
+            stats.chi2(rank) if self.weighted else stats.f(rank, self.dof, scale=rank)
         )
         return bool(self.chi_square(true) <= region.ppf(level))
 
-    def __repr__(self) -> str:
+    def _estimates(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        return self.values, self.standard_errors
+
+    def _summary(self) -> str:
         width = max(map(len, self.names))
         lines = [
-            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})"
+            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
+            self._cost(),
+            "standard errors include noise, but no distortion:",
         ]
-        lines += [self._cost(), "standard errors include noise, but no distortion:"]
         for name, value, error, unit in self._rows():
-            lines.append(
-                f"{name:{width}}  {value:<14} {error} {unit * ('±' in error)}".rstrip()
-            )
-        return "\n  ".join(lines + self._remarks())
+            shown = f"{error} {unit}" if "±" in error else error
+            lines.append(f"{name:{width}}  {value:<14} {shown}".rstrip())
+        return "\n  ".join(lines)
 
-    def _remarks(self) -> list[str]:
-        """Return what is not identified, and bounds that standard errors reach."""
-        remarks = [f"not identified: {x}" for x in self.identifiability.descriptions()]
+    def _doubts(self) -> Iterator[Finding]:
+        """Yield what is not identified, and bounds that standard errors reach."""
+        yield from not_converged(self.result)
+        for combination in self.identifiability.descriptions():
+            yield Finding("not identified", f"{combination}.")
         errors = np.where(np.isfinite(self.standard_errors), self.standard_errors, 0.0)
-        for bounds in (self.problem.parameters.low, self.problem.parameters.high):
-            for k in np.flatnonzero(np.abs(np.asarray(bounds) - self.values) < errors):
-                remarks.append(
-                    f"{self.names[k]} reaches its bound {bounds[k]:g} within its error"
+        parameters = self.problem.parameters
+        for bounds in (np.asarray(parameters.low), np.asarray(parameters.high)):
+            for k in np.flatnonzero(np.abs(bounds - self.values) < errors):
+                text = (
+                    f"{self.names[k]} reaches its bound {bounds[k]:g} within its error."
                 )
-        return remarks
+                yield Finding("a bound", text)
 
     def _cost(self) -> str:
         misfit = (
             f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
         )
-        expected = f"expected {self.freedom}" if self.weighted else misfit
+        expected = f"expected {self.dof:.0f}" if self.weighted else misfit
         good = sum(guess.result == Result.OK for guess in self.guesses)
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"
@@ -286,14 +315,9 @@ class ModelFit(eqx.Module):
             )
             yield name, f"{value:.9g}", shown, unit
 
-    def _repr_html_(self) -> str:
+    def _page(self) -> tuple[str, ...]:
         parameters = table(
             ("parameter", "value", "standard error", "unit"), self._rows()
         )
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
-        return card(
-            "ModelFit",
-            of,
-            parameters,
-            text("\n".join([self._cost(), *self._remarks()])),
-        )
+        return of, parameters, text(self._cost())

@@ -117,12 +117,12 @@ class ObservedHTF(AbstractObservation):
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
         self.delay = None if delay is None else jnp.asarray(delay, float)
-        self.f, self.H, self.sections = htf.f, htf.H, as_family(sections)
-        self.harmonics, self.inputs, self.outputs = (
-            htf.harmonics,
-            htf.inputs,
-            htf.outputs,
-        )
+        self.f = htf.f
+        self.H = htf.H
+        self.sections = as_family(sections)
+        self.harmonics = htf.harmonics
+        self.inputs = htf.inputs
+        self.outputs = htf.outputs
         require_same("HTFs and `sections`", htf, self.sections, ("n_sections",))
         self.weights = jnp.asarray(error_weights(htf, check_values(htf)))
         self.weighted = jnp.asarray(htf.variance is not None)
@@ -180,7 +180,8 @@ class ObservedSeries(AbstractObservation):
         require_same("data and `sections`", data, self.sections, ("n_sections",))
         data.require_ok()
         require_deviations(data.records)
-        self.inputs, self.outputs = data.inputs, data.outputs
+        self.inputs = data.inputs
+        self.outputs = data.outputs
         y = data.y[data.ok]
         self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
         self.weighted = jnp.asarray(std is not None)
@@ -194,7 +195,8 @@ class ObservedSeries(AbstractObservation):
         self.absolute = data.cycle_outputs is not None
         if data.cycle_outputs is not None:
             y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
-        self.u, self.y = jnp.asarray(data.u[data.ok]), jnp.asarray(y)
+        self.u = jnp.asarray(data.u[data.ok])
+        self.y = jnp.asarray(y)
         self.flow = None
 
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
@@ -261,7 +263,8 @@ class ObservedCycle(AbstractObservation):
         """
         self.sections = as_family(sections)
         self.outputs = tuple(outputs)
-        N, ny = self.sections.n_sections, len(self.outputs)
+        N = self.sections.n_sections
+        ny = len(self.outputs)
         given = {
             "values": (values, std, {"sections": N, "outputs": ny}),
             "times": (times, times_std, {"sections": N}),

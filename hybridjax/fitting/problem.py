@@ -286,6 +286,8 @@ def descend(
     Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
 
     The damping is relative to the largest sensitivity, so that units of the residuals do not count.
+    (`scipy.optimize.least_squares` takes 27 evaluations in place of 8 where the data identify only
+    the product of two parameters, and moves along what they do not identify, to 1e17 and 1e-17.)
     The iteration runs on the host, so that only the model is compiled.
     """
     damping, steps = _DAMPING, 1

@@ -1,5 +1,6 @@
+from .fit import Fit as Fit
 from .joint.fit import ldtp_bound as ldtp_bound
-from .joint.realization import realize as realize
 from .loops import loop as loop
 from .multipliers import multiplier_bound as multiplier_bound
+from .rational import fit_rational as fit_rational
 from .transient import remove_transient as remove_transient

@@ -32,12 +32,25 @@ def chi(
     return np.polyval([*c[::-1], 1.0], period_delay)
 
 
+def divided_by_chi(
+    numerators: Inexact[np.ndarray, "*d M R ny nu"],
+    c: Coefficients,
+    f: Float[np.ndarray, " F"],
+    N: int,
+    lead: int = 0,
+) -> Complex[np.ndarray, "*d M F ny nu"]:
+    r"""Return $\sum_r b_m[r] z^{-r} / \chi(z^{-N})$ at frequencies f, with r from -lead on."""
+    delay = np.exp(-2j * np.pi / N * f)
+    powers = delay[:, None] ** (np.arange(numerators.shape[-3]) - lead)
+    values = np.einsum("fr,...mrij->...mfij", powers, numerators)
+    return values / chi(delay**N, c)[:, None, None]
+
+
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by decreasing modulus, of each pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
-    roots = np.pad(
-        roots, (0, len(coefficients) - len(roots))
-    )  # numpy drops roots at zero
+    at_zero = len(coefficients) - len(roots)  # numpy drops these
+    roots = np.pad(roots, (0, at_zero))
     return roots[np.lexsort((-np.imag(roots), -np.abs(roots)))]
 
 
@@ -45,7 +58,7 @@ class Covariance(NamedTuple):
     """A covariance matrix, infinite where nothing is known, and how well it is known."""
 
     matrix: Float[np.ndarray, "d d"]
-    freedom: float
+    dof: float
     """Degrees of freedom that it was estimated with; infinite where it is exact."""
 
     @classmethod
@@ -99,8 +112,9 @@ def in_blocks(
     """Divide the T cycles of each record into blocks, the last one filled up with zeros."""
     S, T, *shape = x.shape
     length = -(-T // count)
-    padding = [(0, 0), (0, count * length - T)] + [(0, 0)] * len(shape)
-    return np.pad(x, padding).reshape(S * count, length, *shape)
+    filled = np.zeros((S, count * length, *shape))
+    filled[:, :T] = x
+    return filled.reshape(S * count, length, *shape)
 
 
 def inverse_of_remainder(
@@ -109,7 +123,7 @@ def inverse_of_remainder(
     """Return (1 - taken)^-power, `taken` being the share of a block's errors that a fit takes."""
     values, vectors = np.linalg.eigh(np.eye(taken.shape[1]) - taken)
     left = np.maximum(values, _SMALLEST_REMAINDER)[:, None] ** power
-    return vectors / left @ vectors.swapaxes(1, 2)
+    return vectors / left @ vectors.mT
 
 
 def block_freedom(
@@ -125,5 +139,5 @@ def block_freedom(
     """
     d = score.shape[1]
     part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(score.T @ score), score) / d
-    normal = np.trace(share, axis1=1, axis2=2) / d
+    normal = np.linalg.trace(share) / d
     return float(1 / max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum()))

@@ -86,45 +86,55 @@ def estimate_htf(
         return htf if harmonics is None else htf.select(harmonics)
     sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())
-    setup, (tried, ran) = sums.setup, sums.experiments
     if len(rows) == 0:
+        tried, ran = sums.experiments
         raise DefinitionError(
             f"no frequency can be estimated from {ran} experiments ({tried - ran} failed): excite "
-            f"each frequency by each of the {len(setup.inputs)} inputs, and multiples of 1/2 with "
-            "two phases."
+            f"each frequency by each of the {len(sums.setup.inputs)} inputs, and multiples of 1/2 "
+            "with two phases."
         )
-    f, lines = sums.f[rows], _solve_lines(sums, rows)
+    lines = _solve_lines(sums, rows)
     why_not = _why_not_total(sums, rows)
-    if variance == "total" and why_not:
-        raise DefinitionError(why_not)
-    if variance == "total" and (lines.realizations < 1).any():
-        raise DefinitionError(
-            f"a single realization, as at f = {f[lines.realizations < 1][0]:.10g}, does not show "
-            "distortion: apply several (`Design.realizations`), or pass variance='noise'."
-        )
-    total, noise, scatter = lines.noise, None, None
+    if variance == "total":
+        _require_total(why_not, sums.f[rows], lines.realizations)
+    total = lines.noise
+    noise = None
+    scatter = None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
-        total, noise = lines.total, lines.noise
-        shared = lines.realizations.sum()
-        freedom = np.where(lines.realizations < 1, shared, lines.realizations).astype(
-            float
-        )
-        scatter = Scatter(freedom, _roundness(sums, rows, lines.H))
+        total = lines.total
+        noise = lines.noise
+        every = lines.realizations.sum()
+        freedom = np.where(lines.realizations < 1, every, lines.realizations)
+        scatter = Scatter(freedom.astype(float), _roundness(sums, rows, lines.H))
     elif lines.noise is not None:
         scatter = Scatter(sums.count[rows] * (repeats - 1.0))
     return HTF(
-        f,
+        sums.f[rows],
         lines.H,
         sums.harmonics,
-        setup.n_sections,
-        setup.inputs,
-        setup.outputs,
+        sums.setup.n_sections,
+        sums.setup.inputs,
+        sums.setup.outputs,
         "estimate",
         variance=total,
         noise_variance=noise,
         scatter=scatter,
         power=lines.power,
     )
+
+
+def _require_total(
+    why_not: str, f: Float[np.ndarray, " F"], realizations: Int[np.ndarray, " F"]
+) -> None:
+    """**Raises:** `DefinitionError` if the scatter of realizations does not show distortion."""
+    if why_not:
+        raise DefinitionError(why_not)
+    single = realizations < 1
+    if single.any():
+        raise DefinitionError(
+            f"a single realization, as at f = {f[single][0]:.10g}, does not show distortion: apply "
+            "several (`Design.realizations`), or pass variance='noise'."
+        )
 
 
 class _LineEstimates(NamedTuple):
@@ -149,32 +159,44 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
     variance of H is their mean square times the diagonal of the inverse of the normal matrix. The
     noise of each experiment, from repeated windows, is propagated in the same way.
     """
-    nu, shape = len(sums.setup.inputs), sums.energy.shape[1:]
+    nu = len(sums.setup.inputs)
+    shape = sums.energy.shape[1:]
+    mirrored = sums.mirrored[rows]
     H = np.zeros((len(rows), nu, *shape), complex)
-    spread, residual = np.zeros((len(rows), nu)), np.zeros((len(rows), *shape))
-    for mirrored, unknowns in ((False, nu), (True, 2 * nu)):
-        entries = np.flatnonzero(sums.mirrored[rows] == mirrored)
+    spread = np.zeros((len(rows), nu))
+    residual = np.zeros((len(rows), *shape))
+    for entries, unknowns in (
+        (np.flatnonzero(~mirrored), nu),
+        (np.flatnonzero(mirrored), 2 * nu),
+    ):
         lines = rows[entries]
         right = sums.along[lines, :unknowns]
         inverse = np.linalg.inv(sums.gram[lines, :unknowns, :unknowns])
         solution = np.einsum("kij,kjml->kiml", inverse, right)
-        H[entries] = solution[:, :nu]
-        spread[entries] = np.einsum("kii->ki", inverse).real[:, :nu]
         explained = np.einsum("kiml,kiml->kml", solution.conj(), right).real
+        H[entries] = solution[:, :nu]
+        spread[entries] = np.linalg.diagonal(inverse).real[:, :nu]
         residual[entries] = np.maximum(sums.energy[lines] - explained, 0)
 
     def variance(square):
-        return (square[:, None] * spread[:, :, None, None]).transpose(2, 0, 3, 1)
+        by_input = square[:, None] * spread[:, :, None, None]
+        return by_input.transpose(2, 0, 3, 1)
 
     count = sums.count[rows]
-    realizations = count - np.where(sums.mirrored[rows], 2 * nu, nu)
+    realizations = count - np.where(mirrored, 2 * nu, nu)
+    single = realizations < 1
     mean = residual / np.maximum(realizations, 1)[:, None, None]
-    mean[realizations < 1] = residual.sum(axis=0) / max(realizations.sum(), 1)
-    noise = (
-        variance(sums.noise[rows] / count[:, None, None]) if sums.repeats > 1 else None
+    mean[single] = residual.sum(axis=0) / max(realizations.sum(), 1)
+    noise = None
+    if sums.repeats > 1:
+        noise = variance(sums.noise[rows] / count[:, None, None])
+    return _LineEstimates(
+        H=H.transpose(2, 0, 3, 1),
+        realizations=realizations,
+        total=variance(mean),
+        noise=noise,
+        power=1 / spread,
     )
-    H = H.transpose(2, 0, 3, 1)
-    return _LineEstimates(H, realizations, variance(mean), noise, 1 / spread)
 
 
 def _roundness(
@@ -191,10 +213,9 @@ def _roundness(
     shared = (gram * ~np.eye(nu, dtype=bool)).any()
     if shared or sums.mirrored[rows].any() or sums.count.max() > _FEW_REALIZATIONS:
         return None
-    power = np.einsum("kii->ki", gram).real[None, :, None]
-    energy, turned = (
-        x[rows].transpose(2, 0, 3, 1) for x in (sums.energies, sums.turned)
-    )
+    power = np.linalg.diagonal(gram).real[None, :, None]
+    energy = sums.energies[rows].transpose(2, 0, 3, 1)
+    turned = sums.turned[rows].transpose(2, 0, 3, 1)
     square = energy - np.abs(H) ** 2 * power
     square = np.where(square > ROUNDING * energy, square, 0.0)
     return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
@@ -222,9 +243,8 @@ def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
     """Return the reason why the scatter over experiments is not that over random phases, if any."""
     nu = len(sums.setup.inputs)
     gram = sums.gram[rows]
-    power, square = (
-        np.einsum("kii->k", x) for x in (gram[:, :nu, :nu], gram[:, nu:, :nu])
-    )
+    power = np.linalg.trace(gram[:, :nu, :nu])
+    square = np.linalg.trace(gram[:, nu:, :nu])
     several = sums.count[rows] > nu
     # |sum of U^2| is the sum of |U|^2 where all phases are the same.
     alike = several & (np.abs(square) > (1 - SILENT_LINE) * power.real)

@@ -16,20 +16,22 @@ $M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$, n the number of rows of 
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.arguments import require_among, require_same
+from .._core.arguments import require_among
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.algebra import Lines
 from ..linear.frequency_response import check_harmonics
 from ..linear.htf import HTF, Scatter
-from .spectral_sums import SILENT_LINE, Experiments, Setup
+from .descent import positive
+from .spectral_sums import SILENT_LINE, Experiments, Setup, parts_of
 
 
 # Smallest singular value of the inputs' answer to the references, relative to the largest, with
@@ -76,14 +78,17 @@ def in_loop(
     records = uninterrupted_records(data)
     names = records[0].inputs
     roles = Roles.of(names, reference)
-    require_loop(roles, [r.u for r in records], names)
-    inputs, references = (tuple(names[i] for i in columns) for columns in roles)
-    plant, drive = [], []
-    for r in records:
-        u, ref = r.u[:, roles.inputs], r.u[:, roles.references]
-        plant.append(dataclasses.replace(r, u=u, inputs=inputs))
+    require_loop(roles, [record.u for record in records], names)
+    inputs = tuple(names[i] for i in roles.inputs)
+    references = tuple(names[i] for i in roles.references)
+    plant = []
+    drive = []
+    for record in records:
+        u = record.u[:, roles.inputs]
+        r = record.u[:, roles.references]
+        plant.append(dataclasses.replace(record, u=u, inputs=inputs))
         drive.append(
-            dataclasses.replace(r, u=ref, y=u, inputs=references, outputs=inputs)
+            dataclasses.replace(record, u=r, y=u, inputs=references, outputs=inputs)
         )
     return plant, drive
 
@@ -92,12 +97,11 @@ def require_loop(
     roles: Roles, signals: Sequence[np.ndarray], names: Sequence[str]
 ) -> None:
     """**Raises:** `DefinitionError` for an input that is its reference: there is no loop then."""
-    for i in roles.inputs:
-        for k in roles.references:
-            if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
-                raise DefinitionError(
-                    f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
-                )
+    for i, k in itertools.product(roles.inputs, roles.references):
+        if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
+            raise DefinitionError(
+                f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
+            )
 
 
 class Sums(NamedTuple):
@@ -115,36 +119,46 @@ class Sums(NamedTuple):
     def rows(self, names: Sequence[str]) -> Int[np.ndarray, " a"]:
         """Return the rows of signals, for all components."""
         signals = [*self.setup.outputs, *self.setup.inputs]
-        columns = np.array([signals.index(x) for x in names], int)
-        return np.add.outer(
-            np.arange(self.setup.n_sections) * len(signals), columns
-        ).ravel()
+        columns = np.array([signals.index(name) for name in names], int)
+        components = np.arange(self.setup.n_sections) * len(signals)
+        return np.add.outer(components, columns).ravel()
+
+    def plus(self, more: "Sums") -> "Sums":
+        """Return the sums over both sets of experiments."""
+        return self._replace(
+            total=self.total + more.total,
+            between=self.between + more.between,
+            experiments=self.experiments + more.experiments,
+        )
 
 
 def spectral_products(
     data: ExperimentData, repeats: int, like: Sums | None = None
 ) -> Sums:
-    N, P = data.n_sections, data.periods
+    N = data.n_sections
+    P = data.periods
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]
-    size = np.linalg.norm(z, axis=(0, 1))
-    unit = like.unit if like else np.where(size > 0, size, 1.0)
-    z = z / unit
+    if like is None:
+        size = np.linalg.norm(z, axis=(0, 1))
+        unit = positive(size)
+    else:
+        unit = like.unit
     bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
-    spectra = np.stack(
-        [np.fft.fft(z[:, w], axis=1)[:, bins] for w in data.windows(repeats)]
-    )
+    windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
+    spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
     spectra = np.moveaxis(spectra, 1, 4)
     spectra = spectra.reshape(*spectra.shape[:2], -1, spectra.shape[4])
     mean = spectra.sum(axis=0) / repeats
     apart = spectra - mean
-    between = (
-        (apart @ apart.conj().swapaxes(2, 3)).sum(axis=0)
-        / max(repeats - 1, 1)
-        / repeats
+    scatter = (apart @ apart.conj().mT).sum(axis=0)
+    return Sums(
+        total=mean @ mean.conj().mT,
+        between=scatter / max(repeats - 1, 1) / repeats,
+        experiments=len(z),
+        setup=Setup.of(data),
+        unit=unit,
     )
-    setup = Setup(N, P, data.inputs, data.outputs)
-    return Sums(mean @ mean.conj().swapaxes(1, 2), between, len(z), setup, unit)
 
 
 def htf_by_reference(
@@ -160,23 +174,20 @@ def htf_by_reference(
     lines, or the inputs do not answer them.
     """
     total = None
-    for part in [data] if isinstance(data, ExperimentData) else data:
+    for part in parts_of(data):
         roles = Roles.of(part.inputs, reference)
         require_loop(roles, [part.u], part.inputs)
         sums = spectral_products(part, repeats, total)
-        if total is not None:
-            require_same("experiments", total, sums, ("setup",))
-            both = (total.total + sums.total, total.between + sums.between)
-            sums = Sums(*both, total.experiments + sums.experiments, *sums[3:])
-        total = sums
+        total = sums if total is None else total.plus(sums)
     if total is None or not total.experiments:
         raise DefinitionError(
             "`data` holds no experiment that ran well: see `data.summary()`."
         )
-    inputs, references = (tuple(total.setup.inputs[i] for i in part) for part in roles)
-    return solve(
-        total, total.setup.outputs, inputs, references, (repeats, variance), threshold
-    )
+    names = total.setup.inputs
+    inputs = tuple(names[i] for i in roles.inputs)
+    references = tuple(names[i] for i in roles.references)
+    how = (repeats, variance)
+    return solve(total, total.setup.outputs, inputs, references, how, threshold)
 
 
 def excited_classes(
@@ -187,7 +198,7 @@ def excited_classes(
     **Raises:** `DefinitionError` if there is none.
     """
     power = sums.total[:, r[:, None], r]
-    size = np.sqrt(np.einsum("kii->ki", power).real)
+    size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
     least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
@@ -195,10 +206,12 @@ def excited_classes(
     if whole.any():
         return np.flatnonzero(whole)
     best = int(strong.sum(axis=1).argmax())
+    least_size = SILENT_LINE * size.max() ** 2
+    apart = int(np.linalg.matrix_rank(power[best], least_size, True))
     raise DefinitionError(
         f"the reference excites too little: at f = {best / sums.setup.periods:g} + integers it "
-        f"tells {int(np.linalg.matrix_rank(power[best], SILENT_LINE * size.max() ** 2, True))} of "
-        f"{len(r)} components apart. Excite all lines up to N/2, or use `fit_ldtp(reference=)`."
+        f"tells {apart} of {len(r)} components apart. Excite all lines up to N/2, or use "
+        "`fit_ldtp(reference=)`."
     )
 
 
@@ -214,54 +227,47 @@ def solve(
 
     **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
     """
+    N = sums.setup.n_sections
+    P = sums.setup.periods
+    repeats, kind = how
     y, u, r = map(sums.rows, (outputs, inputs, references))
-    unit = np.tile(sums.unit, sums.setup.n_sections)
-    unit = unit[y][:, None] / unit[u]
-    classes, (N, P, *_) = excited_classes(sums, r, threshold), sums.setup
-    G, (repeats, kind) = sums.total[classes], how
+    sizes = np.tile(sums.unit, N)
+    unit = sizes[y][:, None] / sizes[u]
+    classes = excited_classes(sums, r, threshold)
+    G = sums.total[classes]
 
     def block(rows, columns, G=G):
         return G[:, rows[:, None], columns]
 
     to_r = np.linalg.solve(block(r, r), block(r, u))  # (R R*)^-1 R U*
     power = block(u, r) @ to_r
-    size = np.linalg.svd(power, compute_uv=False)
-    drive = np.linalg.svd(block(r, r), compute_uv=False)[:, 0]
-    weak = size[:, -1] < _ANSWERS**2 * np.maximum(size[:, 0], SILENT_LINE * drive)
-    if weak.any():
-        raise DefinitionError(
-            f"the references do not move each input: singular values of T_ur at f = "
-            f"{classes[weak][0] / P:g} + integers fall to "
-            f"{np.sqrt(size[weak][0, -1] / size[weak][0, 0]):.1e} of the largest. Choose others."
-        )
-    H = (
-        np.linalg.solve(power, to_r.conj().swapaxes(1, 2) @ block(r, y))
-        .conj()
-        .swapaxes(1, 2)
-    )
+    _require_answers(power, block(r, r), classes / P)
+    along = _adjoint(to_r) @ block(r, y)
+    H = _adjoint(np.linalg.solve(power, along))
     spread = np.linalg.inv(power)
+    by_input = _diagonal(spread)
 
     def variance(G, rows):
-        cross = block(y, u, G) @ H.conj().swapaxes(1, 2)
-        square = block(y, y, G) - cross - cross.conj().swapaxes(1, 2)
-        square = square + H @ block(u, u, G) @ H.conj().swapaxes(1, 2)
-        mean = np.maximum(np.einsum("kii->ki", square).real, 0)[:, :, None] / rows
-        return mean * np.einsum("kii->ki", spread).real[:, None]
+        """Return the variances of H for errors Y - H U with these products, of so many rows."""
+        cross = block(y, u, G) @ _adjoint(H)
+        square = block(y, y, G) - cross - _adjoint(cross)
+        square = square + H @ block(u, u, G) @ _adjoint(H)
+        mean = np.maximum(_diagonal(square), 0)[:, :, None] / rows
+        return mean * by_input[:, None]
 
     freedom = np.full(len(classes), float(sums.experiments - len(u)))
-    total = noise = None
+    total = None
+    noise = None
     if kind != "noise" and freedom[0] > 0:
         # The error of P multiplies all of U in E, of which the references explain only a part. The
         # other part adds errors of entries of P to E: of one at the edge of its disc, where they
         # count three times, and of all others, whose scatter takes degrees of freedom.
         left = spread @ block(u, u) - np.eye(len(u))
-        edge = (
-            np.einsum("kij,kji->ki", left, spread).real
-            / np.einsum("kii->ki", spread).real
-        )
-        rows = freedom + np.einsum("kii->k", left).real
+        edge = _diagonal(left @ spread) / by_input
+        rows = freedom + _diagonal(left).sum(axis=1)
         total = variance(G, rows[:, None, None] + 2 * edge[:, None])
-        freedom = 1 / (1 / freedom + np.einsum("kij,kji->k", left, left).real / rows**2)
+        taken = _diagonal(left @ left).sum(axis=1) / rows**2
+        freedom = 1 / (1 / freedom + taken)
     if repeats > 1:
         noise = variance(sums.between[classes], sums.experiments)
     if kind == "total" and total is None:
@@ -270,19 +276,23 @@ def solve(
             "several realizations (`Design.realizations`), or pass variance='noise'."
         )
     if total is None:
-        total, noise = noise, None
+        total = noise
+        noise = None
         freedom[:] = sums.experiments * (repeats - 1)
 
-    f = (classes[:, None] + P * np.arange(N)) / P
-    f = np.unique(np.round(P * np.abs((f + N / 2) % N - N / 2)).astype(int)) / P
+    every = (classes[:, None] + P * np.arange(N)) / P
+    nearest = np.abs((every + N / 2) % N - N / 2)
+    f = np.unique(np.round(P * nearest).astype(int)) / P
     lines = Lines.of(f, N)
 
     def entries(x):
         return None if x is None else lines.entries(x * unit**2).real
 
-    by_line = np.zeros(len(f))
-    by_line[lines.row] = freedom[:, None]
-    scatter = None if total is None else Scatter(by_line, shared=True)
+    scatter = None
+    if total is not None:
+        by_line = np.zeros(len(f))
+        by_line[lines.row] = freedom[:, None]
+        scatter = Scatter(by_line, shared=True)
     return HTF(
         f,
         lines.entries(H * unit),
@@ -295,3 +305,33 @@ def solve(
         noise_variance=entries(noise),
         scatter=scatter,
     )
+
+
+def _require_answers(
+    power: Complex[np.ndarray, "k u u"],
+    reference: Complex[np.ndarray, "k r r"],
+    f: Float[np.ndarray, " k"],
+) -> None:
+    """**Raises:** `DefinitionError` if the references do not move each input.
+
+    **Arguments:** `power`: of the inputs' answers. `reference`: of the references.
+    """
+    size = np.linalg.svd(power, compute_uv=False)
+    drive = np.linalg.svd(reference, compute_uv=False)[:, 0]
+    largest = np.maximum(size[:, 0], SILENT_LINE * drive)
+    weak = size[:, -1] < _ANSWERS**2 * largest
+    if weak.any():
+        first = size[weak][0]
+        raise DefinitionError(
+            f"the references do not move each input: singular values of T_ur at f = "
+            f"{f[weak][0]:g} + integers fall to {np.sqrt(first[-1] / first[0]):.1e} of the "
+            "largest. Choose others."
+        )
+
+
+def _adjoint(x: Complex[np.ndarray, "k a b"]) -> Complex[np.ndarray, "k b a"]:
+    return x.conj().mT
+
+
+def _diagonal(x: Complex[np.ndarray, "k a a"]) -> Float[np.ndarray, "k a"]:
+    return np.linalg.diagonal(x).real

@@ -1,7 +1,5 @@
 """Plant, controller, loop and sensitivity from experiments with a loop at work."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 
@@ -13,6 +11,9 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..linear.htf import HTF
 from .instrument import Roles, Sums, require_loop, solve, spectral_products
+
+
+Names = tuple[str, ...]
 
 
 class Loop(eqx.Module):
@@ -34,14 +35,12 @@ class Loop(eqx.Module):
     missing: tuple[str, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        htfs = {
-            x: getattr(self, x)
-            for x in ("plant", "controller", "closed", "sensitivity")
-        }
-        lines = [
-            folded(f"  {name:11} {htf!r}", "  ") for name, htf in htfs.items() if htf
-        ]
-        return "\n".join(["Loop", *lines, *(f"  {text}" for text in self.missing)])
+        lines = ["Loop"]
+        for name in ("plant", "controller", "closed", "sensitivity"):
+            htf = getattr(self, name)
+            if htf is not None:
+                lines.append(folded(f"  {name:11} {htf!r}", "  "))
+        return "\n".join([*lines, *(f"  {text}" for text in self.missing)])
 
 
 @checked
@@ -72,7 +71,8 @@ def loop(
     too few of them, equal to an input, or those that excite too little.
     """
     require_x64()
-    r, d = at_input or (), at_output or ()
+    r = at_input or ()
+    d = at_output or ()
     if not (r or d):
         raise DefinitionError(
             "`loop` needs references: name those that enter at the plant's input "
@@ -80,38 +80,47 @@ def loop(
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)
     require_loop(roles, [data.u], data.inputs)
-    u, y = [data.inputs[i] for i in roles.inputs], data.outputs
-    for what, given, needed in (("at_input", r, u), ("at_output", d, y)):
-        if given and len(given) < len(needed):
-            raise DefinitionError(
-                f"`{what}` needs {len(needed)} references, one for each of {', '.join(needed)}, "
-                f"not {len(given)}."
-            )
+    u = tuple(data.inputs[i] for i in roles.inputs)
+    y = data.outputs
+    _require_references("at_input", r, u)
+    _require_references("at_output", d, y)
     products = spectral_products(data, repeats)
 
-    def estimate(
-        outputs: Sequence[str], inputs: Sequence[str], reference: Sequence[str]
-    ) -> HTF:
-        sums = _without(
-            products, products.rows([x for x in (*r, *d) if x not in reference])
-        )
-        return solve(sums, tuple(outputs), tuple(inputs), reference, (repeats, "auto"))
+    def estimate(outputs: Names, inputs: Names, reference: Names) -> HTF:
+        others = [name for name in (*r, *d) if name not in reference]
+        sums = _without(products, products.rows(others))
+        return solve(sums, outputs, inputs, reference, (repeats, "auto"))
 
-    plant = estimate(y, u, r) if r else None
+    plant = None
     controller = None
+    missing = []
+    if r:
+        plant = estimate(y, u, r)
+    else:
+        missing.append(
+            "The plant is not estimated: this needs experiments with a reference that is added to "
+            "its input (a push, an injected current)."
+        )
     if d:
         controller = estimate(u, y, d)
         controller = eqx.tree_at(lambda x: x.H, controller, -controller.H)
-    text = "The {} is not estimated: this needs experiments with a reference that is added to its "
-    missing = (
-        [] if r else [f"{text.format('plant')}input (a push, an injected current)."]
-    )
-    end = "measured signal y (a moved scene, an offset)."
-    missing += [] if d else [text.format("controller") + end]
-    first = r or d
-    answer, entered = (y, u) if r else (u, y)
-    closed, sensitivity = (estimate(x, first, first) for x in (answer, entered))
+    else:
+        missing.append(
+            "The controller is not estimated: this needs experiments with a reference that is "
+            "added to its measured signal y (a moved scene, an offset)."
+        )
+    closed = estimate(y, r, r) if r else estimate(u, d, d)
+    sensitivity = estimate(u, r, r) if r else estimate(y, d, d)
     return Loop(plant, controller, closed, sensitivity, tuple(missing))
+
+
+def _require_references(what: str, given: Names, needed: Names) -> None:
+    """**Raises:** `DefinitionError` for some references that are too few."""
+    if given and len(given) < len(needed):
+        raise DefinitionError(
+            f"`{what}` needs {len(needed)} references, one for each of {', '.join(needed)}, "
+            f"not {len(given)}."
+        )
 
 
 def _without(sums: Sums, rows: np.ndarray) -> Sums:

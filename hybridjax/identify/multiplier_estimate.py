@@ -1,6 +1,5 @@
 """Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
 
-import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Annotated
@@ -13,12 +12,14 @@ from .._core.arguments import Numbers, require_index
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
 from .._core.boundary.values import Complexes
-from .._core.html import card, multiplier_table, text, unit_circle
+from .._core.findings import Finding
+from .._core.html import multiplier_table, text, unit_circle
 from .._core.results import Result
 from .._core.text import folded
-from ..errors import DefinitionError, FindingWarning
+from ..errors import DefinitionError
 from .denominator import Covariance, multipliers_of
-from .descent import Coefficients
+from .descent import Coefficients, positive
+from .fit import Fit
 
 
 Multipliers = Annotated[Numbers, Complexes()]
@@ -26,6 +27,9 @@ Multipliers = Annotated[Numbers, Complexes()]
 
 RoughFit = tuple[Coefficients, Callable[[], Covariance]]
 """Coefficients, and a function for their covariance."""
+
+# Points of the border of a confidence region. Fewer: corners show; more: figures grow.
+_BORDER_POINTS = 100
 
 
 class MultiplierComparison(eqx.Module):
@@ -53,15 +57,13 @@ class MultiplierComparison(eqx.Module):
         return float(np.max(self.error))
 
     def __repr__(self) -> str:
-        width = max(map(len, self.outputs), default=-2) + 2
+        labels = [f"{name}  " for name in self.outputs] or [""] * len(self.true)
+        width = max(map(len, labels))
         rows = [" " * width + f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
-        names = self.outputs or [""] * len(self.true)
-        pairs = zip(names, self.true, self.estimated, self.error, strict=True)
-        for name, true, estimated, error in pairs:
-            label = f"{name:>{width - 2}}  " if width else ""
-            rows.append(
-                f"{label}{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}"
-            )
+        pairs = zip(labels, self.true, self.estimated, self.error, strict=True)
+        for label, true, estimated, error in pairs:
+            numbers = f"{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}"
+            rows.append(f"{label:>{width}}{numbers}")
         return "\n".join(rows)
 
 
@@ -77,36 +79,37 @@ def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComp
     """
     from scipy.optimize import linear_sum_assignment  # (a third of a second)
 
-    values, truth = (
-        np.asarray(estimated, complex).ravel(),
-        np.asarray(true, complex).ravel(),
-    )
+    values = np.asarray(estimated, complex).ravel()
+    truth = np.asarray(true, complex).ravel()
     if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
-    order = np.lexsort((-np.imag(truth[columns]), -np.abs(truth[columns])))
-    return MultiplierComparison(
-        true=truth[columns][order], estimated=values[rows][order]
-    )
+    paired_values = values[rows]
+    paired_truth = truth[columns]
+    order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
+    return MultiplierComparison(paired_truth[order], paired_values[order])
 
 
-class MultiplierEstimate(eqx.Module):
-    r"""Multipliers and their uncertainty: the part that all fits with the denominator $\chi$ share.
+class MultiplierFit(Fit):
+    r"""The part that all fits with the denominator $\chi$ share.
 
-    **Fields:**
+    **Fields** beside those of every `Fit`:
 
     - `multipliers` (d,): by decreasing modulus, the roots of
       $p(\lambda) = \lambda^d + c_1 \lambda^{d-1} + \ldots + c_d$.
     - `coefficients` (d,): c_1 to c_d, real.
     - `covariance` (d, d): that of the coefficients, infinite where it is unknown, estimated with
-      `covariance_freedom` degrees of freedom (infinite where it is exact). All standard errors and
+      `covariance_dof` degrees of freedom (infinite where it is exact). All standard errors and
       confidence regions follow from it.
     """
 
     multipliers: Complex[np.ndarray, " d"]
     coefficients: Float[np.ndarray, " d"]
     covariance: Float[np.ndarray, "d d"]
-    covariance_freedom: float = eqx.field(static=True)
+    covariance_dof: float = eqx.field(static=True)
+    dof: float = eqx.field(static=True, kw_only=True, default=np.inf)
+    result: int = eqx.field(static=True, kw_only=True, default=int(Result.OK))
+    findings: tuple[Finding, ...] = eqx.field(kw_only=True, default=())
 
     @property
     def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:
@@ -121,18 +124,29 @@ class MultiplierEstimate(eqx.Module):
             return np.full((d, 2, 2), np.inf)
         powers = self.multipliers[:, None] ** np.arange(d - 1, -1, -1)
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
+        is_real = np.imag(self.multipliers) == 0
+        # The slope is zero where two multipliers coincide.
         with np.errstate(all="ignore"):
             gradient = -powers / slope[:, None]
-        real = np.imag(self.multipliers) == 0
-        parts = np.stack(
-            [gradient.real, np.where(real[:, None], 0.0, gradient.imag)], axis=1
-        )
-        return np.einsum("iaj,jk,ibk->iab", parts, self.covariance, parts)
+            imaginary = np.where(is_real[:, None], 0.0, gradient.imag)
+            parts = np.stack([gradient.real, imaginary], axis=1)
+            return parts @ self.covariance @ parts.mT
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
         """Root of the expected squared distance of each multiplier from the true one."""
-        return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
+        return np.sqrt(np.linalg.trace(self.multiplier_covariances))
+
+    def _estimates(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """Return the moduli and their standard errors."""
+        modulus = self.modulus
+        if not np.isfinite(self.covariance).all():
+            return modulus, np.full(len(modulus), np.inf)
+        along = self.multipliers / positive(modulus)
+        outward = np.stack([along.real, along.imag], axis=1)[:, :, None]
+        with np.errstate(all="ignore"):
+            variance = outward.mT @ self.multiplier_covariances @ outward
+        return modulus, np.sqrt(variance[:, 0, 0])
 
     @checked
     def distance(self, true: Multipliers) -> Float[np.ndarray, " k"]:
@@ -147,22 +161,22 @@ class MultiplierEstimate(eqx.Module):
         truth = np.atleast_1d(np.asarray(true, complex)).ravel()
         if not np.isfinite(self.covariance).all():
             return np.zeros(len(truth))
-        powers = truth[:, None] ** np.arange(len(self.coefficients), -1, -1)
-        value = powers @ np.concatenate([[1.0], self.coefficients])
-        out = np.empty(len(truth))
-        for i, z in enumerate(truth):
-            equations = 1 if z.imag == 0 else 2
-            rows = np.array([powers[i, 1:].real, powers[i, 1:].imag])[:equations]
-            p = np.array([value[i].real, value[i].imag])[:equations]
-            cov = rows @ self.covariance @ rows.T
-            # Scaled, since a tiny multiplier makes one of the two equations tiny.
-            scale = np.sqrt(np.diag(cov))
-            if not (scale > 0).all():
-                out[i] = np.inf if p.any() else 0.0
-                continue
-            p, cov = p / scale, cov / scale / scale[:, None]
-            out[i] = p @ np.linalg.lstsq(cov, p)[0]
-        return out
+        return np.array([self._distance_of(z) for z in truth])
+
+    def _distance_of(self, multiplier: complex) -> float:
+        powers = multiplier ** np.arange(len(self.coefficients), -1, -1)
+        value = powers @ [1.0, *self.coefficients]
+        equations = 1 if multiplier.imag == 0 else 2
+        slopes = np.array([powers[1:].real, powers[1:].imag])[:equations]
+        missed = np.array([value.real, value.imag])[:equations]
+        covariance = slopes @ self.covariance @ slopes.T
+        # Scaled, since a tiny multiplier makes one of the two equations tiny.
+        scale = np.sqrt(np.diag(covariance))
+        if not (scale > 0).all():
+            return np.inf if missed.any() else 0.0
+        missed = missed / scale
+        correlation = covariance / np.outer(scale, scale)
+        return float(missed @ np.linalg.lstsq(correlation, missed)[0])
 
     @checked
     def contains(
@@ -173,9 +187,8 @@ class MultiplierEstimate(eqx.Module):
         A conjugate pair is one hypothesis, not two.
         """
         truth = np.atleast_1d(np.asarray(true, complex)).ravel()
-        return self.distance(truth) <= self._radius(
-            level, np.where(np.imag(truth) == 0, 1, 2)
-        )
+        equations = np.where(np.imag(truth) == 0, 1, 2)
+        return self.distance(truth) <= self._radius(level, equations)
 
     @checked
     def ellipse(
@@ -189,13 +202,12 @@ class MultiplierEstimate(eqx.Module):
         **Raises:** `DefinitionError` for an index that is not there.
         """
         require_index("multiplier", index, len(self.multipliers))
-        degrees = 1 if self.multipliers[index].imag == 0 else 2
+        equations = 1 if self.multipliers[index].imag == 0 else 2
         values, vectors = np.linalg.eigh(self.multiplier_covariances[index])
-        angle = np.linspace(0, 2 * np.pi, 100)
-        circle = np.sqrt(np.maximum(values, 0))[:, None] * np.stack(
-            [np.cos(angle), np.sin(angle)]
-        )
-        x, y = np.sqrt(self._radius(level, degrees)) * (vectors @ circle)
+        axes = vectors * np.sqrt(np.maximum(values, 0))
+        angle = np.linspace(0, 2 * np.pi, _BORDER_POINTS)
+        circle = np.stack([np.cos(angle), np.sin(angle)])
+        x, y = np.sqrt(self._radius(level, equations)) * (axes @ circle)
         return self.multipliers[index] + x + 1j * y
 
     @checked
@@ -203,82 +215,102 @@ class MultiplierEstimate(eqx.Module):
         """Pair the multipliers with the true ones; printing the result shows a table."""
         return compare_multipliers(self.multipliers, true)
 
-    def contradiction(
-        self, others: Iterable[Callable[[], RoughFit]], drift: str = ""
-    ) -> str:
-        """Return a sentence if the data do not determine the multipliers, or another fit
-        contradicts them; else "".
+    def contradicted_by(
+        self, others: Iterable[Callable[[], RoughFit]], level: float = 0.95
+    ) -> int | None:
+        """Return the order of the first other fit that contradicts this one; None if none does.
 
         It does if a multiplier is outside of its confidence regions, and its nearest one outside of
         those of this fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more
         that are too low pass. Drift moves multipliers further: regions of 99.9 % notice it.)
 
-        **Arguments:** `others`: the fits; a `DefinitionError` means too few data. `drift`: the
-        sentence, for fits that allow for drift. Default: a sentence about their order.
+        **Arguments:** `others`: the fits; a `DefinitionError` means too few data.
         """
-        if not np.isfinite(self.covariance).all():
-            return "the data do not determine all multipliers, some may be spurious: fit fewer"
-        level = 0.999 if drift else 0.95
         for fit in others:
             with suppress(DefinitionError):
-                c, covariance = fit()
-                multipliers = multipliers_of(c)
-                near = np.abs(multipliers - self.multipliers[:, None]).argmin(axis=1)
-                moved = ~self.contains(multipliers[near], level)
+                coefficients, covariance = fit()
+                multipliers = multipliers_of(coefficients)
+                apart = np.abs(multipliers - self.multipliers[:, None])
+                moved = ~self.contains(multipliers[apart.argmin(axis=1)], level)
                 if not moved.any():
                     continue
-                other = MultiplierEstimate(multipliers, c, *covariance())
+                other = MultiplierEstimate(multipliers, coefficients, *covariance())
                 if (moved & ~other.contains(self.multipliers, level)).any():
-                    # (No numbers: those of a few iterations may be far from those of a fit.)
-                    order = f"`order` may be too low: order {len(c)} gives other multipliers"
-                    return drift or f"{order}; compare both fits"
-        return ""
+                    return len(coefficients)
+        return None
 
-    def __repr__(self) -> str:
+    def undetermined(self) -> list[Finding]:
+        """Return a finding if the data do not determine the multipliers."""
+        if np.isfinite(self.covariance).all():
+            return []
+        text = "the data do not determine all multipliers, some may be spurious: fit fewer."
+        return [Finding("undetermined", text)]
+
+    def order_doubts(self, higher: Iterable[Callable[[], RoughFit]]) -> list[Finding]:
+        """Return a finding if the data do not determine the multipliers, or if fits of a higher
+        order contradict them."""
+        unknown = self.undetermined()
+        if unknown:
+            return unknown
+        order = self.contradicted_by(higher)
+        if order is None:
+            return []
+        # (No numbers: those of a few iterations may be far from those of a fit.)
+        text = f"`order` may be too low: order {order} gives other multipliers; compare both fits."
+        return [Finding("order", text)]
+
+    def _summary(self) -> str:
         about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))
         return folded(f"{type(self).__name__}({about})")
 
-    def _repr_html_(self) -> str:
-        if getattr(self, "result", Result.OK) != Result.OK:
-            return card(type(self).__name__, "", text(repr(self)))
+    def _page(self) -> tuple[str, ...]:
+        if self.result != Result.OK:
+            return "", text(self._summary())
         regions = []
         if np.isfinite(self.multiplier_covariances).all():
             regions = [self.ellipse(k) for k in range(len(self.multipliers))]
         shown = multiplier_table(self.multipliers, self.standard_errors)
         circle = unit_circle(self.multipliers, regions)
-        return card(type(self).__name__, "", shown, circle, text(self._about()))
+        return "", shown, circle, text(self._about())
 
     def _about(self) -> str:
-        """The rest of a `repr`, after the multipliers."""
+        """The rest of a summary, after the multipliers."""
         return ""
 
     def show_multipliers(self) -> str:
         """Return the multipliers of a minimum and their standard errors, for a `repr`."""
-        if (code := getattr(self, "result", Result.OK)) != Result.OK:
-            return f"no multipliers: {Result(code).message} (`multipliers` holds its last step)"
+        if self.result != Result.OK:
+            reason = Result(self.result).message
+            return f"no multipliers: {reason} (`multipliers` holds its last step)"
         shown = (
-            f"{x.real:+.7f}{f'{x.imag:+.7f}i' if x.imag else ''} ± {error:.1e}"
-            for x, error in zip(self.multipliers, self.standard_errors, strict=True)
+            f"{_short(z)} ± {error:.1e}"
+            for z, error in zip(self.multipliers, self.standard_errors, strict=True)
         )
         return folded(f"multipliers (± standard error) {', '.join(shown)}")
 
-    def _radius(self, level: float, degrees: int | np.ndarray) -> np.ndarray | float:
+    def _radius(self, level: float, equations: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""
         from scipy import special  # (a fifth of a second)
 
-        if np.isinf(self.covariance_freedom):
-            return 2 * special.gammaincinv(degrees / 2, level)
-        left = np.maximum(self.covariance_freedom - degrees + 1, 1.0)
-        return (
-            degrees
-            * self.covariance_freedom
-            / left
-            * special.fdtri(degrees, left, level)
-        )
+        dof = self.covariance_dof
+        if np.isinf(dof):
+            return 2 * special.gammaincinv(equations / 2, level)
+        left = np.maximum(dof - equations + 1, 1.0)
+        return equations * dof / left * special.fdtri(equations, left, level)
 
 
-def warned(doubt: str, check: bool) -> str:
-    """Return a sentence of doubt, and emit it as a warning of a public function of fits."""
-    if doubt and check:
-        warnings.warn(f"Fit: {doubt}.", FindingWarning, stacklevel=5)
-    return doubt
+def _short(value: complex) -> str:
+    imaginary = f"{value.imag:+.7f}i" if value.imag else ""
+    return f"{value.real:+.7f}{imaginary}"
+
+
+class MultiplierEstimate(MultiplierFit):
+    """Multipliers and their covariance alone, such as a bound of what any estimate can reach."""
+
+    @property
+    def model(self) -> None:
+        return None
+
+    @property
+    def noise(self) -> None:
+        return None

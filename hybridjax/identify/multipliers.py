@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,15 +13,17 @@ from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.execution import one_blas_thread
+from .._core.findings import Finding, refuse, warn_of
 from .._core.results import Result
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from . import variable_projection as varpro, weights
-from .denominator import chi, multipliers_of
+from .denominator import divided_by_chi, multipliers_of
 from .descent import ROUNDING, Coefficients
-from .multiplier_estimate import MultiplierEstimate, RoughFit, warned
+from .fit import not_converged
+from .multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
@@ -29,7 +31,7 @@ from .multiplier_estimate import MultiplierEstimate, RoughFit, warned
 _REWEIGHTINGS = 2
 
 
-class StructuredFit(MultiplierEstimate):
+class StructuredFit(MultiplierFit):
     r"""All harmonics, outputs and inputs with one denominator in $z^{-N}$.
 
     $$H_m(z) = \frac{B_m(z^{-1})}{\chi(z^{-N})}, \qquad
@@ -39,35 +41,40 @@ class StructuredFit(MultiplierEstimate):
     of the polynomials B_m is high enough (d N and an excess: at most N times the number of
     periods after which the zero multipliers' part of the state has vanished).
 
-    **Fields:**
+    **Fields** beside those of every `Fit` (`model` and `noise` are None):
 
     - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d, real.
-    - `covariance` (d, d): that of the coefficients, estimated with `covariance_freedom` degrees of
-      freedom. `standard_errors`, `contains` and `ellipse` follow from it.
+    - `covariance` (d, d): that of the coefficients. `standard_errors`, `contains` and `ellipse`
+      follow from it.
     - `residual` (ny,): rms misfit of each output's HTFs relative to their rms, and `correlation`,
       that of the misfit at neighboring frequencies: about 0 if the order is large enough.
-    - `cost`: sum of squares of the misfit in units of the errors' standard deviations, and
-      `freedom`, its expected value. Without variances the unit is estimated from the misfit, and
-      the two are equal.
+    - `cost`: sum of squares of the misfit in units of the errors' standard deviations; its expected
+      value is `dof`. Without variances the unit is estimated from the misfit, and the two are
+      equal.
     - `numerators` (M, degree + 1, ny, nu): coefficients of B_m, by rising power of z^-1. In a
       narrow band of frequencies many give the same fit; these are the smallest.
-    - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
-    - `doubt`: a sentence if one more multiplier, or two, contradict those of this fit: they
-      lie outside of each other's confidence regions. Empty otherwise, and without `check`.
+    - `findings`: "order" if one more multiplier, or two, contradict those of this fit (they lie
+      outside of each other's confidence regions), or if the data do not support so many;
+      "undetermined"; "no convergence". Higher orders are not tried without `check`.
     """
 
     residual: Float[np.ndarray, " ny"]
     correlation: float = eqx.field(static=True)
     numerators: Complex[np.ndarray, "M powers ny nu"]
     cost: float = eqx.field(static=True)
-    freedom: int = eqx.field(static=True)
-    result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-    doubt: str = eqx.field(static=True, default="")
+
+    @property
+    def model(self) -> None:
+        return None
+
+    @property
+    def noise(self) -> None:
+        return None
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -75,28 +82,19 @@ class StructuredFit(MultiplierEstimate):
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
         """
-        f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
-        H = _evaluate(self.numerators, self.coefficients, f, N)
+        f = np.atleast_1d(np.asarray(f, float))
+        N = self.n_sections
+        H = divided_by_chi(self.numerators, self.coefficients, f, N)
         htf = HTF(f, H, self.harmonics, N, self.inputs, self.outputs, "structured fit")
         return htf if harmonics is None else htf.select(harmonics)
 
     def _about(self) -> str:
-        misfit = ", ".join(
-            f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True)
-        )
-        about = f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
-        about += (
+        pairs = zip(self.outputs, self.residual, strict=True)
+        misfit = ", ".join(f"{name} {x:.1e}" for name, x in pairs)
+        return (
+            f"residual {misfit}; {self.cost / self.dof:.3g} times what is expected; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )
-        return "; ".join(filter(None, [about, self.doubt]))
-
-
-def _evaluate(numerators, c, f, n_sections: int) -> Complex[np.ndarray, "M F ny nu"]:
-    powers = np.exp(
-        -2j * np.pi / n_sections * f[:, None] * np.arange(numerators.shape[1])
-    )
-    H = np.einsum("fr,mrij->mfij", powers, numerators)
-    return H / chi(np.exp(-2j * np.pi * f), c)[:, None, None]
 
 
 @checked
@@ -145,71 +143,89 @@ def fit_multipliers(
         raise DefinitionError(
             "errors='variance' needs HTFs with variances: take 'residuals'."
         )
-    f, H = np.asarray(htf.f), np.asarray(htf.H)
-
-    def weighted(order: int):
-        size, weight = (
-            varpro.numerator_size(htf, order, overhang),
-            weights.error_weights(htf, rms),
-        )
-        groups = varpro.group_htf(htf, weight, size)
-        c, converged = varpro.maximum_likelihood(groups, order)
-        for _ in range(_REWEIGHTINGS * (htf.variance is None)):
-            variance = varpro.error_spectrum(
-                groups, c, f, weights.line_variances(htf), len(rms)
-            )
-            weight = np.broadcast_to(weights.weights_of(variance, rms), H.shape)
-            groups = varpro.group_htf(htf, weight, size)
-            c, converged = varpro.maximum_likelihood(groups, order, c)
-        return groups, weight, size, c, converged
-
-    groups, weight, size, c, converged = weighted(order)
-    covariance, cost, freedom = varpro.summarize(groups, c, errors)
-    B = varpro.unfold(htf, groups, [varpro.numerators_of(group, c) for group in groups])
-    misfit, scale = _evaluate(B, c, f, htf.n_sections) - H, rms[:, None]
+    solution = _solve(htf, rms, order, overhang)
+    groups = solution.groups
+    c = solution.c
+    covariance, cost, dof = varpro.summarize(groups, c, errors)
+    numerators = varpro.unfold(
+        htf, groups, [varpro.numerators_of(group, c) for group in groups]
+    )
+    f = np.asarray(htf.f)
+    H = np.asarray(htf.H)
+    misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
+    scale = rms[:, None]
     residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
+    exact = htf.variance is None and residual.max() < ROUNDING
 
     def ratios(k: int) -> NoiseRatios:
-        used, *_, fitted, _ = (groups, c, True) if k == order else weighted(k)
-        return noise_ratios(
-            used, htf, fitted, htf.variance is None and residual.max() < ROUNDING
-        )
+        fitted = solution if k == order else _solve(htf, rms, k, overhang)
+        return noise_ratios(fitted.groups, htf, fitted.c, exact)
 
-    surplus = unsupported(ratios, order)
-    if check and surplus:
-        raise DefinitionError(f"{surplus}, or pass check=False.")
-
-    correlation = weights.neighbor_correlation(misfit / scale, H / scale, f)
-    result = Result.OK if converged else Result.NOT_CONVERGED
+    surplus = unsupported(ratios, order, check)
+    refuse(surplus)
+    result = int(Result.OK if solution.converged else Result.NOT_CONVERGED)
     fit = StructuredFit(
         multipliers_of(c),
         c,
         *covariance,
         residual,
-        correlation,
-        B,
+        weights.neighbor_correlation(misfit / scale, H / scale, f),
+        numerators,
         cost,
-        freedom,
-        result,
         htf.harmonics,
         htf.n_sections,
         htf.inputs,
         htf.outputs,
+        dof=float(dof),
+        result=result,
     )
 
     def of_order(order: int) -> RoughFit:
         # No larger numerators, if possible: without zero multipliers they are large enough.
-        fewer = max(size - 1 - order * htf.n_sections, 0)
-        groups = varpro.group_htf(htf, weight, varpro.numerator_size(htf, order, fewer))
+        fewer = max(solution.size - 1 - order * htf.n_sections, 0)
+        size = varpro.numerator_size(htf, order, fewer)
+        groups = varpro.group_htf(htf, solution.weight, size)
         start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
         c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
         return c, lambda: varpro.summarize(groups, c, errors)[0]
 
     # One more multiplier, or a pair.
-    more = [functools.partial(of_order, order + k) for k in (1, 2) if check]
-    return dataclasses.replace(
-        fit, doubt=warned(surplus or fit.contradiction(more), check)
-    )
+    higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]
+    doubts = surplus or fit.order_doubts(higher)
+    fit = dataclasses.replace(fit, findings=(*not_converged(result), *doubts))
+    if check:
+        warn_of(fit.findings, wrappers=2)
+    return fit
+
+
+class _Solution(NamedTuple):
+    """The solution of a fit with so many multipliers."""
+
+    groups: list[varpro.HTFGroup]
+    weight: Float[np.ndarray, "M F ny nu"]
+    size: int
+    """The number of coefficients of each numerator."""
+    c: Coefficients
+    converged: bool
+
+
+def _solve(
+    htf: HTF, rms: Float[np.ndarray, " ny"], order: int, overhang: int | None
+) -> _Solution:
+    """Return the solution weighted by variances, or else by those that its residuals suggest."""
+    size = varpro.numerator_size(htf, order, overhang)
+    weight = weights.error_weights(htf, rms)
+    groups = varpro.group_htf(htf, weight, size)
+    c, converged = varpro.maximum_likelihood(groups, order)
+    if htf.variance is not None:
+        return _Solution(groups, weight, size, c, converged)
+    lines = weights.line_variances(htf)
+    for _ in range(_REWEIGHTINGS):
+        variance = varpro.error_spectrum(groups, c, np.asarray(htf.f), lines, len(rms))
+        weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
+        groups = varpro.group_htf(htf, weight, size)
+        c, converged = varpro.maximum_likelihood(groups, order, c)
+    return _Solution(groups, weight, size, c, converged)
 
 
 @checked
@@ -235,13 +251,11 @@ def multiplier_bound(
     **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
     few frequencies to find the multipliers at all.
     """
-    exact, multipliers = exact_htf(model, htf), model.multipliers
-    d, c = len(multipliers), np.poly(multipliers).real[1:]
-    groups = varpro.grouped(exact, d, overhang)
-    J = np.concatenate(
-        [varpro.misfit_of(x, c).jacobian.reshape(d, -1) for x in groups], axis=1
-    )
-    return MultiplierEstimate(multipliers, c, np.linalg.inv(J @ J.T), np.inf)
+    exact = exact_htf(model, htf)
+    multipliers = model.multipliers
+    c = np.poly(multipliers).real[1:]
+    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), overhang), c)
+    return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
 
 
 def exact_htf(model: LDTP, htf: HTF) -> HTF:
@@ -251,8 +265,10 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
     """
     require_same("model and HTFs", model, htf)
     if htf.variance is None:
-        text = "estimate them from several realizations or windows (`repeats`)."
-        raise DefinitionError(f"a bound needs HTFs with variances: {text}")
+        raise DefinitionError(
+            "a bound needs HTFs with variances: estimate them from several realizations or "
+            "windows (`repeats`)."
+        )
     return dataclasses.replace(model.htf(htf.f, htf.harmonics), variance=htf.variance)
 
 
@@ -273,7 +289,7 @@ class OrderSelection(eqx.Module):
     - `strength`: the singular value that an order beyond this one would have to explain, in units
       of the noise: 1 where only noise is left. `deviation`: its distance from 1 in standard
       deviations, and `threshold` the value that noise alone exceeds in 1 % of cases.
-    - `cost`, `freedom`: the misfit of the best fit, and its expected value (somewhat larger where
+    - `cost`, `dof`: the misfit of the best fit, and its expected value (somewhat larger where
       the variances were estimated).
     - `mdl`: Rissanen's criterion, which penalizes each real coefficient, those of the numerators
       too, by the logarithm of the number of data. The smallest is best.
@@ -289,7 +305,7 @@ class OrderSelection(eqx.Module):
     deviation: Float[np.ndarray, " k"]
     threshold: Float[np.ndarray, " k"]
     cost: Float[np.ndarray, " k"]
-    freedom: Int[np.ndarray, " k"]
+    dof: Int[np.ndarray, " k"]
     mdl: Float[np.ndarray, " k"]
     variances: bool = eqx.field(static=True)
 
@@ -311,7 +327,7 @@ class OrderSelection(eqx.Module):
         for k, d in enumerate(self.orders):
             rows.append(
                 f"{d:5d}  {self.strength[k]:10.4g}  {self.deviation[k]:10.3g} "
-                f"({self.threshold[k]:.1f})  {self.cost[k] / self.freedom[k]:14.4g} "
+                f"({self.threshold[k]:.1f})  {self.cost[k] / self.dof[k]:14.4g} "
                 f"{self.mdl[k]:12.5g}"
             )
         rows.append(
@@ -347,44 +363,51 @@ def select_order(
     noise = np.ones(len(rms))
     if htf.variance is None:
         c, _ = varpro.maximum_likelihood(largest, max_order)
-        square, number = np.zeros((2, len(rms)))
-        for group in largest:
-            residual = varpro.misfit_of(group, c).residual
-            np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
-            np.add.at(number, group.channel[:, 0], group.freedom)
-        noise = np.maximum(np.sqrt(square / number), weights.SMALLEST_ERROR)
+        noise = np.maximum(_left_over(largest, c, len(rms)), weights.SMALLEST_ERROR)
         weight = weight / noise[:, None]
         largest = varpro.group_htf(htf, weight, size)
-    costs, freedoms = [], []
-    for d in range(max_order + 1):
+    orders = np.arange(max_order + 1)
+    c = np.zeros(0)
+    costs = []
+    for d in orders.tolist():
         groups = varpro.group_htf(htf, weight, size - (max_order - d) * htf.n_sections)
-        c = varpro.maximum_likelihood(groups, d)[0] if d else np.zeros(0)
-        cost, freedom = varpro.cost_of(groups, c)
-        costs.append(cost)
-        freedoms.append(freedom - d)
-    cost, freedom, data = np.array(costs), np.array(freedoms), 2 * htf.H.size
-    level, _ = weights.estimated_noise(
-        weights.largest_misfit(htf), cost[-1] / freedom[-1]
-    )
-    likelihood = (
-        data * np.log(np.maximum(cost, 1e-300))
-        if htf.variance is None
-        else cost / level
-    )
+        if d:
+            c, _ = varpro.maximum_likelihood(groups, d)
+        costs.append(varpro.cost_of(groups, c))
+    cost, equations = np.transpose(costs)
+    dof = equations.astype(int) - orders
+    data = 2 * htf.H.size
+    if htf.variance is None:
+        likelihood = data * np.log(np.maximum(cost, 1e-300))
+    else:
+        most = weights.largest_misfit(htf)
+        level, _ = weights.estimated_noise(most, cost[-1] / dof[-1])
+        likelihood = cost / level
     exact = bool(noise.max() < ROUNDING)
     values, spread = noise_ratios(largest, htf, c, exact)
     return OrderSelection(
-        orders=np.arange(max_order + 1),
+        orders=orders,
         strength=np.sqrt(values[::-1]),
         deviation=(values[::-1] - 1) / spread,
-        threshold=np.array(
-            [_largest_of_noise(max_order + 1 - d) for d in range(max_order + 1)]
-        ),
+        threshold=np.array([_largest_of_noise(1 + k) for k in orders[::-1].tolist()]),
         cost=cost,
-        freedom=freedom,
-        mdl=likelihood + np.log(data) * (data - freedom),
+        dof=dof,
+        mdl=likelihood + np.log(data) * (data - dof),
         variances=htf.variance is not None or exact,
     )
+
+
+def _left_over(
+    groups: list[varpro.HTFGroup], c: Coefficients, outputs: int
+) -> Float[np.ndarray, " ny"]:
+    """Return the rms residual of each output."""
+    square = np.zeros(outputs)
+    number = np.zeros(outputs)
+    for group in groups:
+        residual = varpro.misfit_of(group, c).residual
+        np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
+        np.add.at(number, group.channel[:, 0], group.freedom)
+    return np.sqrt(square / number)
 
 
 @functools.lru_cache
@@ -395,7 +418,7 @@ def _largest_of_noise(size: int) -> float:
     matrix of the Gaussian orthogonal ensemble.
     """
     draws = np.random.default_rng(0).normal(size=(_DRAWS, size, size))
-    symmetric = (draws + draws.swapaxes(1, 2)) / 2
+    symmetric = (draws + draws.mT) / 2
     return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
 
 
@@ -415,32 +438,38 @@ def noise_ratios(
     cost, freedom = varpro.cost_of(groups, c)
     level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / freedom)
     whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
-    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2
-    return values / level / _ROUNDING_VARIES**exact, tails * float(np.sqrt(2 / freedom))
+    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2 / level
+    if exact:
+        values = values / _ROUNDING_VARIES
+    return values, tails * float(np.sqrt(2 / freedom))
 
 
-def unsupported(ratios: Callable[[int], NoiseRatios], order: int) -> str:
-    """Return a sentence if noise alone may account for multipliers of a fit; else "".
+def unsupported(
+    ratios: Callable[[int], NoiseRatios], order: int, refused: bool = False
+) -> list[Finding]:
+    """Return a finding if noise alone may account for multipliers of a fit.
 
     The number that it names is supported by a fit of that order, too.
 
-    **Arguments:** `ratios(k)`: those of a fit of order k.
+    **Arguments:** `ratios(k)`: those of a fit of order k. `refused`: whether such a fit is refused.
     """
-    most, weakest = order, 0.0
+    most = order
+    weakest = 0.0
     while most:
         values, spread = ratios(most)
-        sizes, limits = (
-            (values - 1) / spread,
-            [_largest_of_noise(k + 1) for k in range(most + 1)],
-        )
-        if (sizes[1:] > limits[1:]).all():
+        sizes = (values - 1) / spread
+        limits = np.array([_largest_of_noise(k + 1) for k in range(most + 1)])
+        above = sizes[1:] > limits[1:]
+        if above.all():
             break
-        most, weakest = (
-            int((sizes[1:] > limits[1:]).sum()),
-            np.sqrt(max(values[1], 0.0)),
-        )
-    text = f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
+        most = int(above.sum())
+        weakest = np.sqrt(max(values[1], 0.0))
+    if most == order:
+        return []
     remedy = f"lower `order` to {most}" if most else "excite more"
-    return f"{text}the noise, and may be noise alone; {remedy}, or measure longer" * (
-        most < order
+    anyway = ", or pass check=False" if refused else ""
+    text = (
+        f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
+        f"the noise, and may be noise alone; {remedy}, or measure longer{anyway}."
     )
+    return [Finding("order", text, "refused" if refused else "warned")]

@@ -12,7 +12,6 @@ Helmersson and Ribarits 2004; Ribarits, Deistler and Hanzon 2005; for each secti
 
 from collections.abc import Callable
 from functools import reduce
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -52,13 +51,15 @@ class PeriodicModel(NamedTuple):
         """Return an `LDTP` with outputs in units of `scale`, and with K = 0 of `errors` columns."""
         dims = [int(d) for d in np.asarray(model.dims)]
         after = [*dims[1:], dims[0]]
-        A, B, C, D = (np.asarray(x) for x in (model.A, model.B, model.C, model.D))
+        unit = scale[:, None]
+        A, B, C, D = (np.asarray(x) for x in model.matrices[:4])
+        sections = range(len(dims))
         return cls(
-            [a[:j, :i] for a, i, j in zip(A, dims, after, strict=True)],
-            [b[:j] for b, j in zip(B, after, strict=True)],
-            [c[:, :i] / scale[:, None] for c, i in zip(C, dims, strict=True)],
-            [d / scale[:, None] for d in D],
-            [np.zeros((j, errors)) for j in after],
+            A=[A[n, : after[n], : dims[n]] for n in sections],
+            B=[B[n, : after[n]] for n in sections],
+            C=[C[n, :, : dims[n]] / unit for n in sections],
+            D=[D[n] / unit for n in sections],
+            K=[np.zeros((after[n], errors)) for n in sections],
         )
 
     def to_ldtp(
@@ -72,8 +73,12 @@ class PeriodicModel(NamedTuple):
 
     def times(self, scale: Float[np.ndarray, " ny"]) -> "PeriodicModel":
         """Return the model with outputs and errors that are larger by these factors."""
-        C, D = ([scale[:, None] * x for x in blocks] for blocks in (self.C, self.D))
-        return self._replace(C=C, D=D, K=[K / scale[: K.shape[1]] for K in self.K])
+        unit = scale[:, None]
+        return self._replace(
+            C=[unit * C for C in self.C],
+            D=[unit * D for D in self.D],
+            K=[K / scale[: K.shape[1]] for K in self.K],
+        )
 
     @property
     def dims(self) -> list[int]:
@@ -86,8 +91,9 @@ class PeriodicModel(NamedTuple):
     @property
     def gain(self) -> Blocks:
         """K, (d[n+1], ny); zero where noise does not enter the state."""
-        free = zip(self.K, self.C, strict=True)
-        return [K if K.shape[1] else np.zeros((len(K), len(C))) for K, C in free]
+        if self.K[0].shape[1]:
+            return self.K
+        return [np.zeros((len(K), len(C))) for K, C in zip(self.K, self.C, strict=True)]
 
     @property
     def F(self) -> Blocks:
@@ -96,9 +102,18 @@ class PeriodicModel(NamedTuple):
 
     def monodromy(self, first: int = 0) -> Float[np.ndarray, "d d"]:
         """Return the product of A over one period from section `first` on."""
-        return reduce(
-            lambda product, A: A @ product, [*self.A[first:], *self.A[:first]]
-        )
+        factors = [*self.A[first:], *self.A[:first]]
+        return reduce(lambda product, A: A @ product, factors)
+
+    @property
+    def radius(self) -> float:
+        """The largest modulus of a multiplier."""
+        return float(np.abs(np.linalg.eigvals(self.monodromy())).max())
+
+    @property
+    def of_errors(self) -> "PeriodicModel":
+        """The model whose states are the errors of predictions, A - K C in place of A."""
+        return self._replace(A=self.F)
 
     def refined(
         self, direct: bool, linearize: Callable[["LocalCoordinates"], NormalEquations]
@@ -108,11 +123,11 @@ class PeriodicModel(NamedTuple):
 
         **Raises:** `LinAlgError` for a model that is resonant or overflows.
         """
-        to_A, to_C = (
-            [np.zeros((len(x), 0)) for x in blocks] for blocks in (self.A, self.C)
-        )
-        coordinates = LocalCoordinates(self, to_A, to_C, direct)
-        return coordinates.moved(linearize(coordinates).step(0.0)[0])
+        fixed_A = [np.zeros((len(A), 0)) for A in self.A]
+        fixed_C = [np.zeros((len(C), 0)) for C in self.C]
+        coordinates = LocalCoordinates(self, fixed_A, fixed_C, direct)
+        step, _ = linearize(coordinates).step(0.0)
+        return coordinates.moved(step)
 
 
 class LocalCoordinates(NamedTuple):
@@ -127,20 +142,27 @@ class LocalCoordinates(NamedTuple):
     direct: bool
     """Whether D is free."""
 
-    def blocks(self, n: int) -> list[tuple[str, tuple[int, int]]]:
-        """Return the names and shapes of the free blocks at section n, in order."""
-        (after, d), (ny, nu) = self.model.A[n].shape, self.model.D[n].shape
-        free = [("Y", (self.to_A[n].shape[1], d)), ("B", (after, nu))]
-        free.append(("K", (after, self.model.K[n].shape[1])))
-        return free + ([("D", (ny, nu))] if self.direct else [])
+    def blocks(self, n: int) -> dict[str, tuple[int, int]]:
+        """Return the shapes of the free blocks at section n by name, in order."""
+        after, d = self.model.A[n].shape
+        ny, nu = self.model.D[n].shape
+        shapes = {
+            "Y": (self.to_A[n].shape[1], d),
+            "B": (after, nu),
+            "K": (after, self.model.K[n].shape[1]),
+        }
+        if self.direct:
+            shapes["D"] = (ny, nu)
+        return shapes
 
     @property
     def places(self) -> list[dict[str, slice]]:
         """The entries of each block in a vector of coordinates, for each section."""
-        out, first = [], 0
+        out = []
+        first = 0
         for n in range(self.model.n_sections):
             places = {}
-            for name, (rows, columns) in self.blocks(n):
+            for name, (rows, columns) in self.blocks(n).items():
                 places[name] = slice(first, first + rows * columns)
                 first += rows * columns
             out.append(places)
@@ -156,21 +178,24 @@ class LocalCoordinates(NamedTuple):
 
         A and B follow from F and B - K D, so that steps go straight where A and K C nearly cancel.
         """
-        A, B, C, D, K = map(list, self.model)
-        places, F, gain = self.places, self.model.F, self.model.gain
-        for n in range(self.model.n_sections):
+        places = self.places
+        moved: list[tuple] = []
+        old = zip(*self.model, self.model.F, self.model.gain, strict=True)
+        for n, (_, B, C, D, K, F, gain) in enumerate(old):
+            place = places[n]
             change = {
-                name: step[places[n][name]].reshape(s) for name, s in self.blocks(n)
+                name: step[place[name]].reshape(shape)
+                for name, shape in self.blocks(n).items()
             }
-            K[n] = K[n] + change["K"]
-            later = K[n] if K[n].shape[1] else gain[n]
-            F[n] = F[n] + (self.to_A[n] - gain[n] @ self.to_C[n]) @ change["Y"]
-            C[n] = C[n] + self.to_C[n] @ change["Y"]
-            A[n] = F[n] + later @ C[n]
-            B[n] = B[n] - gain[n] @ D[n] + change["B"]
-            D[n] = D[n] + change.get("D", 0.0)
-            B[n] = B[n] + later @ D[n]
-        return PeriodicModel(A, B, C, D, K)
+            later_K = K + change["K"]
+            later_gain = later_K if later_K.shape[1] else gain
+            later_F = F + (self.to_A[n] - gain @ self.to_C[n]) @ change["Y"]
+            later_C = C + self.to_C[n] @ change["Y"]
+            later_D = D + change.get("D", 0.0)
+            later_A = later_F + later_gain @ later_C
+            later_B = B - gain @ D + change["B"] + later_gain @ later_D
+            moved.append((later_A, later_B, later_C, later_D, later_K))
+        return PeriodicModel(*map(list, zip(*moved, strict=True)))
 
 
 def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
@@ -178,28 +203,28 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
 
     **Raises:** `DefinitionError` for unobservable states.
     """
-    N, predictor = model.n_sections, model._replace(A=model.F)
-    largest = np.abs(np.linalg.eigvals(predictor.monodromy())).max()
-    rho = float((_LARGEST_MODULUS / max(largest, _LARGEST_MODULUS)) ** (1 / N))
-    roots, back = zip(
-        *[_root(n, P) for n, P in enumerate(_gramians(predictor, rho))], strict=True
-    )
+    N = model.n_sections
+    largest = max(model.of_errors.radius, _LARGEST_MODULUS)
+    rho = (_LARGEST_MODULUS / largest) ** (1 / N)
+    pairs = [_root(n, P) for n, P in enumerate(_gramians(model.of_errors, rho))]
+    roots, back = zip(*pairs, strict=True)
     after = (*roots[1:], roots[0])
-    model = PeriodicModel(
-        [after[n].T @ model.A[n] @ back[n] for n in range(N)],
-        [after[n].T @ model.B[n] for n in range(N)],
-        [model.C[n] @ back[n] for n in range(N)],
-        model.D,
-        [after[n].T @ model.K[n] for n in range(N)],
+    normal = PeriodicModel(
+        A=[after[n].T @ model.A[n] @ back[n] for n in range(N)],
+        B=[after[n].T @ model.B[n] for n in range(N)],
+        C=[model.C[n] @ back[n] for n in range(N)],
+        D=model.D,
+        K=[after[n].T @ model.K[n] for n in range(N)],
     )
-    to_A, to_C = [], []
-    for F, K, C in zip(model.F, model.gain, model.C, strict=True):
-        left = np.linalg.qr(np.concatenate([rho * F, C]), mode="complete")[0][
-            :, F.shape[1] :
-        ]
-        to_C.append(left[len(F) :])
-        to_A.append(left[: len(F)] / rho + K @ to_C[-1])
-    return LocalCoordinates(model, to_A, to_C, direct)
+    to_A = []
+    to_C = []
+    for F, K, C in zip(normal.F, normal.gain, normal.C, strict=True):
+        states, d = F.shape
+        columns = np.concatenate([rho * F, C])
+        orthogonal = np.linalg.qr(columns, mode="complete")[0][:, d:]
+        to_C.append(orthogonal[states:])
+        to_A.append(orthogonal[:states] / rho + K @ orthogonal[states:])
+    return LocalCoordinates(normal, to_A, to_C, direct)
 
 
 def _gramians(model: PeriodicModel, rho: float) -> Blocks:
@@ -213,11 +238,12 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
         return out[::-1]
 
     d = model.dims[0]
-    P, phi = around(np.zeros((d, d)))[0], rho**model.n_sections * model.monodromy()
-    for _ in range(
-        6
-    ):  # periods are doubled until the remainder, 0.5^(2^6), is rounding
-        P, phi = P + phi.T @ P @ phi, phi @ phi
+    P = around(np.zeros((d, d)))[0]
+    phi = rho**model.n_sections * model.monodromy()
+    # Periods are doubled until the remainder, 0.5^(2^6), is rounding.
+    for _ in range(6):
+        P = P + phi.T @ P @ phi
+        phi = phi @ phi
     return around(P)
 
 
@@ -227,7 +253,7 @@ def _root(n: int, gramian: Float[np.ndarray, "d d"]) -> tuple[np.ndarray, np.nda
     if not values[0] > ROUNDING * values[-1]:
         raise DefinitionError(
             f"a state at section {n} of the model has no effect on the outputs: give a minimal "
-            "model (`hj.identify.realize`)."
+            "model."
         )
     return vectors * np.sqrt(values), vectors / np.sqrt(values)
 
@@ -240,24 +266,30 @@ def characteristic_slopes(
     They are computed at the section with the smallest dimension d (recursion of Faddeev and
     Leverrier).
     """
-    model, places = coordinates.model, coordinates.places
-    N, first = model.n_sections, int(np.argmin(model.dims))
-    phi, d = model.monodromy(first), min(model.dims)
-    M, c, by_phi = np.eye(d), [], []
+    model = coordinates.model
+    N = model.n_sections
+    d = min(model.dims)
+    first = int(np.argmin(model.dims))
+    phi = model.monodromy(first)
+    adjugate = np.eye(d)
+    c: list[float] = []
+    by_phi = []
     for k in range(1, d + 1):
-        by_phi.append(-M.T)
-        c.append(-np.trace(phi @ M) / k)
-        M = phi @ M + c[-1] * np.eye(d)
-    slopes = np.zeros((d, coordinates.size))
-    order = [(first + k) % N for k in range(N)]
-    before = accumulate(
-        (model.A[n] for n in order[:-1]), lambda P, A: A @ P, initial=np.eye(d)
-    )
+        by_phi.append(-adjugate.T)
+        c.append(-np.trace(phi @ adjugate) / k)
+        adjugate = phi @ adjugate + c[-1] * np.eye(d)
+    sections = [(first + k) % N for k in range(N)]
+    before = [np.eye(d)]
+    for n in sections[:-1]:
+        before.append(model.A[n] @ before[-1])
+    places = coordinates.places
     after = np.eye(d)
-    for n, entering in zip(reversed(order), reversed(list(before)), strict=True):
+    slopes = np.zeros((d, coordinates.size))
+    for n, entering in zip(reversed(sections), reversed(before), strict=True):
+        place = places[n]
         by_A = after.T @ np.array(by_phi) @ entering.T
-        slopes[:, places[n]["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
+        slopes[:, place["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
         if model.K[n].shape[1]:
-            slopes[:, places[n]["K"]] = (by_A @ model.C[n].T).reshape(d, -1)
+            slopes[:, place["K"]] = (by_A @ model.C[n].T).reshape(d, -1)
         after = after @ model.A[n]
     return np.array(c), slopes

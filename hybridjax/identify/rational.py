@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +20,7 @@ from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
 from .variable_projection import (
     HTFGroup,
+    Response,
     equal_weights,
     late_columns,
     numerators_of,
@@ -69,11 +71,13 @@ class RationalFit(eqx.Module):
     @checked
     def htf(self, f: Scalar | Vector) -> HTF:
         """Return the fitted functions at frequencies f (F,), cycles per period."""
-        f, N = np.atleast_1d(np.asarray(f, float)), self.n_sections
-        w = np.exp(-2j * np.pi * f / N)
+        f = np.atleast_1d(np.asarray(f, float))
+        N = self.n_sections
+        delay = np.exp(-2j * np.pi * f / N)
         polyval = np.polynomial.polynomial.polyval
-        top, bottom = (polyval(w, x.T) for x in (self.numerator, self.denominator))
-        H = (top / bottom * w).T[None, :, :, None]
+        top = polyval(delay, self.numerator.T)
+        bottom = polyval(delay, self.denominator.T)
+        H = (top / bottom * delay).T[None, :, :, None]
         return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
     @checked
@@ -88,22 +92,26 @@ class RationalFit(eqx.Module):
         if output is not None:
             chosen = [channel_index("output", output, self.outputs)]
         parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
-        true, estimated = np.concatenate(
-            [(part.true, part.estimated) for part in parts], axis=1
+        names: list[str] = []
+        for k, part in zip(chosen, parts, strict=True):
+            names += [self.outputs[k]] * len(part.true)
+        return MultiplierComparison(
+            np.concatenate([part.true for part in parts]),
+            np.concatenate([part.estimated for part in parts]),
+            tuple(names),
         )
-        names = tuple(self.outputs[k] for k in chosen for _ in parts[0].true)
-        return MultiplierComparison(true, estimated, names)
 
     def __repr__(self) -> str:
-        rows = [
-            f"RationalFit(H_0 from {self.input}, {self.denominator.shape[1] - 1} "
-            f"poles, {self.numerator.shape[1] - 1} zeros)"
-        ]
-        for name, multipliers, residual, code in zip(
+        poles = self.denominator.shape[1] - 1
+        zeros = self.numerator.shape[1] - 1
+        rows = [f"RationalFit(H_0 from {self.input}, {poles} poles, {zeros} zeros)"]
+        fits = zip(
             self.outputs, self.multipliers, self.residual, self.result, strict=True
-        ):
+        )
+        for name, multipliers, residual, code in fits:
             shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in multipliers)
-            shown = shown if code == Result.OK else f"none: {Result(int(code)).message}"
+            if code != Result.OK:
+                shown = f"none: {Result(int(code)).message}"
             rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}")
         return "\n".join(rows)
 
@@ -123,10 +131,13 @@ def fit_rational(
 ) -> RationalFit:
     """Fit a rational function of z with real coefficients to $H_0$.
 
-    The residual `H - B/A` is minimized by Gauss-Newton steps in the denominator only: for a given
-    denominator the best numerator solves a linear problem (variable projection). The descents start
-    from several solutions of the linearized problem (Levy 1959; Sanathanan and Koerner 1963) and
-    the best result is kept.
+    This is the paper's fit, for comparison with it: a fit of low order is biased even on exact data
+    (see `RationalFit`), and `hj.fit_multipliers` is not. The residual `H - B/A` is minimized by
+    Gauss-Newton steps in the denominator only: for a given denominator the best numerator solves a
+    linear problem (variable projection). The descents start from several solutions of the
+    linearized problem (Levy 1959; Sanathanan and Koerner 1963) and the best result is kept. (One
+    program of optimistix for all outputs finds the same minima, but takes 8 s of a CPU to compile,
+    20 times as long as a first call on the host.)
 
     **Arguments:**
 
@@ -143,7 +154,8 @@ def fit_rational(
     """
     require_x64(htf.H)
     htf.require_sampled("`fit_rational`")
-    column, rows = channel_index("input", input, htf.inputs), range(len(htf.outputs))
+    column = channel_index("input", input, htf.inputs)
+    rows = range(len(htf.outputs))
     if output is not None:
         rows = [channel_index("output", output, htf.outputs)]
     H = np.asarray(htf[0])[:, :, column]
@@ -154,64 +166,86 @@ def fit_rational(
         )
     # The denominator of a system with one section.
     f = np.asarray(htf.f) / htf.n_sections
-    powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
-    fits = []
-    for row in rows:
-        h = H[:, row]
-        name = f"H_0 of {htf.outputs[row]}"
-        if not np.isfinite(h).all():
-            raise DefinitionError(
-                f"{name} holds NaN or infinity: leave these frequencies out."
-            )
-        rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
-        if rms == 0:
-            raise DefinitionError(f"{name} is zero: leave this output out.")
-        entry = (0, -1, 1.0, (row, column), h / rms, np.full(len(h), len(h) ** -0.5))
-        (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [entry])
-        linearize = functools.partial(residuals_of, [group])
-        with np.errstate(all="ignore"):
-            ends = [
-                least_squares(linearize, a, 200, _ACCURACY**2)
-                for a in _starts(group, poles)
-            ]
-            cost = np.array([float(np.linalg.norm(linearize(a)[0])) for a, _ in ends])
-        cost[~np.isfinite(cost)] = np.inf
-        if not np.isfinite(cost).any():
-            raise ComputationError(
-                f"no start led to a finite fit of {name}: try fewer poles."
-            )
-        lowest = cost <= cost.min() * (1 + _ACCURACY)
-        best = int(np.argmax(lowest * [1 + converged for _, converged in ends]))
-        a, converged = ends[best]
-        result = Result.OK if converged else Result.NOT_CONVERGED
-        b = numerators_of(group, a)[:, 0] * rms
-        fits.append((b, np.append(1.0, a), cost[best], int(result)))
+    fits = [
+        _fit_one(f, H[:, row], f"H_0 of {htf.outputs[row]}", poles, zeros)
+        for row in rows
+    ]
     numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
     roots = np.stack([_roots(a) for a in denominator])
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # a useless pole far outside overflows
+    # A useless pole far outside overflows.
+    with np.errstate(over="ignore", invalid="ignore"):
         multipliers = roots**htf.n_sections
-    fitted = (
-        numerator,
-        denominator,
-        roots,
-        np.stack([_roots(b) for b in numerator]),
-        multipliers,
-    )
-    names = tuple(htf.outputs[row] for row in rows)
     return RationalFit(
-        *fitted, residual, result, htf.n_sections, names, htf.inputs[column]
+        numerator=numerator,
+        denominator=denominator,
+        poles=roots,
+        zeros=np.stack([_roots(b) for b in numerator]),
+        multipliers=multipliers,
+        residual=residual,
+        result=result,
+        n_sections=htf.n_sections,
+        outputs=tuple(htf.outputs[row] for row in rows),
+        input=htf.inputs[column],
     )
+
+
+class _Fitted(NamedTuple):
+    """The fit of one response."""
+
+    numerator: Float[np.ndarray, " b"]
+    denominator: Float[np.ndarray, " a"]
+    residual: float
+    result: int
+
+
+def _fit_one(
+    f: Float[np.ndarray, " F"],
+    h: Complex[np.ndarray, " F"],
+    name: str,
+    poles: int,
+    zeros: int,
+) -> _Fitted:
+    """Return the best of the descents from all starts.
+
+    **Raises:** `DefinitionError` for NaN or zeros; `ComputationError` if no start leads to a finite
+    fit.
+    """
+    if not np.isfinite(h).all():
+        raise DefinitionError(
+            f"{name} holds NaN or infinity: leave these frequencies out."
+        )
+    rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
+    if rms == 0:
+        raise DefinitionError(f"{name} is zero: leave this output out.")
+    powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
+    response = Response((0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5))
+    (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [response])
+    linearize = functools.partial(residuals_of, [group])
+    ends = []
+    with np.errstate(all="ignore"):
+        for start in _starts(group, poles):
+            a, converged = least_squares(linearize, start, 200, _ACCURACY**2)
+            cost = float(np.linalg.norm(linearize(a)[0]))
+            if np.isfinite(cost):
+                ends.append((cost, converged, a))
+    if not ends:
+        raise ComputationError(
+            f"no start led to a finite fit of {name}: try fewer poles."
+        )
+    lowest = min(cost for cost, _, _ in ends) * (1 + _ACCURACY)
+    good = [end for end in ends if end[0] <= lowest]
+    cost, converged, a = next((end for end in good if end[1]), good[0])
+    b = numerators_of(group, a)[:, 0] * rms
+    result = Result.OK if converged else Result.NOT_CONVERGED
+    return _Fitted(b, np.append(1.0, a), cost, int(result))
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
     finite = finite[np.lexsort((-np.imag(finite), -np.abs(finite)))]
-    return np.concatenate(
-        [np.full(len(coefficients) - 1 - len(finite), np.nan), finite]
-    )
+    infinite = len(coefficients) - 1 - len(finite)
+    return np.concatenate([np.full(infinite, np.nan), finite])
 
 
 def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:

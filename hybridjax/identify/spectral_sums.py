@@ -4,7 +4,7 @@ Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. T
 same memory for any number of experiments, and those of two sets of experiments add.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..experiments.data import ExperimentData
 from ..experiments.design.partition import check_sharing, needs_two_phases, regular
 from ..experiments.record import require_deviations
 from ..linear.frequency_response import Harmonics, check_harmonics
-from .descent import ROUNDING
+from .descent import ROUNDING, positive
 
 
 Experiments = (
@@ -45,6 +45,23 @@ class Setup(NamedTuple):
     periods: int
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+
+    @classmethod
+    def of(cls, data: ExperimentData) -> "Setup":
+        return cls(data.n_sections, data.periods, data.inputs, data.outputs)
+
+
+def parts_of(data: Experiments) -> Iterator[ExperimentData]:
+    """Iterate over experiments, which may come in parts.
+
+    **Raises:** `DefinitionError` for parts that do not belong together.
+    """
+    setup = None
+    for part in [data] if isinstance(data, ExperimentData) else data:
+        found = Setup.of(part)
+        setup = setup or found
+        require_equal("`data`", "sections, periods or signals", setup, found)
+        yield part
 
 
 class SpectralSums(NamedTuple):
@@ -106,14 +123,11 @@ def spectral_sums(
     **Raises:** `DefinitionError` if nothing is excited, if lines of an experiment disturb each
     other, if records are too short, or if parts do not belong together.
     """
-    total, count = None, 0
-    for part in [data] if isinstance(data, ExperimentData) else data:
-        new = Setup(part.n_sections, part.periods, part.inputs, part.outputs)
-        require_equal(
-            "`data`", "sections, periods or signals", total.setup if total else new, new
-        )
+    total = None
+    count = 0
+    for part in parts_of(data):
         chosen = () if harmonics == () else check_harmonics(harmonics, part.n_sections)
-        sums = _sums_of_part(part, new, chosen, threshold, repeats, count)
+        sums = _sums_of_part(part, chosen, threshold, repeats, count)
         total = sums if total is None else _add(total, sums)
         count += len(part.ok)
     if total is None:
@@ -127,7 +141,6 @@ def spectral_sums(
 
 def _sums_of_part(
     data: ExperimentData,
-    setup: Setup,
     harmonics: tuple[int, ...],
     threshold: float,
     repeats: int,
@@ -137,10 +150,9 @@ def _sums_of_part(
     windows = data.windows(repeats)
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
-    mirrored = needs_two_phases(lines, setup.periods, setup.n_sections)
-    if (
-        mirrored.any() and data.ok.any()
-    ):  # the limit cycle has power at multiples of f = 1
+    mirrored = needs_two_phases(lines, data.periods, data.n_sections)
+    # The limit cycle has power at multiples of f = 1.
+    if mirrored.any() and data.ok.any():
         require_deviations(data.records)
     good = data.ok[experiment]
 
@@ -160,7 +172,7 @@ def _sums_of_part(
     if first or len(lines) < len(line):  # lines were measured several times
         tested = _compare_crest_factors(data.u[:, data.window])
     return SpectralSums(
-        setup,
+        Setup.of(data),
         harmonics,
         lines,
         mirrored,
@@ -180,33 +192,35 @@ def _sums_of_part(
 
 def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
     """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
-    N, P = data.n_sections, data.periods
+    N = data.n_sections
+    P = data.periods
     output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
-    Y = np.stack(
-        [np.fft.fft(data.y[:, w], axis=1)[experiment[:, None], output] for w in windows]
-    )
+    spectra = [np.fft.fft(data.y[:, window], axis=1) for window in windows]
+    Y = np.stack([x[experiment[:, None], output] for x in spectra])
     mean = Y.sum(axis=0) / len(Y)
-    return mean, (np.abs(Y - mean) ** 2).sum(axis=0) / max(len(Y) - 1, 1) / len(Y)
+    square = (np.abs(Y - mean) ** 2).sum(axis=0)
+    return mean, square / max(len(Y) - 1, 1) / len(Y)
 
 
 def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
     """Return experiment, line and U of every excited line, checked that they do not meet."""
-    u = np.where(np.isfinite(data.u).all(axis=(1, 2), keepdims=True), data.u, 0.0)
+    known = np.isfinite(data.u).all(axis=(1, 2), keepdims=True)
+    u = np.where(known, data.u, 0.0)
     spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
     U = spectra.sum(axis=0) / len(spectra)
     # Inputs have units of their own.
     unit = np.maximum(np.abs(U).max(axis=(0, 1)), np.finfo(float).tiny)
     size = np.abs(U) / unit
     peak = size.max(axis=(1, 2), keepdims=True)
-    worst = float(np.max(np.abs(spectra - U) / unit / np.where(peak > 0, peak, 1)))
+    change = np.abs(spectra - U) / unit / positive(peak)
+    worst = float(np.max(change))
     if worst > max(threshold, _REPEATS):
         raise DefinitionError(
             f"the input does not repeat: its last {len(windows)} windows of P = {data.periods} "
             f"differ by {worst:.2g} of the largest line. Take fewer `repeats`, or another P."
         )
-    experiment, line = np.nonzero(
-        ((size > threshold * peak) & (size > ROUNDING)).any(axis=2)
-    )
+    excited = (size > threshold * peak) & (size > ROUNDING)
+    experiment, line = np.nonzero(excited.any(axis=2))
     check_sharing(experiment + first, line, data.periods)
     return experiment, line, U[experiment, line]
 
@@ -220,18 +234,17 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
     those with crest factors below all redraws.
     """
     chosen = np.unique(np.linspace(0, len(u) - 1, _TESTED).round().astype(int))
+    signals = u[chosen].transpose(0, 2, 1).reshape(-1, u.shape[1])
     rng = np.random.default_rng(0)
-    tested = low = 0
-    for signal in u[chosen].transpose(0, 2, 1).reshape(-1, u.shape[1]):
+    tested = 0
+    low = 0
+    for signal in signals[np.isfinite(signals).all(axis=1)]:
         size = np.abs(np.fft.rfft(signal))
         lines = np.flatnonzero(size > SILENT_LINE * size.max())
-        if (
-            not np.isfinite(signal).all()
-            or not _FEWEST_LINES <= len(lines) <= len(signal) // 4
-        ):
+        if not _FEWEST_LINES <= len(lines) <= len(signal) // 4:
             continue
-        spectra = np.zeros((_REDRAWS, len(size)), complex)
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
+        spectra = np.zeros((_REDRAWS, len(size)), complex)
         spectra[:, lines] = size[lines] * np.exp(1j * angle)
         draws = np.abs(np.fft.irfft(spectra, len(signal), axis=1)).max(axis=1)
         tested += 1
@@ -241,17 +254,17 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
 
 def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
     line = np.union1d(a.line, b.line)
-    rows = [np.searchsorted(line, x.line) for x in (a, b)]
-
-    def add(x, y):
-        out = np.zeros((len(line), *x.shape[1:]), x.dtype)
-        out[rows[0]] += x
-        out[rows[1]] += y
-        return out
-
+    rows_a = np.searchsorted(line, a.line)
+    rows_b = np.searchsorted(line, b.line)
     common = ("setup", "harmonics", "line", "repeats")
     both: dict[str, Any] = {}
     for name in set(SpectralSums._fields).difference(common):
-        x, y = getattr(a, name), getattr(b, name)
-        both[name] = (x[0] + y[0], x[1] + y[1]) if isinstance(x, tuple) else add(x, y)
+        x = getattr(a, name)
+        y = getattr(b, name)
+        if isinstance(x, tuple):
+            both[name] = (x[0] + y[0], x[1] + y[1])
+            continue
+        both[name] = np.zeros((len(line), *x.shape[1:]), x.dtype)
+        both[name][rows_a] += x
+        both[name][rows_b] += y
     return a._replace(line=line, **both)

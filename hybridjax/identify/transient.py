@@ -12,7 +12,8 @@ import dataclasses
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
+from scipy import linalg, optimize
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
@@ -21,6 +22,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
+from .descent import Coefficients, positive, without
 from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
@@ -75,115 +77,159 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
     and if no experiment ran well.
     """
-    N, P = data.n_sections, data.periods
-    S, n, ny = data.y.shape
-    cycles = n // N - 1
+    N = data.n_sections
+    P = data.periods
+    cycles = data.y.shape[1] // N - 1
     if order is not None and order > cycles // 2:
         raise DefinitionError(
             f"`order` must be at most half of the {cycles} cycles, not {order}."
         )
     if cycles < P:
         raise DefinitionError(
-            f"the record has {n // N} cycles, but to remove a transient it must hold the "
+            f"the record has {cycles + 1} cycles, but to remove a transient it must hold the "
             f"window of P = {P} and the one before it, which is cut off: record some more."
         )
     data.require_ok()
     # Inputs have units of their own.
-    u = data.u[data.ok] / np.maximum(
-        np.abs(data.u[data.ok]).max(axis=(0, 1)), np.finfo(float).tiny
-    )
-    change = np.abs(u[:, N * P :] - u[:, : -N * P]).max(axis=(1, 2))
-    worst = int(np.argmax(change))
-    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
-        raise DefinitionError(
-            f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
-            f"{P} periods over all of the record: cut off the part in which it does not."
-        )
-
-    size = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
-    good = np.flatnonzero(data.ok).tolist()
-    y = (data.y[data.ok] / np.where(size > 0, size, 1.0)).reshape(
-        len(good), -1, N * ny
-    )[:, 1:]
+    u = data.u[data.ok]
+    u = u / np.maximum(np.abs(u).max(axis=(0, 1)), np.finfo(float).tiny)
+    _require_repetition(data, u)
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
-        free = [_free(np.arange(P // 2 + 1), P, cycles)] * len(good)
+        classes = [np.arange(P // 2 + 1)] * len(u)
     else:
-        size_of = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
-        excited = map(
-            np.flatnonzero, size_of > SILENT_LINE * size_of.max(axis=1, keepdims=True)
-        )
-        free = [
-            _free(np.unique(np.append(line_class(x, P), 0)), P, cycles) for x in excited
-        ]
-    left = [Q @ record for Q, record in zip(free, y, strict=True)]
+        classes = _excited_classes(data, u)
+    c, transients = _decays(data, classes, everything, order)
+    clean = data.y[:, N:].copy()
+    clean[data.ok] -= transients
+    removed = np.full((len(clean), clean.shape[2]), np.nan)
+    removed[data.ok] = np.sqrt(np.mean(transients[:, -N * P :] ** 2, axis=1))
+    simulated = None
+    if data.simulated is not None:
+        # Events, some of which lie in the cycles that were cut off, are left out.
+        failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
+        simulated = Simulated(failed_at, data.error)
+    data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
+    return TransientFit(data, multipliers_of(c), removed)
+
+
+def _decays(
+    data: ExperimentData,
+    classes: list[Int[np.ndarray, " k"]],
+    everything: bool,
+    order: int | None,
+) -> tuple[Coefficients, Float[np.ndarray, "S n ny"]]:
+    """Return the coefficients of the multipliers, and the transients of all experiments that ran.
+
+    **Arguments:** `classes`: those that are excited in each experiment; `everything`: or all.
+
+    **Raises:** `DefinitionError` if the transient cannot be told from the response.
+    """
+    N = data.n_sections
+    y = data.y[data.ok]
+    size = np.sqrt(np.mean(y**2, axis=(0, 1)))
+    later = y[:, N:] / positive(size)
+    cycles = later.shape[1] // N
+    records = later.reshape(len(y), cycles, -1)
+    free = [_free(excited, data.periods, cycles) for excited in classes]
+    left = [Q @ record for Q, record in zip(free, records, strict=True)]
     least = min(map(len, free))
     if least <= (order or 1):
         raise DefinitionError(
             f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
             "from the response: record more, or excite half of the lines (`lines='odd'`)."
         )
-    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
-    # Pairs (Q, z) with no more columns of z than rows, and the same residuals.
+    # With everything, all Q are the same.
     whole = [np.concatenate(left, axis=1)] if everything else left
-    fewer = [z if z.shape[1] <= len(z) else np.linalg.qr(z.T)[1].T for z in whole]
-    blocks = list(
-        zip(free, fewer, strict=False)
-    )  # (with everything, all Q are the same)
-    count = sum(z.size for z in left)
-    fits = [_fit(blocks, _start(y, free, d), count, N * ny * len(good)) for d in tried]
-    c = min(fits, key=lambda fit: fit[0])[1]
+    blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
+    numbers = sum(z.size for z in left)
+    series = records[:, 0].size
+    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
+    fits = []
+    for d in tried:
+        c, cost = _fit(blocks, _start(records, free, d))
+        parameters = d * (series + 1)
+        mean = max(cost, 1e-300) / numbers
+        length = numbers * np.log(mean) + parameters * np.log(numbers)
+        fits.append((length, c))
+    _, c = min(fits, key=lambda fit: fit[0])
+    basis = _decay(c, cycles)
+    transients = []
+    for Q, z in zip(free, left, strict=True):
+        amplitudes = np.linalg.lstsq(Q @ basis, z)[0]
+        transients.append(basis @ amplitudes)
+    return c, np.reshape(transients, later.shape) * size
 
-    basis = start_responses(c, np.zeros(1, int), cycles, len(c))[0]
-    clean, removed = data.y[:, N:].copy(), np.full((S, ny), np.nan)
-    for Q, z, s in zip(free, left, good, strict=True):
-        transient = basis @ np.linalg.lstsq(Q @ basis, z, rcond=None)[0]
-        transient = transient.reshape(-1, ny) * size
-        clean[s] -= transient
-        removed[s] = np.sqrt(np.mean(transient[-N * P :] ** 2, axis=0))
-    failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
-    # Events, some of which lie in the cycles that were cut off, are left out.
-    simulated = None if data.simulated is None else Simulated(failed_at, data.error)
-    data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
-    return TransientFit(data, multipliers_of(c), removed)
+
+def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) -> None:
+    """**Raises:** `DefinitionError` for an input that does not repeat after P periods."""
+    length = data.n_sections * data.periods
+    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    worst = int(np.argmax(change))
+    if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
+        raise DefinitionError(
+            f"the input of experiment {np.flatnonzero(data.ok)[worst]} does not repeat after P = "
+            f"{data.periods} periods over all of the record: cut off the part in which it does not."
+        )
+
+
+def _excited_classes(
+    data: ExperimentData, u: Float[np.ndarray, "S n nu"]
+) -> list[Int[np.ndarray, " k"]]:
+    """Return the classes of the lines that each experiment excites, and class 0."""
+    size = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
+    excited = size > SILENT_LINE * size.max(axis=1, keepdims=True)
+    lines = map(np.flatnonzero, excited)
+    return [np.unique(np.append(line_class(x, data.periods), 0)) for x in lines]
+
+
+def _condensed(z: Float[np.ndarray, "rows _"]) -> Float[np.ndarray, "rows _"]:
+    """Return a matrix with no more columns than rows, and the same residuals of regressions."""
+    if z.shape[1] <= len(z):
+        return z
+    return np.linalg.qr(z.T, mode="r").T
+
+
+def _decay(c: Coefficients, cycles: int) -> Float[np.ndarray, "cycles d"]:
+    """Return a basis of all decays with these multipliers."""
+    return start_responses(c, np.zeros(1, int), cycles, len(c))[0]
 
 
 def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
     """Return rows that are orthogonal to the sinusoids of these classes at one section."""
-    angle = 2 * np.pi / P * np.arange(cycles)[:, None] * classes
+    angle = 2 * np.pi / P * np.outer(np.arange(cycles), classes)
     inner = (classes > 0) & (2 * classes < P)
     signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
-    return np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
+    return linalg.null_space(signals.T).T
 
 
-def _start(y, free, d: int) -> Float[np.ndarray, " d"]:
-    """Solve the equation of the decay, which `y` obeys but for sinusoids, by least squares."""
-    normal, right = np.zeros((d, d)), np.zeros(d)
-    cycles = y.shape[1]
-    for Q, record in zip(free, y, strict=True):
+def _start(records, free, d: int) -> Coefficients:
+    """Solve the equation of the decay, which records obey but for sinusoids, by least squares."""
+    normal = np.zeros((d, d))
+    right = np.zeros(d)
+    cycles = records.shape[1]
+    for Q, record in zip(free, records, strict=True):
         # The same sinusoids, d periods fewer.
-        signals = np.linalg.svd(Q, full_matrices=True)[2][len(Q) :].T[d:]
-        keep = np.linalg.qr(signals, mode="complete")[0][:, signals.shape[1] :].T
-        lags = np.stack([keep @ record[d - i : cycles - i] for i in range(d + 1)])
-        normal += np.einsum("ikl,jkl->ij", lags[1:], lags[1:])
-        right -= np.einsum("ikl,kl->i", lags[1:], lags[0])
-    return np.linalg.lstsq(normal, right, rcond=None)[0]
+        sinusoids = linalg.null_space(Q)[d:]
+        keep = linalg.null_space(sinusoids.T).T
+        now, *earlier = (keep @ record[d - i : cycles - i] for i in range(d + 1))
+        earlier = np.stack(earlier)
+        normal += np.tensordot(earlier, earlier, ((1, 2), (1, 2)))
+        right -= np.tensordot(earlier, now, 2)
+    return np.linalg.lstsq(normal, right)[0]
 
 
-def _fit(blocks, start: Float[np.ndarray, " d"], count: int, series: int):
-    """Return the length of the description, and the coefficients."""
-    from scipy.optimize import least_squares  # (a third of a second)
-
+def _fit(blocks, start: Coefficients) -> tuple[Coefficients, float]:
+    """Return the coefficients that leave the smallest sum of squares, and this sum."""
     cycles = blocks[0][0].shape[1]
 
     def residual(c):
-        basis, out = start_responses(c, np.zeros(1, int), cycles, len(c))[0], []
+        basis = _decay(c, cycles)
+        left = []
         for Q, z in blocks:
-            q = np.linalg.qr(Q @ basis)[0]
-            out.append((z - q @ (q.T @ z)).ravel())
-        return np.concatenate(out)
+            q, _ = np.linalg.qr(Q @ basis)
+            left.append(without(q, z).ravel())
+        return np.concatenate(left)
 
-    fit = least_squares(residual, start, x_scale="jac")
-    parameters = len(start) * (series + 1)
-    mean = max(2 * fit.cost, 1e-300) / count
-    return count * np.log(mean) + parameters * np.log(count), fit.x
+    fit = optimize.least_squares(residual, start, x_scale="jac")
+    return fit.x, 2 * fit.cost

@@ -16,12 +16,13 @@ from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
 from ..linear.ldtp import LDTP
+from .descent import positive
 from .instrument import in_loop
 from .joint.fit import LDTPFit
 from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.prediction import Predictor
-from .series.records import CycleGrid, PreparedRecords, drift_waves
+from .series.records import CycleGrid, PreparedRecords, Signals, drift_waves
 from .series.residuals import (
     FEWEST_SAMPLES,
     independence_test,
@@ -40,7 +41,8 @@ def can_be_compared(
     model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
 ) -> bool:
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
-    N, ny = record.n_sections, record.y.shape[1]
+    N = record.n_sections
+    ny = record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
     if isinstance(model, SeriesFit):
         unknown += N * ny * model.free_cycles * free_start
@@ -121,15 +123,17 @@ class Validation(eqx.Module):
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]
-        w = max(12, *map(len, names))
-        head = f"{'output':>{w}}  {'fit':>9}  {'rms left':>9}"
-        rows = [f"{head}  {'white':>11}  {'independent':>11}"]
+        width = max(12, *map(len, names))
+        tests = f"{'white':>11}  {'independent':>11}"
+        rows = [f"{'output':>{width}}  {'fit':>9}  {'rms left':>9}  {tests}"]
         for i, name in enumerate(names):
-            tests = (
-                f"{p_value(self.whiteness[i]):>11}  {p_value(self.independence[i]):>11}"
+            white, independent = (
+                p_value(self.whiteness[i]),
+                p_value(self.independence[i]),
             )
             rows.append(
-                f"{name:>{w}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  {tests}"
+                f"{name:>{width}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  "
+                f"{white:>11}  {independent:>11}"
             )
         if self.unexplained:
             rows.append(
@@ -208,92 +212,66 @@ def validate(
     unstable outside of its loop or grows without bound, unless it is a fit of `fit_ldtp`.
     """
     free_start = start == "free"
-    tested = (model.predictor or model.model) if isinstance(model, LDTPFit) else model
-    unstable = (
-        not isinstance(tested, Predictor) and (np.abs(model.multipliers) >= 1).any()
-    )
-    records, drive = uninterrupted_records(data), None
+    tested: LDTP | SeriesFit | Predictor = _tested(model)
+    records = uninterrupted_records(data)
+    outside = records
     if reference is not None:
-        records, drive = in_loop(data, reference)
+        records, outside = in_loop(data, reference)
     require_same("model and data", model, records[0])
-    kept = [can_be_compared(tested, r, free_start) for r in records]
+    kept = [can_be_compared(tested, record, free_start) for record in records]
     compared = list(itertools.compress(records, kept))
-    N, outputs, ny = records[0].n_sections, records[0].outputs, len(records[0].outputs)
+    N = records[0].n_sections
+    ny = len(records[0].outputs)
     if not compared:
+        longest = max(len(record.u) for record in records)
         raise DefinitionError(
-            f"{max(len(r.u) for r in records) / N:.3g} cycles without gaps are too few for an "
-            "unknown initial state: record longer without gaps, or use `validate(start='cycle')`."
+            f"{longest / N:.3g} cycles without gaps are too few for an unknown initial state: "
+            "record longer without gaps, or use `validate(start='cycle')`."
         )
     prepared = PreparedRecords(compared)
-    grid, sampled = prepared.whole(), prepared.sampled
-    y = np.where(grid.sampled, grid.y, np.nan)
-
-    def count(lags: int) -> Int[np.ndarray, "N ny"]:
-        """Return how often each section was sampled with so many samples before it."""
-        return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
-
-    if (few := int(sampled.min())) < FEWEST_SAMPLES:
-        raise DefinitionError(
-            f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles."
-        )
-    # One period, less for few cycles.
-    tried = range(1, min(N, few // _SAMPLES_PER_LAG) + 1)
-    lags = max((k for k in tried if count(k).min() >= FEWEST_SAMPLES), default=1)
-    if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
-        raise DefinitionError(
-            f"the records are too short: each section must be sampled {FEWEST_SAMPLES} times with "
-            f"{lags} samples before it. Record longer without gaps."
-        )
-    roots = (
-        []
-        if isinstance(model, LDTP) or isinstance(tested, LDTP)
-        else list(model.spread(grid))
-    )
-    if isinstance(
-        tested, LDTP
-    ):  # outputs in units of their size, so that none is neglected
+    grid = prepared.whole()
+    lags = _lags(prepared, grid)
+    roots = [] if isinstance(tested, LDTP) else list(model.spread(grid))
+    if isinstance(tested, LDTP):
+        # Outputs in units of their size, so that none is neglected.
         S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
+    y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):
         simulated = tested.predict(grid, free_start)
         error = y - simulated
-        # Compare with the mean of the other cycles, cycle by cycle (Diebold and Mariano 1995).
-        n = np.maximum(np.isfinite(y).sum(axis=(0, 1)), 2)
-        alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
-        gain = np.nansum(alone**2 - error**2, axis=2)[grid.sampled.any(axis=(2, 3))]
-        no_better = stats.norm.sf(
-            gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0)
-        )
-    if unstable and (drive or not np.isfinite(simulated[grid.inside]).all()):
-        raise DefinitionError(
-            "the simulation of an unstable plant grows without bound: validate `fit_ldtp(series)`."
-        )
+        no_better = _no_better(y, error)
+    predicts = isinstance(model, LDTPFit) and model.predictor is not None
+    if not predicts and (np.abs(model.multipliers) >= 1).any():
+        finite = np.isfinite(simulated[grid.inside]).all()
+        if reference is not None or not finite:
+            raise DefinitionError(
+                "the simulation of an unstable plant grows without bound: validate "
+                "`fit_ldtp(series)`."
+            )
     rms = np.sqrt(np.nanmean(error**2, axis=(0, 1, 2)))
     size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
-    auto, whiteness = whiteness_test(whitened(error, roots), lags)
+    autocorrelation, whiteness = whiteness_test(whitened(error, roots), lags)
     late = np.where((grid.age >= lags)[..., None], error, np.nan)
-    outside = CycleGrid.from_records(list(itertools.compress(drive or records, kept))).u
-    cross, independence, visible = independence_test(
-        outside, late, lags, level / ny, roots
+    inputs = CycleGrid.from_records(list(itertools.compress(outside, kept))).u
+    cross_correlation, independence, visible = independence_test(
+        inputs, late, lags, level / ny, roots
     )
+    rounding = is_exact(grid, error)  # (shows nothing)
     k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
     first = longest.first_section
-    shown = slice(
-        first, first + len(longest.u) - longest.lead
-    )  # later inputs are unknown
+    # Inputs after the last samples are unknown.
+    shown = slice(first, first + len(longest.u) - longest.lead)
+    share = visible * rms / positive(size)
     return Validation(
         fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
         noise=rms,
         no_better=no_better,
-        whiteness=np.maximum(
-            whiteness, is_exact(grid, error)
-        ),  # (rounding shows nothing)
-        independence=np.maximum(independence, is_exact(grid, error)),
-        visible=np.where(
-            size > 0, visible * rms / np.where(size > 0, size, 1.0), np.inf
-        ),
-        autocorrelation=auto,
-        cross_correlation=cross,
+        whiteness=np.maximum(whiteness, rounding),
+        independence=np.maximum(independence, rounding),
+        visible=np.where(size > 0, share, np.inf),
+        autocorrelation=autocorrelation,
+        cross_correlation=cross_correlation,
         measured=y[k].reshape(-1, ny)[shown],
         simulated=simulated[k].reshape(-1, ny)[shown],
         level=level,
@@ -301,5 +279,49 @@ def validate(
         left_out=len(records) - len(compared),
         n_sections=N,
         inputs=longest.inputs,
-        outputs=outputs,
+        outputs=longest.outputs,
     )
+
+
+def _tested(model: LDTP | SeriesFit | LDTPFit) -> LDTP | SeriesFit | Predictor:
+    """Return what predicts the outputs."""
+    if isinstance(model, LDTPFit):
+        return model.predictor or model.model
+    return model
+
+
+def _lags(prepared: PreparedRecords, grid: CycleGrid) -> int:
+    """Return the number of lags that the tests use: one period, less for few cycles.
+
+    **Raises:** `DefinitionError` for too few samples of a section.
+    """
+
+    def count(lags: int) -> Int[np.ndarray, "N ny"]:
+        """Return how often each section was sampled with so many samples before it."""
+        return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
+
+    few = int(prepared.sampled.min())
+    if few < FEWEST_SAMPLES:
+        raise DefinitionError(
+            f"a section was sampled {few} times: record {FEWEST_SAMPLES} cycles."
+        )
+    most = min(prepared.n_sections, few // _SAMPLES_PER_LAG)
+    enough = [k for k in range(1, most + 1) if count(k).min() >= FEWEST_SAMPLES]
+    lags = max(enough, default=1)
+    if (count(lags).max(axis=0) < FEWEST_SAMPLES).any():
+        raise DefinitionError(
+            f"the records are too short: each section must be sampled {FEWEST_SAMPLES} times with "
+            f"{lags} samples before it. Record longer without gaps."
+        )
+    return lags
+
+
+def _no_better(y: Signals, error: Signals) -> Float[np.ndarray, " ny"]:
+    """Return p-values of the hypothesis that squared errors are no smaller than deviations from the
+    mean of the other cycles, cycle by cycle (Diebold and Mariano 1995)."""
+    sampled = np.isfinite(y)
+    n = np.maximum(sampled.sum(axis=(0, 1)), 2)
+    alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
+    by_cycle = np.nansum(alone**2 - error**2, axis=2)
+    gain = by_cycle[sampled.any(axis=(2, 3))]
+    return stats.norm.sf(gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0))

@@ -8,10 +8,10 @@ depends on c alone (variable projection: Golub and Pereyra 1973).
 Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import count
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Inexact, Int
@@ -24,7 +24,9 @@ from .descent import (
     ROUGH,
     ROUNDING,
     Coefficients,
+    Gradient,
     least_squares,
+    without,
 )
 from .weights import check_values, error_weights
 
@@ -78,16 +80,16 @@ class HTFGroup(NamedTuple):
         self, c: Coefficients, values: Complex[np.ndarray, "E n"]
     ) -> Float[np.ndarray, "2*E n"]:
         """Return the rows of chi H = B, weighted: errors of H are multiplied by chi there."""
-        return split(
-            (self.weight / np.abs(chi(self.period_delay, c)))[:, None] * values
-        )
+        return split(self._weight_by_chi(c)[:, None] * values)
 
     def numerator_space(
         self, c: Coefficients
     ) -> tuple[Float[np.ndarray, "2*E r"], Float[np.ndarray, "r r"]]:
         """Return an orthonormal basis of the numerators' weighted values, and its QR's triangle."""
-        w = self.weight / np.abs(chi(self.period_delay, c))
-        return np.linalg.qr(np.concatenate([w, w])[:, None] * self.basis)
+        return np.linalg.qr(np.tile(self._weight_by_chi(c), 2)[:, None] * self.basis)
+
+    def _weight_by_chi(self, c: Coefficients) -> Float[np.ndarray, " E"]:
+        return self.weight / np.abs(chi(self.period_delay, c))
 
 
 def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"]:
@@ -96,8 +98,6 @@ def split(values: Complex[np.ndarray, "*d E n"]) -> Float[np.ndarray, "*d 2*E n"
 
 
 Groups = Sequence[HTFGroup]
-Gradient = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]
-"""Residuals, and their Jacobian."""
 
 
 class Misfit(NamedTuple):
@@ -115,7 +115,8 @@ class Misfit(NamedTuple):
 
 def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     """Return the misfit at c and its derivatives; `Misfit.noise` is zero unless asked for."""
-    d, E = len(c), len(group.period_delay)
+    d = len(c)
+    E = len(group.period_delay)
     q, _ = group.numerator_space(c)
     below = chi(group.period_delay, c)[:, None]
     target = group.weighted(c, below * group.data)
@@ -124,8 +125,7 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     delays = group.period_delay[:, None] ** np.arange(1, d + 1)[:, None, None] / below
 
     def filtered(rows):
-        rows = split(delays * (rows[:E] + 1j * rows[E:]))
-        return rows - q @ (q.T @ rows)
+        return without(q, split(delays * (rows[:E] + 1j * rows[E:])))
 
     by_noise = np.zeros((d, d))
     if noise:
@@ -144,11 +144,14 @@ def late_columns(
     The coefficients of chi combine the columns to errors alone. Then the part of each equation's
     variance that numerators leave.
     """
-    (q, _), delay = group.numerator_space(c), group.period_delay[:, None]
-    rows = [group.weighted(c, delay**j * group.data) for j in range(len(c) + 1)]
-    columns = np.stack([(x - q @ (q.T @ x)).ravel() for x in rows], axis=1)
+    q, _ = group.numerator_space(c)
+    delay = group.period_delay[:, None]
+    columns = []
+    for j in range(len(c) + 1):
+        rows = group.weighted(c, delay**j * group.data)
+        columns.append(without(q, rows).ravel())
     left = 2 - (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
-    return columns, left / np.abs(chi(group.period_delay, c)) ** 2
+    return np.stack(columns, axis=1), left / np.abs(chi(group.period_delay, c)) ** 2
 
 
 def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.ndarray]:
@@ -157,14 +160,15 @@ def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.n
     The first root is in units of the second, which is that of the Gram matrix that is expected from
     errors of variance 1. (The Gram matrix itself would lose half of the digits.)
     """
-    delays, columns, noise_gram = np.arange(len(c) + 1), [], 0.0
+    delays = np.arange(len(c) + 1)
+    apart = np.abs(delays[:, None] - delays)
+    columns = []
+    noise_gram = np.zeros(apart.shape)
     for group in groups:
         delayed, left = late_columns(group, c)
         columns.append(delayed)
         by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
-        noise_gram = (
-            noise_gram + by_delay[np.abs(delays[:, None] - delays)] * group.size
-        )
+        noise_gram += by_delay[apart] * group.size
     noise = np.linalg.cholesky(noise_gram)
     _, triangle = np.linalg.qr(np.concatenate(columns))
     return np.linalg.solve(noise, triangle.T), noise
@@ -194,10 +198,10 @@ def maximum_likelihood(
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
     problem. `rough`: whether to stop where noise of variance one explains the next step.
     """
-    start = _linearized(groups, order) if start is None else start
-    return least_squares(
-        lambda c: residuals_of(groups, c), start, **(ROUGH if rough else {})
-    )
+    if start is None:
+        start = _linearized(groups, order)
+    limits = ROUGH if rough else {}
+    return least_squares(lambda c: residuals_of(groups, c), start, **limits)
 
 
 def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
@@ -212,7 +216,8 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
         null = np.linalg.solve(noise.T, vectors[:, -1])
         if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
             break
-        c, last = null[1:] / null[0], c
+        last = c
+        c = null[1:] / null[0]
         if np.abs(c - last).max() < _SETTLED_START * (1 + np.abs(c).max()):
             break
     return c
@@ -234,33 +239,28 @@ def summarize(
     """
     d = len(c)
     lines = 1 + max(int(group.line.max()) for group in groups)
-    score, shares = np.zeros((lines, d)), np.zeros((lines, d, d))
-    noise, cost, freedom = np.zeros((d, d)), 0.0, 0
+    score = np.zeros((lines, d))
+    shares = np.zeros((lines, d, d))
+    noise = np.zeros((d, d))
     for group in groups:
         misfit = misfit_of(group, c, noise=True)
         noise += misfit.noise * group.size
-        cost += float((misfit.residual**2).sum())
-        freedom += group.freedom * group.size
         # A residual is smaller than the error, by the share of its equation in the numerators (to
         # rounding, at most all of it).
-        error = (
-            misfit.residual
-            / np.sqrt(1 - np.minimum(misfit.leverage, 1 - 1e-15))[..., None]
-        )
-        np.add.at(score, group.line, np.einsum("jaek,aek->ej", misfit.jacobian, error))
-        np.add.at(
-            shares,
-            group.line,
-            np.einsum("iaek,jaek->eij", misfit.jacobian, misfit.jacobian),
-        )
+        left = 1 - np.minimum(misfit.leverage, 1 - 1e-15)
+        error = misfit.residual / np.sqrt(left)[..., None]
+        slopes = misfit.jacobian
+        np.add.at(score, group.line, np.einsum("jaek,aek->ej", slopes, error))
+        np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", slopes, slopes))
+    cost, freedom = cost_of(groups, c)
     square = shares.sum(axis=0)
     if errors == "variance":
         return sandwich(square - noise, square), cost, freedom
     with suppress(np.linalg.LinAlgError):  # some combination of coefficients is unknown
         root = np.linalg.cholesky(square)
         half = np.linalg.inv(root)
-        left = inverse_of_remainder(half @ shares @ half.T, 0.5)
-        score = np.einsum("lij,lj->li", left, score @ half.T) @ root.T
+        enlarged = inverse_of_remainder(half @ shares @ half.T, 0.5)
+        score = np.einsum("lij,lj->li", enlarged, score @ half.T) @ root.T
     return sandwich(square - noise, score.T @ score, shares), cost, freedom
 
 
@@ -276,20 +276,34 @@ def unfold(
 ) -> Complex[np.ndarray, "M R ny nu"]:
     """Return the numerators of the HTFs from those of the responses of each group."""
     _, _, ny, nu = htf.H.shape
-    out = np.zeros((len(htf.harmonics), len(numerators[0]), ny, nu), complex)
+    out = np.zeros((len(htf.harmonics), ny, nu, len(numerators[0])), complex)
     for group, b in zip(groups, numerators, strict=True):
-        (i, j), two, entries = group.channel.T, group.mirror >= 0, (group.share * b).T
-        at: Any = (group.harmonic, slice(None), i, j)
-        np.add.at(out, at, entries)
-        at = (group.mirror[two], slice(None), i[two], j[two])
-        np.add.at(out, at, entries[two].conj())
-    return out
+        entries = (group.share * b).T
+        i, j = group.channel.T
+        np.add.at(out, (group.harmonic, i, j), entries)
+        paired = group.mirror >= 0
+        opposite = group.mirror[paired], i[paired], j[paired]
+        np.add.at(out, opposite, entries[paired].conj())
+    return np.moveaxis(out, 3, 1)
 
 
 def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
     """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
     size = numerator_size(htf, order, overhang)
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
+
+
+class Response(NamedTuple):
+    """A combination of entries of HTFs whose numerator solves a problem of its own."""
+
+    harmonic: tuple[int, int]
+    """The positions of its harmonic and of the opposite one, which is -1 where there is none."""
+    share: complex
+    """Its factor in the HTF of its harmonic (conjugate: in the opposite one)."""
+    channel: tuple[int, int]
+    """Output and input."""
+    values: Complex[np.ndarray, " E"]
+    weight: Float[np.ndarray, " E"]
 
 
 def group_htf(
@@ -302,40 +316,58 @@ def group_htf(
     two responses with real numerators, and independent errors if both weights are the same. Other
     pairs, and harmonics without the opposite one, have complex numerators.
     """
-    f, H, N = np.asarray(htf.f), np.asarray(htf.H), htf.n_sections
+    f = np.asarray(htf.f)
+    N = htf.n_sections
     powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(size))
     turned = np.concatenate([powers, 1j * powers], axis=1)
-    pair = np.concatenate([turned, np.concatenate([powers, -1j * powers], axis=1)])
+    conjugate = np.concatenate([powers, -1j * powers], axis=1)
+    matrices = {
+        "real": powers,
+        "single": turned,
+        "double": np.concatenate([turned, conjugate]),
+    }
+    responses: dict[str, list[Response]] = {kind: [] for kind in matrices}
     row_of = {m % N: row for row, m in enumerate(htf.harmonics)}
-    entries: tuple[list[tuple], ...] = [], [], []
-    real, single, double = entries
-    half = np.sqrt(0.5)
     for m, row in row_of.items():
-        other, h, w = row_of.get(-m % N, -1), H[row], weight[row]
-        g, v = H[other], weight[other]
-        same = (np.abs(v - w) <= 10.0**-EQUAL_WEIGHTS * w).all(axis=0)
-        for i, j in np.ndindex(same.shape):
-            at, channel = (slice(None), i, j), (i, j)
-            if other == row:
-                real.append((row, -1, 1.0, channel, h[at], w[at]))
-            elif other < 0:
-                single.append((row, -1, 1.0, channel, h[at], w[at]))
-            elif row < other and same[i, j]:
-                real.append((row, other, half, channel, half * (h + g)[at], w[at]))
-                real.append(
-                    (row, other, 1j * half, channel, half / 1j * (h - g)[at], w[at])
-                )
-            elif row < other:
-                both = np.concatenate([h[at], g[at]]), np.concatenate([w[at], v[at]])
-                double.append((row, other, 1.0, channel, *both))
-    kinds = zip((powers, turned, pair), entries, strict=True)
+        other = row_of.get(-m % N, -1)
+        if other < 0 or row <= other:
+            for kind, response in _responses_of(htf, weight, row, other):
+                responses[kind].append(response)
     sources = np.arange(len(f)) if htf.scatter is None else htf.scatter.sources(f)
-    return [
-        group
-        for kind in kinds
-        if kind[1]
-        for group in equal_weights(f, sources, size, *kind)
-    ]
+    groups = []
+    for kind, matrix in matrices.items():
+        if responses[kind]:
+            groups += equal_weights(f, sources, size, matrix, responses[kind])
+    return groups
+
+
+def _responses_of(
+    htf: HTF, weight: Float[np.ndarray, "M F ny nu"], row: int, other: int
+) -> Iterator[tuple[str, Response]]:
+    """Iterate over the responses of a harmonic and the opposite one, with their kinds."""
+    H = np.asarray(htf.H)
+    half = np.sqrt(0.5)
+    w = weight[row]
+    v = weight[other]
+    alike = (np.abs(v - w) <= 10.0**-EQUAL_WEIGHTS * w).all(axis=0)
+    for channel in np.ndindex(alike.shape):
+        at = (slice(None), *channel)
+        h = H[row][at]
+        g = H[other][at]
+        if other == row:
+            yield "real", Response((row, -1), 1.0, channel, h, w[at])
+        elif other < 0:
+            yield "single", Response((row, -1), 1.0, channel, h, w[at])
+        elif alike[channel]:
+            pair = (row, other)
+            total = half * (h + g)
+            difference = half / 1j * (h - g)
+            yield "real", Response(pair, half, channel, total, w[at])
+            yield "real", Response(pair, 1j * half, channel, difference, w[at])
+        else:
+            values = np.concatenate([h, g])
+            both = np.concatenate([w[at], v[at]])
+            yield "double", Response((row, other), 1.0, channel, values, both)
 
 
 def equal_weights(
@@ -343,44 +375,42 @@ def equal_weights(
     sources: Int[np.ndarray, " F"],
     size: int,
     matrix: Complex[np.ndarray, "E u"],
-    entries: list[tuple],
+    responses: list[Response],
 ) -> list[HTFGroup]:
     """Return responses whose numerators solve the same problem, one group for each weight.
 
     **Arguments:** `sources`: for each frequency the number of its noise, see `HTFGroup.line`.
-    `matrix`: maps u real coefficients to the numerator's values. `entries`: for each response the
-    position of its harmonic and of the opposite one, its share, output and input, values and
-    weights.
+    `matrix`: maps u real coefficients to the numerator's values.
     """
-    harmonic, mirror, share, channel, data, weights = map(
-        np.array, zip(*entries, strict=True)
+    harmonic, share, channel, data, weights = map(
+        np.array, zip(*responses, strict=True)
     )
     basis, to_powers = powers_basis(split(matrix))
     if len(to_powers) > size:
         to_powers = to_powers[:size] + 1j * to_powers[size:]
     scale = weights[:, 0]
     shape = weights / scale[:, None]
-    _, first, which = np.unique(
+    _, first, kind = np.unique(
         np.round(shape, EQUAL_WEIGHTS), axis=0, return_index=True, return_inverse=True
     )
-    copies, groups = len(matrix) // len(f), []
+    copies = len(matrix) // len(f)
+    groups = []
     for k, representative in enumerate(first):
-        same = np.flatnonzero(which.ravel() == k)
-        groups.append(
-            HTFGroup(
-                harmonic=harmonic[same],
-                mirror=mirror[same],
-                share=share[same],
-                channel=channel[same],
-                line=np.tile(sources, copies),
-                period_delay=np.tile(np.exp(-2j * np.pi * f), copies),
-                basis=basis,
-                to_powers=to_powers,
-                weight=shape[representative],
-                scale=scale[same],
-                data=(data[same] * scale[same, None]).T,
-            )
+        same = np.flatnonzero(kind.ravel() == k)
+        group = HTFGroup(
+            harmonic=harmonic[same, 0],
+            mirror=harmonic[same, 1],
+            share=share[same],
+            channel=channel[same],
+            line=np.tile(sources, copies),
+            period_delay=np.tile(np.exp(-2j * np.pi * f), copies),
+            basis=basis,
+            to_powers=to_powers,
+            weight=shape[representative],
+            scale=scale[same],
+            data=(data[same] * scale[same, None]).T,
         )
+        groups.append(group)
     return groups
 
 
@@ -393,9 +423,8 @@ def powers_basis(
     (smallest) coefficients that make each element.
     """
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
-    kept = (
-        s > 0.1 * ROUNDING * s[0]
-    )  # one combination less would change bounds by 0.3 %
+    # (One combination less would change bounds by 0.3 %.)
+    kept = s > 0.1 * ROUNDING * s[0]
     return u[:, kept], vh[kept].conj().T / s[kept]
 
 
@@ -405,7 +434,8 @@ def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
     **Raises:** `DefinitionError` for too few frequencies to determine them and the multipliers.
     """
     N = htf.n_sections
-    size = order * N + (N if overhang is None else overhang) + 1
+    beyond = N if overhang is None else overhang
+    size = order * N + beyond + 1
     harmonics = {m % N for m in htf.harmonics}
     # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
     unknown = [size if -m % N in harmonics else 2 * size for m in harmonics]
@@ -439,16 +469,13 @@ def error_spectrum(
     This is a step of scoring towards the largest restricted likelihood (Patterson and Thompson
     1971), from the weights of the groups, which accounts for the fitted numerators.
     """
-    square, expected = np.zeros((outputs, 2)), np.zeros((outputs, 2, 2))
+    square = np.zeros((outputs, 2))
+    expected = np.zeros((outputs, 2, 2))
     for group in groups:
-        relative = lines[
-            :, 0, group.channel[:, 1]
-        ]  # (F, K), columns alike but for factors
-        parts = (
-            _components(group.period_delay, c)
-            * group.weight**2
-            * relative[group.line, 0]
-        )
+        # (F, K), columns alike but for factors
+        relative = lines[:, 0, group.channel[:, 1]]
+        spectra = _components(group.period_delay, c)
+        parts = spectra * group.weight**2 * relative[group.line, 0]
         size = group.scale**2 / 2 * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
         # tr(G_k R G_l R), where R subtracts the best numerators: the mean of `parts[k]` times the
@@ -456,12 +483,14 @@ def error_spectrum(
         q, _ = group.numerator_space(c)
         rows = np.concatenate([parts, parts], axis=1)
         along = np.stack([q.T @ (row[:, None] * q) for row in rows]).reshape(2, -1)
-        products = rows * (1 - 2 * (q**2).sum(axis=1)) @ rows.T + along @ along.T
+        left = 1 - 2 * (q**2).sum(axis=1)
+        products = rows * left @ rows.T + along @ along.T
         for k, i in enumerate(group.channel[:, 0]):
             square[i] += size[k] * (parts @ residual[:, k])
             expected[i] += size[k] ** 2 * products
     sizes = np.stack([amounts(*pair) for pair in zip(expected, square, strict=True)])
-    return (sizes @ _components(np.exp(-2j * np.pi * f), c)).T[..., None] * lines
+    spectrum = sizes @ _components(np.exp(-2j * np.pi * f), c)
+    return spectrum.T[..., None] * lines
 
 
 def _components(

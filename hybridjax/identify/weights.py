@@ -34,11 +34,10 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
         name = htf.outputs[int(np.argmin(rms))]
         raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
     if htf.variance is not None:
-        bad = np.argwhere(
-            ~(np.isfinite(htf.variance) & (np.asarray(htf.variance) >= 0))
-        )
+        variance = np.asarray(htf.variance)
+        bad = np.argwhere(~(np.isfinite(variance) & (variance >= 0)))
         if len(bad):
-            m, k, i, _ = (int(x) for x in bad[0])
+            m, k, i, _ = bad[0].tolist()
             raise DefinitionError(
                 f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = {htf.f[k]:g} is "
                 "not a positive number: leave f out, or measure several realizations or windows."
@@ -59,22 +58,27 @@ def error_weights(
     for the power of the inputs.
     """
     if htf.variance is None:
-        return np.broadcast_to(
-            1 / (rms[:, None] * np.sqrt(line_variances(htf))), htf.H.shape
-        )
+        weight = 1 / (rms[:, None] * np.sqrt(line_variances(htf)))
+        return np.broadcast_to(weight, htf.H.shape)
     variance = np.asarray(htf.variance)
     if htf.scatter is not None and variance.all():
-        _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
-        freedom = np.asarray(htf.scatter.freedom)
-        size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
-        for _ in range(20):  # more sweeps change nothing in 6 digits
-            by_line = (variance / size[same]).mean(axis=0)
-            mean = np.average(variance / by_line, axis=1, weights=freedom)
-            size = np.stack([mean[same == k].mean(axis=0) for k in range(len(size))])[
-                :, None
-            ]
-        variance = size[same] * by_line
+        variance = _separated(htf, variance)
     return weights_of(variance, rms)
+
+
+def _separated(
+    htf: HTF, variance: Float[np.ndarray, "M F ny nu"]
+) -> Float[np.ndarray, "M F ny nu"]:
+    """Return the nearest product of a factor for each frequency and one for each harmonic."""
+    _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
+    freedom = np.asarray(htf.scatter.freedom)
+    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+    for _ in range(20):  # more sweeps change nothing in 6 digits
+        by_line = (variance / size[same]).mean(axis=0)
+        mean = np.average(variance / by_line, axis=1, weights=freedom)
+        for k in range(len(size)):
+            size[k] = mean[same == k].mean(axis=0)
+    return size[same] * by_line
 
 
 def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
@@ -125,9 +129,10 @@ def neighbor_correlation(
     """Return the correlation of errors at neighboring frequencies, in which errors that are
     rounding beside the `values` count as zero."""
     ordered = error[:, np.argsort(f)]
-    rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
     neighbors = np.real(ordered[:, 1:] * ordered[:, :-1].conj()).mean()
-    return float(neighbors / np.maximum((np.abs(error) ** 2).mean(), rounding))
+    square = (np.abs(error) ** 2).mean()
+    rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
+    return float(neighbors / np.maximum(square, rounding))
 
 
 def are_alike(correlation: float, freedom: float) -> bool:

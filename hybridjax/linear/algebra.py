@@ -44,12 +44,18 @@ def static_gain(
 
     **Raises:** `DefinitionError` for another shape.
     """
-    xp, N, (ny, nu) = namespace(gain), n_sections, shape
+    xp = namespace(gain)
+    N = n_sections
+    ny, nu = shape
     one = {"inputs": ny, "outputs": nu}  # of the plant that it controls
     require_axes("a gain", gain, one, {"sections": N} | one)
-    D = xp.broadcast_to(gain, (N, ny, nu))
-    A, B, C = xp.zeros((N, 0, 0)), xp.zeros((N, 0, nu)), xp.zeros((N, ny, 0))
-    return Matrices(A, B, C, D, xp.zeros(N, int))
+    return Matrices(
+        A=xp.zeros((N, 0, 0)),
+        B=xp.zeros((N, 0, nu)),
+        C=xp.zeros((N, ny, 0)),
+        D=xp.broadcast_to(gain, (N, ny, nu)),
+        dims=xp.zeros(N, int),
+    )
 
 
 @host_first
@@ -65,40 +71,50 @@ def connect(
     States of both stand one after the other at each section, and padding behind both.
     """
     xp = namespace(a.A)
-
-    def beside(x, y):
-        (_, a, b), (_, c, d) = x.shape, y.shape
-        return xp.pad(x, ((0, 0), (0, c), (0, d))) + xp.pad(y, ((0, 0), (a, 0), (b, 0)))
-
-    A, B, C, D = (beside(x, y) for x, y in zip(a[:4], b[:4], strict=True))
-    to_inputs = solve(
-        xp.eye(len(K)) - K @ D,
-        xp.concatenate([K @ C, xp.broadcast_to(L, (len(D), *L.shape))], 2),
+    pairs = zip(a[:4], b[:4], strict=True)
+    A, B, C, D = (_side_by_side(x, y) for x, y in pairs)
+    d = C.shape[2]
+    outside = xp.broadcast_to(L, (len(D), *L.shape))
+    to_inputs = solve(xp.eye(len(K)) - K @ D, xp.concatenate([K @ C, outside], 2))
+    by_state = to_inputs[..., :d]
+    by_input = to_inputs[..., d:]
+    # Padding goes behind the states of both, which stay in their order.
+    is_padding = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
+    key = xp.concatenate(is_padding, axis=1) * d + xp.arange(d)
+    order = xp.argsort(key, axis=1)
+    before = order[:, None, :]
+    after = xp.roll(order, -1, axis=0)[:, :, None]
+    A = xp.take_along_axis(A + B @ by_state, after, 1)
+    return Matrices(
+        A=xp.take_along_axis(A, before, 2),
+        B=xp.take_along_axis(B @ by_input, after, 1),
+        C=xp.take_along_axis(M @ (C + D @ by_state), before, 2),
+        D=M @ D @ by_input,
+        dims=a.dims + b.dims,
     )
-    by_state, by_input = to_inputs[..., : C.shape[2]], to_inputs[..., C.shape[2] :]
-    place = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
-    size = C.shape[2]
-    order = xp.argsort(xp.concatenate(place, axis=1) * size + xp.arange(size), axis=1)
-    rows, after = order[:, None, :], xp.roll(order, -1, axis=0)[:, :, None]
-    A = xp.take_along_axis(xp.take_along_axis(A + B @ by_state, after, 1), rows, 2)
-    B = xp.take_along_axis(B @ by_input, after, 1)
-    C = xp.take_along_axis(M @ (C + D @ by_state), rows, 2)
-    return Matrices(A, B, C, M @ D @ by_input, a.dims + b.dims)
+
+
+def _side_by_side(
+    x: Float[Array, "N a b"], y: Float[Array, "N c d"]
+) -> Float[Array, "N ac bd"]:
+    """Return block diagonal matrices."""
+    xp = namespace(x)
+    _, a, b = x.shape
+    _, c, d = y.shape
+    return xp.pad(x, ((0, 0), (0, c), (0, d))) + xp.pad(y, ((0, 0), (a, 0), (b, 0)))
 
 
 def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -> None:
     """**Raises:** `DefinitionError` where a section answers itself without bounds by -F."""
     if is_traced(D, F):
         return
-    values = np.linalg.svd(
-        np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F), compute_uv=False
-    )
-    if len(
-        bad := np.flatnonzero(values[:, -1] < _WELL_POSED * np.maximum(values[:, 0], 1))
-    ):
+    answer = np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F)
+    size = np.linalg.svd(answer, compute_uv=False)
+    singular = size[:, -1] < _WELL_POSED * np.maximum(size[:, 0], 1)
+    if singular.any():
         raise DefinitionError(
-            f"direct feed-through answers itself at section {bad[0]} (I + D of plant times D of "
-            "controller is singular): let the controller wait a section."
+            f"direct feed-through answers itself at section {np.argmax(singular)} (I + D of plant "
+            "times D of controller is singular): let the controller wait a section."
         )
 
 
@@ -116,47 +132,49 @@ class Lines(NamedTuple):
 
         **Raises:** `DefinitionError` for a class that lacks a line.
         """
-        start = np.minimum(f % 1, -f % 1)
-        start = np.sort(start)[
-            np.insert(np.diff(np.sort(start)) > SAME_FREQUENCY, 0, True)
-        ]
-        wanted = start[:, None] + np.arange(N)
-        size = np.abs((f - wanted[..., None] + N / 2) % N - N / 2)
-        opposite = np.abs((f + wanted[..., None] + N / 2) % N - N / 2)
-        there, mirrored = (
-            size.min(axis=2) < SAME_FREQUENCY,
-            opposite.min(axis=2) < SAME_FREQUENCY,
-        )
-        if not (there | mirrored).all():
-            lost = (wanted[~(there | mirrored)][0] + N / 2) % N - N / 2
+        start = np.sort(np.minimum(f % 1, -f % 1))
+        is_new = np.insert(np.diff(start) > SAME_FREQUENCY, 0, True)
+        wanted = start[is_new][:, None] + np.arange(N)
+        apart = np.abs(_centered(f - wanted[..., None], N))
+        from_mirror = np.abs(_centered(f + wanted[..., None], N))
+        there = apart.min(axis=2) < SAME_FREQUENCY
+        mirrored = from_mirror.min(axis=2) < SAME_FREQUENCY
+        lost = wanted[~(there | mirrored)]
+        if len(lost):
             raise DefinitionError(
-                f"the HTFs do not hold f = {abs(lost):.10g} cycles per period: algebra takes all "
-                f"lines f + integers, up to N/2 = {N / 2:g}."
+                f"the HTFs do not hold f = {abs(_centered(lost[0], N)):.10g} cycles per period: "
+                f"algebra takes all lines f + integers, up to N/2 = {N / 2:g}."
             )
-        return cls(
-            np.where(there, size.argmin(axis=2), opposite.argmin(axis=2)), ~there
-        )
+        row = np.where(there, apart.argmin(axis=2), from_mirror.argmin(axis=2))
+        return cls(row, ~there)
 
     def matrices(self, x: Array) -> Complex[Array, "K Nny Nnu"]:
         """Return the harmonic matrices of values (N, F, ny, nu), in the order of all harmonics."""
-        (K, N), xp = self.row.shape, namespace(x)
+        xp = namespace(x)
+        K, N = self.row.shape
         m = np.arange(N)[:, None] - np.arange(N)
         sign = np.where(self.mirrored, -1, 1)[:, None]
         values = x[(sign * m + N // 2) % N, self.row[:, None]]  # (K, a, b, ny, nu)
-        values = xp.where(
-            self.mirrored[:, None, :, None, None], xp.conj(values), values
-        )
+        conjugated = self.mirrored[:, None, :, None, None]
+        values = xp.where(conjugated, xp.conj(values), values)
         return values.swapaxes(2, 3).reshape(K, N * x.shape[2], N * x.shape[3])
 
     def entries(self, matrices: Array) -> Complex[Array, "N F ny nu"]:
         """Return the values of all lines, whose harmonic matrices these are."""
-        (K, N), xp = self.row.shape, namespace(matrices)
+        xp = namespace(matrices)
+        K, N = self.row.shape
         values = matrices.reshape(K, N, matrices.shape[1] // N, N, -1).swapaxes(2, 3)
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
-        mirrored, m = self.mirrored[k, b], np.arange(N)[:, None] - N // 2
+        mirrored = self.mirrored[k, b]
+        m = np.arange(N)[:, None] - N // 2
         values = values[k, (b + np.where(mirrored, -m, m)) % N, b]
         return xp.where(mirrored[:, None, None], xp.conj(values), values)
+
+
+def _centered(f: Float[np.ndarray, "*shape"], N: int) -> Float[np.ndarray, "*shape"]:
+    """Return frequencies modulo N, between -N/2 and N/2."""
+    return (f + N / 2) % N - N / 2
 
 
 Operation = Callable[..., tuple[Array, list[tuple]]]
@@ -187,7 +205,10 @@ def feedback(P, F):
 def variance_of(pairs: list[tuple], variances: list[Array]) -> Array:
     """Return the variance of a result from those of independent errors of all entries."""
     total = 0.0
-    for (before, after), v in zip(pairs, variances, strict=True):
-        v = v if before is None else abs(before) ** 2 @ v
-        total = total + (v if after is None else v @ abs(after) ** 2)
+    for (before, after), variance in zip(pairs, variances, strict=True):
+        if before is not None:
+            variance = abs(before) ** 2 @ variance
+        if after is not None:
+            variance = variance @ abs(after) ** 2
+        total = total + variance
     return total

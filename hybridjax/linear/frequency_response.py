@@ -40,10 +40,12 @@ def check_harmonics(harmonics: Harmonics | None, n_sections: int) -> tuple[int, 
     every = all_harmonics(n_sections)
     if harmonics is None:
         return every
-    integers = (
-        tuple(sorted(harmonics)) if isinstance(harmonics, Iterable) else (harmonics,)
-    )
-    if outside := ([m for m in integers if m not in every] if n_sections else []):
+    if isinstance(harmonics, Iterable):
+        integers = tuple(sorted(harmonics))
+    else:
+        integers = (harmonics,)
+    outside = [m for m in integers if n_sections and m not in every]
+    if outside:
         raise DefinitionError(
             f"Harmonic {outside[0]} does not exist: with {n_sections} sections the harmonics are "
             f"{every[0]} to {every[-1]}."
@@ -63,15 +65,16 @@ def _derived(compiled: Callable) -> Callable:
     def rule(arguments, tangents):
         if not must_be_on_host():
             return eqx.filter_jvp(compiled, arguments, tangents)
-        value, pairs = (
-            harmonic_transfer(*arguments),
-            zip(arguments, tangents[:4], strict=False),
+        value = harmonic_transfer(*arguments)
+        along = [
+            jnp.zeros_like(x) if tangent is None else tangent
+            for x, tangent in zip(arguments, tangents[:4], strict=False)
+        ]
+        shape = jax.ShapeDtypeStruct(value.shape, value.dtype)
+        derivative = jax.pure_callback(
+            _along, shape, *arguments, *along, vmap_method="broadcast_all"
         )
-        along = [jnp.zeros_like(x) if t is None else t for x, t in pairs]
-        shape, each = jax.ShapeDtypeStruct(value.shape, value.dtype), "broadcast_all"
-        return value, jax.pure_callback(
-            _along, shape, *arguments, *along, vmap_method=each
-        )
+        return value, derivative
 
     return derived
 
@@ -80,17 +83,23 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     """Derivatives of `harmonic_transfer` along (A, B, C, D) on the host, with any leading axes, on
     which its arguments, which come first, do not depend."""
     lead = np.shape(arrays[0])[:-3]
-    A, B, C, _, f = (np.asarray(x)[(0,) * len(lead)] for x in arrays[:5])
-    dA, dB, dC, dD = (
-        np.asarray(x).reshape(-1, *x.shape[-3:])[:, :, None] for x in arrays[5:]
-    )
-    z, (P, N, _, d, _), nu = _unit_roots(A, f), dA.shape, B.shape[-1]
+    first = (0,) * len(lead)
+    A, B, C, _, f = (np.asarray(x)[first] for x in arrays[:5])
+    tangents = [np.asarray(x) for x in arrays[5:]]
+    # (directions, N, 1, rows, columns): frequencies have the axis after that of sections.
+    dA, dB, dC, dD = (x.reshape(-1, *x.shape[-3:])[:, :, None] for x in tangents)
+    P, N, _, d, _ = dA.shape
+    nu = B.shape[-1]
+    F = f.size
+    z = _unit_roots(A, f)
     X = _states(A, z * B[:, None], f)
-    # (Directions are further columns.)
-    forcing = np.moveaxis(dA @ X + z * dB, 0, -2).reshape(N, f.size, d, P * nu)
-    dX = np.moveaxis(_states(A, forcing, f).reshape(N, f.size, d, P, nu), -2, 0)
-    G = (dC @ X + C[:, None] @ dX) / z + dD
-    return (np.fft.fft(G, axis=1) / N).reshape(*lead, N, f.size, len(C[0]), nu)
+    # Directions are further columns of the forcing.
+    forcing = dA @ X + z * dB
+    columns = np.moveaxis(forcing, 0, -2).reshape(N, F, d, P * nu)
+    dX = _states(A, columns, f).reshape(N, F, d, P, nu)
+    dX = np.moveaxis(dX, -2, 0)
+    dG = (dC @ X + C[:, None] @ dX) / z + dD
+    return (np.fft.fft(dG, axis=1) / N).reshape(*lead, N, F, len(C[0]), nu)
 
 
 def _unit_roots(A: Array, f: Array) -> Array:

@@ -78,9 +78,10 @@ class Scatter(eqx.Module):
         small.
         """
         freedom, roundness = to_host((self.freedom, self.roundness))
+        freedom = freedom[:, None, None]
+        xp = namespace(freedom)
         excess = 0.0 if roundness is None else roundness - 1
         miss = (1 - level) * (1 + level**2 * excess)
-        freedom, xp = freedom[:, None, None], namespace(freedom)
         return from_host(freedom * xp.expm1(-xp.log(miss) / freedom))
 
 
@@ -181,20 +182,19 @@ class HTF(eqx.Module):
             _optional("scatter.roundness", scatter.roundness, shape)
 
     def __repr__(self) -> str:
-        count, span = self.f.shape[-1], ""
+        count = self.f.shape[-1]
+        span = ""
         if count and not is_traced(self.f):
             f = np.asarray(self.f)
             span = f" {f.min():.4g} to {f.max():.4g}"
-        low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
-        sections = (
-            f"{self.n_sections} sections" if self.n_sections else "continuous time"
-        )
-        dense = number == high - low + 1
-        shown = (
-            f"{low} to {high}"
-            if dense and number > 3
-            else ", ".join(map(str, self.harmonics))
-        )
+        low = self.harmonics[0]
+        high = self.harmonics[-1]
+        shown = ", ".join(map(str, self.harmonics))
+        if len(self.harmonics) == high - low + 1 > 3:
+            shown = f"{low} to {high}"
+        sections = "continuous time"
+        if self.n_sections:
+            sections = f"{self.n_sections} sections"
         return folded(
             f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
@@ -204,19 +204,21 @@ class HTF(eqx.Module):
         """The first input's, as functions of frequency."""
         if is_traced(self) or self.H.ndim != 4 or not self.H.size:
             return None
-        f, H = np.asarray(self.f), np.abs(np.asarray(self.H))[..., 0]
+        size = np.abs(np.asarray(self.H))[..., 0]
+        u = self.inputs[0]
+        f = np.asarray(self.f)
         order = np.argsort(f)
-        u, drawn = self.inputs[0], []
-        largest = np.argsort(-np.nanmax(H, axis=(1, 2)), kind="stable")[:_SHOWN]
+        largest = np.argsort(-np.nanmax(size, axis=(1, 2)), kind="stable")[:_SHOWN]
+        drawn = []
         for j, y in enumerate(self.outputs[:_SHOWN]):
-            curves = [
-                Curve(f[order], H[k, order, j], f"H_{self.harmonics[k]}", COLORS[i])
-                for i, k in enumerate(np.sort(largest))
-            ]
-            name = with_unit(f"|H|, {u} to {y}", ratio(y, u))
-            drawn.append(picture(curves, "f (cycles/period)", name, log=True))
-        of = f"({self.source}):{repr(self).partition(';')[2].removesuffix(')')}"
-        return card("HTF", of, *drawn)
+            curves = []
+            for color, k in zip(COLORS, np.sort(largest), strict=False):
+                name = f"H_{self.harmonics[k]}"
+                curves.append(Curve(f[order], size[k, order, j], name, color))
+            axis = with_unit(f"|H|, {u} to {y}", ratio(y, u))
+            drawn.append(picture(curves, "f (cycles/period)", axis, log=True))
+        about = repr(self).partition(";")[2].removesuffix(")")
+        return card("HTF", f"({self.source}):{about}", *drawn)
 
     def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
         """`H_m`; `m` counts modulo `N`.
@@ -238,12 +240,13 @@ class HTF(eqx.Module):
             "variance": self.variance,
             "noise_variance": self.noise_variance,
         }
-        roundness = None if self.scatter is None else self.scatter.roundness
-        arrays, roundness = jax.tree.map(
-            lambda x: x[rows], to_host((arrays, roundness))
-        )
-        scatter = self.scatter and replace(self.scatter, roundness=roundness)
-        return replace(self, harmonics=harmonics, scatter=scatter, **arrays)
+        if self.scatter is not None:
+            arrays["roundness"] = self.scatter.roundness
+        chosen = jax.tree.map(lambda x: x[rows], to_host(arrays))
+        scatter = self.scatter
+        if scatter is not None:
+            scatter = replace(scatter, roundness=chosen.pop("roundness"))
+        return replace(self, harmonics=harmonics, scatter=scatter, **chosen)
 
     def __matmul__(self, other: "HTF | HasHTF") -> "HTF":
         """This system after another, which acts first: the series `P @ Q`.
@@ -334,27 +337,31 @@ class HTF(eqx.Module):
         symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
         """
         self.require_sampled("`predict`")
-        (n, nu), N, u = u.shape, self.n_sections, np.asarray(u)
+        N = self.n_sections
+        n, nu = u.shape
         if n == 0 or n % N or nu != len(self.inputs):
             raise DefinitionError(
                 f"`u` has shape {u.shape}, but needs a multiple of {N} samples and "
                 f"{len(self.inputs)} columns."
             )
+        periods = n // N
+        U = np.fft.fft(np.asarray(u), axis=0)
+        size = np.abs(U).max(axis=1)
+        lines = np.flatnonzero(size > _SILENT_LINE * size.max())
         # A real system responds to -f with the conjugate of its response to f.
-        mirror = np.array([self._index(-m) for m in self.harmonics])
         f = np.concatenate([self.f, -np.asarray(self.f)])
-        H, xp = to_host(self.H), namespace(to_host(self.H))
-        H = xp.concatenate([H, H[mirror].conj()], axis=1)
-        U, periods = np.fft.fft(u, axis=0), n // N
-        lines = np.flatnonzero(np.abs(U).max(axis=1) > _SILENT_LINE * np.abs(U).max())
         distance = np.abs(self._circle(lines[:, None] / periods - f))
-        lost = distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY
-        if lost.any():
+        lost = lines[distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY]
+        if len(lost):
             raise DefinitionError(
-                f"`u` holds the frequency f = {abs(self._circle(lines[lost][0] / periods)):g} "
+                f"`u` holds the frequency f = {abs(self._circle(lost[0] / periods)):g} "
                 "cycles per period, at which there are no HTFs: compute or estimate them there."
             )
-        parts = xp.einsum("mkij,kj->mki", H[:, distance.argmin(axis=1)], U[lines])
+        H = to_host(self.H)
+        xp = namespace(H)
+        mirror = np.array([self._index(-m) for m in self.harmonics])
+        H = xp.concatenate([H, H[mirror].conj()], axis=1)[:, distance.argmin(axis=1)]
+        parts = xp.einsum("mkij,kj->mki", H, U[lines])
         Y = xp.zeros((n, len(self.outputs)), complex)
         for m, part in zip(self.harmonics, parts, strict=True):
             at = (lines + periods * m) % n
@@ -424,9 +431,10 @@ def require_chain(
 
 
 def _require_same_lines(a: HTF, b: HTF) -> None:
-    if a.f.shape != b.f.shape or not (
-        is_traced(a.f, b.f) or np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
-    ):
+    same = a.f.shape == b.f.shape
+    if same and not is_traced(a.f, b.f):
+        same = np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
+    if not same:
         raise DefinitionError(
             "two HTFs have different frequencies: compute both at one `f`."
         )
@@ -441,58 +449,68 @@ def _combined(
     """Return the result of an operation on harmonic matrices, with its variances."""
     first = terms[0]
     first.require_sampled("the algebra of HTFs")
-    N, every = first.n_sections, check_harmonics(None, first.n_sections)
-    for x in terms:
-        _require_same_lines(first, x)
-        if x.harmonics != every:
+    every = check_harmonics(None, first.n_sections)
+    for term in terms:
+        _require_same_lines(first, term)
+        if term.harmonics != every:
             raise DefinitionError(
-                f"algebra needs all {N} harmonics: leave `harmonics` out."
+                f"algebra needs all {len(every)} harmonics: leave `harmonics` out."
             )
-    lines = algebra.Lines.of(np.asarray(first.f), N)
-    result, pairs = operation(
-        *(lines.matrices(x) for x in to_host([x.H for x in terms]))
-    )
+    lines = algebra.Lines.of(np.asarray(first.f), first.n_sections)
+    matrices = [lines.matrices(H) for H in to_host([term.H for term in terms])]
+    result, pairs = operation(*matrices)
 
     def variance(name: str) -> Array | None:
-        given = to_host([getattr(x, name) for x in terms])
-        exact = [x.source == "exact" for x in terms]
-        if all(exact) or any(
-            v is None and not e for v, e in zip(given, exact, strict=True)
-        ):
+        given = _variances(terms, name)
+        if given is None:
             return None
-        full = [
-            np.zeros(x.H.shape) if v is None else v
-            for x, v in zip(terms, given, strict=True)
-        ]
-        return lines.entries(
-            algebra.variance_of(pairs, [*map(lines.matrices, full)])
-        ).real
+        entries = [lines.matrices(values) for values in given]
+        return lines.entries(algebra.variance_of(pairs, entries)).real
 
-    freedoms = to_host([x.scatter.freedom for x in terms if x.scatter is not None])
-    scatter = None
-    if freedoms:  # of all lines of a class, the least
-        xp = namespace(freedoms[0])
-        least = xp.stack(freedoms).min(axis=0)[lines.row].min(axis=1, keepdims=True)
-        scatter = Scatter(put(xp.zeros(len(first.f)), lines.row, least), shared=True)
-    source = "exact" if all(x.source == "exact" for x in terms) else "estimate"
+    exact = all(term.source == "exact" for term in terms)
     return HTF(
         first.f,
         lines.entries(result),
         every,
-        N,
+        first.n_sections,
         inputs,
         outputs,
-        source,
+        "exact" if exact else "estimate",
         variance=variance("variance"),
         noise_variance=variance("noise_variance"),
-        scatter=scatter,
+        scatter=_least_scatter(terms, lines),
     )
+
+
+def _variances(terms: list[HTF], name: str) -> list[Array] | None:
+    """Return the variances of terms, zero for exact ones; None if all are exact, or one is not and
+    has none."""
+    given = to_host([getattr(term, name) for term in terms])
+    out = []
+    for term, values in zip(terms, given, strict=True):
+        if values is None and term.source != "exact":
+            return None
+        out.append(np.zeros(term.H.shape) if values is None else values)
+    return None if all(term.source == "exact" for term in terms) else out
+
+
+def _least_scatter(terms: list[HTF], lines: algebra.Lines) -> Scatter | None:
+    """Return the degrees of freedom of all lines of a class: the least of its lines and terms."""
+    freedoms = to_host([x.scatter.freedom for x in terms if x.scatter is not None])
+    if not freedoms:
+        return None
+    xp = namespace(freedoms[0])
+    by_line = xp.stack(freedoms).min(axis=0)
+    by_class = by_line[lines.row].min(axis=1, keepdims=True)
+    spread = put(xp.zeros(len(by_line)), lines.row, by_class)
+    return Scatter(spread, shared=True)
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:
     """**Raises:** `DefinitionError` for a frequency that occurs twice."""
     f = np.sort(f)
-    if len(again := np.flatnonzero(np.diff(f) < SAME_FREQUENCY)):
+    again = np.flatnonzero(np.diff(f) < SAME_FREQUENCY)
+    if len(again):
         raise DefinitionError(
             f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one."
         )

@@ -91,16 +91,13 @@ class LDTP(eqx.Module):
             dims = np.zeros(len(A), int)
         A, B, C = from_host(_with_a_coordinate(A, B, C))
         n_sections, d = A.shape[:2]
-        ny, nu = C.shape[1], B.shape[2]
+        ny = C.shape[1]
+        nu = B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         matrices = {"A": A, "B": B, "C": C, "D": through}
-        for name, sizes in {
-            "A": (d, d),
-            "B": (d, nu),
-            "C": (ny, d),
-            "D": (ny, nu),
-        }.items():
-            array, shape = matrices[name], (n_sections, *sizes)
+        shapes = {"A": (d, d), "B": (d, nu), "C": (ny, d), "D": (ny, nu)}
+        for name, array in matrices.items():
+            shape = (n_sections, *shapes[name])
             if array.shape != shape or 0 in shape:
                 raise DefinitionError(
                     f"`{name}` has shape {array.shape}, but with A {A.shape}, B {B.shape} and "
@@ -111,12 +108,13 @@ class LDTP(eqx.Module):
             require_equal(
                 "`A` and `coordinates`", "lengths", n_sections, len(coordinates)
             )
-        self.A, self.B, self.C, self.D = A, B, C, through
+        self.A = A
+        self.B = B
+        self.C = C
+        self.D = through
         self.dims = _dimensions(dims, n_sections, d)
-        self.inputs, self.outputs = (
-            names("inputs", inputs, nu),
-            names("outputs", outputs, ny),
-        )
+        self.inputs = names("inputs", inputs, nu)
+        self.outputs = names("outputs", outputs, ny)
         self.coordinates = (
             None if coordinates is None else tuple(map(tuple, coordinates))
         )
@@ -140,34 +138,37 @@ class LDTP(eqx.Module):
 
         **Raises:** `DefinitionError`, naming the matrix that does not fit.
         """
-        given = {"A": A, "B": B, "C": C} | ({} if D is None else {"D": D})
+        given = {"A": A, "B": B, "C": C}
+        if D is not None:
+            given["D"] = D
         for name, blocks in given.items():
             require_equal(
                 f"`A` and `{name}`", "numbers of matrices", len(A) or 1, len(blocks)
             )
         dims = [np.shape(block)[1] for block in A]
-        after, d = [*dims[1:], dims[0]], max(dims)
-        ny, nu = np.shape(C[0])[0], np.shape(B[0])[1]
+        after = [*dims[1:], dims[0]]
+        ny = np.shape(C[0])[0]
+        nu = np.shape(B[0])[1]
         padded: dict[str, Any] = {}
         xp = jnp if is_traced(given) else np  # JAX compiles a program for each shape
         for name, blocks in given.items():
-            full, parts = (d if name in "AB" else ny, d if name in "AC" else nu), []
-            for n, block in enumerate(map(xp.asarray, blocks)):
-                shape = (
-                    after[n] if name in "AB" else ny,
-                    dims[n] if name in "AC" else nu,
-                )
-                if block.shape != shape:
+            rows = after if name in "AB" else [ny] * len(A)
+            columns = dims if name in "AC" else [nu] * len(A)
+            shapes = list(zip(rows, columns, strict=True))
+            full = (max(rows), max(columns))
+            parts = []
+            for n, (shape, block) in enumerate(zip(shapes, blocks, strict=True)):
+                array = xp.asarray(block)
+                if array.shape != shape:
                     raise DefinitionError(
-                        f"`{name}[{n}]` has shape {block.shape}, but x[{n}] has {dims[n]} and "
+                        f"`{name}[{n}]` has shape {array.shape}, but x[{n}] has {dims[n]} and "
                         f"x[{(n + 1) % len(A)}] {after[n]} coordinates, with {nu} inputs and {ny} "
                         f"outputs: it should be {shape}."
                     )
-                parts.append(
-                    xp.pad(
-                        block, [(0, p - q) for p, q in zip(full, shape, strict=True)]
-                    )
-                )
+                margins = [
+                    (0, most - size) for most, size in zip(full, shape, strict=True)
+                ]
+                parts.append(xp.pad(array, margins))
             padded[name] = xp.stack(parts)
         return cls(
             **padded, dims=dims, inputs=inputs, outputs=outputs, coordinates=coordinates
@@ -188,18 +189,27 @@ class LDTP(eqx.Module):
         if is_traced(self.dims):
             return "traced"
         dims = np.asarray(self.dims)
-        low, high, batch = dims.min(), dims.max(), self.A.ndim > 3
-        lost = 0 if batch or is_traced(self) else int(low) - self.rank()
-        besides = f" (multipliers zero or below resolution: {lost})" if lost else ""
-        return f"{low}{'' if low == high else f' to {high}'}{besides}"
+        low = dims.min()
+        high = dims.max()
+        shown = f"{low}" if low == high else f"{low} to {high}"
+        if self.A.ndim > 3 or is_traced(self):
+            return shown
+        lost = int(low) - self.rank()
+        if lost:
+            return f"{shown} (multipliers zero or below resolution: {lost})"
+        return shown
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
-        names = {"inputs": listed(self.inputs), "outputs": listed(self.outputs)}
-        lines = facts({**names, "dimension": self._dimension()})
-        multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        return card("LDTP", f"{self.n_sections} sections", lines, *multipliers)
+        about = {
+            "inputs": listed(self.inputs),
+            "outputs": listed(self.outputs),
+            "dimension": self._dimension(),
+        }
+        table = multiplier_table(self.multipliers)
+        circle = unit_circle(self.multipliers)
+        return card("LDTP", f"{self.n_sections} sections", facts(about), table, circle)
 
     def states(
         self, u: Signals, x0: Vector | None = None, first_section: int = 0
@@ -247,9 +257,8 @@ class LDTP(eqx.Module):
         require_x64(self, f)
         f = from_host(to_host(f).reshape(-1))
         self._refuse_resonance(f)
-        H = to_host(harmonic_transfer(*self.matrices[:4], f))[
-            np.array(harmonics) % self.n_sections
-        ]
+        H = to_host(harmonic_transfer(*self.matrices[:4], f))
+        H = H[np.array(harmonics) % self.n_sections]
         return HTF(f, H, harmonics, self.n_sections, self.inputs, self.outputs, "exact")
 
     def __matmul__(self, other: "LDTP") -> "LDTP":
@@ -260,12 +269,11 @@ class LDTP(eqx.Module):
         """
         require_chain("@", other.outputs, self.inputs, self, other)
         (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
-        K, L, M = (
-            np.zeros((nu + nr, ny + inner)),
-            np.zeros((nu + nr, nr)),
-            np.eye(ny, ny + inner),
-        )
-        K[:nu, ny:], L[nu:] = np.eye(nu), np.eye(nr)
+        K = np.zeros((nu + nr, ny + inner))
+        L = np.zeros((nu + nr, nr))
+        M = np.eye(ny, ny + inner)
+        K[:nu, ny:] = np.eye(nu)
+        L[nu:] = np.eye(nr)
         return self._connected(other.matrices, K, L, M, other.inputs, self.outputs)
 
     def __add__(self, other: "LDTP") -> "LDTP":
@@ -275,7 +283,8 @@ class LDTP(eqx.Module):
         """
         require_same("terms of a sum", self, other)
         ny, nu = np.shape(self.D)[1:]
-        L, M = np.tile(np.eye(nu), (2, 1)), np.tile(np.eye(ny), (1, 2))
+        L = np.tile(np.eye(nu), (2, 1))
+        M = np.tile(np.eye(ny), (1, 2))
         K = np.zeros((2 * nu, 2 * ny))
         return self._connected(other.matrices, K, L, M, self.inputs, self.outputs)
 
@@ -285,11 +294,11 @@ class LDTP(eqx.Module):
         **Raises:** `DefinitionError` if D is not square and invertible at all sections: an inverse
         then has to know later outputs. The inverse of its HTFs needs no D.
         """
-        if (
-            self.D.shape[1] != self.D.shape[2]
-            or not is_traced(self.D)
-            and (np.linalg.matrix_rank(np.asarray(self.D)) < self.D.shape[1]).any()
-        ):
+        ny, nu = self.D.shape[1:]
+        regular = ny == nu
+        if regular and not is_traced(self.D):
+            regular = (np.linalg.matrix_rank(np.asarray(self.D)) == ny).all()
+        if not regular:
             raise DefinitionError(
                 "an inverse needs a square and invertible D at all sections, since it would have "
                 "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
@@ -321,8 +330,10 @@ class LDTP(eqx.Module):
         else:
             F = algebra.static_gain(to_host(controller), self.n_sections, (nu, ny))
         algebra.require_well_posed(self.D, F.D)
-        K, L = np.zeros((nu + ny, ny + nu)), np.eye(nu + ny, nu)
-        K[:nu, ny:], K[nu:, :ny] = -np.eye(nu), np.eye(ny)
+        K = np.zeros((nu + ny, ny + nu))
+        L = np.eye(nu + ny, nu)
+        K[:nu, ny:] = -np.eye(nu)
+        K[nu:, :ny] = np.eye(ny)
         return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
 
     @property
@@ -332,9 +343,8 @@ class LDTP(eqx.Module):
 
     def _connected(self, other, K, L, M, inputs, outputs) -> "LDTP":
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
-        d = (
-            A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
-        )  # without common padding
+        # Without common padding.
+        d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
         return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
@@ -393,14 +403,17 @@ class LDTP(eqx.Module):
         """The states of `periodic_state` for S inputs (S, P N, nu)."""
         u = self._input(u)
         if u.shape[1] != periods * self.n_sections:
-            text = f"{periods} periods of {self.n_sections} sections, not {u.shape[1]}"
-            raise DefinitionError(f"`u` must have the samples of {text}.")
+            raise DefinitionError(
+                f"`u` must have the samples of {periods} periods of {self.n_sections} sections, "
+                f"not {u.shape[1]}."
+            )
         self._refuse_resonance(np.arange(periods) / periods)
         by_period = u.reshape(len(u), periods, self.n_sections, -1)
         return time_response.periodic_states(self.A, self.B, by_period)
 
     def _response(self, u, x0, first_section):
-        u, x0 = self._input(u), self._state(x0, first_section)
+        u = self._input(u)
+        x0 = self._state(x0, first_section)
         sections = (first_section + np.arange(len(u))) % self.n_sections
         return time_response.response(self.matrices, u, x0, sections)
 
@@ -437,7 +450,8 @@ class LDTP(eqx.Module):
             raise DefinitionError(
                 f"`{method}` takes one LDTP at a time, not a batch of them."
             )
-        A, dims = np.asarray(self.A), np.asarray(self.dims)
+        A = np.asarray(self.A)
+        dims = np.asarray(self.dims)
         return [
             factor[:rows, :columns]
             for factor, rows, columns in zip(A, np.roll(dims, -1), dims, strict=True)
@@ -446,7 +460,8 @@ class LDTP(eqx.Module):
     def _refuse_resonance(self, f):
         if is_traced(self.A, self.dims, f):
             return
-        multipliers, f = self.multipliers, np.asarray(f)
+        multipliers = self.multipliers
+        f = np.asarray(f)
         distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)

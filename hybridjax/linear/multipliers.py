@@ -5,6 +5,7 @@ in double precision destroys eigenvalues smaller than `1e-16` of the largest; th
 Tolerances are on factors only, never on eigenvalues.
 """
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -56,7 +57,8 @@ def product_eigenvalues(
     regular = _regular_part(_balanced(factors), rtol)
     if not regular:
         return np.zeros(0, complex)
-    eigenvalues = np.concatenate([*map(_eigenvalues, _diagonal_blocks(regular))])
+    blocks = [_eigenvalues(block) for block in _diagonal_blocks(regular)]
+    eigenvalues = np.concatenate(blocks)
     return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
 
 
@@ -115,10 +117,14 @@ def _regular_part(factors, rtol):
 def _diagonal_blocks(factors):
     """Yield for each block on the diagonal its part of each factor, all unitarily and periodically
     similar to the given square ones."""
-    d, stalls = len(factors[0]), 0
-    basis, below = np.eye(d), np.full(d - 1, np.inf)
+    d = len(factors[0])
+    basis = np.eye(d)
+    below = np.full(d - 1, np.inf)
+    stalls = 0
     for _ in range(_MOST_SWEEPS):
-        start, before, triangles = basis, below, []
+        start = basis
+        before = below
+        triangles = []
         for factor in factors:
             basis, triangle = np.linalg.qr(factor @ basis)
             triangles.append(triangle)
@@ -130,16 +136,19 @@ def _diagonal_blocks(factors):
         if settled.all() or stalls == 2:
             break
     edges = [0, *(1 + np.flatnonzero(settled)), d]
-    for block in map(slice, edges[:-1], edges[1:]):
+    for begin, end in itertools.pairwise(edges):
+        block = slice(begin, end)
         yield [x[block, block] for x in (*triangles, turn)]
 
 
 def _eigenvalues(factors):
     """The eigenvalues of a product, which may be too small or too large for a number on its way."""
-    product, exponent = np.eye(len(factors[0])), 0
+    product = np.eye(len(factors[0]))
+    exponent = 0
     for factor in factors:
         product = factor @ product
         digits = int(np.frexp(np.abs(product).max())[1])
-        product, exponent = np.ldexp(product, -digits), exponent + digits
+        product = np.ldexp(product, -digits)
+        exponent += digits
     values = np.linalg.eigvals(product).astype(complex)
     return np.ldexp(values.view(float), exponent).view(complex)

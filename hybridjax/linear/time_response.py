@@ -14,10 +14,9 @@ from .algebra import Matrices
 
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
     """The product `A[N-1] ... A[0]`."""
-    xp = namespace(A)
-    return scan(
-        _multiplied, xp.zeros_like(A[0]) + xp.eye(A.shape[-1], dtype=A.dtype), A
-    )[0]
+    identity = namespace(A).eye(A.shape[-1], dtype=A.dtype)
+    product, _ = scan(_multiplied, namespace(A).zeros_like(A[0]) + identity, A)
+    return product
 
 
 @functools.partial(jax.jit, static_argnames="section")
@@ -45,7 +44,8 @@ def response(
         return m.A[n] @ x + m.B[n] @ u, x
 
     last, x = jax.lax.scan(advance, x0, (sections, u))
-    C, D = m.C[sections], m.D[sections]
+    C = m.C[sections]
+    D = m.D[sections]
     y = jnp.einsum("nij,nj->ni", C, x) + jnp.einsum("nij,nj->ni", D, u)
     return jnp.concatenate([x, last[None]]), y
 
@@ -70,15 +70,21 @@ def periodic_states(
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.
     """
-    xp, periods, identity = namespace(A), u.shape[1], np.eye(A.shape[-1])
+    xp = namespace(A)
+    periods = u.shape[1]
+    identity = np.eye(A.shape[-1])
     # What enters at a section reaches the end of the period through the factors after it.
-    phi, after = scan(lambda P, factor: (P @ factor, P), xp.asarray(identity), A[::-1])
-    w = xp.tensordot(u, after[::-1] @ B, ((2, 3), (0, 2)))
+    phi, after = scan(_extended, xp.asarray(identity), A[::-1])
+    entering = after[::-1] @ B
+    w = xp.tensordot(u, entering, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    return (
-        solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1)).mean(axis=0).real.T
-    )
+    starts = solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
+    return starts.mean(axis=0).real.T
+
+
+def _extended(product, factor):
+    return product @ factor, product
 
 
 @jax.jit
@@ -88,7 +94,8 @@ def characteristic_polynomial(
     """Coefficients of det(x I - matrix), highest power first (Faddeev-LeVerrier recursion)."""
     d = matrix.shape[0]
     identity = jnp.eye(d)
-    coefficients, adjugate = [jnp.ones(())], identity
+    coefficients = [jnp.ones(())]
+    adjugate = identity
     for k in range(1, d + 1):
         step = matrix @ adjugate
         coefficients.append(-jnp.trace(step) / k)

@@ -25,7 +25,7 @@ from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
 from ..experiments.run import DesignLike, check_inputs
-from ..identify.multiplier_estimate import MultiplierEstimate
+from ..identify.multiplier_estimate import MultiplierFit
 from ..orbits.crossing import Crossing
 from ..sections import families
 from ..systems import chart, system
@@ -37,10 +37,10 @@ Draw = Callable[[Any], Any]
 Inputs = Annotated[Numbers, Reals("n inputs")]
 
 
-class Returns(MultiplierEstimate):
+class Returns(MultiplierFit):
     """Multipliers from returns of perturbed states to section 0.
 
-    **Fields** beside those of all estimates of multipliers:
+    **Fields** beside those of all fits of multipliers:
 
     - `coordinates`: names of the numbers that were perturbed.
     - `noise` (d,): standard deviation of returns from nearly equal states.
@@ -54,6 +54,10 @@ class Returns(MultiplierEstimate):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     residual: float = eqx.field(static=True)
     bound: float = eqx.field(static=True)
+
+    @property
+    def model(self) -> None:
+        return None
 
     def _about(self) -> str:
         more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
@@ -293,7 +297,7 @@ class SettledCycle:
           those on which nothing depends, such as the distance walked. Default: all; at
           clock sections all but `time`.
 
-        **Returns:** `Returns`, a `MultiplierEstimate`.
+        **Returns:** `Returns`, a `Fit`.
 
         **Raises:** `DefinitionError` for a plant whose state cannot be set, or unknown names;
         `ComputationError` if a perturbed state does not return.

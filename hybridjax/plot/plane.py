@@ -10,7 +10,7 @@ from matplotlib.patches import Circle
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import (
-    MultiplierEstimate,
+    MultiplierFit,
     Multipliers,
     compare_multipliers,
 )
@@ -25,9 +25,8 @@ _MARKERS = "osD^vP*X"
 
 @checked
 def multipliers(
-    true: LimitCycle | LDTP | MultiplierEstimate | Multipliers,
-    estimates: Mapping[str, RationalFit | MultiplierEstimate | Multipliers]
-    | None = None,
+    true: LimitCycle | LDTP | MultiplierFit | Multipliers,
+    estimates: Mapping[str, RationalFit | MultiplierFit | Multipliers] | None = None,
     *,
     zoom: bool = True,
     ax: AxesLike | None = None,
@@ -48,7 +47,7 @@ def multipliers(
 
     **Raises:** `DefinitionError` if there are no multipliers.
     """
-    reference = "estimate" if isinstance(true, MultiplierEstimate) else "exact"
+    reference = "estimate" if isinstance(true, MultiplierFit) else "exact"
     borders = _borders({reference: true, **(estimates or {})})
     true = _values(true)
     if true.size == 0:
@@ -148,7 +147,7 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
 
 
 def _values(source: Any) -> np.ndarray:
-    if isinstance(source, LimitCycle | LDTP | MultiplierEstimate):
+    if isinstance(source, LimitCycle | LDTP | MultiplierFit):
         source = source.multipliers
     return np.asarray(source).ravel().astype(complex)
 
@@ -169,7 +168,7 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
     return {
         label: [fit.ellipse(i) for i in range(len(fit.multipliers))]
         for label, fit in estimates.items()
-        if isinstance(fit, MultiplierEstimate) and np.isfinite(fit.covariance).all()
+        if isinstance(fit, MultiplierFit) and np.isfinite(fit.covariance).all()
     }
 
 

@@ -18,7 +18,7 @@ from .._core.results import Result
 from .._core.text import listed, p_value
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
-from ..identify.series.records import MAY_DRIFT, CycleGrid, PreparedRecords
+from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
 from ..identify.validate import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
@@ -180,14 +180,9 @@ def _few_strides(sampled: int, unknowns: int) -> Iterator[Finding]:
 
 
 def _order_and_feedback(fit: SeriesFit) -> Iterator[Finding]:
-    if fit.doubt:
-        cause = "drift" if fit.doubt == MAY_DRIFT else "order"
-        yield Finding(cause, f"{fit.doubt}.")
-    for name in fit.feedback:
-        yield Finding(
-            "feedback",
-            f"{name} answers earlier residuals of the outputs: fits are biased. {NAME_REFERENCE}",
-        )
+    yield from fit.findings
+    if any(finding.cause == "feedback" for finding in fit.findings):
+        yield Finding("feedback", NAME_REFERENCE)
 
 
 def _about_excitation(
@@ -242,7 +237,6 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
 
 def _about_multipliers(fit: SeriesFit) -> Iterator[Finding]:
     if fit.result != Result.OK:
-        yield Finding("no convergence", f"{Result(fit.result).message}.")
         return
     for z, error in zip(fit.multipliers, fit.standard_errors, strict=True):
         if z.imag >= 0 and abs(z) + 2 * error > 1:

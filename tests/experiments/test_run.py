@@ -51,7 +51,7 @@ def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle)
     assert errors[estimate.harmonics.index(0)].max() < bound
     true = hopper_cycle.multipliers
     assert hj.fit_multipliers(estimate, ldtp).compare(true).max_error < 5e-5
-    fits = [hj.fit_rational(htf) for htf in (estimate, exact)]
+    fits = [hj.identify.fit_rational(htf) for htf in (estimate, exact)]
     for output in estimate.outputs:
         measured, bias = (fit.compare(true, output).max_error for fit in fits)
         assert abs(measured - bias) < 0.1 * bias

@@ -82,7 +82,7 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
     for begin in (0.0, 9.0):
         data = hj.ObservedCycle(where, times=[begin, begin + gap], times_std=0.1)
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
-        assert fit.freedom == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
+        assert fit.dof == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
         data = hj.ObservedCycle(where, "x", [[0.1], [-2.0]], times=[begin, begin + gap])
         rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
@@ -109,16 +109,18 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
-    assert "not identified: p and q apart" in repr(fit) and "1 of 1 guesses" in repr(
-        fit
-    )
+    (lost,) = fit.findings
+    assert lost.cause == "not identified" and lost.text.startswith("p and q apart")
+    assert repr(lost) in repr(fit) and "1 of 1 guesses" in repr(fit)
+    np.testing.assert_allclose(fit.multipliers, oscillation.multipliers, atol=1e-8)
+    assert isinstance(fit, hj.identify.Fit)
 
 
 @pytest.mark.slow
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
     fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
-    assert fit.weighted and fit.freedom == 7 and fit.result == hj.Result.OK
+    assert fit.weighted and fit.dof == 7 and fit.result == hj.Result.OK
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})

@@ -172,7 +172,7 @@ def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
     yield hj.identify.loop, dict(data=t.data, at_input=t.data.inputs[1])
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2)
-    yield hj.fit_rational, dict(htf=t.estimate, output=0)
+    yield hj.identify.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])
     yield hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6)
@@ -187,7 +187,6 @@ def estimates(t):
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
     yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
     yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
-    yield hj.identify.realize, dict(source=t.exact)
 
 
 def series(t):

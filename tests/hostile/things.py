@@ -142,7 +142,9 @@ MAKE = {
         t.estimate, variance=np.full(t.estimate.H.shape, 1e-6)
     ),
     "exact": lambda t: t.model.htf(t.estimate.f, (-1, 0, 1)),
-    "rational": lambda t: hj.fit_rational(t.estimate, output=0, poles=1, zeros=1),
+    "rational": lambda t: hj.identify.fit_rational(
+        t.estimate, output=0, poles=1, zeros=1
+    ),
     "structured": lambda t: hj.fit_multipliers(t.estimate, 2, overhang=6),
     "plan": lambda t: hj.optimal_design(t.model, t.design, goal=CURVE),
     "decaying": lambda t: hj.LDTP(

@@ -160,7 +160,7 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         0.7 < np.sqrt(np.mean(np.square(off))) < 1.3
     )  # (few cycles are divided into blocks)
     assert 0.88 < np.mean(discs) < 0.98
-    assert not fit.doubt
+    assert not fit.findings
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
     moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
@@ -180,8 +180,9 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(hj.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0)
-    assert "3 gives other" in hj.fit_series(data, 2, reference="r").doubt
-    assert not hj.fit_series(data, 3, reference="r").doubt
+    (low,) = hj.fit_series(data, 2, reference="r").findings
+    assert "3 gives other" in low.text
+    assert not hj.fit_series(data, 3, reference="r").findings
 
 
 @pytest.mark.slow
@@ -194,13 +195,14 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
         assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
         biased = hj.fit_series(data, 2, check=False)
-        assert biased.feedback == ("u",) and "name their `reference`" in repr(biased)
+        (doubt,) = (x for x in biased.findings if x.cause == "feedback")
+        assert "(u): the fit is biased; name their `reference`" in doubt.text
     assert sum(held) >= 7
-    assert "biased" in hj.fit_ldtp(data, 2, check=False).feedback
+    assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
     data = hj.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
-    assert not hj.fit_series(data, 2, check=False).feedback
-    assert not hj.fit_ldtp(data, 2, noise="innovations").feedback
+    assert not hj.fit_series(data, 2, check=False).findings
+    assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
 
 def test_whether_outputs_answer_at_once_is_found(plant):

@@ -124,7 +124,7 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
     fit = hj.fit_ldtp(htf, shaken(model, np.random.default_rng(1)))
     assert fit.result == hj.Result.OK and "too few dimensions" not in repr(fit)
-    assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1))
+    assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1).findings)
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
     off = (
@@ -144,7 +144,7 @@ def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=20, seed=0))
     for dims, named in ((2, True), (model.dims, False)):
-        assert ("too few dimensions" in repr(hj.fit_ldtp(htf, dims))) == named
+        assert ("too few dimensions" in repr(hj.fit_ldtp(htf, dims).findings)) == named
 
 
 def test_undetermined_responses_have_infinite_variance():
@@ -169,7 +169,7 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     square = np.einsum("si,ij,sj->", error, np.linalg.inv(bound.covariance), error)
     assert 1e-3 < stats.chi2(2 * draws).cdf(square) < 1 - 1e-3
     cost = sum(fit.cost for fit in fits)
-    assert 1e-3 < stats.chi2(sum(fit.freedom for fit in fits)).cdf(cost) < 1 - 1e-3
+    assert 1e-3 < stats.chi2(sum(fit.dof for fit in fits)).cdf(cost) < 1 - 1e-3
     hits = sum(int(fit.contains(model.multipliers).all()) for fit in fits)
     assert stats.binomtest(hits, draws, 0.95).pvalue > 1e-3
     H = np.array([fit.htf(F).H for fit in fits])
@@ -180,7 +180,7 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     draw = noisy(exact, exact.variance, np.random.default_rng(4))
     fit = hj.fit_ldtp(with_values(draw, draw.H), model)
     np.testing.assert_allclose(fit.standard_errors, fits[0].standard_errors, rtol=0.2)
-    assert fit.cost == pytest.approx(fit.freedom)
+    assert fit.cost == pytest.approx(fit.dof)
 
 
 def test_with_one_section_the_bound_is_that_of_free_numerators():

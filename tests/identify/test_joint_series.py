@@ -15,7 +15,7 @@ from hybridjax.identify.series.prediction import (
     noise_spectrum,
 )
 from hybridjax.identify.series.records import CycleGrid
-from hybridjax.identify.series.residuals import about_misfit, answering
+from hybridjax.identify.series.residuals import about_answers, about_misfit
 
 from .conftest import scaled
 from .test_series import record
@@ -117,7 +117,7 @@ def test_a_drift_is_found_where_samples_are_missing(small):
         data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle"
     )
     assert fit.compare(small.multipliers).max_error < 1e-9
-    assert fit.freedom == np.isfinite(data.y).sum() - 8 - fit.unknowns  # (8 constants)
+    assert fit.dof == np.isfinite(data.y).sum() - 8 - fit.unknowns  # (8 constants)
 
 
 def test_too_few_dimensions_are_named(small):
@@ -129,7 +129,7 @@ def test_too_few_dimensions_are_named(small):
             (small.dims + 1, spare),
         ):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
-            assert doubt in fit.doubt and bool(doubt) == bool(fit.doubt)
+            assert doubt in repr(fit.findings) and bool(doubt) == bool(fit.findings)
 
 
 @pytest.mark.parametrize("through", (0.0, 1.0))
@@ -153,10 +153,10 @@ def test_residuals_of_exact_data_tell_nothing(small):
         size=grid.y.shape
     )
     for size, told in ((1e-3, True), (1e-13, False)):
-        text = about_misfit(grid, grid, size * response, innovations=False)
-        assert bool(text) == told == bool("noise='innovations'" in text)
+        found = about_misfit(grid, grid, size * response, innovations=False)
+        assert bool(found) == told == ("noise='innovations'" in repr(found))
     feedback = np.roll(response.reshape(1, -1, 2), 1, axis=1).reshape(response.shape)
-    assert not answering(grid, 1e-13 * feedback, ("u",))
+    assert not about_answers(grid, 1e-13 * feedback, ("u",), "")
 
 
 def test_outputs_that_do_not_answer_are_refused(small):

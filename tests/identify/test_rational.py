@@ -7,7 +7,7 @@ import hybridjax as hj
 
 
 def test_the_bias_on_exact_data(exact, multipliers):
-    fit = hj.fit_rational(exact)
+    fit = hj.identify.fit_rational(exact)
     errors = [fit.compare(multipliers, name).max_error for name in fit.outputs]
     np.testing.assert_allclose(errors, (2.6e-3, 1.07e-2), atol=0.05e-3)
     assert np.all(fit.result == hj.Result.OK) and fit.outputs == ("yM", "vM")
@@ -22,7 +22,7 @@ def rational(f, numerator, denominator, sections):
 
 def test_no_start_finds_a_better_fit(exact):
     """Against scipy's solver over all coefficients, from 20 random pairs of poles."""
-    fit = hj.fit_rational(exact, output="vM")
+    fit = hj.identify.fit_rational(exact, output="vM")
     f, h = np.asarray(exact.f), np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
@@ -52,7 +52,9 @@ def test_a_rational_function_is_found_exactly():
     f, numerator = np.linspace(0.1, 2.4, 40), np.array([2.0, -1.0, 0.3])
     poles = np.array([0.9 + 0.3j, 0.9 - 0.3j, -0.5])
     h = rational(f, numerator, np.poly(poles).real, 5)
-    fit = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2)
+    fit = hj.identify.fit_rational(
+        hj.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2
+    )
     np.testing.assert_allclose(fit.poles[0], poles, atol=1e-7)
     np.testing.assert_allclose(fit.numerator[0], numerator, atol=1e-6)
     np.testing.assert_allclose(
@@ -61,5 +63,7 @@ def test_a_rational_function_is_found_exactly():
     np.testing.assert_allclose(fit.htf(f).H[0, :, 0, 0], h, atol=1e-6)
     assert fit.residual[0] < 1e-7
     # More poles than there are: the fit stays good and the true ones are among them.
-    more = hj.fit_rational(hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3)
+    more = hj.identify.fit_rational(
+        hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3
+    )
     assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)

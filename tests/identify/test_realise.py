@@ -6,6 +6,8 @@ import numpy as np
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
+from hybridjax.identify.joint.realization import realized_htf
+from hybridjax.identify.realization import realized
 
 from .conftest import SHAPES, scaled
 from .test_series import record
@@ -18,7 +20,7 @@ F = np.linspace(0.05, 9.95, 40)
 
 def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     """620 frequencies up to 10 of 16 cycles per period."""
-    model = hj.identify.realize(exact)
+    model = realized_htf(exact)
     np.testing.assert_array_equal(model.dims, MINIMAL)
     np.testing.assert_allclose(model.multipliers, multipliers, atol=1e-11)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
@@ -32,8 +34,8 @@ def test_random_systems(shape, seed):
     model, N = scaled(seed, dims, ny, nu), len(dims)
     f = np.linspace(0.02, N / 2 - 0.05, 60)
     htf = model.htf(f)
-    for source in (htf, model.impulse_response(40)):
-        found = hj.identify.realize(source)
+    markov = np.asarray(model.impulse_response(40))
+    for found in (realized_htf(htf), realized(markov)):
         assert np.all(np.asarray(found.dims) <= np.asarray(model.dims))
         assert (
             found.htf(f)
@@ -50,11 +52,10 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
         size=data.y.shape
     )
     fit = hj.fit_series(hj.Record(data.u, y, n_sections=32, outputs=("yM", "vM")), 2)
-    model = hj.identify.realize(fit, order=2)
+    model = fit.model
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
     assert model.htf(F).error(hopper.htf(F)).max() < 2e-3
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
-    np.testing.assert_array_equal(hj.identify.realize(fit, 2).dims, 2)
 
 
 def test_from_noisy_htfs(exact, hopper, multipliers):
@@ -62,8 +63,6 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     variance = np.full(exact.H.shape, (1e-4 * np.abs(exact.H).max()) ** 2)
     error = rng.normal(size=exact.H.shape) + 1j * rng.normal(size=exact.H.shape)
     H = exact.H + np.sqrt(variance / 2) * error
-    model = hj.identify.realize(
-        dataclasses.replace(exact, H=H, variance=variance), order=2
-    )
+    model = realized_htf(dataclasses.replace(exact, H=H, variance=variance), order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3

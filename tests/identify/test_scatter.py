@@ -205,7 +205,7 @@ def test_fits_know_of_estimated_variances(model):
         )
         for scatter in (hj.Scatter(np.full(31, x)) for x in (4.0, 1e9))
     ]
-    level = fits[0].cost / fits[0].freedom
+    level = fits[0].cost / fits[0].dof
     ratio = fits[0].covariance / fits[1].covariance
     np.testing.assert_allclose(ratio, level / (2 - level), rtol=1e-6)
     assert level > 1.02

@@ -17,7 +17,7 @@ from hybridjax.identify.series.linearization import (
     linearize,
 )
 from hybridjax.identify.series.output_error import OutputErrorProblem
-from hybridjax.identify.series.records import PreparedRecords, with_drift
+from hybridjax.identify.series.records import OF_DRIFT, PreparedRecords, with_drift
 from hybridjax.identify.series.subspace import (
     late_outputs,
     subspace_model,
@@ -198,20 +198,19 @@ def test_an_order_that_is_too_low_is_noticed(small):
     """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
     for seed in range(2):
         data = record(small, 400, seed, 0.3, drift=np.inf)  # (a constant)
-        text = "Fit: `order` may be too low: order 2 gives"
+        text = "Order: `order` may be too low: order 2 gives"
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert (
-            fit.doubt in " ".join(repr(fit).split()) and "too low" in fit._repr_html_()
-        )
+        assert fit.findings[0].text in " ".join(repr(fit).split())
+        assert "too low" in fit._repr_html_()
         bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
-        assert not hj.fit_series(bent, 2).doubt
+        assert not hj.fit_series(bent, 2).findings
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
     data = hj.experiments.simulate_experiments(small, design)
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=40, seed=1))
-    assert "2 gives other" in hj.fit_multipliers(htf, 1).doubt
-    assert not hj.fit_multipliers(htf, 2).doubt
+    assert "2 gives other" in hj.fit_multipliers(htf, 1).findings[0].text
+    assert not hj.fit_multipliers(htf, 2).findings
 
 
 def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
@@ -232,7 +231,7 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         (hj.fit_ldtp, ((drift, small.dims), (far, small.dims))),
     ):
         for data, guess in cases:
-            with pytest.warns(FindingWarning, match="Fit: outputs may drift"):
+            with pytest.warns(FindingWarning, match="Drift: outputs may drift"):
                 multipliers = fit(data, guess).multipliers
             assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
     first = mock.Mock(wraps=subspace_model)
@@ -241,9 +240,10 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         moved(0.0),
         *(dataclasses.replace(x, drift=20) for x in (drift, offset, far)),
     ):
-        assert not hj.fit_series(data, 2).doubt
+        assert not hj.fit_series(data, 2).findings
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
-        assert fit.result == hj.Result.OK and not fit.doubt
+        assert fit.result == hj.Result.OK
+        assert {x.cause for x in fit.findings} <= {"feedback"}  # (D was fitted)
     assert (
         first.call_count == 8
     )  # (Fits, smaller ones; trials of a drift begin at the fit.)
@@ -263,7 +263,7 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
         data = record(model, 400, noise=0.2)
         signals = (np.pad(x, ((late, 0), (0, 0))) for x in (data.u, data.y))
         fit = hj.fit_series(hj.Record(*signals, n_sections=1), 2, check=False)
-        assert late or not fit.doubt
+        assert late or not fit.findings
         monkeypatch.setattr("hybridjax.identify.series.records.SLOW", 1)
 
 
@@ -275,7 +275,9 @@ def test_how_far_another_fit_contradicts():
         [lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)
     ]
     doubts = [
-        bool(fit.contradiction(x, drift)) for x in others for drift in ("", "drift")
+        fit.contradicted_by(x, level) is not None
+        for x in others
+        for level in (0.95, OF_DRIFT)
     ]
     assert doubts == [False, False, True, False, True, True]
 
@@ -347,7 +349,7 @@ def test_inputs_have_units_of_their_own(unit):
     fits = [hj.fit_series(hj.Record(v, y, n_sections=4), 2) for v in (u, u * units)]
     htfs = [fit.htf([0.3]).H for fit in fits]
     np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
-    found = [hj.identify.realize(fit, order=2).multipliers for fit in fits]
+    found = [fit.model.multipliers for fit in fits]
     np.testing.assert_allclose(*found, rtol=1e-6)
     design = hj.multisine(4, 8, lines="odd", inputs=2, division="disjoint")
     data = hj.experiments.simulate_experiments(two_inputs, design, discard=2)

@@ -72,8 +72,8 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     np.testing.assert_allclose(said, rms, rtol=0.25)
     if not correlation:
         np.testing.assert_allclose(rms, bound, rtol=0.25)
-        freedom = np.sqrt(2 * fits[0].freedom * runs)
-        assert abs(sum(fit.cost - fit.freedom for fit in fits)) < 4 * freedom
+        freedom = np.sqrt(2 * fits[0].dof * runs)
+        assert abs(sum(fit.cost - fit.dof for fit in fits)) < 4 * freedom
 
 
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
@@ -151,9 +151,7 @@ def test_first_order_covariances_and_regions(pair_and_real):
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
     for i, degrees, freedom in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
-        border = dataclasses.replace(estimate, covariance_freedom=freedom).ellipse(
-            i, 0.9
-        )
+        border = dataclasses.replace(estimate, covariance_dof=freedom).ellipse(i, 0.9)
         if degrees == 1:
             border = border[[np.argmin(border.real), np.argmax(border.real)]].real
         left = freedom - degrees + 1  # Hotelling's distribution

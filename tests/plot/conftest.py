@@ -19,7 +19,7 @@ def exact(hopper, estimate):
 
 @pytest.fixture(scope="session")
 def rational(estimate):
-    return hj.fit_rational(estimate)
+    return hj.identify.fit_rational(estimate)
 
 
 @pytest.fixture(scope="session")

@@ -105,12 +105,12 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     with pytest.raises(
         hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
-        hj.plot.bode(exact, fits=hj.fit_rational(exact, input=1), input=0)
+        hj.plot.bode(exact, fits=hj.identify.fit_rational(exact, input=1), input=0)
 
 
 def test_every_input_is_drawn_and_named():
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
-    fit = hj.fit_rational(exact, input=1)
+    fit = hj.identify.fit_rational(exact, input=1)
     assert len(exact.inputs) == 2
     pairs = [(i, j) for i in range(len(exact.outputs)) for j in range(2)]
     names = [f"{exact.outputs[i]} from {exact.inputs[j]}" for i, j in pairs]

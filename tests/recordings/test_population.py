@@ -11,6 +11,7 @@ from matplotlib import pyplot
 from scipy import linalg, stats
 
 import hybridjax as hj
+from hybridjax._core.findings import Finding
 from hybridjax._core.results import Result
 from hybridjax._core.signal import Signal
 from hybridjax.apps import subjects
@@ -355,7 +356,8 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
 def write_numbers(folder, result, formats):
     assert result.fit.result == Result.OK
     (folder / "report.html").write_text("")
-    hj.save(folder / "fit.npz", dataclasses.replace(result.fit, doubt="odd"))
+    odd = (Finding("order", "odd."),)
+    hj.save(folder / "fit.npz", dataclasses.replace(result.fit, findings=odd))
     (folder / "summary.json").write_text(json.dumps(summarize(result)))
 
 

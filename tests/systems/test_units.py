@@ -32,7 +32,7 @@ def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
         estimate,
         fit,
         fit.htf([0.1]),
-        hj.fit_rational(estimate),
+        hj.identify.fit_rational(estimate),
     ):
         assert units(thing.outputs) == ["m", "m/s"]
     for thing in (kinematic_ldtp, data, estimate, fit):

@@ -1,10 +1,9 @@
 """Maximum likelihood for the matrices of a linear periodic model."""
 
 import dataclasses
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
@@ -15,19 +14,21 @@ from ..._core.arguments import Numbers, require_same
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Order, Scalar, SignalNames, Vector
 from ..._core.boundary.values import Integers
+from ..._core.findings import Finding, warn_of
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
-from ...errors import DefinitionError, FindingWarning
+from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import weights
 from ..denominator import Covariance, multipliers_of
-from ..descent import FIRST_DAMPING, Spread, descend
+from ..descent import Spread
+from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, RoughFit
+from ..multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
 from ..multipliers import exact_htf
 from ..periodic import (
     LocalCoordinates,
@@ -35,12 +36,20 @@ from ..periodic import (
     characteristic_slopes,
     local_coordinates,
 )
+from ..realization import default_horizon, given_dims, realized
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
-from ..series.records import MAY_DRIFT, CycleGrid, PreparedRecords, with_drift
-from ..series.subspace import answers_at_once, default_horizon, subspace_model
-from .frequency import FrequencyProblem, ModelPoint, transfer, transfer_slopes
-from .realization import given_dims, realize
+from ..series.records import (
+    MAY_DRIFT,
+    OF_DRIFT,
+    CycleGrid,
+    PreparedRecords,
+    with_drift,
+)
+from ..series.subspace import answers_at_once, subspace_model
+from .descent import ModelPoint, descend
+from .frequency import FrequencyProblem, transfer, transfer_slopes
+from .realization import realized_htf
 
 
 Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
@@ -51,56 +60,68 @@ Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
 _ANSWERED = 5.0
 
 
-class LDTPFit(MultiplierEstimate):
+class LDTPFit(MultiplierFit):
     r"""A linear periodic model that maximizes the likelihood, and its uncertainty.
 
-    **Fields:**
+    **Fields** beside those of every `Fit`:
 
     - `model`: the fitted `LDTP`. The coordinates of its states are arbitrary; multipliers and HTFs
       do not depend on them, and have standard errors.
     - `multipliers` (d,): by decreasing modulus, d the smallest dimension of any x[n].
       `coefficients` (d,): of their polynomial.
-    - `covariance` (d, d): covariance of the coefficients, with `covariance_freedom` degrees of
-      freedom (infinite if variances were given). `standard_errors`, `contains` and `ellipse` follow
-      from it. Infinite if the data do not determine all coefficients.
+    - `covariance` (d, d): covariance of the coefficients. `covariance_dof` is infinite if variances
+      were given. `standard_errors`, `contains` and `ellipse` follow from it. Infinite if the data
+      do not determine all coefficients.
     - `unknowns`: number of unknowns, without the choice of coordinates.
-    - `cost`: sum of squares of the residuals in units of the errors' standard deviations, and
-      `freedom`, its expectation. A larger cost means too few dimensions, or a local minimum.
-      Without variances, as always for time series, the unit follows from the residuals, and the two
-      are equal: see `correlation`, and use `hj.validate`.
+    - `cost`: sum of squares of the residuals in units of the errors' standard deviations, whose
+      expectation is `dof`. A larger cost means too few dimensions, or a local minimum. Without
+      variances, as always for time series, the unit follows from the residuals, and the two are
+      equal: see `correlation`, and use `hj.validate`.
     - `correlation`: of the residuals of HTFs at neighboring frequencies; about 0 for enough
       dimensions. None for time series.
-    - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `harmonics` (M,): harmonics that were fitted; for time series, all N.
-    - `noise`: an `LDTP` whose response to independent white inputs of variance one is the noise of
-      the outputs; None for HTFs.
-    - `feedback`: a sentence about inputs of time series that a controller makes, or may make; empty
-      if nothing speaks for a controller, or a `reference` was given.
-    - `doubt`: a sentence if drift of the outputs of time series (in the first 1000 cycles) gives
-      multipliers outside of each other's confidence regions, or if residuals depend on the inputs:
-      the dimensions are too few, or the iteration found a local minimum. Otherwise empty.
+    - `noise_model`: an `LDTP` whose response to independent white inputs of variance one is the
+      noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
+      ahead.
+    - `findings`: "feedback" for inputs of time series that a controller makes, or may make (not
+      with a `reference`); "drift" if drift of the outputs of time series (in the first 1000 cycles)
+      gives multipliers outside of each other's confidence regions; "left over" if residuals depend
+      on the inputs, or "misfit" if they are larger than their variances, or alike at neighboring
+      frequencies: the dimensions are too few, or the iteration found a local minimum; "order" if
+      one dimension less explains the data; "undetermined"; "no convergence".
     """
 
     model: LDTP
     cost: float = eqx.field(static=True)
-    freedom: int = eqx.field(static=True)
     correlation: float | None = eqx.field(static=True)
-    result: int = eqx.field(static=True)
     harmonics: tuple[int, ...] = eqx.field(static=True)
-    noise: LDTP | None
+    noise_model: LDTP | None
     _coordinates: LocalCoordinates
     _spread: Spread
     _scale: Float[np.ndarray, " ny"]
-    feedback: str = eqx.field(static=True, default="")
-    doubt: str = eqx.field(static=True, default="")
+
+    @property
+    def noise(self) -> Float[np.ndarray, " ny"] | None:
+        if self.noise_model is None:
+            return None
+        D = np.asarray(self.noise_model.D)
+        return np.sqrt((D**2).sum(axis=2).mean(axis=0))
+
+    @property
+    def n_sections(self) -> int:
+        return self.model.n_sections
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return self.model.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.model.outputs
 
     @property
     def unknowns(self) -> int:
         return self._coordinates.size
-
-    n_sections = property(lambda self: self.model.n_sections)
-    inputs = property(lambda self: self.model.inputs)
-    outputs = property(lambda self: self.model.outputs)
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
@@ -113,23 +134,17 @@ class LDTPFit(MultiplierEstimate):
         """
         f = np.atleast_1d(np.asarray(f, float))
         N = self.n_sections
-        harmonics = (
-            self.harmonics if harmonics is None else check_harmonics(harmonics, N)
-        )
+        if harmonics is None:
+            harmonics = self.harmonics
+        harmonics = check_harmonics(harmonics, N)
         H = transfer(self._coordinates.model, f, harmonics)
         variance = np.zeros(H.shape)
         for rows, slopes in transfer_slopes(self._coordinates, f, harmonics):
             variance[:, rows] = self._spread.variance(slopes)
         size = self._scale[:, None]
+        names = self.inputs, self.outputs
         return HTF(
-            f,
-            H * size,
-            harmonics,
-            N,
-            self.inputs,
-            self.outputs,
-            "fit",
-            variance=variance * size**2,
+            f, H * size, harmonics, N, *names, "fit", variance=variance * size**2
         )
 
     @checked
@@ -148,69 +163,56 @@ class LDTPFit(MultiplierEstimate):
 
         **Raises:** `DefinitionError` if no noise was fitted, or if it grows without bound.
         """
-        if self.noise is None:
+        if self.noise_model is None:
             raise DefinitionError(
                 "no noise is fitted to HTFs (`HTF.variance`): fit time series."
             )
-        return prediction.noise_spectrum(
-            self.noise, np.atleast_1d(np.asarray(f, float)), harmonics
-        )
+        f = np.atleast_1d(np.asarray(f, float))
+        return prediction.noise_spectrum(self.noise_model, f, harmonics)
 
     def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
         """Iterate over sections: roots of the covariance of the predictions by errors of the fit,
         in units of the noise."""
-        part, model = SeriesPart.of(grid, self._scale), self._coordinates.model
+        part = SeriesPart.of(grid, self._scale)
         S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
-        path = SeriesProblem([part], S, True, True, 0).path(model, part)
-        sizes = np.sqrt(np.diagonal(S, axis1=1, axis2=2))[:, :, None]
-        for J, size in zip(
-            prediction.slopes_of(self._coordinates, part, path), sizes, strict=True
-        ):
+        path = SeriesProblem([part], S, True, True, 0).path(
+            self._coordinates.model, part
+        )
+        sizes = np.sqrt(np.linalg.diagonal(S))[:, :, None]
+        slopes = prediction.slopes_of(self._coordinates, part, path)
+        for J, size in zip(slopes, sizes, strict=True):
             yield J @ self._spread.root / size
 
     @property
     def predictor(self) -> Predictor | None:
         """The predictor one step ahead that `hj.validate` uses; None if no noise was fitted."""
-        if self.noise is None:
+        if self.noise_model is None:
             return None
-        D = np.asarray(self.noise.D)
-        return Predictor(
-            self._coordinates.model.times(self._scale), D @ D.swapaxes(1, 2)
-        )
+        D = np.asarray(self.noise_model.D)
+        model = self._coordinates.model.times(self._scale)
+        return Predictor(model, D @ D.mT)
 
     @property
     def determines_direct(self) -> bool:
         """Test whether the data determine D, unless it was taken as zero."""
         coordinates = self._coordinates
-        places = [np.r_[x["D"]] for x in coordinates.places if coordinates.direct]
-        slopes = np.eye(coordinates.size)[:, np.concatenate([np.r_[:0], *places])]
+        if not coordinates.direct:
+            return True
+        entries = np.concatenate([np.r_[place["D"]] for place in coordinates.places])
+        slopes = np.eye(coordinates.size)[:, entries]
         return bool(np.isfinite(self._spread.variance(slopes)).all())
 
     def _about(self) -> str:
-        about = f"misfit {self.cost:.6g}, expected {self.freedom}"
-        if self.cost > 2 * self.freedom or weights.are_alike(
-            self.correlation or 0.0, self.freedom
-        ):
-            about += (
-                " (errors are larger than their variances, or alike at neighboring frequencies: "
-                "too few dimensions, or a local minimum that another guess avoids)"
-            )
+        about = f"misfit {self.cost:.6g}, expected {self.dof:.0f}"
         if self.noise is not None:
-            size = np.sqrt((np.asarray(self.noise.D) ** 2).sum(axis=2).mean(axis=0))
-            about = f"errors one step ahead {signal_values(self.outputs, size)}"
-        about = f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
-        unknown = (
-            ""
-            if self.determines_direct
-            else "the data do not determine D: excite more lines"
-        )
-        return "; ".join(filter(None, [about, unknown, self.doubt, self.feedback]))
+            about = f"errors one step ahead {signal_values(self.outputs, self.noise)}"
+        return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
 
 
 @checked
 def fit_ldtp(
     data: HTF | RecordedData,
-    guess: Guess,
+    guess: Guess | None = None,
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
@@ -246,10 +248,11 @@ def fit_ldtp(
       entries of the matrices. Without variances each output is weighted by its residuals. Or time
       series, as for `fit_series`.
     - `guess`: dimensions of the state at each section (or one for all): the fit starts from
-      `hj.identify.realize` for HTFs, and from a subspace method for time series. Alternatively, an
+      a realization of HTFs (states below the noise are left out by default, which may bias a
+      multiplier), and from a subspace method for time series, which need this. Alternatively, an
       observable initial model with these dimensions; if its D is zero, D stays zero. Too few
-      dimensions bias the multipliers: compare `cost` with `freedom` where variances are known;
-      for time series, see `doubt`. The iteration finds a local minimum; the same checks reveal a
+      dimensions bias the multipliers: compare `cost` with `dof` where variances are known;
+      for time series, see `findings`. The iteration finds a local minimum; the same checks reveal a
       poor one.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
@@ -257,14 +260,14 @@ def fit_ldtp(
     - `check`: whether to raise an error if outputs do not respond to the inputs (not with
       "innovations"), and to test whether one dimension less explains the data as well, whether
       residuals of time series depend on the inputs, and whether drift explains the multipliers;
-      `doubt` and a `FindingWarning` then say so. Default: True.
+      `findings`, and warnings (`FindingWarning`), then say so. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
       with innovations. The fit is consistent if D is zero at sections where the controller responds
       without delay; the response of the outputs to the reference shows whether D is zero. If the
       reference was not recorded, pass noise="innovations". Then D is zero if outputs do not depend
       on inputs at the same section, or if inputs respond to earlier residuals; otherwise D is
-      fitted, and `feedback` reports that a controller could cause the dependence. If the past
+      fitted, and a finding reports that a controller could cause the dependence. If the past
       determines the inputs (few lines), D is zero if a fit with D is not better (at 5 %), and it is
       free, and printed as not determined, if the data do not determine it. Default: None.
 
@@ -273,182 +276,261 @@ def fit_ldtp(
     than unknowns, outputs that do not respond to the inputs, or records with `lead`.
     """
     require_x64()
-    if isinstance(data, HTF):
-        if reference is not None or noise == "innovations" or start == "cycle":
+    free_start = start == "free"
+    if not isinstance(data, HTF):
+        if guess is None:
             raise DefinitionError(
-                "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
-                "leave these arguments out (and pass `reference` to `estimate_htf`)."
+                "fit_ldtp: give the dimensions of the state as `guess`, which time series need."
             )
+        how = _How(noise == "innovations" or reference is not None, free_start, check)
+        fit = _fit_to_records(data, guess, how, reference)
+    elif reference is None and noise == "output" and free_start:
         fit = _fit_to_htf(data, guess, check)
     else:
-        drive = None
-        if reference is not None:
-            data, drive = in_loop(data, reference)
-        innovations = noise == "innovations" or drive is not None
-        records, direct = PreparedRecords(data, start == "free"), _is_direct(guess)
-        outside = records if drive is None else PreparedRecords(drive, start == "free")
-        if innovations and not isinstance(guess, LDTP):
-            direct = answers_at_once(records, outside)
-        how = (innovations, start == "free", check)
-        fit = _fit_to_series(records, guess, *how, direct)
-        direct = fit._coordinates.direct
-        grid = records.whole()
-        errors = lambda: cast(Predictor, fit.predictor).errors(grid, start == "free")  # noqa: E731
-        unseen = innovations and direct and drive is None and fit.determines_direct
-        feedback = residuals.UNSEEN * unseen
-        if drive is None and (
-            answers := residuals.answering(grid, errors(), records.inputs)
-        ):
-            if innovations and direct and not isinstance(guess, LDTP):
-                fit, direct = _fit_to_series(records, guess, *how, False), False
-            remedy = residuals.REMEDIES[innovations + (innovations and not direct)]
-            feedback = residuals.about_answering(answers, remedy)
-
-        def drifting() -> RoughFit:  # (from the fit on: half of the steps)
-            begun = PreparedRecords(with_drift(records.records))
-            model = fit._coordinates.model.times(fit._scale / begun.scale)
-            slow = _fit_to_series(begun, model, *how[:2], False, direct)
-            return slow.coefficients, lambda: Covariance(
-                slow.covariance, slow.covariance_freedom
-            )
-
-        doubt = fit.doubt
-        if check and not residuals.is_exact(grid, error := errors()).all():
-            misfit = residuals.about_misfit(outside.whole(), grid, error, innovations)
-            doubt = fit.contradiction([drifting], MAY_DRIFT) or misfit or doubt
-        fit = dataclasses.replace(fit, feedback=feedback, doubt=doubt)
-    if fit.doubt:
-        warnings.warn(f"Fit: {fit.doubt}.", FindingWarning, stacklevel=3)
+        raise DefinitionError(
+            "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
+            "leave these arguments out (and pass `reference` to `estimate_htf`)."
+        )
+    if check:
+        warn_of(fit.findings)
     return fit
 
 
-def _fit_to_htf(htf: HTF, guess: Guess, check: bool) -> LDTPFit:
-    scale, direct = weights.check_values(htf), _is_direct(guess)
+class _How(NamedTuple):
+    """How a model is fitted to time series."""
+
+    innovations: bool
+    """Whether noise enters the states."""
+    free_start: bool
+    """Whether the states at the starts of records are unknown."""
+    check: bool
+
+
+def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
+    scale = weights.check_values(htf)
+    direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
-        guess = realize(htf, np.array(given_dims(guess, htf.n_sections, "guess")))
+        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "guess"))
     require_same("guess and data", guess, htf)
     problem = FrequencyProblem.of(htf, weights.error_weights(htf, scale), scale)
     model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
-    freedom = problem.residuals - unknowns
-    if freedom < 1:
-        text = f"{problem.residuals} numbers, too few for {unknowns} unknowns"
+    dof = problem.residuals - unknowns
+    if dof < 1:
         raise DefinitionError(
-            f"the HTFs hold {text}: give more frequencies, or smaller `guess`."
+            f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns: give "
+            "more frequencies, or smaller `guess`."
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
             "`guess` has an infinite response at a frequency: give a stable one."
         )
-    point, converged = descend(ModelPoint(problem, model, direct), FIRST_DAMPING)
+    point, converged = descend(ModelPoint(problem, model, direct))
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
         square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
-        weight = (
-            problem.weight
-            / np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)[:, None]
-        )
-        problem = problem._replace(weight=weight)
-        point, converged = descend(
-            ModelPoint(problem, point.model, direct), FIRST_DAMPING
-        )
+        size = np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)
+        problem = problem._replace(weight=problem.weight / size[:, None])
+        start = ModelPoint(problem, point.model, direct)
+        point, converged = descend(start)
     if check:
         _require_answer(point)
-    fit = _finished(point, converged, htf, scale, freedom)
-    smaller = lambda dims: PeriodicModel.of(realize(htf, np.array(dims)), scale)  # noqa: E731
-    return dataclasses.replace(
-        fit, doubt=_surplus(fit, point, smaller) if check else ""
-    )
+    fit = _finished(point, converged, htf, scale, dof)
+    if not check:
+        return fit
+
+    def smaller(dims: Sequence[int]) -> PeriodicModel:
+        return PeriodicModel.of(realized_htf(htf, dims), scale)
+
+    return _with_findings(fit, _surplus(fit, point, smaller))
 
 
-def _likelier(
-    records: PreparedRecords, guess: Guess, how: tuple[bool, bool, bool]
+def _fit_to_records(
+    data: RecordedData, guess: Guess, how: _How, reference: SignalNames | None
 ) -> LDTPFit:
+    """Return a fit to time series, with the findings of its residuals."""
+    drive = None
+    if reference is not None:
+        data, drive = in_loop(data, reference)
+    records = PreparedRecords(data, how.free_start)
+    outside = records if drive is None else PreparedRecords(drive, how.free_start)
+    chosen = isinstance(guess, LDTP)
+    direct = _is_direct(guess)
+    if how.innovations and not chosen:
+        direct = answers_at_once(records, outside)
+    fit = _fit_to_series(records, guess, how, direct)
+    grid = records.whole()
+    answers: list[Finding] = []
+    if drive is None:
+        fit, answers = _without_feedback(records, guess, how, fit, grid)
+    error = cast(Predictor, fit.predictor).errors(grid, how.free_start)
+    doubts: list[Finding] = []
+    if how.check and not residuals.is_exact(grid, error).all():
+        doubts = _doubts(records, outside, how, fit, grid, error)
+    if doubts:
+        fit = dataclasses.replace(fit, findings=_about_point(fit))
+    return _with_findings(fit, [*doubts, *answers])
+
+
+def _without_feedback(
+    records: PreparedRecords, guess: Guess, how: _How, fit: LDTPFit, grid: CycleGrid
+) -> tuple[LDTPFit, list[Finding]]:
+    """Return the fit, with D = 0 if a controller seems to make the inputs, and the finding."""
+    error = cast(Predictor, fit.predictor).errors(grid, how.free_start)
+    fitted = how.innovations and fit._coordinates.direct
+    chosen = isinstance(guess, LDTP)
+    remedy = residuals.FOR_WHITE_NOISE
+    if how.innovations:
+        remedy = residuals.FOR_GIVEN_D if fitted and chosen else residuals.FOR_ZERO_D
+    answers = residuals.about_answers(grid, error, records.inputs, remedy)
+    if answers and fitted and not chosen:
+        fit = _fit_to_series(records, guess, how, False)
+    elif not answers and fitted and fit.determines_direct:
+        answers = [residuals.UNSEEN]
+    return fit, answers
+
+
+def _doubts(
+    records: PreparedRecords,
+    outside: PreparedRecords,
+    how: _How,
+    fit: LDTPFit,
+    grid: CycleGrid,
+    error: Float[np.ndarray, "S T N ny"],
+) -> list[Finding]:
+    """Return the most important finding about drift and about residuals that depend on inputs."""
+
+    def drifting() -> RoughFit:  # (from the fit on: half of the steps)
+        begun = PreparedRecords(with_drift(records.records))
+        model = fit._coordinates.model.times(fit._scale / begun.scale)
+        unchecked = how._replace(check=False)
+        slow = _fit_to_series(begun, model, unchecked, fit._coordinates.direct)
+        covariance = Covariance(slow.covariance, slow.covariance_dof)
+        return slow.coefficients, lambda: covariance
+
+    unknown = fit.undetermined()
+    if unknown:
+        return unknown
+    if fit.contradicted_by([drifting], OF_DRIFT) is not None:
+        return [MAY_DRIFT]
+    return residuals.about_misfit(outside.whole(), grid, error, how.innovations)
+
+
+def _likelier(records: PreparedRecords, guess: Guess, how: _How) -> LDTPFit:
     """Return a fit with D = 0 if data that determine D do not contradict it; else one with D."""
-    fit = _fit_to_series(records, guess, *how, True)
-    model = fit._coordinates.model
+    fit = _fit_to_series(records, guess, how, True)
     if not fit.determines_direct:
         return fit
-    for start in (
-        guess,
-        model._replace(D=[0.0 * D for D in model.D]),
-    ):  # (may differ in minima)
-        zero = _fit_to_series(records, start, *how, False)
-        sizes = [
-            np.linalg.slogdet(cast(Predictor, x.predictor).S)[1] for x in (zero, fit)
-        ]
-        ratio = max(float(records.sampled.mean(axis=1) @ (sizes[0] - sizes[1])), 0.0)
+    model = fit._coordinates.model
+    without = model._replace(D=[0.0 * D for D in model.D])
+    samples = records.sampled.mean(axis=1)
+    for start in (guess, without):  # (may differ in minima)
+        zero = _fit_to_series(records, start, how, False)
+        rise = samples @ (_error_sizes(zero) - _error_sizes(fit))
         # (At 5 %: a D that is fitted in vain enlarges errors a little, a missing one is a bias.)
-        degrees = fit.unknowns - zero.unknowns
-        if (
-            zero.result == Result.OK
-            and special.gammaincc(degrees / 2, ratio / 2) > 0.05
-        ):
+        p = _probability(float(rise), fit.unknowns - zero.unknowns)
+        if zero.result == Result.OK and p > 0.05:
             return zero
     return fit
+
+
+def _error_sizes(fit: LDTPFit) -> Float[np.ndarray, " N"]:
+    """Return the log determinants of the errors' covariances."""
+    return np.linalg.slogdet(cast(Predictor, fit.predictor).S)[1]
+
+
+def _probability(rise: float, unknowns: int) -> float:
+    """Return the probability that so many unknowns which are zero lower the cost by as much."""
+    return float(special.gammaincc(unknowns / 2, max(rise, 0.0) / 2))
 
 
 def _fit_to_series(
     records: PreparedRecords,
     guess: Guess | PeriodicModel,
-    innovations: bool,
-    free_start: bool,
-    check: bool,
+    how: _How,
     direct: bool | None,
 ) -> LDTPFit:
     """Return a fit with D, with D = 0, or (None) with D = 0 if the data do not contradict it."""
     if direct is None:
-        return _likelier(records, guess, (innovations, free_start, check))
+        return _likelier(records, cast(Guess, guess), how)
     if records.lead:
         raise DefinitionError(
             f"the outputs of the records depend on inputs up to {records.lead} samples later "
             "(`lead`), those of an LDTP on earlier ones only: use `fit_series`."
         )
-    N, ny, scale = records.n_sections, len(records.outputs), records.scale
-    parts = [SeriesPart.of(grid, scale) for grid in records.grids]
-    first = [n for part in parts for n in part.first.tolist()]
-    drift = sum(round(float((part.drift**2).sum())) for part in parts)
-    numbers = int(records.sampled.sum()) - drift
-    problem = SeriesProblem(
-        parts, np.tile(np.eye(ny), (N, 1, 1)), innovations, free_start, numbers
-    )
-    if isinstance(guess, PeriodicModel):
-        model = guess
-    elif isinstance(guess, LDTP):
-        require_same("guess and data", guess, records)
-        model = PeriodicModel.of(guess, scale, ny if innovations else 0)
-    else:
-        model = subspace_model(
-            records, given_dims(guess, N, "guess") or [], innovations, direct
-        )
-    unknowns = local_coordinates(model, direct).size
-    starts = sum(model.dims[n] for n in first) if free_start else 0
-    freedom = numbers - unknowns - starts
-    if 3 * starts > numbers:  # errors would be smaller, and regions with them
-        raise DefinitionError(
-            f"{starts} coordinates of the states at the start of {len(first)} records are to be "
-            f"found from {numbers} numbers: leave out records shorter than a cycle."
-        )
-    fewest = records.sampled.min()
-    if freedom < 1 or fewest <= ny + unknowns / (N * ny):
-        raise DefinitionError(
-            f"the series hold {numbers} numbers, {fewest} samples of an output at one of "
-            f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
-        )
+    model = _first_model(records, guess, how, direct)
+    problem = _series_problem(records, how)
+    dof = _freedom_of(records, problem, model, direct)
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
             "the responses of `guess` are infinite: give a stable model."
         )
-    point, converged = descend(
-        ModelPoint(problem.reweighted(model), model, direct), FIRST_DAMPING
-    )
-    if check and not innovations:
+    start = ModelPoint(problem.reweighted(model), model, direct)
+    point, converged = descend(start)
+    if how.check and not how.innovations:
         _require_answer(point)
-    fit = _finished(point, converged, records, scale, freedom)
-    smaller = lambda dims: subspace_model(records, dims, innovations, direct)  # noqa: E731
-    return dataclasses.replace(
-        fit, doubt=_surplus(fit, point, smaller) if check else ""
-    )
+    fit = _finished(point, converged, records, records.scale, dof)
+    if not how.check:
+        return fit
+
+    def smaller(dims: Sequence[int]) -> PeriodicModel:
+        return subspace_model(records, dims, how.innovations, direct)
+
+    return _with_findings(fit, _surplus(fit, point, smaller))
+
+
+def _first_model(
+    records: PreparedRecords, guess: Guess | PeriodicModel, how: _How, direct: bool
+) -> PeriodicModel:
+    """Return the model from which the descent starts."""
+    if isinstance(guess, PeriodicModel):
+        return guess
+    if isinstance(guess, LDTP):
+        require_same("guess and data", guess, records)
+        errors = len(records.outputs) if how.innovations else 0
+        return PeriodicModel.of(guess, records.scale, errors)
+    dims = given_dims(guess, records.n_sections, "guess") or []
+    return subspace_model(records, dims, how.innovations, direct)
+
+
+def _series_problem(records: PreparedRecords, how: _How) -> SeriesProblem:
+    parts = [SeriesPart.of(grid, records.scale) for grid in records.grids]
+    drift = sum(round(float((part.drift**2).sum())) for part in parts)
+    numbers = int(records.sampled.sum()) - drift
+    S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
+    return SeriesProblem(parts, S, how.innovations, how.free_start, numbers)
+
+
+def _freedom_of(
+    records: PreparedRecords,
+    problem: SeriesProblem,
+    model: PeriodicModel,
+    direct: bool,
+) -> int:
+    """Return the degrees of freedom of the residuals.
+
+    **Raises:** `DefinitionError` for too few numbers.
+    """
+    numbers = problem.residuals
+    unknowns = local_coordinates(model, direct).size
+    starts = 0
+    if problem.free_start:
+        first = np.concatenate([part.first for part in problem.parts])
+        starts = int(np.array(model.dims)[first].sum())
+    if 3 * starts > numbers:  # errors would be smaller, and regions with them
+        raise DefinitionError(
+            f"{starts} coordinates of the states at the start of {len(records.records)} records "
+            f"are to be found from {numbers} numbers: leave out records shorter than a cycle."
+        )
+    dof = numbers - unknowns - starts
+    fewest = records.sampled.min()
+    N, ny = records.sampled.shape
+    if dof < 1 or fewest <= ny + unknowns / (N * ny):
+        raise DefinitionError(
+            f"the series hold {numbers} numbers, {fewest} samples of an output at one of "
+            f"the sections, too few for {unknowns} unknowns: record more, or fit fewer dimensions."
+        )
+    return dof
 
 
 def _require_answer(point: ModelPoint) -> None:
@@ -463,29 +545,53 @@ def _require_answer(point: ModelPoint) -> None:
 
 
 def _surplus(
-    fit: LDTPFit, point: ModelPoint, smaller: Callable[[Any], PeriodicModel]
-) -> str:
-    """Return a sentence if a model with one dimension less at each section is nearly as good, or
-    the data do not determine the multipliers; else "".
+    fit: LDTPFit, point: ModelPoint, smaller: Callable[[Sequence[int]], PeriodicModel]
+) -> list[Finding]:
+    """Return a finding if a model with one dimension less at each section is nearly as good, or
+    the data do not determine the multipliers.
 
     **Arguments:** `smaller`: a first model with these dimensions.
     """
-    dims, unknown = [d - 1 for d in point.model.dims], fit.contradiction([])
+    unknown = fit.undetermined()
+    dims = [d - 1 for d in point.model.dims]
+    if unknown or min(dims) < 1:
+        return unknown
     with suppress(DefinitionError):
-        if min(dims) > 0 and not unknown:
-            start = ModelPoint(point.problem, smaller(dims), point.direct)
-            fewer, _ = descend(
-                start, FIRST_DAMPING, max_steps=10
-            )  # (enough to come near)
-            unit = 1.0 if fit.covariance_freedom == np.inf else point.cost / fit.freedom
-            rise = max(point.problem.cost(fewer.model) - point.cost, 0.0) / unit
-            degrees = point.coordinates.size - fewer.coordinates.size
-            if special.gammaincc(degrees / 2, rise / 2) > residuals.ANSWER:
-                return "one dimension less explains the data, so a multiplier may be spurious"
-    return unknown
+        start = ModelPoint(point.problem, smaller(dims), point.direct)
+        # (Ten steps are enough to come near.)
+        fewer, _ = descend(start, max_steps=10)
+        unit = 1.0 if np.isinf(fit.covariance_dof) else point.cost / fit.dof
+        rise = (point.problem.cost(fewer.model) - point.cost) / unit
+        lost = point.coordinates.size - fewer.coordinates.size
+        if _probability(rise, lost) > residuals.ANSWER:
+            text = (
+                "one dimension less explains the data, so a multiplier may be spurious."
+            )
+            return [Finding("order", text)]
+    return []
 
 
-def _is_direct(guess: Guess) -> bool:
+def _with_findings(fit: LDTPFit, more: Sequence[Finding]) -> LDTPFit:
+    return dataclasses.replace(fit, findings=(*fit.findings, *more))
+
+
+def _about_point(fit: LDTPFit) -> tuple[Finding, ...]:
+    """Return what the end of the descent alone says about a fit."""
+    findings = not_converged(fit.result)
+    alike = weights.are_alike(fit.correlation or 0.0, fit.dof)
+    if fit.cost > 2 * fit.dof or alike:
+        text = (
+            "errors are larger than their variances, or alike at neighboring frequencies: too few "
+            "dimensions, or a local minimum that another guess avoids."
+        )
+        findings.append(Finding("misfit", text))
+    if not fit.determines_direct:
+        text = "the data do not determine D: excite more lines."
+        findings.append(Finding("undetermined", text))
+    return tuple(findings)
+
+
+def _is_direct(guess: Guess | None) -> bool:
     """Return whether outputs may depend on the input at their own section."""
     return not isinstance(guess, LDTP) or bool(np.asarray(guess.D).any())
 
@@ -495,42 +601,47 @@ def _finished(
     converged: bool,
     data: HTF | PreparedRecords,
     scale: Float[np.ndarray, " ny"],
-    freedom: int,
+    dof: int,
 ) -> LDTPFit:
     """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
-    model, unit, known = point.coordinates.model, point.cost / freedom, False
-    noise = correlation = None
+    model = point.coordinates.model
+    unit = point.cost / dof
+    known = False
+    noise = None
+    correlation = None
     harmonics = all_harmonics(data.n_sections)
     if isinstance(data, HTF):
-        known, harmonics = data.variance is not None, data.harmonics
+        known = data.variance is not None
+        harmonics = data.harmonics
         problem = cast(FrequencyProblem, point.problem)
         if known:
-            unit = weights.estimated_noise(weights.largest_misfit(data), unit)[1] ** 2
-        size = problem.weight * problem.target
+            _, deviation = weights.estimated_noise(weights.largest_misfit(data), unit)
+            unit = deviation**2
         correlation = weights.neighbor_correlation(
-            problem.errors(model), size, np.asarray(data.f)
+            problem.errors(model), problem.weight * problem.target, np.asarray(data.f)
         )
     else:
         S = cast(SeriesProblem, point.problem).S
         noise = prediction.noise_model(model, S, scale, data.outputs)
     c, slopes = characteristic_slopes(point.coordinates)
     spread = point.equations.spread(unit)
-    return LDTPFit(
+    fit = LDTPFit(
         model=model.to_ldtp(scale, data.inputs, data.outputs),
         multipliers=multipliers_of(c),
         coefficients=c,
         covariance=spread.covariance(slopes),
-        covariance_freedom=np.inf if known else float(freedom),
-        cost=point.cost if known else float(freedom),
-        freedom=freedom,
+        covariance_dof=np.inf if known else float(dof),
+        cost=point.cost if known else float(dof),
+        dof=float(dof),
         correlation=correlation,
-        result=Result.OK if converged else Result.NOT_CONVERGED,
+        result=int(Result.OK if converged else Result.NOT_CONVERGED),
         harmonics=harmonics,
-        noise=noise,
+        noise_model=noise,
         _coordinates=point.coordinates,
         _spread=spread,
         _scale=scale,
     )
+    return dataclasses.replace(fit, findings=_about_point(fit))
 
 
 @checked
@@ -552,9 +663,8 @@ def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
     **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
     """
     exact = exact_htf(model, htf)
-    minimal = realize(
-        np.asarray(model.impulse_response(2 * default_horizon(model.n_sections) + 1))
-    )
+    lags = 2 * default_horizon(model.n_sections) + 1
+    minimal = realized(np.asarray(model.impulse_response(lags)))
     scale = weights.check_values(exact)
     problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
     direct = bool(np.asarray(model.D).any())

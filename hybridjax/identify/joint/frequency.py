@@ -1,4 +1,4 @@
-r"""Residuals of harmonic transfer functions, their derivatives in closed form, and the descent.
+r"""Residuals of harmonic transfer functions, and their derivatives in closed form.
 
 With $z = e^{2 \pi i f / N}$ and periodic $\tilde x$, the response to $u[n] = z^n$ is
 $z^n \tilde x[n]$ and
@@ -16,22 +16,14 @@ $\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 from ...linear.htf import HTF
-from ..descent import NormalEquations, Point
-from ..periodic import (
-    LocalCoordinates,
-    PeriodicModel,
-    characteristic_slopes,
-    local_coordinates,
-)
-from ..series.prediction import SeriesProblem
+from ..descent import NormalEquations
+from ..periodic import LocalCoordinates, PeriodicModel
 
 
 # Numbers of a Jacobian that are held at once, 32 MB. Larger: memory; smaller: loops in Python.
@@ -81,8 +73,10 @@ class FrequencyProblem(NamedTuple):
             return np.inf
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
-        P, error = coordinates.size, self.errors(coordinates.model)
-        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        P = coordinates.size
+        error = self.errors(coordinates.model)
+        gram = np.zeros((P, P))
+        gradient = np.zeros(P)
         pieces = transfer_slopes(coordinates, self.f, self.harmonics, self.weight)
         for rows, slopes in pieces:
             J = slopes.reshape(P, -1).view(float)
@@ -96,12 +90,16 @@ def transfer(
 ) -> Complex[np.ndarray, "M F ny nu"]:
     """Return the harmonic transfer functions of a model."""
     N = model.n_sections
-    states = zip(states_at(model, f), model.C, model.D, strict=True)
-    G = np.stack(
-        [_real_times(C, x) + D[:, None] for x, C, D in states]
-    )  # (N, ny, F, nu)
+    states = states_at(model, f)
+    responses = [_outputs(model, n, states[n]) for n in range(N)]
     waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
-    return np.tensordot(waves, G, 1).swapaxes(1, 2)
+    return np.tensordot(waves, np.stack(responses), 1).swapaxes(1, 2)
+
+
+def _outputs(
+    model: PeriodicModel, n: int, state: Complex[np.ndarray, "d F nu"]
+) -> Complex[np.ndarray, "ny F nu"]:
+    return _real_times(model.C[n], state) + model.D[n][:, None]
 
 
 def transfer_slopes(
@@ -111,50 +109,80 @@ def transfer_slopes(
     weight: Float[np.ndarray, "M F ny nu"] | None = None,
 ) -> Iterator[tuple[slice, Complex[np.ndarray, "P M F ny nu"]]]:
     """Iterate over derivatives of the HTFs, times weights, by groups of frequencies."""
-    model, places, m = coordinates.model, coordinates.places, np.array(harmonics)
-    N, (ny, nu) = model.n_sections, model.D[0].shape
-    weight = np.ones((len(m), len(f), ny, nu)) if weight is None else weight
+    model = coordinates.model
+    m = np.array(harmonics)
+    if weight is None:
+        weight = np.ones((len(m), len(f), *model.D[0].shape))
     # Derivatives by later states are those of the transposed system, in the other order.
     dual = model._replace(
         A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]]
     )
-    step = max(_HELD // (coordinates.size * len(m) * ny * nu), 1)
-    for rows in (slice(k, min(k + step, len(f))) for k in range(0, len(f), step)):
-        w, states = weight[:, rows], states_at(model, f[rows])
+    numbers = coordinates.size * weight[:, 0].size
+    step = max(_HELD // numbers, 1)
+    places = coordinates.places
+    for first in range(0, len(f), step):
+        rows = slice(first, first + step)
+        w = weight[:, rows]
+        states = states_at(model, f[rows])
         later = states_at(dual, np.add.outer(m, f[rows]).ravel())[::-1]
-        J = np.zeros((coordinates.size, *w.shape), complex)
-        for n, at in enumerate(places):
-            wave = (np.exp(-2j * np.pi / N * n * m) / N)[:, None, None]
-            after = later[n].reshape(-1, *w.shape[:3]) * wave  # (d, M, F, ny)
-            shapes = dict(coordinates.blocks(n))
-            left = _real_times(coordinates.to_A[n].T, after)  # (q, M, F, ny)
-            left += coordinates.to_C[n].T[:, None, None, :] * wave
-            Y, B, K = (
-                J[at[name]].reshape(*shapes[name], *w.shape) for name in ("Y", "B", "K")
-            )
-            outputs = _real_times(model.C[n], states[n]) + model.D[n][:, None]
-            for j in range(nu):
-                x, y = (
-                    z[None, :, None, :, None, j] for z in (states[n], outputs)
-                )  # (1 d 1 F 1)
-                np.multiply((left * w[..., j])[:, None], x, out=Y[..., j])
-                B[:, j, ..., j] = after * w[..., j]
-                K[..., j] = (after * w[..., j])[:, None] * y[:, : K.shape[1]]
-            if coordinates.direct:
-                D = J[at["D"]].reshape(*shapes["D"], *w.shape)
-                through = _real_times(model.gain[n].T, after)  # (ny, M, F, ny)
-                for j in range(nu):
-                    D[:, j, ..., j] = through * w[..., j]
-                for i, j in np.ndindex(ny, nu):
-                    D[i, j, ..., i, j] += wave[..., 0] * w[..., i, j]
-        yield rows, J
+        slopes = np.zeros((coordinates.size, *w.shape), complex)
+        for n, place in enumerate(places):
+            shapes = coordinates.blocks(n)
+            blocks = {
+                name: slopes[place[name]].reshape(*shape, *w.shape)
+                for name, shape in shapes.items()
+            }
+            waves = np.exp(-2j * np.pi / model.n_sections * n * m) / model.n_sections
+            after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
+            _fill(blocks, coordinates, n, states[n], after, waves, w)
+        yield rows, slopes
+
+
+def _fill(
+    blocks: dict[str, Complex[np.ndarray, "..."]],
+    coordinates: LocalCoordinates,
+    n: int,
+    state: Complex[np.ndarray, "d F nu"],
+    after: Complex[np.ndarray, "after M F ny"],
+    waves: Complex[np.ndarray, " M"],
+    weight: Float[np.ndarray, "M F ny nu"],
+) -> None:
+    """Write the derivatives by the blocks of section n, each (rows, columns, M, F, ny, nu).
+
+    **Arguments:** `after`: derivatives of the HTFs by the next state, less `waves`.
+    """
+    model = coordinates.model
+    wave = waves[:, None, None]
+    after = after * wave
+    outputs = _outputs(model, n, state)
+    by_C = coordinates.to_C[n].T[:, None, None, :] * wave  # (q, M, F, ny)
+    by_Y = _real_times(coordinates.to_A[n].T, after) + by_C
+    gains = blocks["K"].shape[1]
+    for j in range(weight.shape[3]):
+        w = weight[..., j]
+        x = state[None, :, None, :, None, j]
+        np.multiply((by_Y * w)[:, None], x, out=blocks["Y"][..., j])
+        blocks["B"][:, j, ..., j] = after * w
+        if gains:
+            blocks["K"][..., j] = (after * w)[:, None] * outputs[
+                None, :, None, :, None, j
+            ]
+    if not coordinates.direct:
+        return
+    through = _real_times(model.gain[n].T, after)  # (ny, M, F, ny)
+    for i, j in np.ndindex(model.D[n].shape):
+        D = blocks["D"][i, j, ..., j]
+        D += through[i] * weight[..., j]
+        D[..., i] += wave[..., 0] * weight[..., i, j]
 
 
 def states_at(
     model: PeriodicModel, f: Float[np.ndarray, " F"]
 ) -> list[Complex[np.ndarray, "_ F nu"]]:
     r"""Return $\tilde x$ at each section, (d, F, nu)."""
-    N, nu, phi = model.n_sections, model.B[0].shape[1], model.monodromy()
+    N = model.n_sections
+    nu = model.B[0].shape[1]
+    phi = model.monodromy()
     back = np.exp(-2j * np.pi / N * f)[:, None]
 
     def around(x):
@@ -166,79 +194,12 @@ def states_at(
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
     turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
-    return around(
-        np.einsum("fab,bfj->afj", np.linalg.inv(np.eye(len(phi)) - turn), forced)
-    )[0]
+    resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
+    states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))
+    return states
 
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
     """Return the product with a real matrix, (a, *rest)."""
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
     return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
-
-
-Problem = FrequencyProblem | SeriesProblem
-
-# Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
-# Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
-_SETTLED_GAIN = 1e-2
-# Expected squared change of the characteristic polynomial's coefficients there, in units of their
-# variance. Larger: multipliers miss the minimum, at 1e-3 by 3 % of their standard errors.
-_SETTLED_SHIFT = 1e-3
-# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
-# rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
-# converged; smaller: minima of exact data do not.
-_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
-
-
-class ModelPoint(Point):
-    """A model of a descent."""
-
-    def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
-        self.problem, self.direct, self.model = problem, direct, model
-        # A resonant model stays as it is; one that overflows has no finite cost.
-        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-            self.model = model.refined(direct, problem.linearize)
-        self.cost = problem.cost(self.model)
-
-    @cached_property
-    def coordinates(self) -> LocalCoordinates:
-        return local_coordinates(self.model, self.direct)
-
-    @cached_property
-    def equations(self) -> NormalEquations:
-        return self.problem.linearize(self.coordinates)
-
-    def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
-        return self.equations.step(damping)
-
-    def moved(self, step: Float[np.ndarray, " P"]) -> "ModelPoint":
-        return ModelPoint(self.problem, self.coordinates.moved(step), self.direct)
-
-    def accepted(self) -> "ModelPoint":
-        """Return the point with new weights.
-
-        The log determinant of the errors' covariance is concave, so that a step that lowers the
-        cost with the old weights raises the likelihood, where no sample is missing. With gaps the
-        covariance is that of the pairs that are sampled, which is nearly the likelihood's.
-        """
-        if isinstance(self.problem, SeriesProblem):
-            self.problem = self.problem.reweighted(self.model)
-            self.cost = self.problem.cost(self.model)
-        return self
-
-    def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        size = self.coordinates.size
-        unit = min(1.0, self.cost / max(self.problem.residuals - size, 1))
-        if gain > _SETTLED_GAIN * size * unit:
-            return False
-        _, slopes = characteristic_slopes(self.coordinates)
-        change = np.linalg.lstsq(slopes @ self.equations.spread().root, slopes @ step)[
-            0
-        ]
-        return bool(change @ change <= _SETTLED_SHIFT * unit * len(slopes))
-
-    def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
-        return bool(
-            gain <= _STALLED_GAIN * self.cost or np.abs(step).max() < _STALLED_STEP
-        )

@@ -1,14 +1,15 @@
 """Multipliers and transfer functions from recorded time series with any input: output error."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
@@ -20,6 +21,8 @@ from ..._core.boundary.kinds import (
     Vector,
 )
 from ..._core.execution import one_blas_thread
+from ..._core.findings import Finding, refuse, warn_of
+from ..._core.memo import remembered
 from ..._core.precision import require_x64
 from ..._core.results import Result
 from ..._core.text import signal_values
@@ -29,16 +32,27 @@ from ...linear.frequency_response import Harmonics, check_harmonics
 from ...linear.htf import HTF
 from ...linear.ldtp import LDTP
 from .. import denominator
-from ..denominator import Covariance, chi, fading, in_blocks, multipliers_of, sandwich
+from ..denominator import (
+    Covariance,
+    chi,
+    divided_by_chi,
+    fading,
+    in_blocks,
+    multipliers_of,
+    sandwich,
+)
 from ..descent import Coefficients
+from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, RoughFit, warned
+from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..multipliers import NoiseRatios, unsupported
+from ..realization import default_horizon, realized
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
 from .in_loop import LoopEquations
 from .linearization import (
     Linearization,
+    SectionFit,
     each_fit,
     filtered_response,
     linearize,
@@ -47,6 +61,7 @@ from .linearization import (
 from .output_error import OutputErrorProblem, SectionRegression, TooFewCycles
 from .records import (
     MAY_DRIFT,
+    OF_DRIFT,
     CycleGrid,
     PreparedRecords,
     divide_by_chi,
@@ -54,14 +69,14 @@ from .records import (
     start_responses,
     with_drift,
 )
-from .residuals import about_answering, answering
+from .residuals import about_answers
 from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
 _BIASED = "the fit is biased; name their `reference`"
 
 
-class SeriesFit(MultiplierEstimate):
+class SeriesFit(MultiplierFit):
     r"""A periodic system with one denominator in $q^{-N}$, fitted to recorded time series.
 
     $$\chi(q^{-N})\, y[n] = \sum_{r=0}^{R-1} b_{n \bmod N}[r]\, u[n-r], \qquad
@@ -69,38 +84,48 @@ class SeriesFit(MultiplierEstimate):
 
     This is exact for a periodic system with d non-zero multipliers, if R is large enough.
 
-    **Fields:**
+    **Fields** beside those of every `Fit`:
 
     - `multipliers` (d,): by decreasing modulus. `coefficients` (d,): c_1 to c_d.
-    - `covariance` (d, d): covariance of the coefficients, estimated with `covariance_freedom`
-      degrees of freedom. `standard_errors`, `contains` and `ellipse` follow from it.
+    - `covariance` (d, d): covariance of the coefficients. `standard_errors`, `contains` and
+      `ellipse` follow from it.
     - `numerators` (N, R, ny, nu): b at each section. Combinations of inputs that were not
       excited are zero.
     - `slopes` (d, N, R, ny, nu): their derivatives with respect to c.
     - `roots` (N, ny, R, nu, r): a square root of their covariance given c, for noise of variance 1.
     - `noise` (ny,): standard deviation of the residuals.
-    - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `doubt`: a sentence if drift of the outputs (in the first 1000 cycles), or one more multiplier
-      or two, give multipliers outside of each other's confidence regions. Otherwise empty.
-    - `feedback`: inputs that answer earlier residuals, as by a controller. The fit is then biased.
     - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
       standard deviation of $\chi y$.
+    - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
+      more multiplier or two, give multipliers outside of each other's confidence regions;
+      "feedback" if inputs answer earlier residuals, as by a controller: the fit is then biased;
+      "undetermined"; "no convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
     slopes: Float[np.ndarray, "d N R ny nu"]
     roots: Float[np.ndarray, "N ny R nu r"]
     noise: Float[np.ndarray, " ny"]
-    result: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
-    doubt: str = eqx.field(static=True, default="")
-    feedback: tuple[str, ...] = eqx.field(static=True, default=())
     reference: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @remembered
+    def model(self) -> LDTP:
+        """A minimal state-space model with the fitted responses, without states below the noise."""
+        markov = self.impulse_response(2 * default_horizon(self.n_sections) + 1)
+        spread = (self.roots**2).sum(axis=4).mean(axis=(0, 2))
+        return realized(
+            markov,
+            noise=spread * self.noise[:, None] ** 2,
+            order=len(self.multipliers),
+            inputs=self.inputs,
+            outputs=self.outputs,
+        )
 
     @checked
     def impulse_response(
@@ -111,9 +136,8 @@ class SeriesFit(MultiplierEstimate):
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
         h = np.pad(self.numerators, ((0, 0), (0, cycles * N - R), (0, 0), (0, 0)))
-        h = divide_by_chi(self.coefficients, h.reshape(N, cycles, -1)).reshape(
-            N, -1, *shape
-        )
+        by_cycle = h.reshape(N, cycles, -1)
+        h = divide_by_chi(self.coefficients, by_cycle).reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
@@ -127,48 +151,35 @@ class SeriesFit(MultiplierEstimate):
         """
         f = np.atleast_1d(np.asarray(f, float))
         harmonics = check_harmonics(harmonics, self.n_sections)
-        N, R, ny, nu = self.numerators.shape
-        powers = np.exp(-2j * np.pi / N * f[:, None] * (np.arange(R) - self.lead))
-        period_delay = np.exp(-2j * np.pi * f)
-        below = chi(period_delay, self.coefficients)
-        to_harmonics = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
+        N = self.n_sections
+        c = self.coefficients
+        waves = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
-            G = np.einsum("fr,...nrij->...nfij", powers, b) / below[:, None, None]
-            return np.einsum("mn,...nfij->...mfij", to_harmonics, G)
+            by_harmonic = np.einsum("mn,...nrij->...mrij", waves, b)
+            return divided_by_chi(by_harmonic, c, f, N, self.lead)
 
         H = sum_up(self.numerators)
-        delays = period_delay ** np.arange(1, len(self.coefficients) + 1)[:, None]
-        slope = sum_up(self.slopes) - (delays / below)[:, None, :, None, None] * H
-        by_c = np.einsum(
-            "amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj()
-        ).real
+        period_delay = np.exp(-2j * np.pi * f)[:, None, None]
+        below = chi(period_delay, c)
+        lags = np.arange(1, len(c) + 1)[:, None, None, None, None]
+        slope = sum_up(self.slopes) - period_delay**lags / below * H
+        by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
+        r = np.arange(self.numerators.shape[1]) - self.lead
+        powers = np.exp(-2j * np.pi / N * np.outer(f, r))
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
-        by_b = (
-            (np.abs(spread) ** 2).sum(axis=(1, 4))
-            / N**2
-            / np.abs(below)[:, None, None] ** 2
-        )
-        variance = by_c + by_b * self.noise[:, None] ** 2
+        by_b = (np.abs(spread / N) ** 2).sum(axis=(1, 4)) / np.abs(below) ** 2
+        variance = by_c.real + by_b * self.noise[:, None] ** 2
         variance = np.where(np.isnan(variance), np.inf, variance)
-        return HTF(
-            f,
-            H,
-            harmonics,
-            N,
-            self.inputs,
-            self.outputs,
-            "series fit",
-            variance=variance,
-        )
+        names = self.inputs, self.outputs
+        return HTF(f, H, harmonics, N, *names, "series fit", variance=variance)
 
     def _about(self) -> str:
-        noise = signal_values(self.outputs, self.noise)
         loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
-        about = f"{loop}noise {noise}; {self.n_sections} sections, "
-        about += f"{self.numerators.shape[1]} lags"
-        feedback = about_answering(self.feedback, _BIASED)
-        return "; ".join(filter(None, [about, self.doubt, feedback]))
+        return (
+            f"{loop}noise {signal_values(self.outputs, self.noise)}; "
+            f"{self.n_sections} sections, {self.numerators.shape[1]} lags"
+        )
 
     @property
     def free_cycles(self) -> int:
@@ -188,28 +199,24 @@ class SeriesFit(MultiplierEstimate):
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
-        N, R, ny, nu = self.numerators.shape
-        v, T = divide_by_chi(self.coefficients, grid.u), grid.u.shape[1]
+        N, R, ny, _ = self.numerators.shape
+        T = grid.u.shape[1]
+        v = divide_by_chi(self.coefficients, grid.u)
         # As in the fit, earlier inputs act on so many cycles without a model.
         free = min(self.free_cycles, T) if free_start else 0
+        no_drift = grid.drift[:, :, :0]
         out = np.zeros(grid.y.shape)
         for n, i in np.ndindex(N, ny):
-            forced = lagged_inputs(v, n, R, self.lead) @ self.numerators[
-                n, :, i
-            ].reshape(-1, 1)
+            numerator = self.numerators[n, :, i].reshape(-1, 1)
+            forced = lagged_inputs(v, n, R, self.lead) @ numerator
             starts = start_responses(self.coefficients, grid.first[:, n], T, free)
-            unknown, none = (
-                np.concatenate([starts, grid.drift], axis=2),
-                grid.drift[:, :, :0],
-            )
-            regression = SectionRegression.make(
-                forced, unknown, none, grid.sampled[:, :, n, i]
-            )
-            y, sampled = grid.y[:, :, n, i], grid.sampled[:, :, n, i]
+            unknown = np.concatenate([starts, grid.drift], axis=2)
+            y = grid.y[:, :, n, i]
+            sampled = grid.sampled[:, :, n, i]
+            regression = SectionRegression.make(forced, unknown, no_drift, sampled)
             error = regression.residual(np.ones(1), y).reshape(y.shape)
-            out[:, :, n, i] = np.where(
-                sampled, y - error, regression.response(np.ones(1), y)
-            )
+            response = regression.response(np.ones(1), y)
+            out[:, :, n, i] = np.where(sampled, y - error, response)
         return out
 
 
@@ -242,7 +249,7 @@ def fit_series(
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
-      `doubt` as a `FindingWarning`. Default: True.
+      `findings` as warnings (`FindingWarning`). Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` has no
@@ -253,83 +260,119 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    if reference is not None:
-        plant, drive = in_loop(data, reference)
-        fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
-        fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
-        more = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
-        return dataclasses.replace(fit, doubt=warned(fit.contradiction(more), check))
-    records = (
-        data
-        if isinstance(data, PreparedRecords)
-        else PreparedRecords(data, start == "free")
-    )
+    if reference is None:
+        fit = _fit_open_loop(data, order, overhang, start == "free", check)
+    else:
+        fit = _fit_in_loop(data, order, overhang, reference, check)
+    if check:
+        warn_of(fit.findings, wrappers=2)
+    return fit
+
+
+def _fit_in_loop(
+    data: RecordedData,
+    order: int,
+    overhang: int | None,
+    reference: SignalNames,
+    check: bool,
+) -> SeriesFit:
+    plant, drive = in_loop(data, reference)
+    fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
+    fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
+    higher = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
+    return dataclasses.replace(fit, findings=tuple(fit.order_doubts(higher)))
+
+
+class _Weighted(NamedTuple):
+    """A fit with the weights that its residuals suggest."""
+
+    problem: OutputErrorProblem
+    solution: Linearization
+    converged: bool
+    ratios: NoiseRatios
+
+
+def _fit_open_loop(
+    data: RecordedData | PreparedRecords,
+    order: int,
+    overhang: int | None,
+    free_start: bool,
+    check: bool,
+) -> SeriesFit:
+    records = data
+    if not isinstance(records, PreparedRecords):
+        records = PreparedRecords(records, free_start)
     overhang = records.n_sections if overhang is None else overhang
 
-    def weighted(order: int):
-        problem = OutputErrorProblem.from_data(
-            records, order, overhang, start == "free"
-        )
+    def weighted(order: int) -> _Weighted:
+        problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
         delayed = late_outputs(problem, order)
         solution, _ = minimize(problem, total_least_squares(delayed))
         _require_freedom(problem, solution)
-        noise = _noise(solution)  # the weights that the residuals suggest
+        noise = _noise(solution)
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
-        return (
-            _noise_ratios(delayed, noise * _noise(solution)),
-            problem,
-            solution,
-            converged,
-        )
+        ratios = _noise_ratios(delayed, noise * _noise(solution))
+        return _Weighted(problem, solution, converged, ratios)
 
-    ratios, problem, solution, converged = weighted(order)
-    fit = assemble(
-        problem, solution, coefficient_covariance(problem, solution), converged
-    )
+    best = weighted(order)
+    covariance = coefficient_covariance(best.problem, best.solution)
+    fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
-    error = np.where(grid.sampled, grid.y - fit.predict(grid, start == "free"), 0.0)
-    feedback = answering(grid, error, records.inputs)
-    drift = _about_drift(fit, records, start == "free")
-    surplus = unsupported(lambda k: ratios if k == order else weighted(k)[0], order)
-    if surplus and check:
-        cause = about_answering(feedback, _BIASED) or drift
-        raise DefinitionError(f"{surplus}, or pass check=False{cause and '; '}{cause}.")
-    # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
-    more = [
-        partial(_of_order, order + k, records, fit, start == "free") for k in (1, 2)
-    ]
-    doubt = "; ".join(filter(None, [surplus, drift])) or fit.contradiction(more)
-    return dataclasses.replace(fit, feedback=feedback, doubt=warned(doubt, check))
+    error = np.where(grid.sampled, grid.y - fit.predict(grid, free_start), 0.0)
+    answers = about_answers(grid, error, records.inputs, _BIASED)
+    drift = _about_drift(fit, records, free_start)
+
+    def ratios(k: int) -> NoiseRatios:
+        return best.ratios if k == order else weighted(k).ratios
+
+    surplus = unsupported(ratios, order, check)
+    refuse([*surplus, *(answers or drift)])
+    doubts = [*surplus, *drift]
+    if not doubts:
+        # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
+        higher = [
+            partial(_of_order, order + k, records, fit, free_start) for k in (1, 2)
+        ]
+        doubts = fit.order_doubts(higher)
+    return dataclasses.replace(fit, findings=(*fit.findings, *doubts, *answers))
 
 
-def _about_drift(fit: SeriesFit, records: PreparedRecords, free_start: bool) -> str:
-    """Return a sentence if slow drift of the outputs may explain multipliers of a fit; else "".
+def _about_drift(
+    fit: SeriesFit, records: PreparedRecords, free_start: bool
+) -> list[Finding]:
+    """Return a finding if slow drift of the outputs may explain multipliers of a fit.
 
     It does if outputs that may drift have other multipliers, or as little noise without the
     multipliers that may be 1, which a constant resembles.
     """
+
     # (It is refused where an input acts later than the records begin, or drift was declared.)
-    slow, order = (
-        (lambda: PreparedRecords(with_drift(records.records))),
-        len(fit.coefficients),
-    )
-    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
+    def slow() -> PreparedRecords:
+        return PreparedRecords(with_drift(records.records))
 
     def drifting() -> RoughFit:
+        order = len(fit.coefficients)
         problem = _problem_like(fit, slow(), order, free_start)
         return _rough(problem, total_least_squares(late_outputs(problem, order)))
 
-    doubt = fit.contradiction([drifting], MAY_DRIFT)
-    if not doubt and may_be_one.any() and not may_be_one.all():
-        fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
-        with suppress(DefinitionError):
-            problem = _problem_like(fit, slow(), len(fewer), free_start)
-            solution, _ = minimize(problem, fewer, rough=True)
-            _require_freedom(problem, solution)
-            spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
-            return MAY_DRIFT if (_noise(solution) < 1 + 3 * spread).all() else ""
-    return doubt
+    unknown = fit.undetermined()
+    if unknown:
+        return unknown
+    if fit.contradicted_by([drifting], OF_DRIFT) is not None:
+        return [MAY_DRIFT]
+    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
+    if not may_be_one.any() or may_be_one.all():
+        return []
+    fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
+    with suppress(DefinitionError):
+        problem = _problem_like(fit, slow(), len(fewer), free_start)
+        solution, _ = minimize(problem, fewer, rough=True)
+        _require_freedom(problem, solution)
+        spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
+        if (_noise(solution) < 1 + 3 * spread).all():
+            return [MAY_DRIFT]
+    return []
 
 
 def _of_order(
@@ -368,34 +411,37 @@ def assemble(
 ) -> SeriesFit:
     """Return the fit with the denominator of a solution, in the units of the data."""
     N, nu, ny = problem.shape
-    d, columns = len(solution.c), problem.lags * nu  # lags, then inputs
+    d = len(solution.c)
+    lags = problem.lags
+    columns = lags * nu  # lags, then inputs
     widest = max(fit.root.shape[1] for section in solution.fits for fit in section)
-    numerators, slopes = np.zeros((N, columns, ny)), np.zeros((d, N, columns, ny))
+    numerators = np.zeros((N, columns, ny))
+    slopes = np.zeros((d, N, columns, ny))
     roots = np.zeros((N, ny, columns, widest))
-    for n, (section, to_lags) in enumerate(
-        zip(solution.fits, problem.to_lags, strict=True)
-    ):
-        for fit in section:
+    for n, to_lags in enumerate(problem.to_lags):
+        for fit in solution.fits[n]:
+            by_c = np.moveaxis(fit.slopes[..., 0], 1, 0)
             numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
-            slopes[:, n][..., fit.outputs] = to_lags @ np.moveaxis(
-                fit.slopes[..., 0], 1, 0
-            )
+            slopes[:, n][..., fit.outputs] = to_lags @ by_c
             roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
-        b = b.reshape(*b.shape[:-2], problem.lags, nu, ny) * problem.scale
-        return np.swapaxes(b, -1, -2)
+        b = b.reshape(*b.shape[:-2], lags, nu, ny) * problem.scale
+        return b.mT
 
+    result = int(Result.OK if converged else Result.NOT_CONVERGED)
     return SeriesFit(
         multipliers=multipliers_of(solution.c),
         coefficients=solution.c,
         covariance=covariance.matrix,
-        covariance_freedom=covariance.freedom,
+        covariance_dof=covariance.dof,
         numerators=by_input(numerators),
         slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
-        result=Result.OK if converged else Result.NOT_CONVERGED,
+        dof=float(solution.freedom.sum() - d),
+        result=result,
+        findings=tuple(not_converged(result)),
         **problem.records.about,
     )
 
@@ -418,7 +464,8 @@ def missing_cycles(
 
 def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> None:
     order = len(solution.c)
-    if missing := missing_cycles(problem, solution, order + 1):
+    missing = missing_cycles(problem, solution, order + 1)
+    if missing:
         n, i = np.argwhere(solution.freedom <= order)[0]
         raise TooFewCycles(problem, n, i, missing)
 
@@ -450,17 +497,27 @@ def coefficient_covariance(
         return white * sampled
 
     noise = linearize(problem, solution.c, draws).curvature / _WHITE_DRAWS
-    curvature, whole = (
-        (solution.curvature - noise).sum(axis=0),
-        solution.curvature.sum(axis=0),
-    )
+    curvature = (solution.curvature - noise).sum(axis=0)
+    whole = solution.curvature.sum(axis=0)
     if not np.linalg.eigvalsh(whole)[0] > 0:
         return sandwich(curvature, whole)
-    lags = denominator.correlated_cycles(
-        multipliers_of(solution.c), problem.records.cycles
-    )
+    cycles = problem.records.cycles
+    lags = denominator.correlated_cycles(multipliers_of(solution.c), cycles)
     gradient = gradient_covariance(problem, solution, lags + 1)
-    return sandwich(curvature, gradient.matrix)._replace(freedom=gradient.freedom)
+    return sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
+
+
+class _BlockSums(NamedTuple):
+    """Sums over the blocks of a section, for some outputs."""
+
+    score: Float[np.ndarray, "B C d"]
+    """Products of errors and slopes in each block, for the outputs and for drawn noise."""
+    expected: Float[np.ndarray, "B d d"]
+    """Their expected squares, for white noise of variance one."""
+    squares: Float[np.ndarray, "2 C"]
+    """Sums of squares of the errors, and of the errors filtered backward by 1 / chi."""
+    filtered: Float[np.ndarray, "d d"]
+    """Products of the slopes filtered backward."""
 
 
 def gradient_covariance(
@@ -476,53 +533,30 @@ def gradient_covariance(
     white noise, and noise filtered by 1 / chi, as process noise is. The amounts of both follow from
     two sums of squares of the residuals (variance components: Rao 1971).
     """
-    d, memory = len(solution.c), fading(solution.c)
+    d = len(solution.c)
+    memory = fading(solution.c)
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         """Return the outputs, and noise filtered by the system."""
         y = part.y[:, :, n, :, None]
-        draws = np.random.default_rng((k, n)).standard_normal(
-            (*y.shape[:3], _FILTERED_DRAWS)
-        )
+        rng = np.random.default_rng((k, n))
+        draws = rng.standard_normal((*y.shape[:3], _FILTERED_DRAWS))
         return np.concatenate([y, divide_by_chi(memory, draws)], axis=-1)
 
-    def section(k, part, n, fit, regression):
+    def section(k, part, n, fit, regression) -> _BlockSums:
+        x = outputs(k, part, n)[:, :, fit.outputs]
         count = max(1, part.y.shape[1] // cycles)
         sampled = part.sampled[:, :, n, fit.outputs, None]
-
-        def backward(
-            x,
-        ):  # its product with white noise is that of x with filtered noise
-            return divide_by_chi(memory, (sampled * x)[:, ::-1])
-
-        rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
-        inputs, starts = (in_blocks(basis, count) for basis in (rows, regression.basis))
-        weights = denominator.inverse_of_remainder(inputs @ inputs.swapaxes(1, 2))
-        x = outputs(k, part, n)[:, :, fit.outputs]
-        error = regression.residual(fit.coefficients, x).reshape(x.shape)
-        a, by_c, y = (v[..., :1] for v in (fit.coefficients, fit.slopes, x))
-        slopes = regression.residual(
-            by_c, filtered_response(a, solution.c, regression, y)
-        )
-        slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], d)
-        square = [(x**2).sum(axis=(0, 1, 2)) for x in (error, backward(error))]
-        late = backward(slopes)
-        slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))
-        score = np.einsum("bkid,bkic->bcd", slopes, in_blocks(error, count))
-        expected = np.einsum("bkid,bkie->bde", slopes, slopes)
-        for basis in (inputs, starts):
-            along = np.einsum("bkr,bkid->brid", basis, slopes)
-            expected -= np.einsum("brid,brie->bde", along, along)
-        return score, expected, square, np.einsum("stid,stie->de", late, late)
+        return _block_sums(x, sampled, fit, regression, solution.c, memory, count)
 
     fits = linearize(problem, solution.c, outputs).fits
-    results = each_fit(problem, solution._replace(fits=fits), section)
-    score, by_white = (
-        np.concatenate([sum(result[i] for result in grid) for grid in results])
-        for i in (0, 1)
-    )
-    squares = np.sum([result[2] for grid in results for result in grid], axis=0)
-    filtered = sum(result[3] for grid in results for result in grid)
+    grids = each_fit(problem, solution._replace(fits=fits), section)
+    # Scores of the same block add, over all sections and outputs.
+    score = np.concatenate([sum(part.score for part in grid) for grid in grids])
+    by_white = np.concatenate([sum(part.expected for part in grid) for grid in grids])
+    parts = list(itertools.chain(*grids))
+    squares = sum(part.squares for part in parts)
+    filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
     white = np.array([[solution.freedom.sum(), first], [first, second]])
@@ -537,8 +571,50 @@ def gradient_covariance(
         share = np.linalg.inv(np.linalg.cholesky(by_white.sum(axis=0)))
     except np.linalg.LinAlgError:  # nothing is left of any block
         return Covariance.unknown(d)
-    scaled, share = score[:, 0] @ half.T, share @ by_white @ share.T
+    scaled = score[:, 0] @ half.T
+    share = share @ by_white @ share.T
     # Scores add up to zero at the minimum, which takes this part of the sum away.
     taken = np.einsum("bij,bji->", share, share) / d
     matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
     return Covariance(matrix, denominator.block_freedom(scaled, share))
+
+
+def _block_sums(
+    x: Float[np.ndarray, "S T m C"],
+    sampled: Bool[np.ndarray, "S T m 1"],
+    fit: SectionFit,
+    regression: SectionRegression,
+    c: Coefficients,
+    memory: Coefficients,
+    count: int,
+) -> _BlockSums:
+    """Return the sums over so many blocks of each record.
+
+    **Arguments:** `x`: columns for each output, the first measured. `memory`: c, fading.
+    """
+
+    def backward(x):  # its product with white noise is that of x with filtered noise
+        return divide_by_chi(memory, (sampled * x)[:, ::-1])
+
+    rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)
+    inputs = in_blocks(rows, count)
+    starts = in_blocks(regression.basis, count)
+    weights = denominator.inverse_of_remainder(inputs @ inputs.mT)
+    error = regression.residual(fit.coefficients, x).reshape(x.shape)
+    measured = fit.coefficients[..., :1]
+    response = filtered_response(measured, c, regression, x[..., :1])
+    slopes = regression.residual(fit.slopes[..., :1], response)
+    slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], len(c))
+    late = backward(slopes)
+    squares = [(e**2).sum(axis=(0, 1, 2)) for e in (error, backward(error))]
+    slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))
+    expected = np.einsum("bkid,bkie->bde", slopes, slopes)
+    for basis in (inputs, starts):
+        along = np.einsum("bkr,bkid->brid", basis, slopes)
+        expected -= np.einsum("brid,brie->bde", along, along)
+    return _BlockSums(
+        score=np.einsum("bkid,bkic->bcd", slopes, in_blocks(error, count)),
+        expected=expected,
+        squares=np.array(squares),
+        filtered=np.einsum("stid,stie->de", late, late),
+    )

@@ -54,23 +54,18 @@ def predicted(
 
     **Raises:** `DefinitionError` for too few cycles.
     """
-    closed = [
-        dataclasses.replace(
-            r, y=np.concatenate([r.y, p.y], axis=1), outputs=(*r.outputs, *p.outputs)
-        )
-        for r, p in zip(drive, plant, strict=True)
-    ]
+    closed = []
+    for r, p in zip(drive, plant, strict=True):
+        y = np.concatenate([r.y, p.y], axis=1)
+        closed.append(dataclasses.replace(r, y=y, outputs=(*r.outputs, *p.outputs)))
     records = PreparedRecords(closed)
     grid = without_drift(records.whole())
     # (In units of what is left, or large drifts decide what the model explains.)
-    records.scale = np.maximum(
-        np.sqrt((grid.y**2).mean(axis=(0, 1, 2))), RANK * records.scale
-    )
+    size = np.sqrt((grid.y**2).mean(axis=(0, 1, 2)))
+    records.scale = np.maximum(size, RANK * records.scale)
     model = subspace_model(records, [order] * records.n_sections, False)
-    predictor = Predictor(
-        model, np.tile(np.eye(len(records.outputs)), (len(model.A), 1, 1))
-    )
-    return predictor.predict(grid, False) * records.scale
+    S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
+    return Predictor(model, S).predict(grid, False) * records.scale
 
 
 class SectionEquations(NamedTuple):
@@ -107,19 +102,15 @@ def best_order(
     the obstacle to a larger number, if there was one."""
     obstacle = ""
     for order in range(most, 1, -1):
+        # Too few cycles for so many: a finding shows the text.
         try:
-            if (
-                LoopEquations(
-                    *in_loop(data, reference), order, None
-                ).solution.determined
-                >= order
-            ):
-                return order, obstacle
-            obstacle = ""
-        except (
-            DefinitionError
-        ) as error:  # too few cycles for so many: a finding shows its text
+            solution = LoopEquations(*in_loop(data, reference), order, None).solution
+        except DefinitionError as error:
             obstacle = str(error)
+            continue
+        if solution.determined >= order:
+            return order, obstacle
+        obstacle = ""
     return 1, obstacle
 
 
@@ -129,13 +120,12 @@ class LoopEquations:
     def __init__(
         self, plant: list[Record], drive: list[Record], order: int, overhang: int | None
     ):
-        self.records, self.order, self.reference = (
-            PreparedRecords(plant),
-            order,
-            drive[0].inputs,
-        )
+        self.records = PreparedRecords(plant)
+        self.order = order
+        self.reference = drive[0].inputs
         self.grid = self.records.whole()
-        N, z = self.records.n_sections, predicted(plant, drive, order)
+        N = self.records.n_sections
+        z = predicted(plant, drive, order)
         span = N if overhang is None else overhang
         self.lags = self.records.lead + order * N + span + 1
         self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
@@ -143,42 +133,41 @@ class LoopEquations:
     def _section(
         self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
     ) -> SectionEquations:
-        grid, delays = self.grid, range(self.order + 1)
-        (_, T, _, nu), ny = grid.u.shape, grid.y.shape[3]
+        grid = self.grid
+        delays = range(self.order + 1)
+        _, T, _, nu = grid.u.shape
+        ny = grid.y.shape[3]
+        lead = self.records.lead
         sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
-        used = np.all(sampled, axis=0) & (np.arange(T) >= grid.first[:, n, None] + free)
-        signals = [
-            lagged_inputs(x, n, self.lags, self.records.lead)
-            for x in (z[..., :nu], grid.u)
-        ]
-        signals += [
-            delay_cycles(x[:, :, n], j) for x in (z[..., nu:], grid.y) for j in delays
-        ]
-        rows = SectionRegression.make(
-            np.concatenate(signals, axis=2), grid.drift[:, :, :0], grid.drift, used
-        ).remainder
+        begun = np.arange(T) >= grid.first[:, n, None] + free
+        used = np.all(sampled, axis=0) & begun
+        signals = [lagged_inputs(u, n, self.lags, lead) for u in (z[..., :nu], grid.u)]
+        for y in (z[..., nu:], grid.y):
+            signals += [delay_cycles(y[:, :, n], j) for j in delays]
+        columns = np.concatenate(signals, axis=2)
+        no_starts = grid.drift[:, :, :0]
+        rows = SectionRegression.make(columns, no_starts, grid.drift, used).remainder
         Z, U, late = np.split(rows, np.cumsum([self.lags * nu] * 2), axis=1)
         # Combinations of lags, of which the reference excites those that stand out of the noise.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
         noise = np.linalg.norm((U - Z) @ V.T, axis=0) / np.sqrt(max(used.sum(), 1))
         kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
         to_lags = V[kept].T / size[kept]
-        Z, U, inverse = (
-            Z @ to_lags,
-            U @ to_lags,
-            np.linalg.inv(to_lags.T @ (Z.T @ U) @ to_lags),
-        )
-        late = late.reshape(len(late), 2, -1, ny)
-        predictions, y = (np.swapaxes(late[:, k], 1, 2) for k in (0, 1))
-        fitted = np.tensordot(inverse @ Z.T, y, 1)
-        explained = np.tensordot(inverse.T @ U.T, predictions[..., 1:], 1)
+        instruments = Z @ to_lags
+        inputs = U @ to_lags
+        inverse = np.linalg.inv(instruments.T @ inputs)
+        late = late.reshape(len(late), 2, -1, ny).mT
+        predictions = late[:, 0, :, 1:]
+        y = late[:, 1]
+        fitted = np.tensordot(inverse @ instruments.T, y, 1)
+        explained = np.tensordot(inverse.T @ inputs.T, predictions, 1)
         return SectionEquations(
-            y - np.tensordot(U, fitted, 1),
-            predictions[..., 1:] - np.tensordot(Z, explained, 1),
-            np.tensordot(to_lags, fitted, 1),
-            to_lags @ inverse,
-            (U @ inverse, Z),
-            int(used.sum() - kept.sum()),
+            outputs=y - np.tensordot(inputs, fitted, 1),
+            instruments=predictions - np.tensordot(instruments, explained, 1),
+            numerators=np.tensordot(to_lags, fitted, 1),
+            root=to_lags @ inverse,
+            taken=(inputs @ inverse, instruments),
+            freedom=int(used.sum() - kept.sum()),
         )
 
     def fit(self, check: bool) -> dict[str, Any]:
@@ -187,16 +176,14 @@ class LoopEquations:
         **Raises:** `DefinitionError` as `solve`.
         """
         c, covariance, noise = self.solve(check)
-        N, R, nu, ny = (
-            *self.grid.u.shape[2:3],
-            self.lags,
-            self.grid.u.shape[3],
-            len(noise),
-        )
-        b = np.array(
-            [x.numerators.reshape(R, nu, ny, -1).swapaxes(1, 2) for x in self.sections]
-        )
-        roots = np.zeros((N, ny, R, nu, max(x.root.shape[1] for x in self.sections)))
+        N = len(self.sections)
+        R = self.lags
+        nu = self.grid.u.shape[3]
+        ny = len(noise)
+        numerators = [x.numerators.reshape(R, nu, ny, -1) for x in self.sections]
+        b = np.swapaxes(numerators, 2, 3)
+        widest = max(x.root.shape[1] for x in self.sections)
+        roots = np.zeros((N, ny, R, nu, widest))
         for n, x in enumerate(self.sections):
             roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
         return dict(
@@ -207,8 +194,9 @@ class LoopEquations:
             slopes=np.moveaxis(b[..., 1:], -1, 0),
             roots=roots,
             noise=noise,
-            covariance_freedom=covariance.freedom,
-            result=Result.OK,
+            covariance_dof=covariance.dof,
+            dof=float(sum(x.freedom for x in self.sections) * ny - len(c)),
+            result=int(Result.OK),
             **self.records.about,
             reference=self.reference,
         )
@@ -221,31 +209,32 @@ class LoopEquations:
     @cached_property
     def solution(self) -> Solution:
         """**Raises:** `DefinitionError` for too few cycles."""
-        d, sections, scale = self.order, self.sections, self.records.scale
-        if (least := min(x.freedom for x in sections)) <= d:
+        d = self.order
+        sections = self.sections
+        scale = self.records.scale
+        least = min(x.freedom for x in sections)
+        if least <= d:
             raise DefinitionError(
                 f"a section was sampled {d + 1 - least} times too few for numerators of "
                 f"{self.lags} lags: record more, take fewer sections, or lower `order`."
             )
         freedom = sum(x.freedom for x in sections)
+        outputs = np.array([x.outputs for x in sections])
+        instruments = np.array([x.instruments for x in sections])
         for _ in range(2):  # the second time with the weights that the errors suggest
-            y, W = (
-                np.array([x[k] / scale[:, None] for x in sections]).reshape(
-                    -1, d + 1 - k
-                )
-                for k in (0, 1)
-            )
+            y = (outputs / scale[:, None]).reshape(-1, d + 1)
+            W = (instruments / scale[:, None]).reshape(-1, d)
             along = W.T @ y
             c = -np.linalg.lstsq(along[:, 1:], along[:, 0])[0]
-            square = sum(((x.outputs @ [1.0, *c]) ** 2).sum(axis=0) for x in sections)
+            square = ((outputs @ [1.0, *c]) ** 2).sum(axis=(0, 1))
             scale = np.maximum(np.sqrt(square / freedom), RANK * self.records.scale)
         along = along[:, 1:]
         # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
         part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
         part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
-        determined = int((part * freedom * len(scale) > _DETERMINED * (1 - part)).sum())
-        return Solution(c, along, scale, determined)
+        seen = part * freedom * len(scale) > _DETERMINED * (1 - part)
+        return Solution(c, along, scale, int(seen.sum()))
 
     def solve(
         self, check: bool
@@ -255,7 +244,8 @@ class LoopEquations:
         **Raises:** `DefinitionError` for too few cycles, or, with `check`, for an order of which
         the reference does not determine all multipliers.
         """
-        (c, along, scale, determined), d = self.solution, self.order
+        c, along, scale, determined = self.solution
+        d = self.order
         if check and determined < d:
             raise DefinitionError(
                 f"the reference determines {determined} multipliers, not {d}: lower `order`, "
@@ -263,21 +253,15 @@ class LoopEquations:
             )
         if determined < d:
             return c, Covariance.unknown(d), scale
-        cycles = (
-            denominator.correlated_cycles(multipliers_of(c), self.records.cycles) + 1
-        )
-        blocks = max(1, self.records.cycles // max(cycles, _BLOCK))
-        score = np.sum(
-            [self._scores(x, c, scale, blocks) for x in self.sections], axis=0
-        )
+        cycles = self.records.cycles
+        correlated = denominator.correlated_cycles(multipliers_of(c), cycles) + 1
+        blocks = max(1, cycles // max(correlated, _BLOCK))
+        score = sum(self._scores(x, c, scale, blocks) for x in self.sections)
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)
         share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))
-        return (
-            c,
-            Covariance(half @ half.T, denominator.block_freedom(score, share)),
-            scale,
-        )
+        dof = denominator.block_freedom(score, share)
+        return c, Covariance(half @ half.T, dof), scale
 
     def _scores(
         self, section: SectionEquations, c, scale, count: int
@@ -290,10 +274,9 @@ class LoopEquations:
             return in_blocks(x.reshape(*self.grid.y.shape[:2], *x.shape[1:]), count)
 
         error = blocks(section.outputs @ [1.0, *c] / scale)
-        taken = blocks(section.taken[0]) @ blocks(section.taken[1]).swapaxes(1, 2)
-        error = (
-            denominator.inverse_of_remainder((taken + taken.swapaxes(1, 2)) / 2) @ error
-        )
-        return np.einsum(
-            "bki,bkid->bd", error, blocks(section.instruments / scale[:, None])
-        )
+        instruments = blocks(section.instruments / scale[:, None])
+        by_error, by_instrument = map(blocks, section.taken)
+        taken = by_error @ by_instrument.mT
+        symmetric = (taken + taken.mT) / 2
+        error = denominator.inverse_of_remainder(symmetric) @ error
+        return np.einsum("bki,bkid->bd", error, instruments)

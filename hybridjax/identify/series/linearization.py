@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..._core.execution import on_all_cores
-from ..descent import ROUGH, Coefficients, least_squares
+from ..descent import ROUGH, Coefficients, least_squares, positive
 from .output_error import OutputErrorProblem, SectionRegression, root_of
 from .records import (
     CycleGrid,
@@ -63,27 +63,28 @@ class SectionFit(NamedTuple):
             return np.tensordot(root, np.tensordot(root.T, along, 1), 1)
 
         first = solve(_total(r.along(r.reduced(x)) for r, x in pairs))
-        a = first + solve(_total(r.along(r.residual(first, x)) for r, x in pairs))
-        fitted = (r.reduced(filtered_response(first, c, r, x)) for r, x in pairs)
-        slopes = solve(
-            _total(r.along(x) for r, x in zip(regressions, fitted, strict=True))
-        )
+        refined = solve(_total(r.along(r.residual(first, x)) for r, x in pairs))
+        a = first + refined
+        filtered = [r.reduced(filtered_response(first, c, r, x)) for r, x in pairs]
+        slopes = solve(_total(map(SectionRegression.along, regressions, filtered)))
         errors = [r.residual(a, x) for r, x in pairs]
         by_c = [r.residual(slopes, filtered_response(a, c, r, x)) for r, x in pairs]
-        missed = _total(r.along(s) for r, s in zip(regressions, by_c, strict=True))
-        curvature = _total(np.einsum("rimk,rjmk->mij", s, s) for s in by_c)
+        missed = _total(map(SectionRegression.along, regressions, by_c))
+        taken = np.einsum("rimk,rjmk->mij", missed, solve(missed))
         return cls(
-            outputs,
-            root,
-            a,
-            slopes,
-            sum(r.freedom for r in regressions),
-            _total(np.einsum("rmk,rml->mkl", x, x) for x in errors),
-            _total(
-                np.einsum("rjmk,rmk->mj", *x) for x in zip(by_c, errors, strict=True)
-            ),
-            curvature - np.einsum("rimk,rjmk->mij", missed, solve(missed)),
+            outputs=outputs,
+            root=root,
+            coefficients=a,
+            slopes=slopes,
+            freedom=sum(r.freedom for r in regressions),
+            products=_total(np.einsum("rmk,rml->mkl", e, e) for e in errors),
+            gradient=_total(map(_along_slopes, by_c, errors)),
+            curvature=_total(np.einsum("rimk,rjmk->mij", s, s) for s in by_c) - taken,
         )
+
+
+def _along_slopes(slopes: np.ndarray, errors: np.ndarray) -> Float[np.ndarray, "m d"]:
+    return np.einsum("rjmk,rmk->mj", slopes, errors)
 
 
 def _total(terms: Iterable[np.ndarray]) -> np.ndarray:
@@ -98,10 +99,10 @@ def filtered_response(
 ) -> Float[np.ndarray, "S T d m C"]:
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
-    out = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
+    delayed = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
     for j in range(len(c)):
-        out[:, :, j] = delay_cycles(filtered, j + 1)
-    return out
+        delayed[:, :, j] = delay_cycles(filtered, j + 1)
+    return delayed
 
 
 class Linearization(NamedTuple):
@@ -126,10 +127,10 @@ class Linearization(NamedTuple):
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
-        along = np.where(size > 0, along / np.where(size > 0, size, 1), 0.0)
-        last = np.sqrt(max(self.square.sum() - along @ along, 0.0))
-        jacobian = np.concatenate([size[:, None] * vectors.T, np.zeros((1, len(size)))])
-        return np.append(along, last), jacobian
+        along = np.where(size > 0, along / positive(size), 0.0)
+        rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
+        jacobian = np.pad(size[:, None] * vectors.T, ((0, 1), (0, 0)))
+        return np.append(along, rest), jacobian
 
 
 def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny 1"]:
@@ -146,12 +147,12 @@ def sum_up(
     def section(n: int) -> list[SectionFit]:
         regressions = [regress(k, part, n) for k, part in enumerate(parts)]
         columns = [outputs(k, part, n) for k, part in enumerate(parts)]
-        return [
-            SectionFit.of(alike, c, list(each), [x[:, :, alike] for x in columns])
-            for alike, each in zip(
-                problem.alike[n], zip(*regressions, strict=True), strict=True
-            )
-        ]
+        fits = []
+        for i, alike in enumerate(problem.alike[n]):
+            same_weights = [each[i] for each in regressions]
+            chosen = [x[:, :, alike] for x in columns]
+            fits.append(SectionFit.of(alike, c, same_weights, chosen))
+        return fits
 
     return on_all_cores(section, range(problem.records.n_sections))
 
@@ -163,7 +164,8 @@ def linearize(
 
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
-    (N, _, ny), d = problem.shape, len(c)
+    (N, _, ny) = problem.shape
+    d = len(c)
     out = Linearization(
         c=c,
         square=np.zeros((N, ny)),
@@ -174,7 +176,7 @@ def linearize(
     )
     for n, section in enumerate(out.fits):
         for fit in section:
-            out.square[n, fit.outputs] = np.trace(fit.products, axis1=1, axis2=2)
+            out.square[n, fit.outputs] = np.linalg.trace(fit.products)
             out.gradient[fit.outputs] += fit.gradient
             out.curvature[fit.outputs] += fit.curvature
             out.freedom[n, fit.outputs] = round(fit.freedom) - fit.root.shape[1]
@@ -185,10 +187,8 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
     inputs = [divide_by_chi(c, part.u) for part in problem.parts()]
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        rows = (
-            lagged_inputs(inputs[k], n, problem.lags, problem.records.lead)
-            @ problem.to_lags[n]
-        )
+        columns = lagged_inputs(inputs[k], n, problem.lags, problem.records.lead)
+        rows = columns @ problem.to_lags[n]
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
         sampled = (part.sampled[:, :, n, alike[0]] for alike in problem.alike[n])
@@ -203,17 +203,19 @@ def each_fit(
     work: Callable[[int, CycleGrid, int, SectionFit, SectionRegression], Any],
 ) -> list[list[Any]]:
     """Return, for each grid, the results of `work` at all sections and lists of outputs."""
-    parts, regress = problem.parts(), _regressions_at(problem, solution.c)
+    parts = problem.parts()
+    regress = _regressions_at(problem, solution.c)
+    sections = range(problem.records.n_sections)
 
     def section(k: int, n: int) -> list[Any]:
         pairs = zip(solution.fits[n], regress(k, parts[k], n), strict=True)
         return [work(k, parts[k], n, *pair) for pair in pairs]
 
-    sections = range(problem.records.n_sections)
-    by_part = (
-        on_all_cores(functools.partial(section, k), sections) for k in range(len(parts))
-    )
-    return [list(itertools.chain(*by_section)) for by_section in by_part]
+    results = []
+    for k in range(len(parts)):
+        by_section = on_all_cores(functools.partial(section, k), sections)
+        results.append(list(itertools.chain(*by_section)))
+    return results
 
 
 def minimize(
@@ -226,11 +228,10 @@ def minimize(
     last: list[Linearization] = []
 
     def at(c: Coefficients) -> Linearization:
-        if not last or c is not last[0].c:
+        if not last or not np.array_equal(c, last[0].c):
             last[:] = [linearize(problem, c)]
         return last[0]
 
-    c, converged = least_squares(
-        lambda c: at(c).as_residuals(), start, **(ROUGH if rough else {})
-    )
+    limits = ROUGH if rough else {}
+    c, converged = least_squares(lambda c: at(c).as_residuals(), start, **limits)
     return at(c), converged

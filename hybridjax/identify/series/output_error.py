@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 from ..._core.execution import on_all_cores
 from ..._core.text import listed
 from ...errors import DefinitionError
-from ..descent import ROUNDING
+from ..descent import ROUNDING, positive, without
 from .records import Columns, CycleGrid, PreparedRecords, lagged_inputs
 
 
@@ -71,13 +71,12 @@ class SectionRegression(NamedTuple):
     ) -> "SectionRegression":
         rows = weight[:, :, None].astype(float)
         unknown = rows * np.concatenate([starts, drift], axis=2)
-        basis, s, right = np.linalg.svd(unknown, full_matrices=False)
-        kept = s > RANK * s.max(axis=1, initial=0, keepdims=True)
+        basis, size, right = np.linalg.svd(unknown, full_matrices=False)
+        kept = size > RANK * size.max(axis=1, initial=0, keepdims=True)
         basis = basis * kept[:, None]
-        inverse = np.where(kept, 1 / np.where(kept, s, 1), 0)[:, None]
-        to_starts = (np.swapaxes(right, 1, 2) * inverse)[:, : starts.shape[2]]
-        remainder = rows * inputs
-        remainder = remainder - basis @ (basis.swapaxes(1, 2) @ remainder)
+        inverse = np.where(kept, 1 / np.where(kept, size, 1), 0)[:, None]
+        to_starts = (right.mT * inverse)[:, : starts.shape[2]]
+        remainder = without(basis, rows * inputs)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
         return cls(inputs, starts, rows, basis, to_starts, remainder)
 
@@ -90,7 +89,7 @@ class SectionRegression(NamedTuple):
         """Return outputs, weighted, without the part in the basis."""
         left = self.weight * x.reshape(*x.shape[:2], -1)
         for _ in range(2):  # the second time removes rounding errors
-            left = left - self.basis @ (self.basis.swapaxes(1, 2) @ left)
+            left = without(self.basis, left)
         return left.reshape(len(self.remainder), *x.shape[2:])
 
     def residual(self, a: ByInput, x: Columns) -> Rows:
@@ -103,11 +102,10 @@ class SectionRegression(NamedTuple):
 
     def response(self, a: ByInput, x: Columns) -> Columns:
         """Return the response to the inputs and to the initial conditions that fit x best."""
-        x_columns = x.reshape(*x.shape[:2], -1)
-        forced = self.inputs @ a.reshape(len(a), x_columns.shape[2])
-        free = self.to_starts @ (
-            self.basis.swapaxes(1, 2) @ (self.weight * (x_columns - forced))
-        )
+        columns = x.reshape(*x.shape[:2], -1)
+        forced = self.inputs @ a.reshape(len(a), columns.shape[2])
+        left = self.weight * (columns - forced)
+        free = self.to_starts @ (self.basis.mT @ left)
         return (forced + self.starts @ free).reshape(x.shape)
 
 
@@ -135,7 +133,8 @@ class OutputErrorProblem(NamedTuple):
 
         **Raises:** `DefinitionError` for too few cycles, and for inputs that depend on each other.
         """
-        N, nu, ny = records.n_sections, len(records.inputs), len(records.outputs)
+        N = records.n_sections
+        nu = len(records.inputs)
         lags = records.lead + order * N + overhang + 1
         free = order + -(-overhang // N) if free_start else 0
         if lags > records.cycles * N:
@@ -153,31 +152,18 @@ class OutputErrorProblem(NamedTuple):
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
         # One section tells, before the work on all, that nothing is left of its samples.
-        n, i = map(
-            int, np.unravel_index(np.argmin(records.sampled), records.sampled.shape)
-        )
-        rows = triangle(n)
-        if records.sampled[n, i] <= lags * nu and _independent(rows, nu).shape[
-            1
-        ] == len(rows):
-            problem = cls(records, lags, free, [], [], records.scale)
-            raise TooFewCycles(problem, n, i, order + 1 - problem.freedom_left(n, i))
-        triangles, equal = on_all_cores(triangle, range(N)), np.ones((N, ny, ny), bool)
-        for grid in records.grids:
-            for i in range(ny):
-                equal[:, i] &= (grid.sampled == grid.sampled[..., [i]]).all(axis=(0, 1))
-        alike = [
-            [np.flatnonzero(x).tolist() for x in np.unique(e, axis=0)[::-1]]
-            for e in equal
-        ]
-        to_lags = on_all_cores(lambda x: _independent(x, nu), triangles)
-        alone = [_independent(triangles[0][:, i::nu], 1).shape[1] for i in range(nu)]
-        # (Ranks of inputs in a narrow band are not exact.)
-        if to_lags[0].shape[1] < min(len(triangles[0]), sum(alone) - min(alone) / 2):
-            raise DefinitionError(
-                f"{listed(records.inputs)} cannot be told apart: leave out what others determine."
-            )
-        return cls(records, lags, free, to_lags, alike, records.scale)
+        fewest = np.unravel_index(np.argmin(records.sampled), records.sampled.shape)
+        n, i = map(int, fewest)
+        if records.sampled[n, i] <= lags * nu:
+            rows = triangle(n)
+            if _independent(rows, nu).shape[1] == len(rows):
+                problem = cls(records, lags, free, [], [], records.scale)
+                missing = order + 1 - problem.freedom_left(n, i)
+                raise TooFewCycles(problem, n, i, missing)
+        triangles = on_all_cores(triangle, range(N))
+        to_lags = on_all_cores(lambda rows: _independent(rows, nu), triangles)
+        _require_different_inputs(records, triangles[0], to_lags[0].shape[1])
+        return cls(records, lags, free, to_lags, _alike(records), records.scale)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -200,14 +186,44 @@ class OutputErrorProblem(NamedTuple):
         return [grid._replace(y=grid.y / self.scale) for grid in self.records.grids]
 
 
+def _alike(records: PreparedRecords) -> list[list[list[int]]]:
+    """Return the outputs of each section, in lists of those that are sampled together."""
+    N, ny = records.sampled.shape
+    equal = np.ones((N, ny, ny), bool)
+    for grid in records.grids:
+        for i in range(ny):
+            same = grid.sampled == grid.sampled[..., [i]]
+            equal[:, i] &= same.all(axis=(0, 1))
+    alike = []
+    for table in equal:
+        rows = np.unique(table, axis=0)[::-1]
+        alike.append([np.flatnonzero(row).tolist() for row in rows])
+    return alike
+
+
+def _require_different_inputs(
+    records: PreparedRecords, triangle: np.ndarray, rank: int
+) -> None:
+    """**Raises:** `DefinitionError` for inputs that depend on each other.
+
+    **Arguments:** `triangle`: of the lagged inputs of a section, of this rank.
+    """
+    nu = len(records.inputs)
+    alone = [_independent(triangle[:, i::nu], 1).shape[1] for i in range(nu)]
+    # (Ranks of inputs in a narrow band are not exact.)
+    if rank < min(len(triangle), sum(alone) - min(alone) / 2):
+        raise DefinitionError(
+            f"{listed(records.inputs)} cannot be told apart: leave out what others determine."
+        )
+
+
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
-    size = np.linalg.norm(
-        triangle.reshape(-1, nu), axis=0
-    )  # inputs have units of their own
-    size = np.tile(np.where(size > 0, size, 1.0), triangle.shape[1] // nu)
-    _, s, vh = np.linalg.svd(triangle / size, full_matrices=False)
-    kept = s > RANK * s.max(initial=0)
-    return vh[kept].T / s[kept] / size[:, None]
+    # Inputs have units of their own.
+    size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)
+    size = np.tile(positive(size), triangle.shape[1] // nu)
+    _, values, right = np.linalg.svd(triangle / size, full_matrices=False)
+    kept = values > RANK * values.max(initial=0)
+    return right[kept].T / values[kept] / size[:, None]
 
 
 def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:

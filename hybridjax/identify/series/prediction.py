@@ -45,15 +45,18 @@ class SeriesPart(NamedTuple):
 
     @classmethod
     def of(cls, grid: CycleGrid, scale: Float[np.ndarray, " ny"]) -> "SeriesPart":
-        by_section = np.moveaxis(grid.sampled, 2, 0)
-        waves = grid.drift[None, :, None] * np.moveaxis(by_section, 3, 2)[..., None]
-        basis, s, _ = np.linalg.svd(waves, full_matrices=False)  # (N R ny T K)
-        kept = s > RANK * np.maximum(s.max(axis=-1, keepdims=True, initial=0), RANK)
+        sampled = np.moveaxis(grid.sampled, 2, 0)
+        inside = np.moveaxis(grid.inside, 2, 0)[..., None]
+        by_output = np.moveaxis(sampled, 3, 2)[..., None]
+        waves = grid.drift[None, :, None] * by_output  # (N R ny T K)
+        basis, size, _ = np.linalg.svd(waves, full_matrices=False)
+        largest = size.max(axis=-1, keepdims=True, initial=0)
+        kept = size > RANK * np.maximum(largest, RANK)
         return cls(
             u=np.ascontiguousarray(np.moveaxis(grid.u, 2, 0)),
             y=np.ascontiguousarray(np.moveaxis(grid.y / scale, 2, 0)),
-            sampled=by_section,
-            lost=np.moveaxis(grid.inside, 2, 0)[..., None] & ~by_section,
+            sampled=sampled,
+            lost=inside & ~sampled,
             first=np.argmax(grid.inside[:, 0], axis=1),
             drift=np.moveaxis(basis * kept[..., None, :], 2, 3),
         )
@@ -112,27 +115,30 @@ class SeriesProblem(NamedTuple):
                 except np.linalg.LinAlgError:
                     return np.inf
                 pairs = zip(path.whiten, path.error, strict=True)
-                cost += sum(float((_times(w, e) ** 2).sum()) for w, e in pairs)
+                cost += sum(float((np.matvec(w, e) ** 2).sum()) for w, e in pairs)
         return cost
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
         """Return the problem with the covariance of the errors of a model."""
-        square, count = np.zeros(self.S.shape), np.zeros(self.S.shape)
+        square = np.zeros(self.S.shape)
+        count = np.zeros(self.S.shape)
         for part in self.parts:
-            for n, e in enumerate(self.path(model, part).error):
-                square[n] += np.einsum("rti,rtj->ij", e, e)
+            for n, error in enumerate(self.path(model, part).error):
                 sampled = part.sampled[n].astype(float)
+                square[n] += np.einsum("rti,rtj->ij", error, error)
                 count[n] += np.einsum("rti,rtj->ij", sampled, sampled)
         if not self.by_section:
-            square[:], count[:] = square.sum(axis=0), count.sum(axis=0)
+            square[:] = square.sum(axis=0)
+            count[:] = count.sum(axis=0)
         values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
         floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * values[:, -1:])
-        S = vectors * np.maximum(values, floor)[:, None] @ vectors.swapaxes(1, 2)
-        return self._replace(S=S)
+        variances = np.maximum(values, floor)[:, None]
+        return self._replace(S=vectors * variances @ vectors.mT)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
         P = coordinates.size
-        gram, gradient = np.zeros((P, P)), np.zeros(P)
+        gram = np.zeros((P, P))
+        gradient = np.zeros(P)
         for part in self.parts:
             path = self.path(coordinates.model, part)
             R, _ = part.shape
@@ -140,77 +146,87 @@ class SeriesProblem(NamedTuple):
             for n, slopes in enumerate(slopes_of(coordinates, part, path)):
                 J = path.whiten[n] @ part.without_drift(n, slopes)
                 flat = J.reshape(-1, P)
+                white = np.matvec(path.whiten[n], path.error[n])
                 gram += flat.T @ flat
-                gradient += _times(path.whiten[n], path.error[n]).ravel() @ flat
-                along += path.starts[n].swapaxes(1, 2) @ J.reshape(R, -1, P)
-            gram -= np.tensordot(
-                along, _solve_starts(path.start_gram, along), ((0, 1), (0, 1))
-            )
+                gradient += white.ravel() @ flat
+                along += path.starts[n].mT @ J.reshape(R, -1, P)
+            # Less what the initial states explain.
+            taken = _solve_starts(path.start_gram, along)
+            gram -= np.tensordot(along, taken, ((0, 1), (0, 1)))
         return NormalEquations(gram, gradient)
 
     def path(self, model: PeriodicModel, part: SeriesPart) -> Path:
         """Return states and errors for the initial states that fit best."""
         R, T = part.shape
-        given, whiten = zip(
-            *[self._weights(part, n) for n in range(len(self.S))], strict=True
-        )
-        gain = [
-            K @ G if K.shape[1] else np.zeros((1, 1, len(K), G.shape[-1]))
-            for K, G in zip(model.K, given, strict=True)
-        ]
+        N = len(self.S)
+        pairs = [self._weights(part, n) for n in range(N)]
+        given = [mean for mean, _ in pairs]
+        whiten = [root for _, root in pairs]
+        gain = [_gain(K, mean) for K, mean in zip(model.K, given, strict=True)]
         F = [A - G @ C for A, C, G in zip(model.A, model.C, gain, strict=True)]
-        y = [part.y[n] - part.u[n] @ D.T for n, D in enumerate(model.D)]
-        s = max(model.dims[n] for n in part.first) if self.free_start else 0
+        y = [part.y[n] - part.u[n] @ model.D[n].T for n in range(N)]
+        starts = max(model.dims[n] for n in part.first) if self.free_start else 0
 
         def enter(n: int, x: Columns) -> None:
             begins = part.first == n
-            if s and begins.any():
+            if starts and begins.any():
                 x[begins, 0, :, 1 : 1 + x.shape[2]] = np.eye(x.shape[2])
 
         def drive(n: int, later: Columns) -> None:
-            later[..., 0] += part.u[n] @ model.B[n].T + _times(
-                gain[n], y[n] * part.sampled[n]
-            )
+            later[..., 0] += part.u[n] @ model.B[n].T
+            later[..., 0] += np.matvec(gain[n], y[n] * part.sampled[n])
 
-        states, left, starts = [], [], []
-        gram, along = np.zeros((R, s, s)), np.zeros((R, s, 1))
-        for n, x in enumerate(
-            recursion(F, (R, T, 1 + s), enter, drive, [1 + s] * len(F))
-        ):
+        # The first column is driven, the others start from each coordinate of the initial state.
+        filled = [1 + starts] * N
+        states = []
+        errors = []
+        responses = []
+        gram = np.zeros((R, starts, starts))
+        along = np.zeros((R, starts, 1))
+        for n, x in enumerate(recursion(F, (R, T, 1 + starts), enter, drive, filled)):
             error = model.C[n] @ x
             error[..., 0] = y[n] - error[..., 0]
             error = part.without_drift(n, error)
             white = whiten[n] @ error
-            rows = white[..., 1:].reshape(R, error.shape[1] * error.shape[2], s)
-            gram += rows.swapaxes(1, 2) @ rows
-            along += rows.swapaxes(1, 2) @ white[..., :1].reshape(R, -1, 1)
+            samples = white.shape[1] * white.shape[2]
+            rows = white[..., 1:].reshape(R, samples, starts)
+            gram += rows.mT @ rows
+            along += rows.mT @ white[..., :1].reshape(R, samples, 1)
             states.append(x)
-            left.append(error)
-            starts.append(rows)
+            errors.append(error)
+            responses.append(rows)
         x0 = _solve_starts(gram, along)[:, None]
         states = [x[..., 0] + (x[..., 1:] @ x0)[..., 0] for x in states]
+        errors = [e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in errors]
         entering = [
-            _times(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
+            np.matvec(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
             for n, x in enumerate(states)
         ]
-        error = [e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in left]
-        return Path(F, gain, list(whiten), states, entering, error, starts, gram)
+        return Path(F, gain, whiten, states, entering, errors, responses, gram)
 
     def _weights(self, part: SeriesPart, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrix of the mean of all errors, given the sampled ones, and the matrix that
         whitens the sampled ones."""
-        S, lost = self.S[n], part.lost[n]
+        S = self.S[n]
+        identity = np.eye(len(S))
+        lost = part.lost[n]
         if not lost.any():
-            return np.eye(len(S))[None, None], np.linalg.inv(np.linalg.cholesky(S))[
-                None, None
-            ]
+            return identity[None, None], _whitening(S)[None, None]
         kept = 1.0 - lost
-        both = (
-            kept[..., :, None] * kept[..., None, :] * S
-            + np.eye(len(S)) * lost[..., None]
-        )
-        mean = (S * kept[..., None, :]) @ np.linalg.inv(both)
-        return mean, np.linalg.inv(np.linalg.cholesky(both))
+        among_kept = S * kept[..., None, :]
+        both = kept[..., :, None] * among_kept + identity * lost[..., None]
+        return among_kept @ np.linalg.inv(both), _whitening(both)
+
+
+def _whitening(covariance: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _gain(K: Float[np.ndarray, "after k"], mean: np.ndarray) -> np.ndarray:
+    """Return K as a factor of the errors of sampled outputs; zero where K has no columns."""
+    if K.shape[1]:
+        return K @ mean
+    return np.zeros((1, 1, len(K), mean.shape[-1]))
 
 
 def recursion(
@@ -233,16 +249,16 @@ def recursion(
     - `filled`: number of columns that are not zero in the first cycle after each section.
     """
     R, T, columns = shape
-    x, phi = (
-        np.zeros((R, T, F[0].shape[-1], columns)),
-        np.eye(F[0].shape[-1])[None, None],
-    )
+    d = F[0].shape[-1]
+    x = np.zeros((R, T, d, columns))
+    phi = np.eye(d)[None, None]
     for n, step in enumerate(F):
         enter(n, x)
         later = np.zeros((R, T, step.shape[-2], columns))
         later[..., : filled[n]] = step @ x[..., : filled[n]]
         drive(n, later)
-        x, phi = later, step @ phi
+        x = later
+        phi = step @ phi
     starts = np.zeros_like(x)
     for k in range(T - 1):
         starts[:, k + 1] = phi[:, min(k, phi.shape[1] - 1)] @ starts[:, k] + x[:, k]
@@ -258,35 +274,37 @@ def slopes_of(
     coordinates: LocalCoordinates, part: SeriesPart, path: Path
 ) -> Iterator[Columns]:
     """Iterate over the derivatives of the predictions at each section."""
-    model, places = coordinates.model, coordinates.places
+    model = coordinates.model
+    places = coordinates.places
+
+    def enter(n: int, x: Columns) -> None:
+        """No derivative enters at the start of a record."""
 
     def drive(n: int, later: Columns) -> None:
-        place, gain, u = places[n], path.gain[n], part.u[n]
-        left = coordinates.to_A[n] - gain @ coordinates.to_C[n]
-        later[..., place["Y"]] += _outer(left, path.x[n])
+        place = places[n]
+        gain = path.gain[n]
+        x = path.x[n]
+        u = part.u[n]
         unit = np.eye(later.shape[2])[None, None]
+        by_Y = coordinates.to_A[n] - gain @ coordinates.to_C[n]
+        later[..., place["Y"]] += _outer(by_Y, x)
         later[..., place["B"]] += _outer(unit, u)
         if model.K[n].shape[1]:
-            y = path.x[n] @ model.C[n].T + u @ model.D[n].T + path.entering[n]
-            later[..., place["K"]] += _outer(unit, y)
+            predicted = x @ model.C[n].T + u @ model.D[n].T
+            later[..., place["K"]] += _outer(unit, predicted + path.entering[n])
         if coordinates.direct:
             later[..., place["D"]] += _outer(model.gain[n] - gain, u)
 
-    ends = [max(s.stop for s in place.values()) for place in places]
+    ends = [max(block.stop for block in place.values()) for place in places]
     shape = (*part.shape, coordinates.size)
-    for n, x in enumerate(recursion(path.F, shape, lambda n, x: None, drive, ends)):
-        J = model.C[n] @ x
-        J[..., places[n]["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
+    for n, states in enumerate(recursion(path.F, shape, enter, drive, ends)):
+        place = places[n]
+        slopes = model.C[n] @ states
+        slopes[..., place["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
         if coordinates.direct:
-            J[..., places[n]["D"]] += _outer(
-                np.eye(len(model.C[n]))[None, None], part.u[n]
-            )
-        yield J
-
-
-def _times(matrix: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the product with the vector of each sample."""
-    return (matrix @ x[..., None])[..., 0]
+            unit = np.eye(len(model.C[n]))[None, None]
+            slopes[..., place["D"]] += _outer(unit, part.u[n])
+        yield slopes
 
 
 def _outer(
@@ -339,10 +357,11 @@ def noise_spectrum(
             f"noise with a multiplier of modulus {abs(noise.multipliers[0]):.4g} grows for ever."
         )
     k = np.arange(N)
-    matrices = (np.asarray(x) for x in (noise.A, noise.B, noise.C, noise.D))
-    H = harmonic_transfer(*matrices, np.add.outer(k, f).ravel())  # (k, inputs at f + j)
-    square = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
-    return np.stack([square[k, (m - k) % N].sum(axis=0) for m in harmonics])
+    matrices = map(np.asarray, noise.matrices[:4])
+    H = harmonic_transfer(*matrices, np.add.outer(k, f).ravel())
+    # (harmonic k, inputs at f + j, frequency, output)
+    power = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
+    return np.stack([power[k, (m - k) % N].sum(axis=0) for m in harmonics])
 
 
 def noise_model(
@@ -355,17 +374,17 @@ def noise_model(
 
     **Arguments:** `S`: covariances of the innovations, in units of `scale`, as the model's outputs.
     """
-    L = np.linalg.cholesky(S)
+    roots = np.linalg.cholesky(S)
     names = tuple(f"noise of {name}" for name in outputs)
-    D = [scale[:, None] * root for root in L]
+    unit = scale[:, None]
+    D = [unit * root for root in roots]
     if not model.K[0].shape[1]:
-        zero = np.zeros((len(S), 1, 1))
-        B, C = zero * np.ones(len(outputs)), np.zeros((len(S), len(outputs), 1))
-        return LDTP(zero, B, C, D, None, names, outputs)
-    B = [K @ root for K, root in zip(model.K, L, strict=True)]
-    return LDTP.from_blocks(
-        model.A, B, [scale[:, None] * C for C in model.C], D, names, outputs
-    )
+        N, ny, _ = S.shape
+        A, B, C = np.zeros((N, 1, 1)), np.zeros((N, 1, ny)), np.zeros((N, ny, 1))
+        return LDTP(A, B, C, D, None, names, outputs)
+    B = [K @ root for K, root in zip(model.K, roots, strict=True)]
+    C = [unit * C for C in model.C]
+    return LDTP.from_blocks(model.A, B, C, D, names, outputs)
 
 
 class Predictor(NamedTuple):
@@ -384,12 +403,16 @@ class Predictor(NamedTuple):
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
-        path = SeriesProblem([part], self.S, True, free_start, 0).path(self.model, part)
-        states = zip(path.x, self.model.C, part.u, self.model.D, strict=True)
-        outputs = np.stack([x @ C.T + u @ D.T for x, C, u, D in states])
-        return np.moveaxis(
-            np.where(part.sampled, part.y - np.stack(path.error), outputs), 0, 2
-        )
+        problem = SeriesProblem([part], self.S, True, free_start, 0)
+        path = problem.path(self.model, part)
+        out = np.zeros(grid.y.shape)
+        for n, (x, C, D) in enumerate(
+            zip(path.x, self.model.C, self.model.D, strict=True)
+        ):
+            simulated = x @ C.T + part.u[n] @ D.T
+            predicted = part.y[n] - path.error[n]
+            out[:, :, n] = np.where(part.sampled[n], predicted, simulated)
+        return out
 
     def errors(
         self, grid: CycleGrid, free_start: bool

@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from scipy.signal import lfilter
 
+from ..._core.findings import Finding
 from ...errors import DefinitionError
 from ...experiments.record import (
     Record,
@@ -21,7 +23,13 @@ from ..descent import Coefficients
 # Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
 # faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
 SLOW = 20.0
-MAY_DRIFT = f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers"
+MAY_DRIFT = Finding(
+    "drift",
+    f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers.",
+)
+# Level of the confidence regions of multipliers that a drift must leave (drift moves them further
+# than a missing multiplier does). Lower: right fits are doubted; higher: drifts pass.
+OF_DRIFT = 0.999
 
 
 Signals = Float[np.ndarray, "S T N ny"]
@@ -46,20 +54,29 @@ class CycleGrid(NamedTuple):
     @classmethod
     def from_records(cls, records: Sequence[Record]) -> "CycleGrid":
         """Put records of one kind, without unknown inputs, on one grid."""
-        S, T, about = len(records), max(map(count_cycles, records)), records[0]
-        N, nu, ny = about.n_sections, len(about.inputs), len(about.outputs)
-        u, y = np.zeros((S, T * N, nu)), np.full((S, T * N, ny), np.nan)
+        S = len(records)
+        T = max(map(count_cycles, records))
+        N = records[0].n_sections
+        u = np.zeros((S, T * N, len(records[0].inputs)))
+        y = np.full((S, T * N, len(records[0].outputs)), np.nan)
         inside = np.zeros((S, T * N), bool)
-        waves = [drift_waves(r) for r in records]
-        drift = np.zeros((S, T, max(w.shape[1] for w in waves)))
-        for s, (r, w) in enumerate(zip(records, waves, strict=True)):
-            rows = slice(r.first_section, r.first_section + len(r.u))
-            u[s, rows], y[s, rows], inside[s, rows] = r.u, r.y, True
-            drift[s, : len(w), : w.shape[1]] = w
-        y = y.reshape(S, T, N, ny)
+        waves = [drift_waves(record) for record in records]
+        drift = np.zeros((S, T, max(wave.shape[1] for wave in waves)))
+        for s, (record, wave) in enumerate(zip(records, waves, strict=True)):
+            first = record.first_section
+            rows = slice(first, first + len(record.u))
+            u[s, rows] = record.u
+            y[s, rows] = record.y
+            inside[s, rows] = True
+            drift[s, : len(wave), : wave.shape[1]] = wave
         sampled = np.isfinite(y)
-        u, y = u.reshape(S, T, N, nu), np.where(sampled, y, 0.0)
-        return cls(u, y, sampled, inside.reshape(S, T, N), drift)
+        return cls(
+            u=u.reshape(S, T, N, u.shape[2]),
+            y=np.where(sampled, y, 0.0).reshape(S, T, N, y.shape[2]),
+            sampled=sampled.reshape(S, T, N, y.shape[2]),
+            inside=inside.reshape(S, T, N),
+            drift=drift,
+        )
 
     @property
     def first(self) -> Int[np.ndarray, "S N"]:
@@ -106,36 +123,46 @@ class PreparedRecords:
     def __init__(self, data: RecordedData, free_start: bool = False):
         """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
         zero and outputs that are constant at every sample, missing, or no deviations."""
-        cut = _pieces if free_start else lambda record: [record]
-        self.records = uninterrupted_records(
-            x for r in uninterrupted_records(data) for x in cut(r)
-        )
-        names = "n_sections", "lead", "inputs", "outputs"
-        self.about = {name: getattr(self.records[0], name) for name in names}
-        self.n_sections, self.lead, self.inputs, self.outputs = self.about.values()
+        records = uninterrupted_records(data)
+        if free_start:
+            records = list(chain.from_iterable(map(_pieces, records)))
+        self.records = uninterrupted_records(records)
+        first = self.records[0]
+        self.n_sections = first.n_sections
+        self.lead = first.lead
+        self.inputs = first.inputs
+        self.outputs = first.outputs
         self.grids = _grids(self.records)
         self.cycles = max(map(count_cycles, self.records))
-        self.sampled = np.sum(
-            [grid.sampled.sum(axis=(0, 1)) for grid in self.grids], axis=0
-        )
-        u, y = (
-            np.concatenate([getattr(r, name) for r in self.records]) for name in "uy"
-        )
-        varies = np.append(
-            u.any(axis=0), np.fmax.reduce(y) > np.fmin.reduce(y)
-        )  # (without NaN)
-        for name, acts in zip(self.inputs + self.outputs, varies, strict=True):
-            if not acts:
-                what = "constant" if name in self.outputs else "zero"
-                raise DefinitionError(
-                    f"{name} is {what} or missing: leave it out, or record more."
-                )
+        self.sampled = sum(grid.sampled.sum(axis=(0, 1)) for grid in self.grids)
+        u = np.concatenate([record.u for record in self.records])
+        y = np.concatenate([record.y for record in self.records])
+        _require_signals(self.inputs, u.any(axis=0), "zero")
+        varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
+        _require_signals(self.outputs, varies, "constant")
         require_deviations(self.records)
         self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The fields that fits take from the records."""
+        names = "n_sections", "lead", "inputs", "outputs"
+        return {name: getattr(self, name) for name in names}
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""
         return CycleGrid.from_records(self.records)
+
+
+def _require_signals(
+    names: tuple[str, ...], varies: Bool[np.ndarray, " signals"], what: str
+) -> None:
+    """**Raises:** `DefinitionError` for a signal that does not vary."""
+    if not varies.all():
+        name = names[int(np.argmin(varies))]
+        raise DefinitionError(
+            f"{name} is {what} or missing: leave it out, or record more."
+        )
 
 
 def with_drift(records: Sequence[Record]) -> list[Record]:
@@ -143,24 +170,27 @@ def with_drift(records: Sequence[Record]) -> list[Record]:
 
     Records that may drift as fast already are left out.
     """
-    slower, n = (
-        [r for r in records if (r.drift or np.inf) > SLOW],
-        1000 * records[0].n_sections,
-    )
-    return [dataclasses.replace(r.part(0, n), drift=SLOW) for r in slower]
+    n = 1000 * records[0].n_sections
+    slower = [record for record in records if (record.drift or np.inf) > SLOW]
+    return [dataclasses.replace(record.part(0, n), drift=SLOW) for record in slower]
 
 
 def _pieces(record: Record) -> list[Record]:
     """Cut a record into pieces of 50 times its drift, or less."""
     longest = 50 * (record.drift or np.inf) * record.n_sections
-    n = -(-len(record.u) // max(int(np.ceil(len(record.u) / longest)), 1))
-    return [record.part(k, k + n) for k in range(0, len(record.u), n)]
+    samples = len(record.u)
+    pieces = max(int(np.ceil(samples / longest)), 1)
+    n = -(-samples // pieces)
+    return [record.part(k, k + n) for k in range(0, samples, n)]
 
 
 def _grids(records: Sequence[Record]) -> list[CycleGrid]:
-    left, grids = sorted(records, key=count_cycles, reverse=True), []
+    """Put records on grids, each at least half as long as the longest of its grid."""
+    left = sorted(records, key=count_cycles, reverse=True)
+    grids = []
     while left:
-        alike = [r for r in left if 2 * count_cycles(r) >= count_cycles(left[0])]
+        longest = count_cycles(left[0])
+        alike = [record for record in left if 2 * count_cycles(record) >= longest]
         grids.append(CycleGrid.from_records(alike))
         left = left[len(alike) :]
     return grids
@@ -174,19 +204,19 @@ def lagged_inputs(
     Inputs outside of the grid are zero. Columns are ordered by r, then by input.
     """
     S, T, N, nu = u.shape
-    before, after = np.zeros((S, lags - 1 - lead, nu)), np.zeros((S, lead, nu))
-    row = np.concatenate([before, u.reshape(S, T * N, nu), after], axis=1)
-    windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)[:, section::N]
-    return windows[..., ::-1].swapaxes(2, 3).reshape(S, T, lags * nu)
+    margins = ((0, 0), (lags - 1 - lead, lead), (0, 0))
+    row = np.pad(u.reshape(S, T * N, nu), margins)
+    windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)
+    newest_first = windows[:, section::N, :, ::-1]
+    return newest_first.mT.reshape(S, T, lags * nu)
 
 
 def delay_cycles(x: Columns, cycles: int, fill: float | bool = 0) -> Columns:
     """Delay x by a number of cycles; the first cycles become `fill`."""
     T = x.shape[1]
     cycles = min(cycles, T)
-    return np.concatenate(
-        [np.full_like(x[:, :cycles], fill), x[:, : T - cycles]], axis=1
-    )
+    before = np.full_like(x[:, :cycles], fill)
+    return np.concatenate([before, x[:, : T - cycles]], axis=1)
 
 
 def divide_by_chi(c: Coefficients, x: Columns) -> Columns:
@@ -201,5 +231,6 @@ def start_responses(
 
     **Arguments:** `first`: the cycle in which each record first crosses the section.
     """
-    cycle = first[:, None] + np.arange(K)
-    return divide_by_chi(c, (np.arange(T)[:, None] == cycle[:, None]).astype(float))
+    begins = first[:, None] + np.arange(K)
+    impulse = np.arange(T)[:, None] == begins[:, None]
+    return divide_by_chi(c, impulse.astype(float))

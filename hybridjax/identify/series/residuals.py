@@ -1,13 +1,15 @@
 """Tests of residuals, section by section: their correlations in time and with inputs."""
 
-from collections.abc import Iterable, Sequence
-from itertools import compress, repeat
+from collections.abc import Sequence
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import special, stats
 
-from ..descent import ROUNDING
+from ..._core.findings import Finding
+from ..descent import ROUNDING, positive
 from .output_error import RANK
 from .records import CycleGrid, Signals, lagged_inputs
 
@@ -26,16 +28,19 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
-# Advice where inputs answer residuals: for white noise, for innovations with D, and without.
-REMEDIES = (
-    "the fit is biased; name their `reference`, or pass noise='innovations'",
-    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
-    "with D = 0",
-    "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`",
+# Advice where inputs answer residuals.
+FOR_WHITE_NOISE = (
+    "the fit is biased; name their `reference`, or pass noise='innovations'"
 )
-UNSEEN = (
+FOR_GIVEN_D = (
+    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
+    "with D = 0"
+)
+FOR_ZERO_D = "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`"
+UNSEEN = Finding(
+    "feedback",
     "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
-    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0)"
+    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0).",
 )
 
 
@@ -48,11 +53,11 @@ def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
     error = error.copy()
     for n, root in enumerate(spread):
         for i in range(error.shape[3]):
-            at = np.isfinite(error[:, :, n, i])
-            left, s, _ = np.linalg.svd(root[:, :, i][at], full_matrices=False)
-            error[at, n, i] -= left @ (
-                (left.T @ error[at, n, i]) * (1 - 1 / np.sqrt(1 + s**2))
-            )
+            sampled = np.isfinite(error[:, :, n, i])
+            left, size, _ = np.linalg.svd(root[:, :, i][sampled], full_matrices=False)
+            along = left.T @ error[sampled, n, i]
+            excess = 1 - 1 / np.sqrt(1 + size**2)
+            error[sampled, n, i] -= left @ (along * excess)
     return error
 
 
@@ -62,24 +67,28 @@ def whiteness_test(
     """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
     size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
-    scaled = (error / np.where(size > 0, size, 1.0)).reshape(S, T * N, ny)
-    z, tested = np.zeros((N, lags, ny)), np.zeros((N, lags, ny), bool)
+    scaled = (error / positive(size)).reshape(S, T * N, ny)
+    z = np.zeros((N, lags, ny))
+    tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
         product = np.full(scaled.shape, np.nan)
         product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
-        product = product.reshape(error.shape)
-        count = np.isfinite(product).sum(axis=(0, 1))
-        z[:, k] = np.nansum(product, axis=(0, 1)) / np.sqrt(np.maximum(count, 1))
-        tested[:, k] = count >= FEWEST_SAMPLES
+        by_section = product.reshape(error.shape)
+        samples = np.isfinite(by_section).sum(axis=(0, 1))
+        total = np.nansum(by_section, axis=(0, 1))
+        tested[:, k] = samples >= FEWEST_SAMPLES
+        z[:, k] = tested[:, k] * total / np.sqrt(np.maximum(samples, 1))
     # The mean over the sections of each lag, and the deviations from it: independent.
-    z, count = z * tested, tested.sum(axis=0)
-    pooled = z.sum(axis=0) ** 2 / np.maximum(count, 1)
-    deviations = (z**2).sum(axis=(0, 1)) - pooled.sum(axis=0)
-    degrees = (count > 0).sum(axis=0)
-    p = stats.chi2.sf(pooled.sum(axis=0), degrees)
+    sections = tested.sum(axis=0)
+    by_lag = z.sum(axis=0) ** 2 / np.maximum(sections, 1)
+    pooled = by_lag.sum(axis=0)
+    deviations = (z**2).sum(axis=(0, 1)) - pooled
+    degrees = (sections > 0).sum(axis=0)
+    p = stats.chi2.sf(pooled, degrees)
     if N > 1:
-        p = np.minimum(p, stats.chi2.sf(deviations, count.sum(axis=0) - degrees))
-        p = -np.expm1(2 * np.log1p(-p))
+        p_deviations = stats.chi2.sf(deviations, sections.sum(axis=0) - degrees)
+        # The smaller of two, as a p-value.
+        p = -np.expm1(2 * np.log1p(-np.minimum(p, p_deviations)))
     return z, p
 
 
@@ -102,88 +111,109 @@ def independence_test(
     degrees of freedom of all sections, which is 1 to 4 % too optimistic.
     """
     S, T, N, ny = error.shape
-    nu = u.shape[3]
-    z, deviates, tested = np.zeros((N, lags, ny, nu)), np.zeros(ny), np.zeros(ny)
-    degrees, by_fits = np.zeros((2, ny)), np.zeros(ny)
-    for n, root in zip(
-        range(N), spread or repeat(np.zeros((S, T, ny, 0))), strict=False
-    ):
+    z = np.zeros((N, lags, ny, u.shape[3]))
+    deviates = np.zeros(ny)
+    tested = np.zeros(ny)
+    degrees = np.zeros((2, ny))
+    by_fits = np.zeros(ny)
+    roots = spread or [np.zeros((S, T, ny, 0))] * N
+    for n, root in enumerate(roots):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
             present = np.isfinite(error[:, :, n, i])
-            U, r, count = past[present], error[:, :, n, i][present], int(present.sum())
-            if count < FEWEST_SAMPLES or not r.any():
+            residual = error[:, :, n, i][present]
+            if len(residual) < FEWEST_SAMPLES or not residual.any():
                 continue
-            size = np.sqrt((U**2).sum(axis=0) * (r @ r) / count)
-            U = U / np.where(size > 0, size, 1.0)  # inputs have units of their own
-            rows = np.column_stack([r, root[:, :, i][present]])
-            along, *by_fit = (U.T @ rows).T
-            variance = 1 + np.sum(np.square(by_fit), axis=0) * (r @ r) / count
-            variance /= 1 + (rows[:, 1:] ** 2).sum() / count
-            z[n, :, i] = (along / np.sqrt(variance)).reshape(lags, nu)
-            left, s, _ = np.linalg.svd(U, full_matrices=False)
-            left = left[:, s > RANK * s[0]][:, : count // 2]
-            # Explained against unexplained part: an F ratio, as its Gaussian deviate.
-            a, b = left.shape[1], count - left.shape[1]
-            inside = ((left.T @ rows) ** 2).sum(axis=0)
-            outside, by_fit = (rows**2).sum(axis=0) - inside, inside[1:].sum()
-            p = stats.f.sf(
-                inside[0] / (a + by_fit) * (b + outside[1:].sum()) / outside[0], a, b
-            )
-            by_fits[i] += by_fit
-            deviates[i] += stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
-            degrees[:, i] += a, b
+            test = _regressed(past[present], residual, root[:, :, i][present])
+            z[n, :, i] = test.correlation.reshape(lags, u.shape[3])
+            deviates[i] += test.deviate
+            degrees[:, i] += test.degrees
+            by_fits[i] += test.by_fit
             tested[i] += 1
     p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
-    shift = special.ncfdtrinc(*degrees, 1 - _POWER, special.fdtri(*degrees, 1 - level))
+    critical = special.fdtri(*degrees, 1 - level)
+    shift = special.ncfdtrinc(*degrees, 1 - _POWER, critical)
     shift *= 1 + by_fits / np.maximum(degrees[0], 1)
-    return z, p, np.sqrt(shift / np.maximum(degrees.sum(axis=0), 1))
+    samples = np.maximum(degrees.sum(axis=0), 1)
+    return z, p, np.sqrt(shift / samples)
+
+
+class _Regressed(NamedTuple):
+    """Residuals at a section, regressed on inputs."""
+
+    correlation: Float[np.ndarray, " columns"]
+    deviate: float
+    """The Gaussian deviate of the F ratio of the explained to the unexplained part."""
+    degrees: tuple[int, int]
+    """Degrees of freedom of both parts."""
+    by_fit: float
+    """The explained part of errors of a fit to other data."""
+
+
+def _regressed(
+    inputs: Float[np.ndarray, "samples columns"],
+    residual: Float[np.ndarray, " samples"],
+    root: Float[np.ndarray, "samples r"],
+) -> _Regressed:
+    samples = len(residual)
+    variance = residual @ residual / samples
+    size = np.sqrt((inputs**2).sum(axis=0) * variance)
+    inputs = inputs / positive(size)  # inputs have units of their own
+    along_fit = inputs.T @ root
+    spread = 1 + (along_fit**2).sum(axis=1) * variance
+    spread /= 1 + (root**2).sum() / samples
+    correlation = inputs.T @ residual / np.sqrt(spread)
+    left, values, _ = np.linalg.svd(inputs, full_matrices=False)
+    left = left[:, values > RANK * values[0]][:, : samples // 2]
+    explained = ((left.T @ residual) ** 2).sum()
+    by_fit = ((left.T @ root) ** 2).sum()
+    unexplained = (residual**2).sum() - explained
+    degrees = left.shape[1], samples - left.shape[1]
+    left_by_fit = (root**2).sum() - by_fit
+    ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
+    p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
+    return _Regressed(correlation, float(stats.norm.isf(p)), degrees, float(by_fit))
 
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     """Return whether the residuals of each output are only rounding, and tell nothing."""
-    left, size = (np.sqrt(np.nansum(x**2, axis=(0, 1, 2))) for x in (error, grid.y))
+    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)))
+    size = np.sqrt((grid.y**2).sum(axis=(0, 1, 2)))
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
 
 
 def about_misfit(
     outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool
-) -> str:
-    """Return a sentence about residuals that depend on inputs of the period before them; empty if
-    there are none.
+) -> list[Finding]:
+    """Return a finding if residuals depend on inputs of the period before them.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled.
     """
     N, ny = error.shape[2:]
     late = np.where((grid.age > N)[..., None], error, np.nan)
-    p = independence_test(outside.u, late, N, ANSWER)[1]
+    _, p, _ = independence_test(outside.u, late, N, ANSWER)
     if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
-        return ""
-    remedies = (
-        "more dimensions" if innovations else "more dimensions, noise='innovations'"
-    )
-    return (
+        return []
+    noise = "" if innovations else ", noise='innovations'"
+    text = (
         "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
-        f"errors: give {remedies}, or another guess"
+        f"errors: give more dimensions{noise}, or another guess."
     )
+    return [Finding("left over", text)]
 
 
-def answering(
-    grid: CycleGrid, error: Signals, inputs: tuple[str, ...]
-) -> tuple[str, ...]:
-    """Return the inputs that answer earlier residuals, as by a controller."""
-    answers = feedback_test(grid, error) < ANSWER * ~is_exact(grid, error).all()
-    return tuple(compress(inputs, answers))
-
-
-def about_answering(inputs: Iterable[str], remedy: str) -> str:
-    """Return a sentence about inputs that answer earlier residuals; empty if there are none."""
-    names = ", ".join(inputs)
-    return (
-        names
-        and f"inputs answer earlier residuals, as by a controller ({names}): {remedy}"
-    )
+def about_answers(
+    grid: CycleGrid, error: Signals, inputs: tuple[str, ...], remedy: str
+) -> list[Finding]:
+    """Return a finding if inputs answer earlier residuals, as by a controller."""
+    if is_exact(grid, error).all():
+        return []
+    names = ", ".join(compress(inputs, feedback_test(grid, error) < ANSWER))
+    if not names:
+        return []
+    text = f"inputs answer earlier residuals, as by a controller ({names}): {remedy}."
+    return [Finding("feedback", text)]
 
 
 def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
@@ -196,14 +226,13 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     """
     S, T, N, nu = grid.u.shape
     lags = 2
-    late = np.zeros((S, T * N, error.shape[3]))
-    late[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
+    earlier = np.zeros((S, T * N, error.shape[3]))
+    earlier[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
-        rows = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
-        past, u = (
-            lagged_inputs(grid.u, n, lags + 1, 0)[rows][:, nu:],
-            grid.u[:, :, n][rows],
-        )
-        new[:, :, n][rows] = u - past @ np.linalg.lstsq(past, u)[0]
-    return independence_test(late.reshape(error.shape), new, lags, ANSWER)[1]
+        whole = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
+        past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
+        u = grid.u[:, :, n][whole]
+        new[:, :, n][whole] = u - past @ np.linalg.lstsq(past, u)[0]
+    _, p, _ = independence_test(earlier.reshape(error.shape), new, lags, ANSWER)
+    return p

@@ -9,27 +9,21 @@ from scipy import special
 
 from ...errors import DefinitionError
 from ..denominator import SLOWEST, multipliers_of
-from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from ..descent import NO_LEADING_COEFFICIENT, Coefficients, positive
 from ..periodic import PeriodicModel
+from ..realization import default_horizon
 from .linearization import sum_up
 from .output_error import OutputErrorProblem, SectionRegression
 from .records import CycleGrid, PreparedRecords, Signals, delay_cycles, lagged_inputs
 from .residuals import ANSWER
 
 
-# Sections in which a state is observed, at least, by default. Smaller: less averaging.
-_SHORTEST_HORIZON = 8
 # Samples of a section for each coefficient of the regression on its past. Larger: a short past,
 # which states outlast; smaller: noise.
 _ROWS = 3
 # Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
 # combinations that are hardly excited.
 _SHRINKAGE = 1e-6
-
-
-def default_horizon(N: int) -> int:
-    """Return the number of sections in which a state is observed; twice as many lags are needed."""
-    return max(_SHORTEST_HORIZON, 2 * N)
 
 
 def subspace_model(
@@ -47,36 +41,42 @@ def subspace_model(
 
     **Raises:** `DefinitionError` for too few cycles for a past as long as the states need.
     """
-    N, ny, most = len(dims), len(records.outputs), int(max(dims))
-    sections, columns = _sections(records), len(records.inputs) + ny
+    N = len(dims)
+    ny = len(records.outputs)
+    columns = len(records.inputs) + ny
+    most = int(max(dims))
+    sections = _sections(records)
     samples = min(len(section.y) for section in sections)
     past = min(samples // (_ROWS * columns), default_horizon(N))
     needed = -(-most // columns) + 1
     if past < needed:
         raise DefinitionError(
             f"{samples} cycles are too few to begin with {most} dimensions: record about "
-            f"{_ROWS * columns * needed}, or give a model as `guess`: `realize(fit_series(...))`."
+            f"{_ROWS * columns * needed}, or give a model as `guess`: `fit_series(...).model`."
         )
-    rows = (np.concatenate([x.u * direct, x.past(past)], axis=1) for x in sections)
     # The effect of the past of each section on its outputs.
-    rules = [
-        _regress(x, s.y)[s.u.shape[1] :] for x, s in zip(rows, sections, strict=True)
-    ]
+    rules = []
+    for section in sections:
+        rows = np.concatenate([section.u * direct, section.past(past)], axis=1)
+        rules.append(_regress(rows, section.y)[section.u.shape[1] :])
     horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
         ahead = np.zeros((past * columns, horizon, ny))
         for i in range(min(horizon, past)):
-            ahead[: (past - i) * columns, i] = rules[(n + i) % N][i * columns :]
+            kept = (past - i) * columns
+            ahead[:kept, i] = rules[(n + i) % N][i * columns :]
         ahead = ahead.reshape(len(ahead), -1)
         root = np.linalg.qr(section.past(past), mode="r")
-        _, s, vh = np.linalg.svd(root @ ahead, full_matrices=False)
-        if dims[n] > len(s):
-            text = f"the data show {len(s)} dimensions of section {n}, not {dims[n]}"
-            raise DefinitionError(f"{text}: lower `guess`.")
-        kept = np.maximum(s[: dims[n]], _SHRINKAGE * s[0])
-        to_state.append(ahead @ (vh[: dims[n]].T / kept * np.sqrt(len(section.y))))
+        _, size, directions = np.linalg.svd(root @ ahead, full_matrices=False)
+        d = dims[n]
+        if d > len(size):
+            raise DefinitionError(
+                f"the data show {len(size)} dimensions of section {n}, not {d}: lower `guess`."
+            )
+        scale = np.maximum(size[:d], _SHRINKAGE * size[0]) / np.sqrt(len(section.y))
+        to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
 
 
@@ -93,8 +93,13 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
     them apart.
     """
-    N, ny, nr = records.n_sections, len(records.outputs), len(drive.inputs)
-    columns, statistic, left, whole = nr + len(records.inputs) + ny, 0.0, 0.0, 0.0
+    N = records.n_sections
+    ny = len(records.outputs)
+    nr = len(drive.inputs)
+    columns = nr + len(records.inputs) + ny
+    statistic = 0.0
+    left = 0.0
+    whole = 0.0
     age = records.whole().age.reshape(len(records.records), -1)
     for section in _sections(records, without_drift(drive.whole()).u):
         length = max(min(len(section.y) // (_ROWS * columns), default_horizon(N)), 1)
@@ -102,17 +107,14 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
             continue
-        past, y, inputs = (
-            x[later] for x in (section.past(length), section.y, section.u)
-        )
-        r, u = inputs[:, :nr], inputs[:, nr:]
+        past = section.past(length)[later]
+        y = section.y[later]
+        r, u = np.split(section.u[later], [nr], axis=1)
         rows = np.concatenate([past, r], axis=1)
-        errors = [y - x @ _regress(x, y) for x in (past, rows)]
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
-        sizes = [np.linalg.slogdet(e.T @ e + floor)[1] for e in errors]
-        statistic += max(len(y) - rows.shape[1] - (ny - nr + 1) / 2, 0.0) * (
-            sizes[0] - sizes[1]
-        )
+        gain = _log_size(past, y, floor) - _log_size(rows, y, floor)
+        degrees = len(y) - rows.shape[1] - (ny - nr + 1) / 2
+        statistic += max(degrees, 0.0) * gain
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
@@ -128,30 +130,40 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     return False
 
 
+def _log_size(rows: np.ndarray, y: np.ndarray, floor: np.ndarray) -> float:
+    """Return the log determinant of the errors of a regression."""
+    error = y - rows @ _regress(rows, y)
+    return float(np.linalg.slogdet(error.T @ error + floor)[1])
+
+
 def without_drift(grid: CycleGrid) -> CycleGrid:
     """Return records without the drift of each section, in outputs and inputs.
 
     Offsets of inputs drive a drift of outputs, which a controller answers: without the drift of all
     signals, the rest is the response to the rest.
     """
-    none, make = grid.drift[..., :0], SectionRegression.make
+    no_columns = grid.drift[..., :0]
 
     def left(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        pairs = zip(np.moveaxis(x, 2, 0), np.moveaxis(weight, 2, 0), strict=True)
-        parts = [
-            (make(none, none, grid.drift, w).reduced(z), z.shape) for z, w in pairs
-        ]
-        return np.stack([z.reshape(shape) for z, shape in parts], axis=2)
+        out = np.zeros(x.shape)
+        for n in range(x.shape[2]):
+            regression = SectionRegression.make(
+                no_columns, no_columns, grid.drift, weight[:, :, n]
+            )
+            z = x[:, :, n]
+            out[:, :, n] = regression.reduced(z).reshape(z.shape)
+        return out
 
-    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
-    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=none)
+    y = left(grid.y, grid.sampled.all(axis=3))
+    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=no_columns)
 
 
 def _sections(
     records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]
 ) -> "list[_Section]":
     """Return the samples of more signals, the inputs and the outputs at each section."""
-    grid, ny = without_drift(records.whole()), len(records.outputs)
+    grid = without_drift(records.whole())
+    ny = len(records.outputs)
     z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
     sampled = np.asarray(grid.sampled.all(axis=3))
     return [_Section(z, sampled, n, ny) for n in range(records.n_sections)]
@@ -179,9 +191,9 @@ class _Section:
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
     size = np.sqrt(np.square(rows).sum(axis=0))
-    rows = rows / np.where(size > 0, size, 1.0)
+    rows = rows / positive(size)
     x = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
-    return x / np.where(size > 0, size, 1.0)[:, None]
+    return x / positive(size)[:, None]
 
 
 def _from_states(
@@ -191,33 +203,32 @@ def _from_states(
     innovations: bool,
     direct: bool,
 ) -> PeriodicModel:
-    N, nu = len(sections), sections[0].u.shape[1]
-    C, D, A, B, K = [], [], [], [], []
+    N = len(sections)
+    nu = sections[0].u.shape[1]
+    blocks: list[tuple] = []
     for n, section in enumerate(sections):
         x = section.past(past) @ to_state[n]
-        rows = np.concatenate([x, section.u], axis=1)
-        output = _regress(np.concatenate([x, section.u * direct], axis=1), section.y)
-        rows = np.concatenate([rows, section.y - rows @ output], axis=1)
-        later = _regress(rows, section.past(past, 1) @ to_state[(n + 1) % N])
         d = x.shape[1]
-        C.append(output[:d].T)
-        D.append(output[d:].T)
-        A.append(later[:d].T)
-        B.append(later[d : d + nu].T)
-        K.append(later[d + nu :].T if innovations else np.zeros((later.shape[1], 0)))
-    size = np.abs(np.linalg.eigvals(PeriodicModel(A, B, C, D, K).monodromy())).max()
-    shrunk = (SLOWEST / max(size, SLOWEST)) ** (1 / N)
-    model = PeriodicModel([a * shrunk for a in A], B, C, D, K)
+        seen = np.concatenate([x, section.u * direct], axis=1)
+        output = _regress(seen, section.y)
+        rows = np.concatenate([x, section.u], axis=1)
+        error = section.y - rows @ output
+        later = _regress(
+            np.concatenate([rows, error], axis=1),
+            section.past(past, 1) @ to_state[(n + 1) % N],
+        )
+        A, B, K = np.split(later.T, [d, d + nu], axis=1)
+        blocks.append(
+            (A, B, output[:d].T, output[d:].T, K if innovations else K[:, :0])
+        )
+    model = PeriodicModel(*map(list, zip(*blocks, strict=True)))
+    shrunk = (SLOWEST / max(model.radius, SLOWEST)) ** (1 / N)
+    model = model._replace(A=[shrunk * A for A in model.A])
     # (The largest modulus of A may be above SLOWEST by rounding, for any K.)
-    most = max(SLOWEST, _slowest_error(model._replace(K=[0 * k for k in K])))
-    while innovations and _slowest_error(model) > most:
-        model = model._replace(K=[k / 2 for k in model.K])
+    most = max(SLOWEST, model.radius)
+    while innovations and model.of_errors.radius > most:
+        model = model._replace(K=[K / 2 for K in model.K])
     return model
-
-
-def _slowest_error(model: PeriodicModel) -> float:
-    """Return the largest modulus of a multiplier of A - K C, for errors of predictions."""
-    return float(np.abs(np.linalg.eigvals(model._replace(A=model.F).monodromy())).max())
 
 
 class DelayedOutputs(NamedTuple):
@@ -239,37 +250,33 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
-        inputs = (
-            lagged_inputs(part.u, n, problem.lags, problem.records.lead)
-            @ problem.to_lags[n]
-        )
-        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        columns = lagged_inputs(part.u, n, problem.lags, problem.records.lead)
+        inputs = columns @ problem.to_lags[n]
         sampled = part.sampled[:, :, n]
-        before = np.all(
-            [delay_cycles(sampled, j, not problem.free) for j in delays], axis=0
-        )
-        starts = part.drift[:, :, :0]
+        delayed = [delay_cycles(sampled, j, not problem.free) for j in delays]
+        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        used = np.all(delayed, axis=0) & later[..., None]
+        no_starts = part.drift[:, :, :0]
         return [
-            SectionRegression.make(
-                inputs, starts, part.drift, later & before[..., alike[0]]
-            )
+            SectionRegression.make(inputs, no_starts, part.drift, used[..., alike[0]])
             for alike in problem.alike[n]
         ]
 
-    gram, freedom = np.zeros((ny, order + 1, order + 1)), 0
+    gram = np.zeros((ny, order + 1, order + 1))
+    freedom = 0
     for section in sum_up(problem, np.zeros(0), past, regress):
-        for each in section:
-            gram[each.outputs] += each.products
-            freedom += max(round(each.freedom) - each.root.shape[1], 0) * len(
-                each.outputs
-            )
+        for fit in section:
+            gram[fit.outputs] += fit.products
+            rows = round(fit.freedom) - fit.root.shape[1]
+            freedom += max(rows, 0) * len(fit.outputs)
     return DelayedOutputs(gram, freedom)
 
 
 def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     """Return c without bias by white noise in the outputs."""
     order = delayed.gram.shape[1] - 1
-    null = np.linalg.eigh(delayed.gram.sum(axis=0))[1][:, 0]
+    _, vectors = np.linalg.eigh(delayed.gram.sum(axis=0))
+    null = vectors[:, 0]
     if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])

@@ -158,7 +158,7 @@ def phase_response(
     return PhaseResponse(
         coefficients=fit.coefficients,
         covariance=covariance.matrix,
-        freedom=max(covariance.freedom, 1.0),
+        freedom=max(covariance.dof, 1.0),
         detail=detail,
         phase=x,
         values=waves @ fit.coefficients,

@@ -12,7 +12,7 @@ from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
 from ..._core.text import folded
 from ...errors import DefinitionError
-from ...identify.multiplier_estimate import MultiplierEstimate
+from ...identify.multiplier_estimate import MultiplierFit
 from ...scale.draws import monte_carlo
 from .reml import Mixed, meta, mixed, moderated, spread_interval
 from .tables import Columns, cells_of, factors_of, require, rows_with, signed, table_of
@@ -86,7 +86,7 @@ class Population:
     @classmethod
     def from_fits(
         cls,
-        fits: Sequence[MultiplierEstimate],
+        fits: Sequence[MultiplierFit],
         table: Columns,
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
@@ -111,7 +111,7 @@ class Population:
             for kind, number, square in zip(kinds, numbers, squares, strict=False):
                 values[kind][row] = number
                 errors[kind][row] = np.sqrt(square)
-        freedom = [fit.covariance_freedom for fit in fits]
+        freedom = [fit.covariance_dof for fit in fits]
         return cls(frame, values, errors, {"angle": "rad"}, freedom)
 
     def __repr__(self) -> str:
@@ -443,7 +443,7 @@ class Population:
         return frame
 
 
-def _polar(fit: MultiplierEstimate) -> tuple[float, float, list[float]]:
+def _polar(fit: MultiplierFit) -> tuple[float, float, list[float]]:
     """Return modulus and angle of the leading multiplier, and their variances. The angle of a real
     one is NaN."""
     z = complex(fit.multipliers[0])
@@ -457,7 +457,7 @@ def _polar(fit: MultiplierEstimate) -> tuple[float, float, list[float]]:
 
 
 def _require_comparable(
-    fits: Sequence[MultiplierEstimate],
+    fits: Sequence[MultiplierFit],
     subjects: Sequence[str],
 ) -> None:
     """**Raises:** `DefinitionError` for a fit without covariance, and other outputs."""

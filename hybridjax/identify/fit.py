@@ -1,0 +1,99 @@
+"""`Fit`: what all fits to data share, whatever they fit."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Probability
+from .._core.findings import Finding, print_findings
+from .._core.html import card, text
+from .._core.results import Result
+
+
+class Fit(eqx.Module):
+    """A fit to data.
+
+    **Fields** of all fits:
+
+    - `multipliers` (d,): the Floquet multipliers, by decreasing modulus.
+    - `covariance` (p, p): that of the fitted numbers: coefficients of the multipliers' polynomial,
+      or parameters. `covariance_dof`: degrees of freedom with which it was estimated; infinite
+      where it is exact.
+    - `model`: the fitted system, which simulates: an `LDTP` or a `HybridSystem`; None where only
+      multipliers and responses were fitted.
+    - `noise`: standard deviation of the noise of each output; None where the data themselves tell
+      their errors, or nothing does.
+    - `dof`: degrees of freedom of the residuals: numbers in the data less unknowns.
+    - `result`: code of `Result`, OK or NOT_CONVERGED.
+    - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.
+    """
+
+    multipliers: eqx.AbstractVar[Complex[np.ndarray, " d"]]
+    covariance: eqx.AbstractVar[Float[np.ndarray, "p p"]]
+    covariance_dof: eqx.AbstractVar[float]
+    model: eqx.AbstractVar[Any]
+    noise: eqx.AbstractVar[Float[np.ndarray, " ny"] | None]
+    dof: eqx.AbstractVar[float]
+    result: eqx.AbstractVar[int]
+    findings: eqx.AbstractVar[tuple[Finding, ...]]
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " d"]:
+        """The moduli of the multipliers."""
+        return np.abs(self.multipliers)
+
+    @property
+    @abstractmethod
+    def standard_errors(self) -> Float[np.ndarray, " k"]:
+        """Standard error of each estimated number."""
+
+    @abstractmethod
+    def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Return the real numbers of which `interval` gives bounds, and their standard errors."""
+
+    @abstractmethod
+    def _summary(self) -> str:
+        """Return what a `repr` says before the findings."""
+
+    @abstractmethod
+    def _page(self) -> tuple[str, ...]:
+        """Return what the fit belongs to, and the parts of its page (HTML) before the findings."""
+
+    @checked
+    def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "k 2"]:
+        """Return bounds that hold each true value with this probability, to first order.
+
+        The values are the moduli of the multipliers, or the parameters. Bounds are infinite where
+        the data do not determine a value.
+        """
+        from scipy import special  # (a fifth of a second)
+
+        values, errors = self._estimates()
+        tail = (1 + level) / 2
+        reach = special.ndtri(tail)
+        if np.isfinite(self.covariance_dof):
+            reach = special.stdtrit(self.covariance_dof, tail)
+        return values[:, None] + reach * errors[:, None] * np.array([-1.0, 1.0])
+
+    def __repr__(self) -> str:
+        return "\n".join(filter(None, [self._summary(), self._shown_findings()]))
+
+    def _repr_html_(self) -> str:
+        belongs_to, *parts = self._page()
+        return card(
+            type(self).__name__, belongs_to, *parts, text(self._shown_findings())
+        )
+
+    def _shown_findings(self) -> str:
+        return print_findings(self.findings, "  ")
+
+
+def not_converged(result: int) -> list[Finding]:
+    """Return a finding about the result of an iteration that did not end at a minimum."""
+    if result == Result.OK:
+        return []
+    return [Finding("no convergence", f"{Result(result).message}.")]

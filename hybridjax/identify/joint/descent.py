@@ -1,0 +1,119 @@
+"""The descent of a periodic model: Gauss-Newton steps, shortened as Levenberg and Marquardt do.
+
+It is not left to a library, since a step changes the problem: the local coordinates are those of
+the last model, and the weights of time series those of its errors.
+"""
+
+from contextlib import suppress
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from ..descent import NormalEquations
+from ..periodic import (
+    LocalCoordinates,
+    PeriodicModel,
+    characteristic_slopes,
+    local_coordinates,
+)
+from ..series.prediction import SeriesProblem
+from .frequency import FrequencyProblem
+
+
+Problem = FrequencyProblem | SeriesProblem
+
+# The first damping, relative to the squared length of each column. Larger: short steps; smaller:
+# several attempts until a step lowers the cost.
+_FIRST_DAMPING = 1e-4
+# Factors of the damping: the smallest after a step that lowers the cost (Nielsen 1999), and the
+# first after a step that fails. Closer to 1: more attempts; farther: steps too long or short.
+_LESS, _MORE = 0.1, 4.0
+# Largest damping: steps are then below 1e-8 of the full one. Larger: attempts below rounding;
+# smaller: descents stop in narrow valleys.
+_MOST_DAMPING = 1e8
+# Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
+# Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
+_SETTLED_GAIN = 1e-2
+# Expected squared change of the characteristic polynomial's coefficients there, in units of their
+# variance. Larger: multipliers miss the minimum, at 1e-3 by 3 % of their standard errors.
+_SETTLED_SHIFT = 1e-3
+# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
+# rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
+# converged; smaller: minima of exact data do not.
+_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
+
+
+class ModelPoint:
+    """A model, and the local least-squares problem there."""
+
+    def __init__(self, problem: Problem, model: PeriodicModel, direct: bool):
+        self.problem = problem
+        self.direct = direct
+        self.model = model
+        # A resonant model stays as it is; one that overflows has no finite cost.
+        with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+            self.model = model.refined(direct, problem.linearize)
+        self.cost = problem.cost(self.model)
+
+    @cached_property
+    def coordinates(self) -> LocalCoordinates:
+        return local_coordinates(self.model, self.direct)
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        return self.problem.linearize(self.coordinates)
+
+    def moved(self, step: Float[np.ndarray, " P"]) -> "ModelPoint":
+        return ModelPoint(self.problem, self.coordinates.moved(step), self.direct)
+
+    def reweighted(self) -> "ModelPoint":
+        """Return the point with new weights.
+
+        The log determinant of the errors' covariance is concave, so that a step that lowers the
+        cost with the old weights raises the likelihood, where no sample is missing. With gaps the
+        covariance is that of the pairs that are sampled, which is nearly the likelihood's.
+        """
+        if isinstance(self.problem, SeriesProblem):
+            self.problem = self.problem.reweighted(self.model)
+            self.cost = self.problem.cost(self.model)
+        return self
+
+    def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
+        """Test whether the undamped step and its expected decrease are too small to matter."""
+        size = self.coordinates.size
+        unit = min(1.0, self.cost / max(self.problem.residuals - size, 1))
+        if gain > _SETTLED_GAIN * size * unit:
+            return False
+        _, slopes = characteristic_slopes(self.coordinates)
+        root = slopes @ self.equations.spread().root
+        change = np.linalg.lstsq(root, slopes @ step)[0]
+        return bool(change @ change <= _SETTLED_SHIFT * unit * len(slopes))
+
+    def stalled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
+        """Test whether rounding explains that no part of the undamped step lowers the cost."""
+        small = np.abs(step).max() < _STALLED_STEP
+        return bool(gain <= _STALLED_GAIN * self.cost or small)
+
+
+def descend(point: ModelPoint, max_steps: int = 50) -> tuple[ModelPoint, bool]:
+    """Descend from a point to a minimum; return the last point and whether it is a minimum."""
+    damping = _FIRST_DAMPING
+    for _ in range(max_steps):
+        whole = point.equations.step(0.0)
+        if point.settled(*whole):
+            return point, True
+        step, gain = point.equations.step(damping)
+        trial = point.moved(step)
+        factor = _MORE
+        while not trial.cost < point.cost:
+            if damping > _MOST_DAMPING:
+                return point, point.stalled(*whole)
+            damping = max(damping, _FIRST_DAMPING) * factor
+            factor = 2 * factor
+            step, gain = point.equations.step(damping)
+            trial = point.moved(step)
+        kept = min((point.cost - trial.cost) / gain, 1.0)
+        damping *= max(_LESS, 1 - (2 * kept - 1) ** 3)
+        point = trial.reweighted()
+    return point, False
