@@ -11,9 +11,8 @@ import stat
 import tempfile
 import warnings
 
-import jax
-
 from ..errors import DefinitionError
+from . import jax_compat
 from .boundary.checked import checked
 from .boundary.kinds import FilePath
 
@@ -51,14 +50,8 @@ def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | N
             raise DefinitionError(f"{problem}: give another folder.") from error
         warnings.warn(f"{problem}; nothing is kept.", stacklevel=3)
         return None
-    jax.config.update("jax_compilation_cache_dir", str(programs))
-    # Also the smallest programs: those of users' functions are the first that a process needs.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # XLA prints two errors, a page each, for each program that it loads on a processor with
-    # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
-    level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
-    jax.config.update("jax_logging_level", "CRITICAL")
-    jax.config.update("jax_logging_level", level)
+    jax_compat.keep_programs_in(programs)
+    jax_compat.silence_xla()
     return programs
 
 
@@ -93,7 +86,7 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     marks = [path.name for path in programs.glob(f"{_MARK}*")]
     if marks != [f"{_MARK}{here.st_ino}"]:
         raise PermissionError(f"'{programs}' was not made in this place: move it away")
-    for path in programs.glob("*-[ac]*e"):  # the only files that JAX reads or writes
+    for path in jax_compat.kept_programs(programs):
         about = path.lstat()
         is_ours = (
             about.st_uid == here.st_uid and about.st_nlink == 1

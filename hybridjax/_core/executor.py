@@ -17,8 +17,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import core
-from jax.extend.core import get_opaque_trace_state
+
+from . import jax_compat
 
 
 if TYPE_CHECKING:
@@ -177,7 +177,7 @@ def stop_gradient(x: Array) -> Array:
 
 def is_tracer(x: Any) -> bool:
     """Return whether JAX traces x."""
-    return isinstance(x, core.Tracer)
+    return jax_compat.is_tracer(x)
 
 
 def is_traced(*trees: Any) -> bool:
@@ -185,16 +185,13 @@ def is_traced(*trees: Any) -> bool:
     return any(map(is_tracer, jax.tree_util.tree_leaves(trees)))
 
 
-# The state outside of all transformations, where no program is traced. In others an operation
-# tells, as the state differs under `vmap` and `jvp`, too, which compute values.
-with core.eval_context():
-    _OUTSIDE = get_opaque_trace_state()
-
-
 def is_inside_program() -> bool:
     """Return whether JAX traces a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
     computed then becomes part of it, even a constant."""
-    return get_opaque_trace_state() != _OUTSIDE and is_traced(jax.device_put(0.0))
+    if jax_compat.is_outside():
+        return False
+    # (`vmap` and `jvp` compute values: an operation tells whether they belong to a program.)
+    return is_tracer(jax.device_put(0.0))
 
 
 def is_hidden(*trees: Any) -> bool:
@@ -205,7 +202,7 @@ def is_hidden(*trees: Any) -> bool:
 
 def default_device() -> Any:
     """Return the device of `jax.default_device`: a device, the name of a platform, or None."""
-    return getattr(jax.config, "jax_default_device")  # noqa: B009 (JAX does not declare it)
+    return jax_compat.default_device()
 
 
 def on_cpu() -> bool:
@@ -220,11 +217,7 @@ _AS_IT_IS = contextlib.nullcontext()
 def as_numpy() -> contextlib.AbstractContextManager:
     """A context in which JAX combines arrays of different ranks and types as NumPy does, on which
     this package relies. (Users may forbid it for their own lines, which are outside.)"""
-    config: Any = jax.config
-    if (
-        config.jax_numpy_rank_promotion == "allow"
-        and config.jax_numpy_dtype_promotion == "standard"
-    ):
+    if jax_compat.combines_as_numpy():
         return _AS_IT_IS
     both = contextlib.ExitStack()
     both.enter_context(jax.numpy_rank_promotion("allow"))

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_context
 from jax.flatten_util import ravel_pytree
 
 from ..errors import DefinitionError
+from . import jax_compat
 from .compilation import at_ease, uncollected
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
@@ -78,7 +78,7 @@ def by_columns(
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
         directions = jax.tree_util.tree_unflatten(structure, parts)
         try:
-            with on_the_cpu(), eval_context(), uncollected(), at_ease():
+            with on_the_cpu(), jax_compat.outside(), uncollected(), at_ease():
                 result, columns = along(to_host(arguments), directions)
         except NotOnHostError:
             require_program()

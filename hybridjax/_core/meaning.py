@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.tree_util import keystr, tree_leaves_with_path
 
 from ..errors import DefinitionError
+from . import jax_compat
 from .call import once_in_call
 from .executor import Definition
 from .memo import Memory
@@ -261,7 +261,7 @@ def _failure(error: Exception, reading: Reading) -> str:
 def _own_traces() -> contextlib.AbstractContextManager:
     """A context in which JAX uses no trace from outside: it remembers traces by the words that
     belong to their operations, too."""
-    return cast(Any, set_xla_metadata(hybridjax=str(next(_calls))))
+    return jax_compat.own_traces(str(next(_calls)))
 
 
 def _require_the_same(

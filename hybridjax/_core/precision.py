@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import PrecisionError
+from . import jax_compat
 from .executor import is_inside_program
 
 
@@ -17,7 +18,7 @@ def enable_x64() -> None:
     anything is computed. Models, guesses, sections and settings may be built earlier; arrays of
     `jax.numpy` that were made earlier stay 32 bit, and raise an error.
     """
-    jax.config.update("jax_enable_x64", True)
+    jax_compat.use_double_precision()
 
 
 def require_x64(*trees: Any) -> None:
@@ -26,7 +27,7 @@ def require_x64(*trees: Any) -> None:
     **Raises:** `PrecisionError` if JAX runs in 32-bit mode, or if a floating-point leaf of one
     of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
-    if not jax.config.read("jax_enable_x64"):
+    if not jax_compat.has_double_precision():
         raise PrecisionError(
             "JAX is in 32-bit mode: call `hybridjax.enable_x64()` first."
         )

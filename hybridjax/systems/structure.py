@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
+from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.call import once_in_call
 from .._core.compilation import kernel
@@ -32,7 +31,6 @@ from .._core.executor import Array, is_hidden
 from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
-from .._core.vector_math.rewrite import jaxprs
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart, Method, as_method
@@ -76,18 +74,17 @@ def member_of(alike: Sequence[Any], place: Any) -> Any:
     )
 
 
-def counts_alike(program: jex.Jaxpr) -> bool:
+def counts_alike(program: jax_compat.Program) -> bool:
     """Test whether a program computes with integers as Python does. (JAX evaluates integer powers
     by the bits of the exponent: a negative or too large one would give another number.)"""
-    return not any(
-        (eqn.primitive.name.startswith("shift") or eqn.primitive.name == "pow")
-        and all(
-            jnp.issubdtype(getattr(v.aval, "dtype", object), jnp.integer)
-            for v in eqn.invars
-        )
-        or not all(map(counts_alike, jaxprs(eqn.params)))
-        for eqn in program.eqns
-    )
+    for equation in program.eqns:
+        types = [getattr(v.aval, "dtype", object) for v in equation.invars]
+        whole = all(jnp.issubdtype(x, jnp.integer) for x in types)
+        if whole and jax_compat.works_on_bits(equation):
+            return False
+        if not all(map(counts_alike, jax_compat.inner_programs(equation))):
+            return False
+    return True
 
 
 def _form(x: Transition) -> Hashable:
@@ -409,7 +406,7 @@ class Structure:
             return guard.period, guard.offset
 
         program, *_ = eqx.filter_make_jaxpr(schedule)(one_lane(self.source))
-        needed, _ = dce_jaxpr(program.jaxpr, [True, True], instantiate=True)
+        needed, _ = jax_compat.needed_part(program.jaxpr, every_argument=True)
         constants = tuple(np.asarray(x).tobytes() for x in program.consts)
         return str(needed), constants
 

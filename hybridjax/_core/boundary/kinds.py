@@ -18,6 +18,7 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
+from ..jax_compat import is_numpy_annotation
 from . import values
 from .containers import Either, Having, Instance, Items, Names, Table, Tuple
 from .values import Complexes, Integers, Kind, Number, OneOf, Reals, Switch, Whole
@@ -137,7 +138,7 @@ def _either(arguments: tuple[Any, ...]) -> Kind | None:
 def _of_class(cls: type) -> Kind:
     if issubclass(cls, jaxtyping.AbstractArray):
         return _array(cls)
-    if cls.__module__.startswith("numpy._typing"):
+    if is_numpy_annotation(cls):
         raise TypeError("an array is annotated as `Annotated[Numbers, Reals(shape)]`.")
     return Having(cls) if getattr(cls, "_is_protocol", False) else Instance(cls)
 

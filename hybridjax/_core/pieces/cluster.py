@@ -12,12 +12,12 @@ from typing import Any
 
 import cloudpickle
 import equinox as eqx
-import jax
 import numpy as np
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
+from .. import jax_compat
 from ..cache import enable_compilation_cache
 from ..meaning import meaning
 from ..progress import counted, say
@@ -60,7 +60,7 @@ def _run(
 ) -> None:
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
-    x64 = bool(jax.config.read("jax_enable_x64"))
+    x64 = jax_compat.has_double_precision()
     # Dask gives out the tasks again that a lost worker had, and what they need.
     needed = client.submit(bytes, packed, pure=False)
     tasks = client.map(_piece, missing, packed=needed, x64=x64, pure=False)
@@ -140,7 +140,7 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece
 def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     if x64:
-        jax.config.update("jax_enable_x64", True)
+        jax_compat.use_double_precision()
     enable_compilation_cache()
     # Dask's nanny starts workers with MALLOC_TRIM_THRESHOLD_ = 65536.
     with contextlib.suppress(AttributeError, OSError):  # (glibc only)
