@@ -45,7 +45,8 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     written.
     """
     kind = type(thing).__name__
-    if (wrong := _wrong_field(thing)) is not None:
+    wrong = _wrong_field(thing)
+    if wrong is not None:
         raise DefinitionError(
             f"this {kind} cannot be saved: its {wrong}, a wrong type or shape."
         )
@@ -122,9 +123,12 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     other = ValueError(f"its fields are not those of {kind.__name__}")
     if not isinstance(static, dict):
         raise other
-    static, arrays, values = dict(static), dict(arrays), {}
+    static = dict(static)
+    arrays = dict(arrays)
+    values = {}
     for field in dataclasses.fields(kind):
-        name, inner = field.name, _module_in(field.type)
+        name = field.name
+        inner = _module_in(field.type)
         if field.metadata.get("static", False):
             if name in static:
                 values[name] = static.pop(name)
@@ -141,7 +145,8 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     if static or arrays:
         raise other
     module = kind(**values)
-    if (wrong := _wrong_field(module)) is not None:
+    wrong = _wrong_field(module)
+    if wrong is not None:
         raise ValueError(wrong)
     return module
 
@@ -164,7 +169,8 @@ def _read_header(
         if array is None or array.nbytes > limits.TEXT:
             raise ValueError
         header = json.loads(array.item())
-        name, version = header["format"], header["format_version"]
+        name = header["format"]
+        version = header["format_version"]
     except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
         name = None
     if name != _FORMAT:
@@ -202,11 +208,9 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
         return {key: restored(part, units) for key, part in value.items()}
     if isinstance(value, list):
         return tuple(restored(part, units) for part in value)
-    return (
-        Signal(value, str(units[value]))
-        if isinstance(value, str) and value in units
-        else value
-    )
+    if isinstance(value, str) and value in units:
+        return Signal(value, str(units[value]))
+    return value
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:
@@ -215,11 +219,10 @@ def _wrong_field(thing: eqx.Module) -> str | None:
         for field in dataclasses.fields(thing):
             value = getattr(thing, field.name)
             if not _matches(value, field.type):
-                what = (
-                    f"{value.dtype}{value.shape}"
-                    if hasattr(value, "dtype")
-                    else repr(value)
-                )
+                if hasattr(value, "dtype"):
+                    what = f"{value.dtype}{value.shape}"
+                else:
+                    what = repr(value)
                 return f"{field.name} is {what}"
             if (
                 isinstance(value, eqx.Module)
@@ -230,7 +233,8 @@ def _wrong_field(thing: eqx.Module) -> str | None:
 
 
 def _matches(value: Any, hint: Any) -> bool:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if origin is typing.Annotated:
         return _matches(value, arguments[0])
     if origin is types.UnionType or origin is typing.Union:
@@ -281,7 +285,8 @@ def damaged(path: Path, reason: str) -> FileFormatError:
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
-    size, most = sum(m.file_size for m in members), limits.unpacked(packed)
+    size = sum(m.file_size for m in members)
+    most = limits.unpacked(packed)
     if size > most:
         raise ValueError(
             f"it declares arrays of {size} bytes, but packs them into {packed}"

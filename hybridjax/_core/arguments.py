@@ -43,14 +43,16 @@ def input_and_output_names(
 
     **Raises:** `DefinitionError` as `names`, and for an output that is an input.
     """
-    u, y = names("inputs", inputs, nu), names("outputs", outputs, ny)
+    u = names("inputs", inputs, nu)
+    y = names("outputs", outputs, ny)
     require_apart(u, y)
     return u, y
 
 
 def require_apart(inputs: Collection[str], outputs: Collection[str]) -> None:
     """**Raises:** `DefinitionError` for an output that is an input."""
-    if shared := [name for name in outputs if name in inputs]:
+    shared = [name for name in outputs if name in inputs]
+    if shared:
         raise DefinitionError(
             f"'{shared[0]}' is in `inputs` and in `outputs`: name it in one."
         )

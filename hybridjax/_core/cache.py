@@ -108,7 +108,8 @@ def _refuse_others(path: pathlib.Path, is_above: bool) -> None:
     rename what is not theirs."""
     if not hasattr(os, "geteuid"):
         return
-    about, user = path.lstat(), os.geteuid()
+    about = path.lstat()
+    user = os.geteuid()
     is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     is_alone = is_open == stat.S_IWGRP and _is_alone(about.st_gid)
     if is_above and (about.st_mode & stat.S_ISVTX or is_alone):
@@ -123,7 +124,8 @@ def _is_alone(number: int) -> bool:
     import pwd
 
     try:
-        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid()).pw_name
+        group = grp.getgrgid(number)
+        user = pwd.getpwuid(os.geteuid()).pw_name
     except KeyError:
         return False
     return group.gr_name == user and set(group.gr_mem) <= {user}

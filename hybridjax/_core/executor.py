@@ -123,11 +123,9 @@ def scan(
 
 def for_each_row(function: Callable, rows: Any) -> Any:
     """`jax.vmap` of a function of one row."""
-    return (
-        np.stack([function(x) for x in rows])
-        if on_host(rows)
-        else jax.vmap(function)(rows)
-    )
+    if on_host(rows):
+        return np.stack([function(x) for x in rows])
+    return jax.vmap(function)(rows)
 
 
 def put(x: Array, index: Any, value: Any) -> Array:
@@ -141,11 +139,9 @@ def put(x: Array, index: Any, value: Any) -> Array:
 
 def lane(x: Array, i: Array) -> Array:
     """Lane i of x, as the only one."""
-    return (
-        x[..., i : i + 1]
-        if on_host(x)
-        else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
-    )
+    if on_host(x):
+        return x[..., i : i + 1]
+    return jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
 def solve(matrices: Array, right: Array) -> Array:

@@ -66,8 +66,13 @@ def by_columns(
     @derived.def_jvp
     def rule(arguments, tangents):
         moved = relevant(tangents[0]), *tangents[1:]
-        still = lambda t: t is None  # noqa: E731
-        values = lambda t, x: None if still(t) else x  # noqa: E731
+
+        def still(t):
+            return t is None
+
+        def values(t, x):
+            return None if still(t) else x
+
         moving = jax.tree_util.tree_map(values, moved, arguments, is_leaf=still)
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])

@@ -114,9 +114,15 @@ def vmap_to_lanes(function: Callable[[tuple, Any], Any]) -> Callable[[tuple, Any
                 _join_common(tree, mapped, size, L)
                 for tree, mapped in zip(common, batched[0], strict=True)
             )
-            join = lambda x, mapped: _join(x, mapped, True, size, L)  # noqa: E731
+
+            def join(x, mapped):
+                return _join(x, mapped, True, size, L)
+
             out = call(joined, jax.tree_util.tree_map(join, lanes, batched[1]))
-            split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, L), -2, 0)  # noqa: E731
+
+            def split(x):
+                return jnp.moveaxis(x.reshape(*x.shape[:-1], size, L), -2, 0)
+
             out = jax.tree_util.tree_map(split, out)
             return out, jax.tree_util.tree_map(lambda _: True, out)
 
@@ -170,7 +176,10 @@ def lane_jvp(
     function itself would store and read again all that happens in it. And where JAX asks for
     several tangents, they all use one Jacobian.
     """
-    has_tangent = lambda x, t: t is not None and eqx.is_inexact_array(x)  # noqa: E731
+
+    def has_tangent(x, t):
+        return t is not None and eqx.is_inexact_array(x)
+
     has = [
         jax.tree_util.tree_map(has_tangent, x, t, is_leaf=lambda x: x is None)
         for x, t in (lane, shared)
@@ -200,7 +209,10 @@ def lane_jvp(
 
     def push(direction):
         of_lane, of_all = parts(direction)
-        spread = lambda t, x: jnp.broadcast_to(t[..., None], x.shape)  # noqa: E731
+
+        def spread(t, x):
+            return jnp.broadcast_to(t[..., None], x.shape)
+
         tangents = jax.tree_util.tree_map(spread, of_lane, moving), of_all
         return jax.jvp(of, (moving, common), tangents)
 
@@ -255,7 +267,10 @@ def by_jacobian(function: Callable) -> Callable:
             return eqx.combine(smooth, rest), columns
 
         value, columns = by_jacobian(with_columns)(moving)
-        contract = lambda column: jnp.tensordot(along, column, 1)  # noqa: E731
+
+        def contract(column):
+            return jnp.tensordot(along, column, 1)
+
         return value, jax.tree_util.tree_map(contract, columns)
 
     return derived

@@ -598,11 +598,9 @@ def _names(code: types.CodeType) -> _Names:
 def _version(package: str) -> str:
     """Return the version of an installed package, "" for others and Python's own."""
     try:
-        return (
-            ""
-            if package in sys.stdlib_module_names
-            else importlib.metadata.version(package)
-        )
+        if package in sys.stdlib_module_names:
+            return ""
+        return importlib.metadata.version(package)
     except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
         return str(getattr(sys.modules.get(package), "__version__", ""))
 

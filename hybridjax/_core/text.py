@@ -95,7 +95,8 @@ def fields(self: Any) -> str:
     shown_fields = (field for field in dataclasses.fields(self) if field.repr)
     named = ((field.name, getattr(self, field.name)) for field in shown_fields)
     shown = [f"{name}={value(x)}" for name, x in named if x is not None]
-    kind, line = type(self).__name__, ", ".join(shown)
+    kind = type(self).__name__
+    line = ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
         return f"{kind}({line})"
     inside = (textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown)
@@ -110,9 +111,8 @@ def _array(x: np.ndarray) -> str:
     shape = " x ".join(map(str, x.shape)) + (" numbers" if x.ndim == 1 else "")
     if x.dtype.kind not in "iuf" or not np.isfinite(x).any():
         return f"{shape} ({x.dtype})"
-    low, high = np.nanmin(x), np.nanmax(x)
-    return (
-        f"{shape}, all {low:.6g}"
-        if low == high
-        else f"{shape}, {low:.6g} to {high:.6g}"
-    )
+    low = np.nanmin(x)
+    high = np.nanmax(x)
+    if low == high:
+        return f"{shape}, all {low:.6g}"
+    return f"{shape}, {low:.6g} to {high:.6g}"

@@ -164,7 +164,8 @@ def write_results(
 ) -> None:
     """Write all results into a folder that is new."""
     (folder / "figures").mkdir()
-    data, recording = result.data, result.recording
+    data = result.data
+    recording = result.recording
     # 240 frequencies, up to the edge of the band that the inputs excited.
     edge = min(max(result.advice.band), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
@@ -222,7 +223,9 @@ def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> Non
 
 def summarize(result: Identification) -> dict[str, Any]:
     """Return the numbers of the report, ready for JSON."""
-    data, fit, held = result.data, result.fit, result.held_out
+    data = result.data
+    fit = result.fit
+    held = result.held_out
     periods = np.concatenate(result.phase.periods)
     return {
         "version": __version__,
@@ -277,14 +280,15 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
 
 def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
-    data, recording, warnings = result.data, result.recording, result.advice.warnings
+    data = result.data
+    recording = result.recording
+    warnings = result.advice.warnings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.reference
-    method = (
-        f"instrumental variables of {escape(listed(loop))}"
-        if loop
-        else "output-error fit"
-    )
+    if loop:
+        method = f"instrumental variables of {escape(listed(loop))}"
+    else:
+        method = "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(note)}</li>" for note in recording.notes)
     expected = zip(result.advice.strides, result.advice.expected, strict=True)

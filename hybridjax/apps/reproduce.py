@@ -136,7 +136,8 @@ def _identify(
     name: str, cycle: LimitCycle, design: Design, discard: int, begin: float
 ) -> Family:
     """Return all results with one family of sections."""
-    apex, N = Crossing("vM", "falling"), design.n_sections
+    apex = Crossing("vM", "falling")
+    N = design.n_sections
     sections: Any = ClockPhase(N, anchor=apex)
     if name == "kinematic":
         plane: Any = {
@@ -155,7 +156,8 @@ def _identify(
     _log(begin, f"{name}: experiments, {experiments}")
     data.require_ok()
     estimate = estimate_htf(data)
-    rational, rational_exact = fit_rational(estimate), fit_rational(exact)
+    rational = fit_rational(estimate)
+    rational_exact = fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)
     _log(begin, f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
     return Family(
@@ -177,7 +179,8 @@ def _draw(
 
 def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> Iterator:
     """Fig. 1 for each family of sections; Figs. 3 and 4, multipliers, poles and zeros with all."""
-    perturbed, estimates = _perturbed(cycle), dict[str, Any]()
+    perturbed = _perturbed(cycle)
+    estimates = dict[str, Any]()
     for name, family in families.items():
         drawn = plot.cycle(cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn

@@ -179,7 +179,8 @@ def identify_subjects(
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
     all subjects fail.
     """
-    rows, root = _rows(Path(table)), Path(folder)
+    rows = _rows(Path(table))
+    root = Path(folder)
     calls: dict[str, Any] = {}
     reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
@@ -253,7 +254,8 @@ def _rows(path: Path) -> Any:
 
 def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
     """Write the tables, and the report for all."""
-    population, results = study.population, study.results
+    population = study.population
+    results = study.results
     links = (
         f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>'
         for n in population.table["report"]

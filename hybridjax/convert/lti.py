@@ -47,14 +47,12 @@ def to_lti(model: LDTP) -> LDTP:
     **Raises:** `PrecisionError` in single precision.
     """
     require_x64(model)
-    A, B, C, D, d, ny = (
-        model.A,
-        model.B,
-        model.C,
-        model.D,
-        model.A.shape[-1],
-        len(model.outputs),
-    )
+    A = model.A
+    B = model.B
+    C = model.C
+    D = model.D
+    d = model.A.shape[-1]
+    ny = len(model.outputs)
     N, _, nu = B.shape
 
     def advance(carry, section):
@@ -169,7 +167,8 @@ def to_harmonic_state_space(
     """
     exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
     map = hosted(cycle).return_map
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
     sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
@@ -187,7 +186,8 @@ def to_harmonic_state_space(
         by_input[..., columns],
     )
     for n in [order] if order else _ORDERS:
-        m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
+        m = np.arange(-n, n + 1)
+        k = np.arange(-2 * n, 2 * n + 1)
         waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(map) / period)
         waves = waves * flow.length[:, None] * rule().weights / period
         parts = [

@@ -96,7 +96,8 @@ def from_xarray(dataset: Any) -> Saved:
     static = restored(header["static"], header["units"])
     try:
         for dimension, size in header["sizes"].items():
-            order, whole = dataset[dimension].values, dimension == "section"
+            order = dataset[dimension].values
+            whole = dimension == "section"
             late = order[0] % (size if whole else static["n_sections"])
             if late or (np.diff(order) != 1).any() or (whole and len(order) < size):
                 raise DefinitionError(
@@ -131,7 +132,8 @@ def _from_module(module: eqx.Module) -> Any:
     static, arrays = taken_apart(module)
     coordinates: dict[str, Any] = {}
     for dimension, field in _COORDINATES.items():
-        if (values := static.pop(field, None)) is not None:
+        values = static.pop(field, None)
+        if values is not None:
             coordinates[dimension] = [
                 str(x) if isinstance(x, str) else int(x) for x in values
             ]
@@ -200,7 +202,8 @@ def _from_recording(recording: Recording) -> Any:
 
 
 def _from_section_data(data: SectionData) -> Any:
-    records, N = data.records, data.n_sections
+    records = data.records
+    N = data.n_sections
     lengths = [len(r.u) for r in records]
     values = [np.concatenate([r.u, r.y], axis=1) for r in records]
     variables = _signals(data, np.concatenate(values))
@@ -256,7 +259,8 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
 
     **Raises:** `DefinitionError` for signals that are called like a coordinate.
     """
-    if reserved := _RESERVED & set(data.signals):
+    reserved = _RESERVED & set(data.signals)
+    if reserved:
         raise DefinitionError(
             f"'{min(reserved)}' is also the name of a coordinate: rename it."
         )

@@ -104,7 +104,8 @@ def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Alloca
 
     power = floored(start)
     shares = len(limits.use(power))
-    prices, length = np.full(shares, 1 / shares), _LONGER
+    prices = np.full(shares, 1 / shares)
+    length = _LONGER
     now = criterion.bound(power)
     for step in range(_MAX_STEPS + 1):
         if step % _CHECK == 0:
@@ -117,7 +118,9 @@ def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Alloca
         trial = floored(limits.scaled(power * (floored(target) / power) ** length))
         bound = criterion.bound(trial)
         if bound.criterion <= now.criterion:
-            power, now, length = trial, bound, length * _LONGER
+            power = trial
+            now = bound
+            length = length * _LONGER
         else:
             length = 1.0 if length > 1 else length / 2
     return Allocation(power, now, certificate)
@@ -182,7 +185,8 @@ def to_design(
     share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
     member, experiment = np.nonzero(share)
     order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
-    member, experiment = member[order], experiment[order]
+    member = member[order]
+    experiment = experiment[order]
     part = share[member, experiment] / share.sum(axis=1)[member]
     return Design(
         experiment=experiment,

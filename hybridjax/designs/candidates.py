@@ -145,7 +145,8 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
 
     **Raises:** `DefinitionError` for outputs that do not exist, and spectra that are not positive.
     """
-    outputs, N = model.outputs, model.n_sections
+    outputs = model.outputs
+    N = model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
     require_among("output", noise, outputs, "`noise`: ")
@@ -221,7 +222,9 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
 
     **Raises:** `DefinitionError` if hardly any are stable.
     """
-    rng, models, root = np.random.default_rng(seed), [], fit._spread.root
+    rng = np.random.default_rng(seed)
+    models = []
+    root = fit._spread.root
     for _ in range(_TRIES * count):
         moved = fit._coordinates.moved(root @ rng.normal(size=root.shape[1]))
         if np.abs(np.linalg.eigvals(moved.monodromy())).max() < 1:

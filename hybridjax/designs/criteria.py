@@ -100,7 +100,9 @@ def wanted_parts(
         )
     require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
-    wanted, names, part = list[np.ndarray](), list[str](), list[int]()
+    wanted = list[np.ndarray]()
+    names = list[str]()
+    part = list[int]()
     for k in range(d) if goal.which is None else [goal.which]:
         z = multipliers[k]
         if goal.which is None and z.imag < 0:
@@ -113,7 +115,8 @@ def wanted_parts(
         name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
         rows = [gradient.real, gradient.imag][: 1 + (z.imag != 0)]
         if goal.part == "modulus":
-            rows, name = [(z.conj() * gradient).real / abs(z)], f"|{name}|"
+            rows = [(z.conj() * gradient).real / abs(z)]
+            name = f"|{name}|"
         part += [len(names)] * len(rows)
         wanted += rows
         names.append(name)

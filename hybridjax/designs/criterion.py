@@ -96,7 +96,8 @@ class LinearCriterion(eqx.Module):
         cosine = [np.repeat(x.cosine, x.slopes.shape[1] // d) for x in self.channels]
         half = _root(rows @ rows.T, self.unknowns)
         spread = self.wanted @ half
-        influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
+        influence = spread @ half.T @ rows
+        variances = (spread**2).sum(axis=1)
         squares = np.bincount(
             np.concatenate(cosine), (influence**2).sum(axis=0), len(power)
         )

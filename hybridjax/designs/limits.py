@@ -153,7 +153,8 @@ class PowerLimits(NamedTuple):
 
         **Arguments:** `level`: factor by which the quadratic forms may exceed 1. Default: 1.
         """
-        slope, use = self.curved @ power, self.use_of_curved(power)
+        slope = self.curved @ power
+        use = self.use_of_curved(power)
         slope = slope / np.where(use > 0, use * level, 1.0)[:, None]
         return PowerLimits(
             self.names, np.concatenate([self.cost, slope]), self.curved[:0]
@@ -196,7 +197,8 @@ def power_limits(
 
     **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies.
     """
-    inputs, outputs = models[0].inputs, models[0].outputs
+    inputs = models[0].inputs
+    outputs = models[0].outputs
     if isinstance(limits.rms, str):
         names = inputs if limits.rms == "input" else outputs
         levels = [
@@ -213,7 +215,8 @@ def power_limits(
     for level in levels:
         level |= {f"rate of {n}": float(x) for n, x in limits.rate.items()}
         level |= {f"peak of {n}": float(x) for n, x in limits.peak.items()}
-    if silent := [n for level in levels for n, rms in level.items() if rms == 0]:
+    silent = [n for level in levels for n, rms in level.items() if rms == 0]
+    if silent:
         raise DefinitionError(
             f"the `design` does not move {silent[0]}: leave it out of `limit`."
         )
@@ -282,7 +285,8 @@ class Products(NamedTuple):
             if name not in model.outputs:
                 continue
             expected = H_model[:, model.outputs.index(name)]
-            difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
+            difference = np.linalg.norm(H - expected)
+            size = np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
                 share = difference / max(size, np.finfo(float).tiny)
                 text = (

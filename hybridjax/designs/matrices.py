@@ -96,7 +96,8 @@ def ldtp_matrices(
         flat = _flat(rows * np.sqrt(power[lines])[:, None, None])
         gram += flat @ flat.T
     spread = NormalEquations(gram, np.zeros(len(gram))).spread()
-    cosine, slopes = [], []
+    cosine = []
+    slopes = []
     for lines, rows in _rows(coordinates, htfs, scale):
         cosine.append(np.repeat(lines, rows.shape[2]))
         slopes.append(spread.root.T @ _flat(rows))
@@ -134,7 +135,8 @@ def response_criterion(
 
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
-    N, (low, high) = cosines.n_sections, goal.band
+    N = cosines.n_sections
+    (low, high) = goal.band
     if high > N / 2:
         raise DefinitionError(
             f"`band` must lie within 0 and {N / 2:g}, not {goal.band}."

@@ -95,7 +95,8 @@ class OptimalDesign(eqx.Module):
     @property
     def usual_name(self) -> str:
         """The name of the design that it improves, in prints and figures."""
-        size, channel = self.usual.amplitude, self.usual.channel
+        size = self.usual.amplitude
+        channel = self.usual.channel
         relative = size / (np.bincount(channel, size) / np.bincount(channel))[channel]
         # (Amplitudes are larger in experiments with fewer lines.)
         return "equal amplitudes" if np.ptp(relative) < 0.2 else "the given amplitudes"
@@ -141,9 +142,10 @@ class OptimalDesign(eqx.Module):
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
         text = f"one stride of this design replaces {saved:g} with {self.usual_name}."
-        text = (
-            text if self.saved > _WORTH_IT else f"{self.usual_name} are nearly optimal."
-        )
+        if self.saved > _WORTH_IT:
+            text = text
+        else:
+            text = f"{self.usual_name} are nearly optimal."
         return f"With the {limits} limited, {text}"
 
     def __repr__(self) -> str:
@@ -298,18 +300,19 @@ def optimal_design(
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
         raise DefinitionError("`model` must be one model or more, not an empty list.")
-    usual = (
-        multisine(models[0].n_sections, inputs=models[0].inputs)
-        if design is None
-        else design
-    )
+    if design is None:
+        usual = multisine(models[0].n_sections, inputs=models[0].inputs)
+    else:
+        usual = design
     _check_alike(models, usual)
-    given, cosines = as_limits(limit), Candidates.of(usual)
+    given = as_limits(limit)
+    cosines = Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]
     linear = power_limits(given, models, squares, cosines.power_of(usual))
 
     count = given.experiments(usual, len(cosines.line))
-    distortion, limits = None, linear
+    distortion = None
+    limits = linear
     if given.distortion is not None:
         power = cosines.power_of(usual)
         distortion = products(given.distortion, cosines, models[0].inputs, power)

@@ -53,16 +53,15 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     require_deviations(data.records)
     each = []
     for s in np.flatnonzero(data.ok):
-        u, y = data.u[s : s + 1], data.y[s : s + 1]
+        u = data.u[s : s + 1]
+        y = data.y[s : s + 1]
         single = dataclasses.replace(
             data, u=u, y=y, result=data.result[s : s + 1], simulated=None
         )
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
-    N, P, f = (
-        data.n_sections,
-        data.periods,
-        np.concatenate([sums.line for sums in each]),
-    )
+    N = data.n_sections
+    P = data.periods
+    f = np.concatenate([sums.line for sums in each])
     power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
     H = (
         np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1)
@@ -110,16 +109,15 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     where these are few; and from the levels of the noise, as if it were white.
     """
     htfs = to_host([block.htf for block in blocks])
-    f, H = (
-        np.concatenate([x.f for x in htfs]),
-        np.concatenate([x.H for x in htfs], axis=1),
-    )
+    f = np.concatenate([x.f for x in htfs])
+    H = np.concatenate([x.H for x in htfs], axis=1)
     member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
     square = [
         np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs
     ]
-    noise, c = np.sqrt(square), None
+    noise = np.sqrt(square)
+    c = None
 
     def weighted() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
@@ -135,9 +133,11 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         _, groups = weighted()
         c, _ = maximum_likelihood(groups, order, c)
         # The rms residual of each block and output, in units of the supposed noise.
-        left, freedom = np.zeros(noise.shape), np.zeros(noise.shape)
+        left = np.zeros(noise.shape)
+        freedom = np.zeros(noise.shape)
         for group in groups:
-            misfit, block = misfit_of(group, c), member[group.line]
+            misfit = misfit_of(group, c)
+            block = member[group.line]
             for k, output in enumerate(group.channel[:, 0]):
                 np.add.at(
                     left[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0)
@@ -181,7 +181,9 @@ def refuse_transient(
 
     **Raises:** `DefinitionError` if more is left.
     """
-    N, P, y = data.n_sections, data.periods, data.y[data.ok]
+    N = data.n_sections
+    P = data.periods
+    y = data.y[data.ok]
     before = y.shape[1] // N - P * repeats
     if not before:
         return

@@ -51,7 +51,10 @@ class BuckConverter(HybridSystem):
 
     def transitions(self):
         tick = Scheduled(self.T)
-        anew = lambda t, q, u: (q[0], q[1], self.lower)  # noqa: E731
+
+        def anew(t, q, u):
+            return (q[0], q[1], self.lower)
+
         return (
             Transition("switch on", "open", "closed", self.control),
             Transition(
@@ -113,7 +116,10 @@ class CukConverter(HybridSystem):
 
     def transitions(self):
         tick = Scheduled(self.T)
-        left = lambda t, q, u: self.Iref + u[0] - q[0] - q[2]  # noqa: E731
+
+        def left(t, q, u):
+            return self.Iref + u[0] - q[0] - q[2]
+
         return (
             Transition("switch off", "closed", "open", left),
             Transition("switch on", "open", "closed", tick),

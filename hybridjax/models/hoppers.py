@@ -19,7 +19,8 @@ _MASSES = ("yM", "vM", "ym", "vm"), ("m", "m/s", "m", "m/s")
 
 def _hopper(i: int, yM: Array, ym: Array) -> tuple[dict, dict]:
     """Lines and circles of hopper i. (Its foot has a radius of 0.1 m.)"""
-    x, tag = 1.5 * i, f" {i + 1}" if i else ""
+    x = 1.5 * i
+    tag = f" {i + 1}" if i else ""
     circles = {f"body{tag}": (x, yM, 0.3), f"foot{tag}": (x, ym + 0.1, 0.1)}
     return {f"leg{tag}": Drawing.spring((x, ym + 0.2), (x, yM - 0.3))}, circles
 
@@ -79,10 +80,18 @@ class VerticalHopper(HybridSystem):
         return field
 
     def transitions(self):
-        height = lambda t, q, u: q[2]  # noqa: E731
-        landed = lambda t, q, u: (q[0], self.retention * q[1])  # noqa: E731
-        force = lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g  # noqa: E731
-        lifted = lambda t, q, u: (q[0], q[1], 0.0, 0.0)  # noqa: E731
+        def height(t, q, u):
+            return q[2]
+
+        def landed(t, q, u):
+            return (q[0], self.retention * q[1])
+
+        def force(t, q, u):
+            return self.leg(t, q[0], 0.0) + self.m * self.g
+
+        def lifted(t, q, u):
+            return (q[0], q[1], 0.0, 0.0)
+
         return (
             Transition("touchdown", "flight", "stance", height, reset=landed),
             Transition("liftoff", "stance", "flight", force, reset=lifted),
@@ -121,7 +130,9 @@ class CompliantHopper(VerticalHopper):
         return {"flight": self._flight(), "contact": contact}
 
     def transitions(self):
-        force = lambda t, q, u: self.ground(q[2], q[3])  # noqa: E731
+        def force(t, q, u):
+            return self.ground(q[2], q[3])
+
         return (
             Transition("touchdown", "flight", "contact", lambda t, q, u: q[2]),
             Transition("liftoff", "contact", "flight", force),
@@ -182,12 +193,11 @@ class HopperPair(VerticalHopper):
         def field(t, q, u):
             whole = _whole(down, q)
             pull = self.coupling * (whole[2] - whole[0])
-            bodies, feet = [], []
+            bodies = []
+            feet = []
             for i, between in enumerate((pull, -pull)):
-                (y, v), (ym, vm) = (
-                    whole[2 * i : 2 * i + 2],
-                    whole[2 * i + 4 : 2 * i + 6],
-                )
+                (y, v) = whole[2 * i : 2 * i + 2]
+                (ym, vm) = whole[2 * i + 4 : 2 * i + 6]
                 leg = self.leg(t - i * self.lag, y, ym)
                 bodies += [v, (leg + between + u[i]) / self.M - self.g]
                 feet += [vm, -(leg + self.b * vm) / self.m - self.g]

@@ -67,7 +67,8 @@ class MuJoCoPlant(_Made):
     substeps: Count = 1
 
     def __post_init__(self) -> None:
-        mujoco, model = package("mujoco"), self.model
+        mujoco = package("mujoco")
+        model = self.model
         if not isinstance(model, mujoco.MjModel):
             raise DefinitionError(
                 "`model` must be a `mujoco.MjModel`: see `from_xml_path`."
@@ -75,7 +76,8 @@ class MuJoCoPlant(_Made):
         actuators = [model.actuator(i).name for i in range(model.nu)]
         require_among("actuator", list(self.inputs), actuators, "MuJoCoPlant: ")
         self._actuators = [actuators.index(name) for name in self.inputs]
-        self.data, self.dt = mujoco.MjData(model), model.opt.timestep * self.substeps
+        self.data = mujoco.MjData(model)
+        self.dt = model.opt.timestep * self.substeps
         joints = [model.joint(i).name or f"joint{i}" for i in range(model.njnt)]
         sensors = [model.sensor(i).name or f"sensor{i}" for i in range(model.nsensor)]
         q = _numbered(joints, np.diff([*model.jnt_qposadr, model.nq]))
@@ -88,9 +90,10 @@ class MuJoCoPlant(_Made):
         self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
         # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
-        self._integrate = (
-            mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
-        )
+        if model.opt.integrator == 1:
+            self._integrate = mujoco.mj_step
+        else:
+            self._integrate = mujoco.mj_step2
         self._mujoco = mujoco
 
     def reset(self, seed: int) -> Mapping[str, float]:
@@ -103,7 +106,9 @@ class MuJoCoPlant(_Made):
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Hold the inputs for some time."""
-        model, data, whole = self.model, self.data, self.dt / self.substeps
+        model = self.model
+        data = self.data
+        whole = self.dt / self.substeps
         steps = int(duration / whole + 1e-9)
         for h in [whole] * steps + [duration - steps * whole] * (
             duration > (steps + 1e-9) * whole
@@ -157,7 +162,8 @@ class FMUPlant(_Made):
     period: Positive | None = None
 
     def __post_init__(self) -> None:
-        fmpy, self.file = package("fmpy"), os.path.abspath(self.file)
+        fmpy = package("fmpy")
+        self.file = os.path.abspath(self.file)
         try:
             about = fmpy.read_model_description(self.file)
             can = about.coSimulation if about.fmiVersion.startswith("2.") else None
@@ -168,10 +174,8 @@ class FMUPlant(_Made):
                 f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
             )
         self.fixed_step = not can.canHandleVariableCommunicationStepSize
-        real, names = (
-            {x.name: x for x in about.modelVariables if x.type == "Real"},
-            self.signals,
-        )
+        real = {x.name: x for x in about.modelVariables if x.type == "Real"}
+        names = self.signals
         require_among("real variable", [*self.inputs, *names], real, "FMUPlant: ")
         self._at = [
             [real[x].valueReference for x in group] for group in (self.inputs, names)
@@ -179,7 +183,8 @@ class FMUPlant(_Made):
         self.units = {x: real[x].unit for x in names if real[x].unit}
         folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._slave, self._t = fmpy.instantiate_fmu(folder, about, "CoSimulation"), 0.0
+        self._slave = fmpy.instantiate_fmu(folder, about, "CoSimulation")
+        self._t = 0.0
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at time 0."""

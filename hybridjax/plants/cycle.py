@@ -67,7 +67,8 @@ class Recorded(system.HybridSystem):
 
     states: tuple[str, ...] = eqx.field(static=True)
     picture: Callable[[Any], Any] | None = eqx.field(static=True)
-    time_unit, inputs = "s", ()
+    time_unit = "s"
+    inputs = ()
 
     def charts(self):
         return {"plant": chart.FieldChart(lambda t, q, u: 0 * q, self.states)}
@@ -84,7 +85,8 @@ class _Map:
     """
 
     def __init__(self, cycle: Any, names: Any = None):
-        self.drive, plant = cycle.drive, cycle.plant
+        self.drive = cycle.drive
+        plant = cycle.plant
         if not self.drive.sets or self.drive.fixed:
             raise DefinitionError(
                 "use a plant whose state can be set, with steps of any size."
@@ -97,16 +99,19 @@ class _Map:
         timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
         names = names or [x for x in states if not (timeless and x == "time")]
         require_among("coordinate", names, states, "perturbed_returns: ")
-        self.names, self.columns = tuple(names), [states.index(x) for x in names]
+        self.names = tuple(names)
+        self.columns = [states.index(x) for x in names]
         turn = 0.0 if period is None else round(cycle.period / period) * period
         self.shift = turn * np.array([x == "time" for x in names])
-        self.x, self.n = self.base[self.columns], cycle.sections.n_sections
+        self.x = self.base[self.columns]
+        self.n = cycle.sections.n_sections
         # (A perturbed state before a crossing must not return to it at once.)
         self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
         points = list[At]()
         self(self.x, points)
         rows = np.array([x.state for x in points], float)[:, self.columns]
-        size, top = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
+        size = np.ptp(rows, axis=0)
+        top = np.abs(rows).max(axis=0)
         self.size = np.where(
             size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0)
         )
@@ -119,7 +124,8 @@ class _Map:
         self, x: Float[np.ndarray, " d"], points: Any = None
     ) -> Float[np.ndarray, " d"]:
         """Return the coordinates after one cycle, and append the points of its steps."""
-        state, drive = self.base.copy(), self.drive
+        state = self.base.copy()
+        drive = self.drive
         state[self.columns] = x
         drive.restore(drive.start._replace(state=state))
         drive.phase.begin(drive.t, drive.z, on_section=True)
@@ -169,7 +175,8 @@ def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> A
     draws = error * np.random.default_rng(0).standard_normal((1000, *J.shape))
     each = np.linalg.eigvals(np.concatenate([J[None], J + draws])).astype(complex)
     each = np.take_along_axis(each, np.argsort(-np.abs(each), axis=1), axis=1)
-    values, sizes = each[0], np.abs(each)
+    values = each[0]
+    sizes = np.abs(each)
     spread = np.sqrt(((sizes - sizes[0]) ** 2).mean(axis=0))
     count = int(np.cumprod(sizes[0] > 3 * spread).sum())
     if 0 < count < len(values) and values[count - 1].imag > 0 > values[count].imag:
@@ -301,11 +308,13 @@ class SettledCycle:
         map = _Map(self, coordinates)
         residual = map.solve()
         fine, middle, wide = (map.slopes(k) for k in (1, 2, 4))
-        J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
+        J = (4 * fine - middle) / 3
+        coarse = (4 * middle - wide) / 3
         # (Weights 8/12 and -1/12 of four returns, each with this noise.)
         noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
         # (A jump of the second derivative leaves in J an error as large as this difference.)
-        error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
+        error = np.hypot(noise, J - coarse)
+        scale = map.size / map.size[:, None]
         values, coefficients, spread, bound = _resolved(J * scale, error * scale)
         # (10: eleven differences in each line.)
         return Returns(
@@ -328,12 +337,13 @@ class SettledCycle:
 
         **Raises:** any other error of the plant.
         """
-        u = (
-            np.zeros((self.sections.n_sections, len(self.inputs)))
-            if u is None
-            else np.asarray(u)
-        )
-        drive, points, result = self.drive, list[At](), Result.OK
+        if u is None:
+            u = np.zeros((self.sections.n_sections, len(self.inputs)))
+        else:
+            u = np.asarray(u)
+        drive = self.drive
+        points = list[At]()
+        result = Result.OK
         drive.begin(self.seed)
         try:
             for k, held in enumerate(u.tolist(), 1):
@@ -341,9 +351,12 @@ class SettledCycle:
             points.append(drive.here())
         except ComputationError:
             result = Result.PLANT_STOPPED
-        q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
-        n, s = len(t), Structure(Recorded(drive.names, draw))
-        rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
+        q = np.array([x.z for x in points])
+        t = np.array([x.t for x in points])
+        n = len(t)
+        s = Structure(Recorded(drive.names, draw))
+        rates = np.gradient(q, t, axis=0) if n > 1 else 0 * q
+        events = np.full(n, -1)
         return Trajectory(
             s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result
         )
@@ -385,7 +398,8 @@ def settle(
     plant that does not continue from the state that it returned; `ComputationError` if the plant
     has not settled, or returns NaN. Errors of the plant pass through.
     """
-    family, drive = families.as_family(sections), Drive(plant)
+    family = families.as_family(sections)
+    drive = Drive(plant)
     drive.reset(seed)
     require_among("output", outputs, drive.names, "")
     drive.columns = tuple(map(drive.names.index, outputs))
@@ -407,7 +421,9 @@ def settle(
 
 def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
-    N, plant, points = family.n_sections, drive.plant, list[At]()
+    N = family.n_sections
+    plant = drive.plant
+    points = list[At]()
 
     def turn() -> tuple[At, list[At]]:
         start = drive.here()
@@ -422,10 +438,8 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     )
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
-    half, size = (
-        len(values) // 2,
-        np.ptp([x.z for x in points], axis=0)[list(drive.columns)],
-    )
+    half = len(values) // 2
+    size = np.ptp([x.z for x in points], axis=0)[list(drive.columns)]
     change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     if (
@@ -442,7 +456,8 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
             raise DefinitionError(
                 "`set_state` does not continue as before: save all of the state."
             )
-    names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
+    names = [drive.names[c] for c in drive.columns]
+    units = getattr(plant, "units", {})
     outputs = signals(names, [units.get(name, "") for name in names])
     about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
     period = float(np.diff([at[-1].t for _, at in turns]).mean())
@@ -453,11 +468,9 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
 
 def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     """Return the sections as a plant is taken to them. An angle first makes so many turns."""
-    N, names, period = (
-        family.n_sections,
-        drive.names,
-        getattr(drive.plant, "period", None),
-    )
+    N = family.n_sections
+    names = drive.names
+    period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
     if items and all(
         isinstance(getattr(x, "function", None), str) and not x.charts for x in items

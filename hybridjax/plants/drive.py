@@ -130,23 +130,28 @@ class Drive:
     """
 
     def __init__(self, plant: Any):
-        self.plant, self.dt = plant, float(plant.dt)
+        self.plant = plant
+        self.dt = float(plant.dt)
         self.fixed = bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t, self.warmup, self.longest = 0.0, 0.0, 1e6 * self.dt
-        self.names, self.columns, self.z = (
-            tuple[str, ...](),
-            tuple[int, ...](),
-            tuple[float, ...](),
-        )
-        self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
+        self.t = 0.0
+        self.warmup = 0.0
+        self.longest = 1e6 * self.dt
+        self.names = tuple[str, ...]()
+        self.columns = tuple[int, ...]()
+        self.z = tuple[float, ...]()
+        self.phase = Phase(1)
+        self.start = At(0.0, ())
+        self.last = At(0.0, ())
 
     def _take(self, observation: Any, t: float) -> None:
-        names, self.t = tuple(observation), t
+        names = tuple(observation)
+        self.t = t
         if self.names and names != self.names:
             raise ComputationError(f"signals changed from {self.names} to {names}")
-        self.z, self.names = tuple(observation.values()), names
+        self.z = tuple(observation.values())
+        self.names = names
         for name, x in zip(names, self.z, strict=True):
             if not x - x == 0:
                 raise ComputationError(f"{name} became {x}")
@@ -170,7 +175,9 @@ class Drive:
     def restore(self, start: At) -> None:
         """Continue from a state that was kept."""
         self.plant.set_state(start.state)
-        self.t, self.z, self.last = start.t, tuple(start.z), At(0.0, ())
+        self.t = start.t
+        self.z = tuple(start.z)
+        self.last = At(0.0, ())
 
     def pass_time(self, duration: float) -> None:
         """Let the plant run without input."""
@@ -181,22 +188,23 @@ class Drive:
         """Hold the input until section k, and append the points before all steps. Steps end on the
         section if its time is known, or if the state can be set; steps of fixed length end after
         it. A crossing counts after a step that ends before it, so that none is counted twice."""
-        phase, began, armed = self.phase, self.t, not self.phase.crossings
+        phase = self.phase
+        began = self.t
+        armed = not self.phase.crossings
         clock = not phase.axes and armed
         lands = self.sets and not self.fixed and not clock
         last = (
             self.last if self.last.z else At(self.t, self.z)
         )  # (a step may cross two sections)
-        x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
+        x = phase.level(k, last.t, last.z)
+        y = phase.level(k, self.t, self.z)
         while y > 1e-9 * self.dt * clock or not armed:  # (rounding is no step)
             if self.t - began > self.longest:
                 raise ComputationError(
                     f"a section was not reached within {self.longest:.4g}"
                 )
-            last, x = (
-                self.here() if lands or points is not None else At(self.t, self.z),
-                y,
-            )
+            last = self.here() if lands or points is not None else At(self.t, self.z)
+            x = y
             if points is not None:
                 points.append(last)
             self.step(u, min(y, self.dt) if clock and not self.fixed else self.dt)
@@ -213,14 +221,16 @@ class Drive:
 
             level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-11 * self.dt))  # type: ignore
             return At(self.t, self.z)
-        self.last, share = last, x / (x - y) if x > y else 1.0
+        self.last = last
+        share = x / (x - y) if x > y else 1.0
         at = last.t + share * (self.t - last.t)
         values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
         return At(at, values, self.t - at)
 
     def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
         """Run one experiment with inputs u (n, nu), each held until the next section."""
-        rows, ended = list[At](), ""
+        rows = list[At]()
+        ended = ""
         try:
             if self.begun(seed) != self.begun(seed):
                 raise ComputationError(
@@ -274,18 +284,23 @@ def run_all(
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
     """
-    packed, local, begun = _pack(drive), threading.local(), list[Any]()
+    packed = _pack(drive)
+    local = threading.local()
+    begun = list[Any]()
 
     def run(item: tuple[int, Any]) -> Trial:
         local.worker = getattr(local, "worker", None) or _start(packed, begun)
-        worker, timer = local.worker, threading.Timer(limit, local.worker.kill)
+        worker = local.worker
+        timer = threading.Timer(limit, local.worker.kill)
         timer.start()
         try:
             pickle.dump(item, worker.stdin)
             worker.stdin.flush()
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
-            local.worker, code, waits = None, worker.wait(), timer.is_alive()
+            local.worker = None
+            code = worker.wait()
+            waits = timer.is_alive()
             ended = (
                 f"the process ended with code {code} (its error is on standard error)"
             )
@@ -347,7 +362,8 @@ def _start(packed: bytes, begun: list[Any]) -> Any:
         "from hybridjax.plants.drive import serve; serve()",
     ]
     changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    pipe, environment = subprocess.PIPE, os.environ | changes
+    pipe = subprocess.PIPE
+    environment = os.environ | changes
     begun.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
     pickle.dump(packed, begun[-1].stdin)
     return begun[-1]

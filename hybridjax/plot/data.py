@@ -65,7 +65,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     deviation. Right: for an input, its power against frequency; for an output, its deviations in
     successive cycles, at the section where they are largest.
     """
-    N, nu = data.n_sections, len(data.inputs)
+    N = data.n_sections
+    nu = len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     values = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in data.records])
@@ -122,7 +123,8 @@ def impulse_responses(
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: those at the phases
     marked left, with bands of 95 %; dashed, those of a model with the same sections."""
-    ny, N = len(responses.outputs), len(responses.phase)
+    ny = len(responses.outputs)
+    N = len(responses.phase)
     pushing = channel_index("input", input, responses.inputs)
     theory = None if model is None else responses.of_model(model)
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
@@ -148,7 +150,8 @@ def impulse_responses(
                 )
                 if theory is not None:
                     curves.plot(responses.lag, theory[m, :, i, pushing], "k--", lw=0.8)
-                low, high = values[m] - band, values[m] + band
+                low = values[m] - band
+                high = values[m] + band
                 curves.fill_between(responses.lag, low, high, alpha=0.25, lw=0, **line)
             curves.axhline(0, color="black", lw=0.4)
         if theory is not None:
@@ -173,7 +176,8 @@ def phase_response(
     **Raises:** `DefinitionError` for inputs in different units.
     """
     curves = [curve] if model is None else [curve, model]
-    if all(units := [unit_of(x.input) for x in curves]):
+    units = [unit_of(x.input) for x in curves]
+    if allunits:
         require_equal("the inputs of both curves", "units", units[0], units[-1])
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
@@ -212,7 +216,8 @@ def experiment(
     """
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
-    index, time = index % S, np.arange(n) / data.n_sections
+    index = index % S
+    time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
     rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
     size = {"width": COLUMN, "height": 0.5 + 0.85 * len(rows)}
@@ -251,7 +256,8 @@ def validation(
 
     **Arguments:** `cycles`: number of cycles to show. Default: 4.
     """
-    N, ny = validation.n_sections, len(validation.outputs)
+    N = validation.n_sections
+    ny = len(validation.outputs)
     shown = slice(max(len(validation.measured) - cycles * N, 0), None)
     time = (validation.first_section + np.arange(len(validation.measured)))[shown] / N
     limit = float(stats.norm.isf(0.005))

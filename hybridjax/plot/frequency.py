@@ -58,17 +58,16 @@ def magnitude(
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
     first, *_ = drawn = _exact_first(htfs)
-    name, pushed = (
-        _pick("output", output, first.outputs),
-        _pick("input", input, first.inputs),
-    )
+    name = _pick("output", output, first.outputs)
+    pushed = _pick("input", input, first.inputs)
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in drawn:
             for m in harmonics:
                 at = _same(name, output, htf.outputs), _same(pushed, input, htf.inputs)
                 f, values, radius = _values(htf, m, *at)
-                size, style = np.abs(values), _harmonic_style(m, harmonics)
+                size = np.abs(values)
+                style = _harmonic_style(m, harmonics)
                 line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
                 _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
@@ -168,14 +167,16 @@ def bode(
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         upper, lower = axes[:, 0]
         for number, (name, pushed, which) in enumerate(curves):
-            color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
+            color = _OUTPUTS[number % len(_OUTPUTS)]
+            reference = None
             curve = _curve(name, pushed, first) if input is None else name
             label = with_unit(curve, "" if same else units[number])
             for htf in drawn:
                 f, values, radius = _values(
                     htf, harmonic, name, _same(pushed, which, htf.inputs)
                 )
-                size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
+                size = np.abs(values)
+                line = _line(htf, drawn, {"color": color}, label)
                 is_certain = np.full(len(f), True) if radius is None else radius < size
                 is_certain &= (
                     np.convolve(is_certain, np.ones(3))[1:-1] > 1
@@ -225,7 +226,8 @@ def bodes(
 
     **Raises:** `DefinitionError` for fits of a family that is not there.
     """
-    columns, fits = _columns(families), dict(fits or {})
+    columns = _columns(families)
+    fits = dict(fits or {})
     require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, htfs) in enumerate(columns.items()):
@@ -304,7 +306,8 @@ def _values(
         channel_index("output", output, htf.outputs),
         channel_index("input", input, htf.inputs),
     )
-    values, radius = np.asarray(htf[m])[(order, *at)], None
+    values = np.asarray(htf[m])[(order, *at)]
+    radius = None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
     return np.asarray(htf.f)[order], values, radius

@@ -193,9 +193,10 @@ def save(
 
     **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
     """
-    figure = (
-        cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
-    )
+    if isinstance(plot, Axes):
+        figure = cast(Figure, plot.get_figure(root=True))
+    else:
+        figure = plot
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix[1:] in get_args(Format):

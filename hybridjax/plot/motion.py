@@ -146,12 +146,14 @@ class Track(NamedTuple):
 
     def observed(self, names: Sequence[str], t: Float[np.ndarray, " p"]):
         """States or outputs (n, p) at times."""
-        path, at = self.trajectory, self.wrapped(t)
+        path = self.trajectory
+        at = self.wrapped(t)
         return observed(path.structure, names, at, *path.at(at))
 
     def events(self, flash: float) -> list[list[str]]:
         """Names of the events in so much time before each frame."""
-        path, rows = self.trajectory, np.flatnonzero(self.trajectory.event >= 0)
+        path = self.trajectory
+        rows = np.flatnonzero(self.trajectory.event >= 0)
         names = [path.structure.transitions[g].name for g in path.event[rows]]
         ago = np.mod(self.times[:, None] - path.t[rows], self.period)
         return [
@@ -218,22 +220,25 @@ def animate(
         )
     if cycle is not None and sections is perturbed is None:
         motion = cycle = _both_halves(cycle)
-    s, unit = motion.structure, motion.system.time_unit
+    s = motion.structure
+    unit = motion.system.time_unit
     if cycle is None and not sections is perturbed is None:
         raise DefinitionError(
             "`sections` and `perturbed` are for limit cycles: animate the cycle."
         )
     require_same_system(s, sections, perturbed)
-    everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
+    everywhere = s.states_everywhere()
+    has_picture = drawing_of(s, 0) is not None
     plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
     default = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
     names = s.resolve_outputs(default if traces is None else traces).names
     path = motion.trajectory() if isinstance(motion, LimitCycle) else motion
     period = math.inf if cycle is None else float(cycle.period)
     last = perturbed or path
-    length = (
-        period if cycle is not None and perturbed is None else float(np.ptp(last.t))
-    )
+    if cycle is not None and perturbed is None:
+        length = period
+    else:
+        length = float(np.ptp(last.t))
     pace, note = _pace(length, unit, speed)
     times = np.linspace(0, length, max(12, round(length / pace * rate)), endpoint=False)
     begin = last.t[0] + times
@@ -275,7 +280,8 @@ def animate(
 
 def _both_halves(cycle: LimitCycle) -> LimitCycle:
     """The cycle of the system itself, where a `Quotient` with `half_period` has a half of it."""
-    s, anchor = cycle.structure, to_host(cycle.anchor)
+    s = cycle.structure
+    anchor = to_host(cycle.anchor)
     a = int(anchor.chart[0])
     at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
     whole = cycle.system.whole(at) if isinstance(cycle.system, Quotient) else None
@@ -299,7 +305,8 @@ def _sheet() -> tuple[Figure, Any]:
 
 def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
     """Units of the system's time in a second of playback, and a note if that is not real speed."""
-    pace, real = length / 2 * (speed or 1.0), length * SECONDS.get(unit, 0.0)
+    pace = length / 2 * (speed or 1.0)
+    real = length * SECONDS.get(unit, 0.0)
     if real and (speed is not None or 0.25 <= real <= 20):
         pace = (speed or 1.0) / SECONDS[unit]
     share = pace / length * real
@@ -308,20 +315,24 @@ def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
 
 def _picture(ax: Axes, track: Track) -> list[Part]:
     """The mechanism."""
-    pictures, at = Pictures(track.trajectory, track.period), track.wrapped(track.times)
-    scenes, size = pictures.at(at), float(max(*(pictures.high - pictures.low), 1e-9))
+    pictures = Pictures(track.trajectory, track.period)
+    at = track.wrapped(track.times)
+    scenes = pictures.at(at)
+    size = float(max(*(pictures.high - pictures.low), 1e-9))
     ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
     ax.autoscale_view()
     ax.set(
         xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title
     )
     ax.spines[:].set_visible(False)
-    (dots,), nowhere = ax.plot([], [], "ko", ms=2.5, zorder=5), np.full(3, np.nan)
+    (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
+    nowhere = np.full(3, np.nan)
     points = [np.stack([nowhere[:2], *x.points.values()]).T for x in scenes]
     parts: list[Part] = [(dots, dots.set_data, points)]
     colors = itertools.cycle(CYCLE[: 3 if len(scenes[0].lines) <= 4 else 1])
     for name in dict.fromkeys(name for x in scenes for name in x.lines):
-        lines, look = [x.lines.get(name, nowhere[None, :2]) for x in scenes], _GROUND
+        lines = [x.lines.get(name, nowhere[None, :2]) for x in scenes]
+        look = _GROUND
         if name == "ground":
             lines = [to_borders(line, size) for line in lines]
             (marks,) = ax.plot(
@@ -348,7 +359,8 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
 
 def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
     """A line with its ends beyond the borders of a picture of this size."""
-    first, last = line[0] - line[1], line[-1] - line[-2]
+    first = line[0] - line[1]
+    last = line[-1] - line[-2]
     ends = [
         x + 5 * size * way / np.hypot(*way)
         for x, way in ((line[0], first), (line[-1], last))
@@ -373,10 +385,8 @@ def _traces(
     axes: list[Axes], tracks: list[Track], names: Sequence[str], events
 ) -> list[Part]:
     """Signals over time, where they are now, and the names of events."""
-    times, unit = (
-        tracks[0].times - tracks[0].times[0],
-        tracks[0].trajectory.system.time_unit,
-    )
+    times = tracks[0].times - tracks[0].times[0]
+    unit = tracks[0].trajectory.system.time_unit
     fine = np.linspace(0, 2 * times[-1] - times[-2], 2000, endpoint=False)
     for track in tracks:
         for ax, values in zip(
@@ -403,7 +413,8 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
     """Dots that move along the orbit, rings at events, and the section that was passed last."""
     ax.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
     ax.locator_params(nbins=5)
-    marks, ring = list[tuple](), {"mfc": "none", "mew": 1.5, "zorder": 7}
+    marks = list[tuple]()
+    ring = {"mfc": "none", "mew": 1.5, "zorder": 7}
     for track, names in zip(tracks, events, strict=True):
         if np.isinf(track.period) and len(tracks) == 1:
             for line in by_chart(track.trajectory, *plane).values():
@@ -481,7 +492,8 @@ def widened(ax: Axes) -> bool:
 def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) -> Motion:
     """At most 100 cycles of a branch, one after the other."""
     rows = np.unique(np.linspace(0, len(branch) - 1, 100).round().astype(int))
-    cycles, values = [branch[int(k)] for k in rows], branch.values[rows]
+    cycles = [branch[int(k)] for k in rows]
+    values = branch.values[rows]
     plane = plane_of(cycles[0].structure, x, y)
     with style():
         figure, grid = _sheet()

@@ -149,7 +149,8 @@ def at_events(
     path: Trajectory, *names: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transitions (e,) of the events, and the points (e, n) before and after each."""
-    rows, s = np.flatnonzero(path.event >= 0), path.structure
+    rows = np.flatnonzero(path.event >= 0)
+    s = path.structure
     before = observed(s, names, path.t[rows], path.chart[rows - 1], path.before[rows]).T
     after = observed(s, names, path.t[rows], path.chart[rows], path.after[rows]).T
     return path.event[rows], before, after
@@ -194,7 +195,8 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     inwards = np.arctan2(*(to - at)[::-1])
 
     def covered(turn: float) -> int:
-        x, y = np.cos(inwards + turn), np.sin(inwards + turn)
+        x = np.cos(inwards + turn)
+        y = np.sin(inwards + turn)
         note.set(
             position=(9 * x, 9 * y),
             ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
@@ -215,7 +217,8 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
     figure: Any = ax.get_figure(root=True)
     width, height = ax.get_position().size * figure.get_size_inches()
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
-    bars, step = [], max(1, round(placed.n_sections / 8))
+    bars = []
+    step = max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
         bars += [point - _BAR * along, point + _BAR * along, (np.nan, np.nan)]
         if i % step == 0:  # at the end of the bar that is outside of the loop
@@ -229,7 +232,8 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
 def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tuple]:
     """Yield the point of the cycle at each section, and a step of length 1 on the page along the
     section, in the units of the axes."""
-    lanes, normals = placed.lanes, np.asarray(placed.normal)
+    lanes = placed.lanes
+    normals = np.asarray(placed.normal)
     charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
     points, rates = np.empty((2, len(charts), 2))
     items = tuple(s.resolve_outputs(names).items)

@@ -28,10 +28,8 @@ class Pictures:
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
         place = np.array([drawing.place for drawing in drawings])
-        self._t, self._velocity = (
-            t,
-            np.array([drawing.velocity for drawing in drawings]),
-        )
+        self._t = t
+        self._velocity = np.array([drawing.velocity for drawing in drawings])
         # Over an event the body stays; between events the origin moves by its velocity.
         moves = 0.5 * (self._velocity[1:] + self._velocity[:-1]) * np.diff(t)[:, None]
         moves = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], moves)
@@ -50,7 +48,8 @@ class Pictures:
             ]
             places += x.points.values()
         corners = np.vstack(places)
-        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
+        self.low = corners.min(axis=0)
+        self.high = corners.max(axis=0)
 
     def at(self, t: Float[np.ndarray, " n"]) -> list[Drawing]:
         """The pictures at times of the trajectory."""
@@ -101,7 +100,10 @@ def drawing_of(s: Structure, a: int) -> Any:
     """
     point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
     with evaluating(f"method `draw(self, chart, t, q)` of {type(s.system).__name__}"):
-        shapes = lambda: jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)  # noqa: E731
+
+        def shapes():
+            return jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)
+
         return s.once(("drawing", a), (), shapes)
 
 

@@ -57,7 +57,8 @@ def multipliers(
     cross: dict[str, Any] = {"marker": "+", "ms": 9, "mew": 1.2, "color": "black"}
     drawn = [(reference, reference, true, cross)]
     for k, (label, z) in enumerate(series.items()):
-        marker, color = _MARKERS[k % len(_MARKERS)], CYCLE[k % len(CYCLE)]
+        marker = _MARKERS[k % len(_MARKERS)]
+        color = CYCLE[k % len(CYCLE)]
         text = rf"{label}: $|\Delta\lambda|$ = {compare_multipliers(z, true).max_error:.1e}"
         line = {"marker": marker, "ms": 5, "mew": 1.0, "color": color, "mfc": "none"}
         drawn.append((label, text, z, line))
@@ -67,17 +68,17 @@ def multipliers(
         far = 1.1 * max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
         panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
         panel.locator_params(nbins=5)
-        inset = (
-            _zoom(panel, true, series, borders)
-            if zoom and (series or borders)
-            else None
-        )
+        if zoom and (series or borders):
+            inset = _zoom(panel, true, series, borders)
+        else:
+            inset = None
         for box in filter(None, (panel, inset)):
             for label, text, z, line in drawn:
                 box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
                 for border in borders.get(label, ()):
                     # Of a real multiplier it is an interval, whose ends would not be seen.
-                    x, y = np.real(border), np.imag(border)
+                    x = np.real(border)
+                    y = np.imag(border)
                     ends = [] if np.ptp(y) else [int(x.argmin()), int(x.argmax())]
                     edge = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
                     box.plot(x, y, color=line["color"], **edge)
@@ -105,7 +106,8 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
         raise DefinitionError(
             "`fits` must hold one or more fits with the same outputs and N."
         )
-    outputs, N = (first := next(iter(fits.values()))).outputs, first.n_sections
+    outputs = (first := next(iter(fits.values()))).outputs
+    N = first.n_sections
     width = COLUMN if len(outputs) == 1 else PAGE
     with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
         for i, output in enumerate(outputs):
@@ -121,7 +123,8 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
                         "mew": 1.0,
                     }
                     line["color"] = CYCLE[k % len(CYCLE)]
-                    p, z = fit.poles[i], fit.zeros[i]
+                    p = fit.poles[i]
+                    z = fit.zeros[i]
                     panel.plot(
                         p.real, p.imag, marker="x", label=f"poles, {family}", **line
                     )
@@ -133,7 +136,8 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             reach = 1.5 * np.abs(poles - center).max() or 1.0
             lower.set(xlim=(center - reach, center + reach), ylim=(-reach, reach))
             upper.set_aspect("equal", adjustable="datalim")
-            (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
+            (x0, x1) = lower.get_xlim()
+            (y0, y1) = lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
             upper.set_title(output)
             lower.set_title("enlarged: around the poles")
@@ -185,7 +189,8 @@ def _zoom(
         min(np.abs(x - leading).max() for x in region) for region in borders.values()
     ]
     reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
-    side, far = 0.36, ax.get_xlim()[1]
+    side = 0.36
+    far = ax.get_xlim()[1]
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
     places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
     room = (

@@ -125,7 +125,8 @@ class Draws:
         drawn = [
             lost if isinstance(values, ComputationError) else values for values in drawn
         ]
-        if other := {name for values in drawn for name in values.keys() ^ lost.keys()}:
+        other = {name for values in drawn for name in values.keys() ^ lost.keys()}
+        if other:
             raise DefinitionError(
                 f"`function` must always give the same names: `{min(other)}` is in some draws only."
             )

@@ -128,7 +128,8 @@ class Family:
     def __init__(
         self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]
     ):
-        self.model, self.names = model, tuple(names)
+        self.model = model
+        self.names = tuple(names)
         allowed, required = _parameters(model)
         if allowed is not None:
             require_among("parameter", self.names, allowed, "`model`: ")

@@ -42,7 +42,8 @@ class Wanted:
                 )
         # (Words only: workers get a copy.)
         s = Structure(system)
-        self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
+        self._charts = tuple(s.names)
+        self._time_unit = str(system.time_unit or "")
         self._states = [tuple(s.states(a)) for a in range(len(s.charts))]
         self._all_states = list(
             dict.fromkeys(x for names in self._states for x in names)
@@ -92,10 +93,8 @@ class Wanted:
     def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
         """Return the quantities with a name."""
         ok = cycles.ok
-        q, chart = (
-            np.asarray(cycles.anchor.q)[..., 0],
-            np.asarray(cycles.anchor.chart)[:, 0],
-        )
+        q = np.asarray(cycles.anchor.q)[..., 0]
+        chart = np.asarray(cycles.anchor.chart)[:, 0]
         state = np.full((len(ok), len(self._all_states)), np.nan)
         for a, names in enumerate(self._states):
             rows = np.flatnonzero(ok & (chart == a))

@@ -104,6 +104,8 @@ class DerivedChart(Chart):
     """A chart made of another one, of which it has all that it does not define anew."""
 
     chart: Chart
-    states, units = attribute_of("chart", "states"), attribute_of("chart", "units")
-    inputs, absent = attribute_of("chart", "inputs"), attribute_of("chart", "absent")
+    states = attribute_of("chart", "states")
+    units = attribute_of("chart", "units")
+    inputs = attribute_of("chart", "inputs")
+    absent = attribute_of("chart", "absent")
     solver = attribute_of("chart", "solver")

@@ -116,7 +116,8 @@ def _are_all(items: Any, type_: type) -> bool:
 
 
 def _check_chart(s: Structure, a: int) -> Iterator[str]:
-    name, chart = s.names[a], s.charts[a]
+    name = s.names[a]
+    chart = s.charts[a]
     of = f"chart '{name}'"
     inputs = chart.inputs or ()
     _check_names(of, "inputs", inputs)

@@ -101,7 +101,8 @@ class Drawing(eqx.Module):
 
         **Raises:** `DefinitionError` for ends that are no points of the plane.
         """
-        a, b = _array("start", start, (2,)), _array("end", end, (2,))
+        a = _array("start", start, (2,))
+        b = _array("end", end, (2,))
         width = _array("width", width, ())
         along = b - a
         length = jnp.sqrt(

@@ -81,14 +81,19 @@ class Quotient(Derived):
         translation: SignalNames = (),
         half_period: str | Callable | bool = False,
     ):
-        swap, relabel = dict(swap or {}), dict(relabel or {})
+        swap = dict(swap or {})
+        relabel = dict(relabel or {})
         if half_period:  # every chart is kept, and has an image
             swap |= {b: a for a, b in swap.items()}
             swap = {name: swap.get(name, name) for name in (*system.charts(), *swap)}
         partners = {b: a for a, b in relabel.items()} | relabel
-        self.system, self.solver, self.half_period = system, system.solver, half_period
-        self.pairs, self.names = tuple(swap.items()), tuple(partners.items())
-        self.flipped, self.translation = tuple(flipped), tuple(translation)
+        self.system = system
+        self.solver = system.solver
+        self.half_period = half_period
+        self.pairs = tuple(swap.items())
+        self.names = tuple(partners.items())
+        self.flipped = tuple(flipped)
+        self.translation = tuple(translation)
 
     @property
     def swap(self) -> dict[str, str]:
@@ -155,31 +160,43 @@ class Quotient(Derived):
         self, x: Transition, images: Mapping[str, str], clock: float
     ) -> Transition:
         """A transition, with the state in the image of its target; the clock is multiplied."""
-        chart, guard, direction = self._reduced(x.source), x.guard, x.direction
+        chart = self._reduced(x.source)
+        guard = x.guard
+        direction = x.direction
         target, landed = self._landing(x, images)
         if isinstance(guard, Scheduled) and chart.clocked:
-            guard, direction = _phase_of(guard), "rising"
+            guard = _phase_of(guard)
+            direction = "rising"
         guard = guard if isinstance(guard, Scheduled) else chart.lifted(guard)
         enabled = None if x.enabled is None else chart.lifted(x.enabled)
-        at, n = chart.lifted(landed), len(chart.kept)
-        reset = lambda *point: jnp.append(at(*point), clock * point[1][n:])  # noqa: E731
+        at = chart.lifted(landed)
+        n = len(chart.kept)
+
+        def reset(*point):
+            return jnp.append(at(*point), clock * point[1][n:])
+
         return Transition(x.name, x.source, target, guard, direction, reset, enabled)
 
     def _halves(self):
         """The ends of half a period, as transitions of the original system."""
-        rises, period, charts = (
-            self.half_period,
-            self.system.period(),
-            self.system.charts(),
-        )
+        rises = self.half_period
+        period = self.system.period()
+        charts = self.system.charts()
         for name in self.swap if rises else ():
             if period is not None:
-                guard = lambda t, q, u: t - period / 2  # noqa: E731
+
+                def guard(t, q, u):
+                    return t - period / 2
             elif callable(rises):
-                guard = lambda t, q, u: rises(t, q)  # noqa: E731
+
+                def guard(t, q, u):
+                    return rises(t, q)
             else:
                 place = charts[name].states.index(rises)
-                guard = lambda t, q, u, k=place: q[k]  # noqa: E731
+
+                def guard(t, q, u, k=place):
+                    return q[k]
+
             title = "half period" + f" ({name})" * (len(self.pairs) > 1)
             yield Transition(title, name, name, guard, "rising")
 
@@ -187,20 +204,23 @@ class Quotient(Derived):
         guess = self.system.guess()
         if guess is None or guess.chart not in self.charts():
             return None
-        chart, period = self.charts()[guess.chart], self.system.period()
-        state, time = chart.less(guess.state), guess.time
+        chart = self.charts()[guess.chart]
+        period = self.system.period()
+        state = chart.less(guess.state)
+        time = guess.time
         if chart.clocked and period is not None:
-            state, time = jnp.append(state, jnp.asarray(time) % (period / 2)), 0.0
+            state = jnp.append(state, jnp.asarray(time) % (period / 2))
+            time = 0.0
         return Guess(guess.chart, state, time, after=guess.after)
 
     def outputs(self):
-        charts, outputs = self.charts(), []
+        charts = self.charts()
+        outputs = []
         for x in self.system.outputs():
-            functions = (
-                dict.fromkeys(charts, x.function)
-                if callable(x.function)
-                else x.function
-            )
+            if callable(x.function):
+                functions = dict.fromkeys(charts, x.function)
+            else:
+                functions = x.function
             kept = {
                 name: charts[name].lifted(f)
                 for name, f in functions.items()
@@ -211,7 +231,8 @@ class Quotient(Derived):
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """The picture of the original system, which stands at the translation 0 and moves."""
-        whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
+        whole = self.system.charts()[chart]
+        still = dict.fromkeys(self.translation, 0.0)
         state = jnp.stack(
             [jnp.asarray((still | dict(q))[x], float) for x in whole.states]
         )
@@ -268,19 +289,26 @@ class Quotient(Derived):
         the chart is among the `images`; transitions in the order of their list, or `back`; under a
         translation by `shift`, outputs, too."""
         kept = images.get(name, name)
-        chart, mirrored = (
-            self._reduced(kept),
-            self._mirrored if name in images else _same,
-        )
-        n, moves = len(chart.kept), np.isin(chart.chart.states, self.translation)
+        chart = self._reduced(kept)
+        mirrored = self._mirrored if name in images else _same
+        n = len(chart.kept)
+        moves = np.isin(chart.chart.states, self.translation)
         size = sizes[kept][:n]
-        state = lambda q: mirrored(kept, chart.full(size * q[:n], shift or 0.0))  # noqa: E731
+
+        def state(q):
+            return mirrored(kept, chart.full(size * q[:n], shift or 0.0))
+
         field, used = (
             getattr(self.system.charts()[name], x) for x in ("field", "inputs")
         )
         used = slice(None if used is None else len(used))
-        at = lambda f: lambda t, q, u: f(t + later, state(q), u[used])  # noqa: E731
-        rates = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
+
+        def at(f):
+            return lambda t, q, u: f(t + later, state(q), u[used])
+
+        def rates(*point):
+            return mirrored(kept, as_vector(field(*point)), back=True)
+
         yield (
             f"field of chart '{name}'",
             at(lambda *point: chart.less(rates(*point)) / size),
@@ -288,7 +316,8 @@ class Quotient(Derived):
         yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
         for x in list(self.system.transitions())[:: -1 if back else 1]:
             if x.source == name:
-                (target, reset), guard = self._landing(x, images), x.guard
+                (target, reset) = self._landing(x, images)
+                guard = x.guard
                 if isinstance(guard, Scheduled):
                     guard = _phase_of(guard)
                 into = sizes[target][: len(self._reduced(target).kept)]
@@ -336,7 +365,8 @@ class Quotient(Derived):
         """The mirror image of a state of a chart that is kept, or with `back`, of a state of its
         image."""
         charts = self.system.charts()
-        source, target = charts[kept].states, charts[self.swap[kept]].states
+        source = charts[kept].states
+        target = charts[self.swap[kept]].states
         if back:
             source, target = target, source
         order = [source.index(self._partner(name)) for name in target]
@@ -362,7 +392,8 @@ def check_symmetry(
     sizes = sizes or {
         name: np.ones(len(x.states)) for name, x in system.charts().items()
     }
-    clock, rng = system.system.period(), np.random.default_rng(0)
+    clock = system.system.period()
+    rng = np.random.default_rng(0)
     q = rng.normal(size=(3, max(map(len, sizes.values()))))
     t = rng.normal(size=3) * (1.0 if clock is None else clock)
     values = _sides(system, sizes, q, t, along)
@@ -380,12 +411,13 @@ def check_symmetry(
 def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list[tuple]:
     """Both sides of all claims of a symmetry, or with `along` their derivatives by a parameter."""
     if along:
-        at = lambda x: _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)  # noqa: E731
+
+        def at(x):
+            return _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)
+
         return jax.jvp(at, (parameter_of(quotient, along),), (1.0,))[1]
-    u, claims = (
-        jnp.zeros(len(quotient.inputs)),
-        [x for _, *x in quotient._claims(sizes)],
-    )
+    u = jnp.zeros(len(quotient.inputs))
+    claims = [x for _, *x in quotient._claims(sizes)]
     return jax.vmap(
         lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims]
     )(q, t)

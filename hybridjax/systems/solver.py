@@ -89,11 +89,9 @@ def solvers(
     for solver in given.values() if isinstance(given, Mapping) else (given,):
         if not isinstance(solver, Method | eqx.Module | ByChart | None):
             raise _no_solver(solver)
-    return (
-        ByChart(tuple(given), tuple(given.values()))
-        if isinstance(given, Mapping)
-        else given
-    )
+    if isinstance(given, Mapping):
+        return ByChart(tuple(given), tuple(given.values()))
+    return given
 
 
 def as_method(solver: Any) -> Method:

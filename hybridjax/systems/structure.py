@@ -118,9 +118,9 @@ def _form_of_leaf(leaf: Any) -> Hashable:
 def as_vector(value: Any) -> jax.Array:
     """Numbers returned by a user's function, as one floating-point vector."""
     if isinstance(value, tuple | list):
-        return (
-            jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
-        )
+        if value:
+            return jnp.stack([jnp.asarray(v, float) for v in value])
+        return jnp.zeros(0)
     return jnp.asarray(value, float)
 
 
@@ -213,7 +213,9 @@ class Structure:
 
     @ft.cached_property
     def inputs(self) -> tuple[Signal, ...]:
-        named = lambda: signals(self.system.inputs, self.system.input_units)  # noqa: E731
+        def named():
+            return signals(self.system.inputs, self.system.input_units)
+
         return self._once_in_call("inputs", named)
 
     def inputs_among(
@@ -245,7 +247,10 @@ class Structure:
 
         def make():
             if isinstance(self.source, PerLane):
-                of_source = lambda source, *x: function(Structure(source), *x)  # noqa: E731
+
+                def of_source(source, *x):
+                    return function(Structure(source), *x)
+
                 return by_lane(of_source, self.source, *trees, by_row=by_row)
             return by_lane(lambda *x: function(self, *x), *trees, by_row=by_row)
 
@@ -312,7 +317,8 @@ class Structure:
         """g_a(û): the inputs that chart a uses."""
         if isinstance(self.system, Driven):
             u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
-        if (names := self.charts[a].inputs) is None:
+        names = self.charts[a].inputs
+        if names is None:
             return u
         return u[np.array([self.inputs.index(n) for n in names], int)]
 
@@ -344,11 +350,10 @@ class Structure:
             x = Member(kind, place)
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
-        real, array = jnp.result_type(float), jax.ShapeDtypeStruct
-        place, single = (
-            array((), jnp.result_type(int)),
-            Structure(one_lane(self.source)),
-        )
+        real = jnp.result_type(float)
+        array = jax.ShapeDtypeStruct
+        place = array((), jnp.result_type(int))
+        single = Structure(one_lane(self.source))
         point = array((), real), array((n,), real), array((single.nu,), real)
         try:
             program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
@@ -363,7 +368,10 @@ class Structure:
 
     def guard_kinds(self, a: int) -> tuple[Kind, ...]:
         """Kinds of the state-dependent transitions out of chart a."""
-        leaves = lambda kind: self._leaves(kind[0], a, by_clock=False)  # noqa: E731
+
+        def leaves(kind):
+            return self._leaves(kind[0], a, by_clock=False)
+
         return self.once(("guards", a), (), lambda: tuple(filter(leaves, self.kinds)))
 
     def guards(self, a: int) -> list[int]:
@@ -388,7 +396,8 @@ class Structure:
         return _all_clocks.recall(self.source, None, self._clocks)
 
     def _clocks(self) -> Int[np.ndarray, " G"]:
-        numbers, formulas = np.full(len(self.transitions), -1), []
+        numbers = np.full(len(self.transitions), -1)
+        formulas = []
         for g, transition in enumerate(self.transitions):
             if isinstance(transition.guard, Scheduled):
                 formula = self._formula(g)
@@ -432,9 +441,8 @@ class Structure:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
         assert not isinstance(tr.guard, Scheduled)
-        if (
-            value := jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
-        ).dtype == bool:
+        value = jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
+        if (value).dtype == bool:
             raise DefinitionError(
                 f"the guard of '{tr.name}' must be `a - b`, not `a > b`."
             )
@@ -447,7 +455,10 @@ class Structure:
         the only one of its kind."""
         if all(len(kind) == 1 for kind in kinds):
             return [self.guard(g, t, q, u) for (g,) in kinds]
-        every = lambda kind: jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))  # noqa: E731
+
+        def every(kind):
+            return jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))
+
         return [every(kind)(np.arange(len(kind))) for kind in kinds]
 
     def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:

@@ -98,7 +98,10 @@ def arrays_of(system: "HybridSystem") -> dict[str, Array]:
 
 def copies_of(system: "HybridSystem") -> dict[str, Array]:
     """Copies of `arrays_of`. (A buffer that a tree holds twice cannot be donated.)"""
-    copied = lambda x: x if is_tracer(x) else jax.device_put(np.array(x))  # noqa: E731
+
+    def copied(x):
+        return x if is_tracer(x) else jax.device_put(np.array(x))
+
     return {name: copied(x) for name, x in arrays_of(system).items()}
 
 
@@ -150,7 +153,8 @@ def require_positive(system: "HybridSystem") -> None:
             continue
         wrong = np.asarray(value)[~(np.asarray(value) > 0)]
         if wrong.size:
-            name, unit = type(system).__name__, field.metadata.get("unit", "")
+            name = type(system).__name__
+            unit = field.metadata.get("unit", "")
             raise DefinitionError(
                 f"parameter `{field.name}` of {name} is {wrong.flat[0]:g} {unit}".rstrip()
                 + ": it must be positive."
@@ -173,12 +177,10 @@ class Guess(eqx.Module):
     def __init__(
         self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None
     ):
-        self.chart, self.state, self.time, self.after = (
-            chart,
-            real(state),
-            real(time),
-            after,
-        )
+        self.chart = chart
+        self.state = real(state)
+        self.time = real(time)
+        self.after = after
 
     __repr__ = fields
 
@@ -312,10 +314,8 @@ class Derived(HybridSystem):
 
     system: HybridSystem
 
-    inputs, time_unit = (
-        attribute_of("system", "inputs"),
-        attribute_of("system", "time_unit"),
-    )
+    inputs = attribute_of("system", "inputs")
+    time_unit = attribute_of("system", "time_unit")
     input_units = attribute_of("system", "input_units")
 
     def charts(self):

@@ -49,7 +49,8 @@ class Scheduled(eqx.Module):
                 raise DefinitionError(
                     f"Scheduled: `{name}` must be one number, not of shape {given.shape}."
                 )
-        self.period, self.offset = real(period), real(offset)
+        self.period = real(period)
+        self.offset = real(offset)
 
     __repr__ = fields
 

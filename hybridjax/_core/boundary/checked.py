@@ -69,11 +69,10 @@ def checked_methods(cls: Class) -> Class:
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
-        function = (
-            member.__func__
-            if isinstance(member, classmethod | staticmethod)
-            else member
-        )
+        if isinstance(member, classmethod | staticmethod):
+            function = member.__func__
+        else:
+            function = member
         if not inspect.isfunction(function) or getattr(
             function, "__isabstractmethod__", False
         ):
@@ -142,10 +141,8 @@ class _Kinds:
     @functools.cached_property
     def by_name(self) -> dict[str, Kind | None]:
         """Kinds of all parameters that can be given by name."""
-        hints, parameters = (
-            self.hints(),
-            inspect.signature(self.function).parameters.values(),
-        )
+        hints = self.hints()
+        parameters = inspect.signature(self.function).parameters.values()
         named = (p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
         return {name: kind_of(hints.get(name, Any)) for name in named}
 
@@ -167,7 +164,8 @@ class _Kinds:
         **Raises:** `Misfit` for the first that does not fit.
         """
         positional, further = self.in_order
-        taken, name = [], ""
+        taken = []
+        name = ""
         try:
             for k, value in enumerate(args):
                 name, kind = positional[k] if k < len(positional) else further

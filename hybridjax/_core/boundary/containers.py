@@ -66,9 +66,10 @@ class Items(Kind):
         self, item: Kind | None, *, form: type | None = None, iterable: bool = False
     ):
         self.item, self.form, self.iterable = item, form, iterable
-        self.allowed = (
-            "a sequence" if item is None else f"a sequence (each item {item.allowed})"
-        )
+        if item is None:
+            self.allowed = "a sequence"
+        else:
+            self.allowed = f"a sequence (each item {item.allowed})"
 
     def take(self, value):
         if isinstance(value, str | bytes | Mapping):
@@ -85,11 +86,9 @@ class Items(Kind):
         if self.item is not None:
             form = list if isinstance(value, list) else tuple
             value = form(_taken(self.item, i, x) for i, x in enumerate(value))
-        return (
-            value
-            if self.form is None or isinstance(value, self.form)
-            else self.form(value)
-        )
+        if self.form is None or isinstance(value, self.form):
+            return value
+        return self.form(value)
 
 
 class Tuple(Kind):
@@ -177,7 +176,8 @@ class Stream(Kind):
     is checked when it comes, and named as `argument`."""
 
     def __init__(self, cls: type, argument: str):
-        self.item, self.argument = Instance(cls), argument
+        self.item = Instance(cls)
+        self.argument = argument
         self.allowed = f"an iterable of items, each {self.item.allowed}"
 
     def take(self, value):

@@ -93,7 +93,8 @@ def kind_of(hint: Any) -> Kind | None:
         return None
     if hint in _PLAIN:
         return _PLAIN[hint]
-    origin, arguments = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    arguments = get_args(hint)
     if origin is Annotated:
         declared = [x for x in hint.__metadata__ if isinstance(x, Kind)]
         return declared[-1] if declared else kind_of(arguments[0])

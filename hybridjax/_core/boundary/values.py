@@ -72,9 +72,9 @@ def show(value: Any) -> str:
         return f"the class {value.__name__} itself"
     if isinstance(value, list | tuple | set | frozenset | dict) and len(value) < 100:
         text = repr(value)
-        return (
-            text if len(text) <= _SHOWN else f"a {type(value).__name__} of {len(value)}"
-        )
+        if len(text) <= _SHOWN:
+            return text
+        return f"a {type(value).__name__} of {len(value)}"
     if callable(value) and hasattr(value, "__name__"):
         return f"the function {value.__name__}"
     return with_article(type(value).__name__)
@@ -228,11 +228,9 @@ def _is_path(value: Any) -> bool:
 def _plain(value: Any, allowed: str) -> Any:
     """A number of Python for an array without axes."""
     refuse_traced(value, allowed)
-    return (
-        value.item()
-        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0
-        else value
-    )
+    if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
+        return value.item()
+    return value
 
 
 def unmasked(values: Any) -> np.ndarray:
@@ -281,10 +279,12 @@ class Reals(Kind):
         infinite: bool = False,
         form: Callable[[Any], Any] | None = None,
     ):
-        self.shape, self.sign = tuple(shape.split()), sign
+        self.shape = tuple(shape.split())
+        self.sign = sign
         self.missing, self.infinite, self.form = missing, infinite, form
         if sign != "any":
-            self.single, self.items = f"a {sign} number", f"{sign} numbers"
+            self.single = f"a {sign} number"
+            self.items = f"{sign} numbers"
         self.allowed = self.single if self.shape == () else f"an array of {self.items}"
         if self.shape not in ((), ("...",)):
             self.allowed += f" with shape {self._written()}"

@@ -26,7 +26,8 @@ def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
             inside = f"{name}.{key}" if name else key
             if key not in mine or key not in theirs:
                 return f"`{inside}` is {'only there' if key in theirs else 'not there'}"
-            if (change := difference(mine[key], theirs[key], inside)) is not None:
+            change = difference(mine[key], theirs[key], inside)
+            if change is not None:
                 return change
         return None
     if mine == theirs:

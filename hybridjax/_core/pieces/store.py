@@ -120,7 +120,8 @@ class ArrayStore:
     address = None
 
     def __init__(self, layout: Layout):
-        self.layout, arrays = layout, layout.variables.items()
+        self.layout = layout
+        arrays = layout.variables.items()
         self._arrays = {
             k: np.full(layout.array(k)[1], x.fill, x.dtype) for k, x in arrays
         }
@@ -136,7 +137,8 @@ class ArrayStore:
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`."""
-        of, arrays = self.layout, self._arrays.items()
+        of = self.layout
+        arrays = self._arrays.items()
         data = {k: (of.array(k)[0], x, of.variables[k].attributes) for k, x in arrays}
         data = package("xarray").Dataset({**of.constants, **data})
         return data.set_coords(of.coordinates).assign_attrs(
@@ -164,7 +166,8 @@ class ZarrStore:
                 name: self._group[name].with_config({"write_empty_chunks": True})
                 for name in about["variables"]
             }
-            first, p = next(iter(self._arrays.values())), len(about["dims"])
+            first = next(iter(self._arrays.values()))
+            p = len(about["dims"])
             arrays = {
                 name: Variable(
                     x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:]
@@ -179,7 +182,8 @@ class ZarrStore:
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]
             whole = [*start, *(self._group[name] for name in about["constants"])]
-            if lost := {_key(x) for x in whole if x.size} - self._present():
+            lost = {_key(x) for x in whole if x.size} - self._present()
+            if lost:
                 raise FileNotFoundError(f"{min(lost)} is missing")
             self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
@@ -198,7 +202,8 @@ class ZarrStore:
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
 
-        present, pieces = self._present(), range(len(self.layout.blocks))
+        present = self._present()
+        pieces = range(len(self.layout.blocks))
         return [k for k in pieces if not present.issuperset(self._chunks(k))]
 
     def _present(self) -> set[str]:
@@ -292,9 +297,8 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
             return None
         text = f"'{address}' is no store of results, or only begun ({error!r})"
         raise DefinitionError(f"{text}: choose another name, or delete it.") from error
-    if (
-        change := difference(json.loads(json.dumps(job.description)), theirs)
-    ) is not None:
+    change = difference(json.loads(json.dumps(job.description)), theirs)
+    if (change) is not None:
         raise DefinitionError(
             f"'{address}' holds other results: {change}. Choose another store."
         )
@@ -352,9 +356,10 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        if beside := [
+        beside = [
             x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])
-        ]:
+        ]
+        if beside:
             group.attrs["coordinates"] = " ".join(beside)
         about = {
             "description": layout.description,

@@ -37,7 +37,8 @@ def solve_positive(
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
-    lower, below = dict[tuple[int, int], Array](), dict[tuple[int, int], Array]()
+    lower = dict[tuple[int, int], Array]()
+    below = dict[tuple[int, int], Array]()
     pivots: list[Array] = []
     singular = jnp.asarray(False)
     for j in range(n):
@@ -136,9 +137,11 @@ def triangular_solve(
     """Return X in `op(matrix) @ X = right`, or in `X @ op(matrix) = right`:
     `jax.lax.linalg.triangular_solve` for real numbers."""
     if not left_side:  # the transpose of the first form
-        right, transpose_a = jnp.swapaxes(right, -1, -2), not transpose_a
+        right = jnp.swapaxes(right, -1, -2)
+        transpose_a = not transpose_a
     op = jnp.swapaxes(matrix, -1, -2) if transpose_a else matrix
-    downwards, n = lower != transpose_a, op.shape[-1]
+    downwards = lower != transpose_a
+    n = op.shape[-1]
     X: dict[int, Array] = {}
     for i in range(n) if downwards else reversed(range(n)):
         x = _less(right[..., i, :], [(op[..., i, k][..., None], X[k]) for k in X])
@@ -172,9 +175,11 @@ def lu(
         column = _column(X, k)
         p = jnp.argmax(jnp.where(index >= k, jnp.abs(column), -1.0), axis=-1)
         chosen = index == p[..., None]
-        X, order = traded(X, k, chosen), traded(order, k, chosen)
+        X = traded(X, k, chosen)
+        order = traded(order, k, chosen)
         pivots = jnp.where(index == k, p[..., None].astype(np.int32), pivots)
-        row, column = _row(X, k), _column(X, k)
+        row = _row(X, k)
+        column = _column(X, k)
         pivot = _row(column[..., None], k)
         share = jnp.where(index > k, column / jnp.where(pivot == 0, 1.0, pivot), 0.0)
         X = X - share[..., :, None] * jnp.where(index > k, row, 0.0)[..., None, :]
