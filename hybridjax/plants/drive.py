@@ -90,13 +90,9 @@ class Phase:
             c, sign, value = self.crossings[k % self.n]
             return sign * (z[c] - value)
         if self.axes:
-            (i, a, p), (j, b, q) = self.axes
-            angle = self.sense * (
-                math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first
-            )
-            self.turns = angle / (2 * math.pi) + round(
-                self.turns - angle / (2 * math.pi)
-            )
+            x, y = ((z[column] - center) / scale for column, center, scale in self.axes)
+            angle = self.sense * (math.atan2(y, x) - self.first) / (2 * math.pi)
+            self.turns = angle + round(self.turns - angle)
         else:
             self.turns = (t - self.first) / self.period
         return (self.start + k / self.n - self.turns) * self.period
@@ -190,41 +186,57 @@ class Drive:
         it. A crossing counts after a step that ends before it, so that none is counted twice."""
         phase = self.phase
         began = self.t
-        armed = not self.phase.crossings
-        clock = not phase.axes and armed
-        lands = self.sets and not self.fixed and not clock
-        last = (
-            self.last if self.last.z else At(self.t, self.z)
-        )  # (a step may cross two sections)
-        x = phase.level(k, last.t, last.z)
-        y = phase.level(k, self.t, self.z)
-        while y > 1e-9 * self.dt * clock or not armed:  # (rounding is no step)
+        armed = not phase.crossings
+        by_clock = armed and not phase.axes
+        lands = self.sets and not self.fixed and not by_clock
+        reached = 1e-9 * self.dt if by_clock else 0.0  # (rounding is no step)
+        # (A step may cross two sections.)
+        last = self.last if self.last.z else At(self.t, self.z)
+        before = phase.level(k, last.t, last.z)
+        level = phase.level(k, self.t, self.z)
+        while level > reached or not armed:
             if self.t - began > self.longest:
                 raise ComputationError(
                     f"a section was not reached within {self.longest:.4g}"
                 )
-            last = self.here() if lands or points is not None else At(self.t, self.z)
-            x = y
+            last = At(self.t, self.z)
+            before = level
+            if lands or points is not None:
+                last = self.here()
             if points is not None:
                 points.append(last)
-            self.step(u, min(y, self.dt) if clock and not self.fixed else self.dt)
-            y = phase.level(k, self.t, self.z)
-            armed = armed or y > 0
-        if lands and y < 0 < x:
-            from scipy import optimize
-
-            def level(h: float) -> float:
-                self.restore(last)
-                if h > 0:
-                    self.step(u, h)
-                return phase.level(k, self.t, self.z)
-
-            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-11 * self.dt))  # type: ignore
-            return At(self.t, self.z)
+            duration = self.dt
+            if by_clock and not self.fixed:
+                duration = min(level, self.dt)
+            self.step(u, duration)
+            level = phase.level(k, self.t, self.z)
+            armed = armed or level > 0
+        if lands and level < 0 < before:
+            return self._landed(u, k, last)
         self.last = last
-        share = x / (x - y) if x > y else 1.0
+        return self._interpolated(last, before, level)
+
+    def _landed(self, u: Sequence[float], k: int, last: At) -> At:
+        """Repeat the step after `last` with the length at which it ends on section k."""
+        from scipy import optimize
+
+        def level(h: float) -> float:
+            self.restore(last)
+            if h > 0:
+                self.step(u, h)
+            return self.phase.level(k, self.t, self.z)
+
+        longest = self.t - last.t
+        h: Any = optimize.brentq(level, 0.0, longest, xtol=1e-11 * self.dt)
+        level(h)
+        return At(self.t, self.z)
+
+    def _interpolated(self, last: At, before: float, level: float) -> At:
+        """Where the line between the last two points meets the section, by their levels."""
+        share = before / (before - level) if before > level else 1.0
         at = last.t + share * (self.t - last.t)
-        values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
+        ends = zip(last.z, self.z, strict=True)
+        values = tuple(begin + share * (end - begin) for begin, end in ends)
         return At(at, values, self.t - at)
 
     def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
@@ -240,10 +252,14 @@ class Drive:
             for k, held in enumerate(u[:-1], 1):
                 rows.append(self.advance(held, k))
         except Exception as error:
-            told = isinstance(error, ComputationError)
-            kind = "" if told else f"the plant raised {type(error).__name__}: "
-            ended = f"{kind}{error} (t = {self.t:.6g})"
-        return [[*(float(x.z[c]) for c in self.columns), x.late] for x in rows], ended
+            ended = f"{error} (t = {self.t:.6g})"
+            if not isinstance(error, ComputationError):
+                ended = f"the plant raised {type(error).__name__}: {ended}"
+        values = []
+        for x in rows:
+            outputs = [float(x.z[c]) for c in self.columns]
+            values.append([*outputs, x.late])
+        return values, ended
 
     def begun(self, seed: int) -> Sequence[float]:
         """Return the signals after the first steps."""
@@ -300,17 +316,18 @@ def run_all(
         except (EOFError, pickle.UnpicklingError, OSError):
             local.worker = None
             code = worker.wait()
-            waits = timer.is_alive()
-            ended = (
+            cause = (
                 f"the process ended with code {code} (its error is on standard error)"
             )
-            return [], ended if waits else f"no answer within the limit of {limit:g} s"
+            if not timer.is_alive():
+                cause = f"no answer within the limit of {limit:g} s"
+            return [], cause
         finally:
             timer.cancel()
         if isinstance(answer, str):
-            text = "define it in a module that can be imported, or use `processes=0`"
             raise DefinitionError(
-                f"another process cannot make the plant ({answer}): {text}."
+                f"another process cannot make the plant ({answer}): define it in a module that can "
+                "be imported, or use `processes=0`."
             )
         return answer
 
@@ -330,22 +347,18 @@ def resume(
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
     """
+    table = "create table if not exists trials (about, s, trial, unique (about, s))"
+    rows = "select s, trial from trials where about = ?"
     try:
-        with contextlib.closing(
-            sqlite3.connect(file or ":memory:", isolation_level=None)
-        ) as base:
-            base.execute(
-                "create table if not exists trials (about, s, trial, unique (about, s))"
-            )
-            kept = dict(
-                base.execute("select s, trial from trials where about = ?", [about])
-            )
+        base = sqlite3.connect(file or ":memory:", isolation_level=None)
+        with contextlib.closing(base):
+            base.execute(table)
+            kept = dict(base.execute(rows, [about]))
             missing = [s for s in range(count) if s not in kept]
             for s, trial in zip(missing, run(missing), strict=True):
                 kept[s] = json.dumps(trial)
-                base.execute(
-                    "replace into trials values (?, ?, ?)", (about, s, kept[s])
-                )
+                row = about, s, kept[s]
+                base.execute("replace into trials values (?, ?, ?)", row)
     except sqlite3.Error as error:
         raise DefinitionError(
             f"'{file}' is no store of experiments ({error})."
@@ -384,7 +397,6 @@ def _pack(drive: Drive) -> bytes:
                     packer.register_pickle_by_value(module)  # type: ignore
         return packer.dumps(drive)
     except Exception as error:
-        text = "give it `__getstate__`, or use `processes=0`"
         raise DefinitionError(
-            f"the plant cannot be pickled ({error}): {text}."
+            f"the plant cannot be pickled ({error}): give it `__getstate__`, or use `processes=0`."
         ) from error
