@@ -21,13 +21,14 @@ class Either(Kind):
         self.allowed = listed(list(dict.fromkeys(kind.allowed for kind in kinds)))
 
     def take(self, value):
-        near = None
+        nearest = None
         for kind in self.kinds:
             try:
                 return kind.take(value)
             except Misfit as misfit:
-                near = near or (misfit if misfit.near else None)
-        raise self.refused(value) if near is None else near
+                if misfit.near and nearest is None:
+                    nearest = misfit
+        raise nearest or self.refused(value)
 
 
 class Instance(Kind):
@@ -53,9 +54,9 @@ class Having(Kind):
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):
-        return all(
-            inspect.getattr_static(value, name, self) is not self for name in self.names
-        )
+        missing = object()
+        found = [inspect.getattr_static(value, x, missing) for x in self.names]
+        return all(x is not missing for x in found)
 
 
 class Items(Kind):
@@ -145,23 +146,28 @@ class Names(Kind):
             self.allowed += ", or their units by name"
 
     def take(self, value):
-        if self.units and isinstance(value, Mapping):
-            if not all(isinstance(x, str) for x in (*value, *value.values())):
-                raise self.refused(value)
-            value = tuple(map(Signal, value, value.values()))
-        if not isinstance(value, list | tuple | np.ndarray):
-            value = (value,)
-        elif isinstance(value, np.ndarray) and value.ndim != 1:
+        items = self._items(value)
+        if not items and not self.empty:
             raise self.refused(value)
-        if not all(isinstance(x, self.types) for x in value) or not (
-            len(value) or self.empty
-        ):
+        if not all(isinstance(x, self.types) for x in items):
             raise self.refused(value)
-        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
+        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in items)
         names = [x for x in given if isinstance(x, str)]
         if len(set(names)) < len(names):
             raise Misfit(f"must name each only once, not {show(given)}", near=True)
         return given
+
+    def _items(self, value: Any) -> list[Any]:
+        """The names in a sequence or a table of units, or the single one that it is."""
+        if self.units and isinstance(value, Mapping):
+            if not all(isinstance(x, str) for x in (*value, *value.values())):
+                raise self.refused(value)
+            return list(map(Signal, value, value.values()))
+        if isinstance(value, np.ndarray) and value.ndim != 1:
+            raise self.refused(value)
+        if isinstance(value, list | tuple | np.ndarray):
+            return list(value)
+        return [value]
 
 
 def _taken(kind: Kind, key: Any, value: Any) -> Any:

@@ -93,8 +93,8 @@ def kind_of(hint: Any) -> Kind | None:
         return None
     if hint in _PLAIN:
         return _PLAIN[hint]
-    origin = get_origin(hint)
     arguments = get_args(hint)
+    origin = get_origin(hint) or hint
     if origin is Annotated:
         declared = [x for x in hint.__metadata__ if isinstance(x, Kind)]
         return declared[-1] if declared else kind_of(arguments[0])
@@ -102,22 +102,29 @@ def kind_of(hint: Any) -> Kind | None:
         return OneOf(*arguments)
     if origin in (Union, types.UnionType):
         return _either(arguments)
-    if hint is collections.abc.Callable or origin is collections.abc.Callable:
+    if origin is collections.abc.Callable:
         return values.FUNCTION
-    if origin is tuple:
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return Items(kind_of(arguments[0]), form=tuple)
-        return Tuple(*map(kind_of, arguments))
-    container = hint if origin is None else origin
-    if container in _SEQUENCES:
-        return Items(
-            kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container]
-        )
-    if container in _MAPPINGS:
-        return Table(*map(kind_of, arguments)) if arguments else Table(None, None)
-    if isinstance(container, type):
-        return _of_class(container)
+    if origin is tuple and arguments:
+        return _tuple(arguments)
+    if origin in _SEQUENCES or origin in _MAPPINGS:
+        return _container(origin, *map(kind_of, arguments))
+    if isinstance(origin, type):
+        return _of_class(origin)
     raise TypeError(f"there is no kind for the annotation {hint}.")
+
+
+def _tuple(arguments: tuple[Any, ...]) -> Kind:
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return Items(kind_of(arguments[0]), form=tuple)
+    return Tuple(*map(kind_of, arguments))
+
+
+def _container(origin: Any, *inside: Kind | None) -> Kind:
+    if origin in _MAPPINGS:
+        key, value = inside or (None, None)
+        return Table(key, value)
+    (item,) = inside or (None,)
+    return Items(item, **_SEQUENCES[origin])
 
 
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
