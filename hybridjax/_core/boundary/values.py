@@ -58,16 +58,8 @@ def show(value: Any) -> str:
         return f"an array of {value.dtype} with shape {value.shape}"
     if isinstance(value, np.generic):
         return show(value.item())
-    if (
-        value is None
-        or value is ...
-        or isinstance(value, int | float | complex | str | bytes)
-    ):
-        try:
-            text = repr(value)
-        except ValueError:  # an integer with more digits than Python writes
-            return "a number with thousands of digits"
-        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+    if isinstance(value, _WRITTEN):
+        return _written(value)
     if isinstance(value, type):
         return f"the class {value.__name__} itself"
     if isinstance(value, list | tuple | set | frozenset | dict) and len(value) < 100:
@@ -80,6 +72,17 @@ def show(value: Any) -> str:
     return with_article(type(value).__name__)
 
 
+_WRITTEN = int, float, complex, str, bytes, type(None), type(...)
+
+
+def _written(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # an integer with more digits than Python writes
+        return "a number with thousands of digits"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
 def with_article(name: str) -> str:
     """ "a Record", "an Output", "an LDTP"."""
     vowels = "AEFHILMNORSX" if name[:2].isupper() else "AEIOUaeiou"
@@ -88,7 +91,8 @@ def with_article(name: str) -> str:
 
 def listed(words: list[str]) -> str:
     """ "a", "a or b", "a, b or c"."""
-    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    *first, last = words
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 class Kind:
