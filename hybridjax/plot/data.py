@@ -177,7 +177,7 @@ def phase_response(
     """
     curves = [curve] if model is None else [curve, model]
     units = [unit_of(x.input) for x in curves]
-    if allunits:
+    if all(units):
         require_equal("the inputs of both curves", "units", units[0], units[-1])
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
