@@ -178,17 +178,18 @@ def _read_header(
             f"'{path}' was not written by `hj.save`, whose files alone are read."
         )
     if version != _VERSION:
-        text = f"format version {version}, not {_VERSION}: use hybridjax"
-        raise FileFormatError(f"'{path}' has {text} {header.get('package_version')}.")
+        raise FileFormatError(
+            f"'{path}' has format version {version}, not {_VERSION}: use hybridjax "
+            f"{header.get('package_version')}."
+        )
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(
             f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only."
         )
     header.setdefault("units", {})  # (files written before units were kept)
-    if not all(
-        isinstance(header.get(part), dict) for part in ("static", "arrays", "units")
-    ):
+    parts = [header.get(part) for part in ("static", "arrays", "units")]
+    if not all(isinstance(part, dict) for part in parts):
         raise damaged(path, "its header is incomplete")
     return header
 
@@ -197,8 +198,10 @@ def signals_in(value: Any) -> Iterator[Signal]:
     """All names with a unit."""
     if isinstance(value, Signal) and value.unit:
         yield value
-    elif isinstance(value, dict | tuple):
-        for part in value.values() if isinstance(value, dict) else value:
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    if isinstance(value, tuple):
+        for part in value:
             yield from signals_in(part)
 
 
@@ -220,15 +223,12 @@ def _wrong_field(thing: eqx.Module) -> str | None:
             value = getattr(thing, field.name)
             if not _matches(value, field.type):
                 if hasattr(value, "dtype"):
-                    what = f"{value.dtype}{value.shape}"
-                else:
-                    what = repr(value)
-                return f"{field.name} is {what}"
-            if (
-                isinstance(value, eqx.Module)
-                and (wrong := _wrong_field(value)) is not None
-            ):
-                return f"{field.name}.{wrong}"
+                    return f"{field.name} is {value.dtype}{value.shape}"
+                return f"{field.name} is {value!r}"
+            if isinstance(value, eqx.Module):
+                wrong = _wrong_field(value)
+                if wrong is not None:
+                    return f"{field.name}.{wrong}"
     return None
 
 

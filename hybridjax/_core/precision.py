@@ -37,8 +37,10 @@ def require_x64(*trees: Any) -> None:
             continue
         if dtype not in (jnp.float64, jnp.complex128):
             name = jax.tree_util.keystr(path[1:]).lstrip(".") or "argument"
-            text = "it was built before `hybridjax.enable_x64()`: build it again"
-            raise PrecisionError(f"`{name}` is {dtype}: {text}.")
+            raise PrecisionError(
+                f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`: build it "
+                "again."
+            )
 
 
 def real(x: Any) -> jax.Array:

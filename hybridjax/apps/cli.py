@@ -381,6 +381,8 @@ def _reproduce(options) -> int:
 
 def _status(converged: bool) -> int:
     if not converged:
-        text = "a fit did not converge: do not rely on its numbers, which were written."
-        print(f"hybridjax: {text}", file=sys.stderr)
+        print(
+            "hybridjax: a fit did not converge: do not rely on its numbers, which were written.",
+            file=sys.stderr,
+        )
     return 0 if converged else 1

@@ -218,14 +218,12 @@ class Rules(NamedTuple):
         each = self.cosines.powers_in(design)
         power = each.mean(axis=0)
         kept = np.flatnonzero(power)
-        power, share = power[kept], each[:, kept] / power[kept]
-        limits = self.linear.only(kept)._replace(
-            curved=self.distortion.divided(kept, share)
-        )
+        power = power[kept]
+        curved = self.distortion.divided(kept, each[:, kept] / power)
+        limits = self.linear.only(kept)._replace(curved=curved)
+        best = allocate(criterion.only(kept), limits, power)
         factor = np.ones(len(self.cosines.line))
-        factor[kept] = np.sqrt(
-            allocate(criterion.only(kept), limits, power).power / power
-        )
+        factor[kept] = np.sqrt(best.power / power)
         amplitude = design.amplitude * factor[self.cosines.places(design)]
         return self.scaled(dataclasses.replace(design, amplitude=amplitude))
 
@@ -234,14 +232,13 @@ class Rules(NamedTuple):
         use: dict[str, float] = {}
         shares = self.linear.cost @ self.cosines.power_of(design)
         for name, share in zip(self.linear.names, shares, strict=True):
-            use[name] = max(
-                use.get(name, 0.0), np.inf if name.startswith("peak of ") else share
-            )
+            if name.startswith("peak of "):
+                share = np.inf
+            use[name] = max(use.get(name, 0.0), share)
         if self.distortion is not None:
-            levels = zip(
-                self.distorted(design).items(), self.distortion.level, strict=True
-            )
-            use |= {name: rms / level for (name, rms), level in levels}
+            rms = self.distorted(design)
+            for name, level in zip(rms, self.distortion.level, strict=True):
+                use[name] = rms[name] / level
         return tuple(name for name, share in use.items() if share > 1 / (1 + ENOUGH))
 
 
@@ -368,7 +365,9 @@ def _check_alike(models: list[Model], design: Design) -> None:
     for k, model in enumerate(models):
         require_same(f"model {k} and model 0", model, first)
         if (np.abs(model.multipliers) >= 1).any():
-            text = "has no periodic response: give a stable loop, `model.feedback(controller)`."
-            raise DefinitionError(f"model {k} is unstable, so that it {text}")
+            raise DefinitionError(
+                f"model {k} is unstable, so that it has no periodic response: give a stable loop, "
+                "`model.feedback(controller)`."
+            )
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
     require_equal("design and model", "inputs", design.input_names, first.inputs)

@@ -210,9 +210,9 @@ class Study(eqx.Module):
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
         if are_alike(best.fit.correlation, best.fit.freedom):
-            text = f"the data show more than {self.order} multipliers"
             raise DefinitionError(
-                f"{text}: add the blocks to a study with a larger `order`."
+                f"the data show more than {self.order} multipliers: add the blocks to a study with "
+                "a larger `order`."
             )
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
@@ -290,10 +290,10 @@ class Study(eqx.Module):
         return card("Study", self._state(), multipliers, strides, text(self._outlook()))
 
     def _state(self) -> str:
+        wanted = f"standard error {self.standard_error:.2g} requested"
         if self.fit is None:
-            return f"standard error {self.standard_error:.2g} requested; nothing measured yet"
-        state = "reached" if self.done else "not yet reached"
-        return f"standard error {self.standard_error:.2g} requested: {state}"
+            return f"{wanted}; nothing measured yet"
+        return f"{wanted}: {'reached' if self.done else 'not yet reached'}"
 
     def _rows(self) -> list[tuple[str, str]]:
         rows = []

@@ -69,10 +69,9 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     nu = len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
-    values = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in data.records])
-    at = np.concatenate(
-        [(r.first_section + np.arange(len(r.u))) % N for r in data.records]
-    )
+    values = np.concatenate([np.hstack([r.u, r.y]) for r in data.records])
+    samples = [r.first_section + np.arange(len(r.u)) for r in data.records]
+    at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
     f, power = input_spectrum(data)
     phase = np.arange(N) / N
@@ -91,11 +90,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
-                last.semilogy(
-                    f,
-                    np.maximum(power[:, i], 1e-12 * power[:, i].max()),
-                    color=CYCLE[1],
-                )
+                floor = 1e-12 * power[:, i].max()
+                last.semilogy(f, np.maximum(power[:, i], floor), color=CYCLE[1])
                 last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
             else:
                 last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
@@ -195,10 +191,8 @@ def phase_response(
             for phase in drawn.phase[np.isnan(drawn.values)]:
                 panel.axvline(phase, color=color, lw=0.8, ls=":")
         panel.axhline(0, color="black", lw=0.4)
-        name = f"response to {curve.input}"
-        panel.set(
-            xlabel="phase (cycles)", ylabel=f"{name}\n({curve.unit})", xlim=(0, 1)
-        )
+        response = f"response to {curve.input}\n({curve.unit})"
+        panel.set(xlabel="phase (cycles)", ylabel=response, xlim=(0, 1))
         panel.legend()
     return Plot(axes)
 
@@ -238,7 +232,8 @@ def experiment(
             panel.margins(x=0)
         axes[-1, 0].set_xlabel("time (cycles)")
         title = f"experiment {index}"
-        title += f": {Result(int(data.result[index])).message}" * (not data.ok[index])
+        if not data.ok[index]:
+            title += f": {Result(int(data.result[index])).message}"
         axes[0, 0].set_title(title, wrap=True)
     return Plot(axes)
 
@@ -279,15 +274,10 @@ def validation(
             auto.set_title(
                 f"residuals\n{p_value(validation.whiteness[i])}", loc="right"
             )
-            for j, _ in enumerate(validation.inputs):
+            for j in range(len(validation.inputs)):
                 color = CYCLE[(1 + j) % len(CYCLE)]
-                _stems(
-                    cross,
-                    0.2 * j,
-                    validation.cross_correlation[:, :, i, j],
-                    color,
-                    limit,
-                )
+                correlation = validation.cross_correlation[:, :, i, j]
+                _stems(cross, 0.2 * j, correlation, color, limit)
             cross.set_title(
                 f"with the input\n{p_value(validation.independence[i])}", loc="right"
             )

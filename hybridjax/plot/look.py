@@ -132,9 +132,8 @@ def panels(
         }
         with style():
             axes = pyplot.subplots(rows, columns, **size, **options)[1]
-            for (
-                panel
-            ) in axes.flat:  # here, since ticks are made when the figure is drawn
+            # (Here, since ticks are made when the figure is drawn.)
+            for panel in axes.flat:
                 panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
             yield axes
             axes[0, 0].figure.align_ylabels(axes)
@@ -143,8 +142,9 @@ def panels(
     if not all(isinstance(panel, Axes) for panel in axes.flat):
         raise DefinitionError("`ax` must hold Axes of matplotlib, and nothing else.")
     if axes.size != rows * columns:
-        text = f"{rows} x {columns} Axes, one for each panel, not {axes.size}"
-        raise DefinitionError(f"`ax` must hold {text}.")
+        raise DefinitionError(
+            f"`ax` must hold {rows} x {columns} Axes, one for each panel, not {axes.size}."
+        )
     yield axes.reshape(rows, columns)
 
 

@@ -160,9 +160,9 @@ class Family:
         """
         system = self.system({name: jnp.asarray(x) for name, x in values.items()})
         if not isinstance(system, HybridSystem):
-            text = "a system, or a function of parameters that returns one"
             raise DefinitionError(
-                f"`model` must be {text}, not a {type(system).__name__}."
+                "`model` must be a system, or a function of parameters that returns one, not a "
+                f"{type(system).__name__}."
             )
         require_x64(system)
         check_periodic(system)

@@ -108,48 +108,45 @@ class Quotient(Derived):
     def __check_init__(self):
         charts = self.system.charts()
         require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
-        states = sorted({state for chart in charts.values() for state in chart.states})
+        states = sorted(set().union(*(chart.states for chart in charts.values())))
         named = (*dict(self.names), *self.flipped, *self.translation)
         require_among("state", named, states, "Quotient: ")
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
-                text = (
-                    f"{sorted(mirrored)}, but '{image}' {sorted(charts[image].states)}"
-                )
                 raise DefinitionError(
-                    f"Quotient: '{kept}' mirrored has {text}: use `relabel`."
+                    f"Quotient: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
+                    f"{sorted(charts[image].states)}: use `relabel`."
                 )
         if self.half_period:
             self._check_half_period()
 
     def _check_half_period(self):
         if (self.system.period() is not None) != (self.half_period is True):
-            sentence = "True if a clock drives the system, else a state or a function of (t, q)"
-            raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
-        for x in self.system.transitions():
-            if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
-                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < TOGETHER:
-                    text = (
-                        f"'{x.name}' must not be scheduled at t = 0, where halves begin"
-                    )
-                    raise DefinitionError(
-                        f"Quotient: {text}: let the clock begin earlier."
-                    )
-        for name, x in (
-            self.system.charts().items() if isinstance(self.half_period, str) else ()
-        ):
-            require_among(
-                "state", [str(self.half_period)], x.states, f"Quotient: in '{name}' "
+            raise DefinitionError(
+                "Quotient: `half_period` must be True if a clock drives the system, else a state "
+                "or a function of (t, q)."
             )
+        for x in self.system.transitions():
+            if not isinstance(x.guard, Scheduled) or is_traced(x.guard):
+                continue
+            phase = math.remainder(x.guard.offset / x.guard.period, 1.0)
+            if abs(phase) < TOGETHER:
+                raise DefinitionError(
+                    f"Quotient: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
+                    "the clock begin earlier."
+                )
+        if isinstance(self.half_period, str):
+            for name, chart in self.system.charts().items():
+                here = f"Quotient: in '{name}' "
+                require_among("state", [self.half_period], chart.states, here)
 
     def period(self):
         return None if self.half_period else self.system.period()
 
     def charts(self):
-        return {
-            x: self._reduced(x) for x in self.system.charts() if x not in self._kept_of
-        }
+        kept = [x for x in self.system.charts() if x not in self._kept_of]
+        return {name: self._reduced(name) for name in kept}
 
     def transitions(self):
         events = [x for x in self.system.transitions() if x.source not in self._kept_of]
@@ -164,10 +161,11 @@ class Quotient(Derived):
         guard = x.guard
         direction = x.direction
         target, landed = self._landing(x, images)
-        if isinstance(guard, Scheduled) and chart.clocked:
-            guard = _phase_of(guard)
+        if not isinstance(guard, Scheduled):
+            guard = chart.lifted(guard)
+        elif chart.clocked:
+            guard = chart.lifted(_phase_of(guard))
             direction = "rising"
-        guard = guard if isinstance(guard, Scheduled) else chart.lifted(guard)
         enabled = None if x.enabled is None else chart.lifted(x.enabled)
         at = chart.lifted(landed)
         n = len(chart.kept)
@@ -179,26 +177,22 @@ class Quotient(Derived):
 
     def _halves(self):
         """The ends of half a period, as transitions of the original system."""
+        if not self.half_period:
+            return
+        for name in self.swap:
+            title = "half period" if len(self.pairs) == 1 else f"half period ({name})"
+            yield Transition(title, name, name, self._end_of_half(name), "rising")
+
+    def _end_of_half(self, name: str) -> Callable:
+        """A function (t, q, u) of a chart that rises through zero after half a period."""
         rises = self.half_period
         period = self.system.period()
-        charts = self.system.charts()
-        for name in self.swap if rises else ():
-            if period is not None:
-
-                def guard(t, q, u):
-                    return t - period / 2
-            elif callable(rises):
-
-                def guard(t, q, u):
-                    return rises(t, q)
-            else:
-                place = charts[name].states.index(rises)
-
-                def guard(t, q, u, k=place):
-                    return q[k]
-
-            title = "half period" + f" ({name})" * (len(self.pairs) > 1)
-            yield Transition(title, name, name, guard, "rising")
+        if period is not None:
+            return lambda t, q, u: t - period / 2
+        if callable(rises):
+            return lambda t, q, u: rises(t, q)
+        place = self.system.charts()[name].states.index(rises)
+        return lambda t, q, u: q[place]
 
     def guess(self):
         guess = self.system.guess()
@@ -217,29 +211,24 @@ class Quotient(Derived):
         charts = self.charts()
         outputs = []
         for x in self.system.outputs():
-            if callable(x.function):
-                functions = dict.fromkeys(charts, x.function)
-            else:
-                functions = x.function
-            kept = {
-                name: charts[name].lifted(f)
-                for name, f in functions.items()
-                if name in charts
-            }
-            outputs.append(Output(x.name, kept, x.unit))
+            functions = x.function
+            if callable(functions):
+                functions = dict.fromkeys(charts, functions)
+            kept = [name for name in functions if name in charts]
+            lifted = {name: charts[name].lifted(functions[name]) for name in kept}
+            outputs.append(Output(x.name, lifted, x.unit))
         return outputs
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """The picture of the original system, which stands at the translation 0 and moves."""
         whole = self.system.charts()[chart]
         still = dict.fromkeys(self.translation, 0.0)
-        state = jnp.stack(
-            [jnp.asarray((still | dict(q))[x], float) for x in whole.states]
-        )
         time = q["clock"] if self.charts()[chart].clocked else t
         drawing = self.system.draw(chart, time, {**q, **still})
         if drawing is None or len(self.translation) != 1:
             return drawing
+        values = {**still, **q}
+        state = jnp.stack([jnp.asarray(values[x], float) for x in whole.states])
         rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
         along = rates[whole.states.index(self.translation[0])]
         return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
@@ -250,39 +239,39 @@ class Quotient(Derived):
             return None
         if self.charts()[at.chart].clocked:
             at = Guess(at.chart, at.state[:-1], at.state[-1])
-        still = self.translation
-        return Quotient(self.system, translation=still) if still else self.system, at
+        if not self.translation:
+            return self.system, at
+        return Quotient(self.system, translation=self.translation), at
 
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
         (t, q, u) that are equal. The first numbers of q are the state without translations, in
         its `sizes`."""
-        for name in self.system.charts() if self.translation else ():
-            parts = (
-                self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7)
-            )
-            for (what, before), (_, after) in zip(*parts, strict=True):
-                yield f"the {what} changes under the translation", before, after
+        if self.translation:
+            yield from self._claims_of_translation(sizes)
         clock: Any = self.system.period()
         images = self.swap if self.half_period else self._kept_of
         later = 0.5 * clock if self.half_period is True else 0.0
         for kept, other in self.swap.items():
             ours = list(self._parts(kept, self._kept_of, sizes))
             # In a chart that is its own mirror image, the last transition is that of the first.
-            theirs = list(
-                self._parts(other, images, sizes, later=later, back=kept == other)
-            )
+            back = kept == other
+            theirs = list(self._parts(other, images, sizes, later=later, back=back))
             if len(ours) != len(theirs):
                 sentence = (
                     f"'{kept}' and '{other}' have different numbers of transitions"
                 )
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
             for (what, function), (name, image) in zip(ours, theirs, strict=False):
-                yield (
-                    f"the {name} is not the mirror image of the {what}",
-                    function,
-                    image,
-                )
+                sentence = f"the {name} is not the mirror image of the {what}"
+                yield sentence, function, image
+
+    def _claims_of_translation(self, sizes: Mapping[str, Any]):
+        for name in self.system.charts():
+            here = self._parts(name, self._kept_of, sizes, shift=0.0)
+            there = self._parts(name, self._kept_of, sizes, shift=0.7)
+            for (what, before), (_, after) in zip(here, there, strict=True):
+                yield f"the {what} changes under the translation", before, after
 
     def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
         """All functions of a chart, of points of the reduced one, with rates and states mirrored if
@@ -290,56 +279,53 @@ class Quotient(Derived):
         translation by `shift`, outputs, too."""
         kept = images.get(name, name)
         chart = self._reduced(kept)
+        original = self.system.charts()[name]
         mirrored = self._mirrored if name in images else _same
         n = len(chart.kept)
         moves = np.isin(chart.chart.states, self.translation)
         size = sizes[kept][:n]
+        used = slice(None if original.inputs is None else len(original.inputs))
 
-        def state(q):
-            return mirrored(kept, chart.full(size * q[:n], shift or 0.0))
+        def at(function, *scale):
+            """A function of the original chart, divided by a scale, of a reduced point."""
 
-        field, used = (
-            getattr(self.system.charts()[name], x) for x in ("field", "inputs")
-        )
-        used = slice(None if used is None else len(used))
+            def of_reduced(t, q, u):
+                state = mirrored(kept, chart.full(size * q[:n], shift or 0.0))
+                value = function(t + later, state, u[used])
+                return value / scale[0] if scale else value
 
-        def at(f):
-            return lambda t, q, u: f(t + later, state(q), u[used])
+            return of_reduced
 
         def rates(*point):
-            return mirrored(kept, as_vector(field(*point)), back=True)
+            return mirrored(kept, as_vector(original.field(*point)), back=True)
 
-        yield (
-            f"field of chart '{name}'",
-            at(lambda *point: chart.less(rates(*point)) / size),
-        )
-        yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
-        for x in list(self.system.transitions())[:: -1 if back else 1]:
-            if x.source == name:
-                (target, reset) = self._landing(x, images)
-                guard = x.guard
-                if isinstance(guard, Scheduled):
-                    guard = _phase_of(guard)
-                into = sizes[target][: len(self._reduced(target).kept)]
-                yield (
-                    f"transition '{x.name}'",
-                    at(lambda *y, r=reset, c=into: r(*y) / c),
-                )
-                yield (
-                    f"transition '{x.name}'",
-                    at(lambda *y, g=guard, x=x: x.sign * g(*y)),
-                )
-        for x in self.system.outputs() if shift is not None else ():
-            function = x.function if callable(x.function) else x.function.get(name)
+        field = f"field of chart '{name}'"
+        yield field, at(lambda *point: chart.less(rates(*point)), size)
+        yield field, at(lambda *point: rates(*point)[moves])
+        transitions = [x for x in self.system.transitions() if x.source == name]
+        if back:
+            transitions.reverse()
+        for x in transitions:
+            target, reset = self._landing(x, images)
+            into = sizes[target][: len(self._reduced(target).kept)]
+            guard = _phase_of(x.guard) if isinstance(x.guard, Scheduled) else x.guard
+            yield f"transition '{x.name}'", at(reset, into)
+            yield f"transition '{x.name}'", at(guard, x.sign)
+        if shift is not None:
+            yield from self._output_parts(name, at)
+        if self.system.period() is None:
+            sign = -1.0 if name in images else 1.0
+            for x in self._halves():
+                if x.source == name and callable(x.guard):
+                    yield f"sign of '{x.name}'", at(x.guard, sign)
+
+    def _output_parts(self, name, at):
+        for x in self.system.outputs():
+            function = x.function
+            if not callable(function):
+                function = function.get(name)
             if function is not None:
                 yield f"output '{x.name}'", at(function)
-        sign = -1.0 if name in images else 1.0
-        for x in self._halves() if self.system.period() is None else ():
-            if x.source == name and callable(x.guard):
-                yield (
-                    f"sign of '{x.name}'",
-                    at(lambda *point, g=x.guard: sign * g(*point)),
-                )
 
     def _reduced(self, name: str) -> "_Reduced":
         clocked = bool(self.half_period) and self.system.period() is not None
@@ -370,10 +356,9 @@ class Quotient(Derived):
         if back:
             source, target = target, source
         order = [source.index(self._partner(name)) for name in target]
-        names = target if back else map(self._partner, target)
-        return q[np.array(order)] * np.array(
-            [-1.0 if x in self.flipped else 1.0 for x in names]
-        )
+        names = target if back else [self._partner(x) for x in target]
+        signs = np.where([x in self.flipped for x in names], -1.0, 1.0)
+        return q[np.array(order)] * signs
 
 
 @jax.ensure_compile_time_eval()
@@ -389,9 +374,9 @@ def check_symmetry(
     if not isinstance(system, Quotient):
         return
     check_symmetry(system.system, None, along and along.removeprefix("system."))
-    sizes = sizes or {
-        name: np.ones(len(x.states)) for name, x in system.charts().items()
-    }
+    if not sizes:
+        charts = system.charts()
+        sizes = {name: np.ones(len(chart.states)) for name, chart in charts.items()}
     clock = system.system.period()
     rng = np.random.default_rng(0)
     q = rng.normal(size=(3, max(map(len, sizes.values()))))
@@ -401,9 +386,10 @@ def check_symmetry(
         size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
         x, y = (values / size for values in pair)
         if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
-            text = f"{type(system.system).__name__} does not have the symmetry of its Quotient"
+            once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
-                f"{text}{f' once {along!r} changes' * bool(along)}: {sentence}."
+                f"{type(system.system).__name__} does not have the symmetry of its "
+                f"Quotient{once}: {sentence}."
             )
 
 
@@ -417,10 +403,14 @@ def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list
 
         return jax.jvp(at, (parameter_of(quotient, along),), (1.0,))[1]
     u = jnp.zeros(len(quotient.inputs))
-    claims = [x for _, *x in quotient._claims(sizes)]
-    return jax.vmap(
-        lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims]
-    )(q, t)
+
+    def at_a_point(q, t):
+        values = []
+        for _, first, second in quotient._claims(sizes):
+            values.append((as_vector(first(t, q, u)), as_vector(second(t, q, u))))
+        return values
+
+    return jax.vmap(at_a_point)(q, t)
 
 
 def _same(kept: str, q: Any, back: bool = False):
@@ -440,18 +430,20 @@ class _Reduced(DerivedChart):
 
     @property
     def kept(self) -> np.ndarray:
-        return np.array(
-            [k for k, x in enumerate(self.chart.states) if x not in self.translation]
-        )
+        return np.flatnonzero(~np.isin(self.chart.states, self.translation))
 
     @property
     def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return *(self.chart.states[k] for k in self.kept), *("clock",) * self.clocked
+        kept = tuple(self.chart.states[k] for k in self.kept)
+        return (*kept, "clock") if self.clocked else kept
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
         units = self.chart.units
-        return (*(units[k] for k in self.kept), *("",) * self.clocked) if units else ()
+        if not units:
+            return ()
+        kept = tuple(units[k] for k in self.kept)
+        return (*kept, "") if self.clocked else kept
 
     def full(self, q, shift=0.0):
         """The state of the whole chart, translated by a shift."""
@@ -463,7 +455,12 @@ class _Reduced(DerivedChart):
 
     def lifted(self, function: Callable) -> Callable:
         """A function of the whole chart's state, of the reduced one."""
-        return lambda t, q, u: function(q[-1] if self.clocked else t, self.full(q), u)
+
+        def of_reduced(t, q, u):
+            time = q[-1] if self.clocked else t
+            return function(time, self.full(q), u)
+
+        return of_reduced
 
     def field(self, t, q, u):
         rates = self.less(as_vector(self.lifted(self.chart.field)(t, q, u)))

@@ -75,7 +75,11 @@ def sliding(
     def height(t, q, u):
         return surface(t, q)
 
-    up, down = (lambda t, q, u, k=k: middle.rates(t, q, u)[k] for k in (0, 1))
+    def up(t, q, u):
+        return middle.rates(t, q, u)[0]
+
+    def down(t, q, u):
+        return middle.rates(t, q, u)[1]
 
     def held(t, q, u):
         return down(t, q, u) >= 0

@@ -283,9 +283,12 @@ class Structure:
 
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
         """Return what was made under this name for these trees, made anew only for other trees."""
-        if name in self._made and all(map(operator.is_, self._made[name][1], trees)):
-            return self._made[name][0]
-        self._made[name] = made, _ = make(), trees
+        if name in self._made:
+            made, before = self._made[name]
+            if all(map(operator.is_, before, trees)):
+                return made
+        made = make()
+        self._made[name] = made, trees
         return made
 
     def under(self, u: Array) -> "Structure":
@@ -309,8 +312,10 @@ class Structure:
     def _method(self, a: int) -> Method:
         system = self.system.system if isinstance(self.system, Driven) else self.system
         solver = type(system).solver if system.solver is None else system.solver
-        solver = solver.get(self.names[a]) if isinstance(solver, ByChart) else solver
-        solver = self.charts[a].solver if solver is None else solver
+        if isinstance(solver, ByChart):
+            solver = solver.get(self.names[a])
+        if solver is None:
+            solver = self.charts[a].solver
         return VERNER76 if solver is None else as_method(solver)
 
     def chart_input(self, a: int, t: ArrayLike, u: Array) -> Array:
@@ -332,11 +337,10 @@ class Structure:
         def make():
             groups = []
             for kind in kinds(self.transitions):
-                groups += (
-                    [kind]
-                    if len(kind) == 1 or self._is_one(kind)
-                    else [(g,) for g in kind]
-                )
+                if len(kind) == 1 or self._is_one(kind):
+                    groups.append(kind)
+                else:
+                    groups += [(g,) for g in kind]
             return groups
 
         return _kinds.recall(self.source, None, make)
@@ -351,10 +355,10 @@ class Structure:
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
         real = jnp.result_type(float)
-        array = jax.ShapeDtypeStruct
-        place = array((), jnp.result_type(int))
+        place = jax.ShapeDtypeStruct((), jnp.result_type(int))
         single = Structure(one_lane(self.source))
-        point = array((), real), array((n,), real), array((single.nu,), real)
+        shapes = (), (n,), (single.nu,)
+        point = [jax.ShapeDtypeStruct(shape, real) for shape in shapes]
         try:
             program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
         except Exception:  # any error of a user's function, or of JAX in it
@@ -376,7 +380,7 @@ class Structure:
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a, by kind."""
-        return [g for kind in self.guard_kinds(a) for g in kind]
+        return list(itertools.chain(*self.guard_kinds(a)))
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
@@ -432,9 +436,8 @@ class Structure:
         alike = [self.transitions[x] for x in g.kind]
         if len(alike) == 1:
             return alike[0]
-        guard, reset, enabled = member_of(
-            [(x.guard, x.reset, x.enabled) for x in alike], g.place
-        )
+        functions = [(x.guard, x.reset, x.enabled) for x in alike]
+        guard, reset, enabled = member_of(functions, g.place)
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
     def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
@@ -442,7 +445,7 @@ class Structure:
         tr = self.transition(g)
         assert not isinstance(tr.guard, Scheduled)
         value = jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
-        if (value).dtype == bool:
+        if value.dtype == bool:
             raise DefinitionError(
                 f"the guard of '{tr.name}' must be `a - b`, not `a > b`."
             )
@@ -491,9 +494,10 @@ class Structure:
     def state_names(self) -> tuple[str, ...]:
         """All state names, in order of first appearance."""
         names: dict[str, Signal] = {}
-        for name in (name for a in range(len(self.charts)) for name in self.states(a)):
-            if not unit_of(names.get(name, "")):
-                names[name] = name
+        for a in range(len(self.charts)):
+            for name in self.states(a):
+                if not unit_of(names.get(name, "")):
+                    names[name] = name
         return tuple(names.values())
 
     def output_names(self) -> tuple[str, ...]:
@@ -502,12 +506,8 @@ class Structure:
 
     def states_everywhere(self) -> list[str]:
         """The states that every chart defines."""
-        charts = range(len(self.charts))
-        return [
-            x
-            for x in self.state_names()
-            if all(self.state_function(x, a) for a in charts)
-        ]
+        defined = [{*chart.states, *chart.absent} for chart in self.charts]
+        return [x for x in self.state_names() if all(x in names for names in defined)]
 
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
@@ -515,9 +515,8 @@ class Structure:
 
     def sizes(self, scale: Any) -> dict[str, np.ndarray]:
         """Sizes of the states of each chart, by its name, from `Settings.scale`."""
-        return {
-            x: np.asarray(scale)[a, : self.dims[a]] for a, x in enumerate(self.names)
-        }
+        rows = zip(self.names, np.asarray(scale), self.dims, strict=True)
+        return {name: row[:d] for name, row, d in rows}
 
     def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
         """A state of chart a by names."""
@@ -525,10 +524,11 @@ class Structure:
 
     def drawing(self, a: int, t: Any, q: Any) -> Any:
         """The drawing of a state of chart a, or `None`."""
-        values = {name: self.state_function(name, a) for name in self.state_names()}
-        named = {
-            str(name): f(t, q, None) for name, f in values.items() if f is not None
-        }
+        named = {}
+        for name in self.state_names():
+            function = self.state_function(name, a)
+            if function is not None:
+                named[str(name)] = function(t, q, None)
         return self.system.draw(self.names[a], t, ByName(named))
 
     def resolve_outputs(

@@ -90,10 +90,11 @@ def unit_of_parameter(system: Any, path: str) -> str:
 def arrays_of(system: "HybridSystem") -> dict[str, Array]:
     """The arrays of a system by name, those of its parts by a path with dots."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
-    return {
-        ".".join(str(getattr(x, "name", x)) for x in path): leaf
-        for path, leaf in leaves
-    }
+    arrays = {}
+    for path, leaf in leaves:
+        names = [str(getattr(x, "name", x)) for x in path]
+        arrays[".".join(names)] = leaf
+    return arrays
 
 
 def copies_of(system: "HybridSystem") -> dict[str, Array]:
@@ -251,8 +252,10 @@ class HybridSystem(Definition):
         super().__init_subclass__(**options)
         for name in ("charts", "transitions", "period", "outputs", "guess", "draw"):
             if not callable(vars(cls).get(name, callable)):
-                text = f"must be a method: write `def {name}(self): return ...`"
-                raise DefinitionError(f"{cls.__name__}: `{name}` {text}.")
+                raise DefinitionError(
+                    f"{cls.__name__}: `{name}` must be a method: write `def {name}(self): return "
+                    "...`."
+                )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)

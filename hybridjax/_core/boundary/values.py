@@ -298,8 +298,9 @@ class Reals(Kind):
         if array.dtype.kind not in self.types:
             raise self._wrong_type(value, array)
         if not self._fits(array.shape):
-            what = "one number" if self.shape == () else f"of shape {self._written()}"
-            raise Misfit(f"must be {what}, not of shape {array.shape}", near=True)
+            wanted = f"of shape {self._written()}" if self.shape else "one number"
+            problem = f"must be {wanted}, not of shape {array.shape}"
+            raise Misfit(problem, near=True)
         if not is_tracer(array):
             self._check_values(array)
         # (Arrays of JAX in single precision have lost digits, and are refused by `require_x64`.)
@@ -372,7 +373,8 @@ class Reals(Kind):
         )
 
     def _written(self) -> str:
-        return f"({', '.join(self.shape)}{',' * (len(self.shape) == 1)})"
+        comma = "," if len(self.shape) == 1 else ""
+        return f"({', '.join(self.shape)}{comma})"
 
 
 class Complexes(Reals):

@@ -72,8 +72,10 @@ def _run(
             try:
                 values = task.result()
             except KilledWorker as error:
-                text = f"piece {k} has ended each worker that it was given to"
-                raise ComputationError(f"{text}: give workers more memory.") from error
+                raise ComputationError(
+                    f"piece {k} has ended each worker that it was given to: give workers more "
+                    "memory."
+                ) from error
             if values is not None:
                 store.write(k, values)
     finally:
@@ -88,27 +90,23 @@ class _Packer(cloudpickle.Pickler):
 
     def reducer_override(self, obj: Any) -> Any:
         way = super().reducer_override(obj)
-        if (
-            way is not NotImplemented
-            and isinstance(obj, type)
-            and issubclass(obj, eqx.Module)
-        ):
-            raise DefinitionError(
-                f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
-            )
-        if way is NotImplemented and isinstance(
-            obj, types.FunctionType | types.ModuleType | type
-        ):
+        if way is not NotImplemented:
+            if isinstance(obj, type) and issubclass(obj, eqx.Module):
+                raise DefinitionError(
+                    f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
+                )
+            return way
+        if isinstance(obj, types.FunctionType | types.ModuleType | type):
             if not is_packaged(getattr(obj, "__module__", obj.__name__)):
-                with contextlib.suppress(
-                    DefinitionError
-                ):  # of a module's other functions
+                # (Errors may be of a module's other functions.)
+                with contextlib.suppress(DefinitionError):
                     self.imported.append((obj, meaning(obj)))
         return way
 
 
 def _packed(job: Any) -> bytes:
-    packer = _Packer(file := io.BytesIO())
+    file = io.BytesIO()
+    packer = _Packer(file)
     packer.imported = []
     packer.dump(job)
     return cloudpickle.dumps((packer.imported, file.getvalue()))
@@ -122,9 +120,10 @@ def _check_packages(client: Client) -> None:
         for name in _PACKAGES:
             theirs = about["packages"].get(name)
             if theirs != mine[name]:
-                has = f"has {name} {theirs}" if theirs else f"lacks {name}"
-                text = f"{has}, and this process has {mine[name]}: use one environment"
-                raise DefinitionError(f"the Dask worker {worker} {text}.")
+                raise DefinitionError(
+                    f"the Dask worker {worker} has {name} {theirs}, and this process has "
+                    f"{mine[name]}: use one environment."
+                )
 
 
 def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
@@ -150,7 +149,9 @@ def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     imported, packed = cloudpickle.loads(packed)
     for x, digest in imported:
         if meaning(x) != digest:
-            text = "is not what it is in this process: after changes of it, call `client.restart()`"
-            raise DefinitionError(f"`{x.__name__}` on a Dask worker {text}.")
+            raise DefinitionError(
+                f"`{x.__name__}` on a Dask worker is not what it is in this process: after changes "
+                "of it, call `client.restart()`."
+            )
     job, address = cloudpickle.loads(packed)
     return job, None if address is None else ZarrStore(address)

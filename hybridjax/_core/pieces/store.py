@@ -121,10 +121,10 @@ class ArrayStore:
 
     def __init__(self, layout: Layout):
         self.layout = layout
-        arrays = layout.variables.items()
-        self._arrays = {
-            k: np.full(layout.array(k)[1], x.fill, x.dtype) for k, x in arrays
-        }
+        self._arrays = {}
+        for name, x in layout.variables.items():
+            _, shape = layout.array(name)
+            self._arrays[name] = np.full(shape, x.fill, x.dtype)
 
     def missing(self) -> list[int]:
         """Return all pieces."""
@@ -137,13 +137,13 @@ class ArrayStore:
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`."""
-        of = self.layout
-        arrays = self._arrays.items()
-        data = {k: (of.array(k)[0], x, of.variables[k].attributes) for k, x in arrays}
-        data = package("xarray").Dataset({**of.constants, **data})
-        return data.set_coords(of.coordinates).assign_attrs(
-            {_ABOUT: json.dumps(of.description)}
-        )
+        layout = self.layout
+        arrays: dict[str, Any] = dict(layout.constants)
+        for name, x in self._arrays.items():
+            dims, _ = layout.array(name)
+            arrays[name] = dims, x, layout.variables[name].attributes
+        data = package("xarray").Dataset(arrays).set_coords(layout.coordinates)
+        return data.assign_attrs({_ABOUT: json.dumps(layout.description)})
 
 
 class ZarrStore:
@@ -168,12 +168,10 @@ class ZarrStore:
             }
             first = next(iter(self._arrays.values()))
             p = len(about["dims"])
-            arrays = {
-                name: Variable(
-                    x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:]
-                )
-                for name, x in self._arrays.items()
-            }
+            arrays = {}
+            for name, x in self._arrays.items():
+                dims = tuple(x.metadata.dimension_names[p:])
+                arrays[name] = Variable(x.dtype.str, dims, x.shape[p:])
             blocks = Blocks(first.shape[:p], first.chunks[:p])
             self.layout = Layout(
                 tuple(about["dims"]), blocks, arrays, {}, (), about["description"]
@@ -190,9 +188,8 @@ class ZarrStore:
             raise DefinitionError(
                 f"cannot open '{address}' as a store: {error}"
             ) from error
-        chunk = max(
-            math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values()
-        )
+        arrays = self._arrays.values()
+        chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in arrays)
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
                 raise DefinitionError(
@@ -228,9 +225,9 @@ class ZarrStore:
             try:
                 values[name] = array[(*self.layout.blocks.slices(k), ...)]
             except Exception as error:  # (of many kinds: checksums, sizes, headers)
-                text = f"piece {k} of '{self.address}' is damaged in `{name}`"
                 raise FileFormatError(
-                    f"{text}: make the call that wrote it again."
+                    f"piece {k} of '{self.address}' is damaged in `{name}`: make the call that "
+                    "wrote it again."
                 ) from error
         return values
 
@@ -262,9 +259,8 @@ class ZarrStore:
         options = {"consolidated": False, "chunks": None, "zarr_format": 3}
         try:
             data = package("xarray").open_zarr(self.address, **options)
-        except (
-            Exception
-        ) as error:  # (of many kinds, for an array that another program has added)
+        except Exception as error:
+            # (Of many kinds, for an array that another program has added.)
             raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
         # (Zarr lists arrays in any order.)
         dims = [name for name in self.layout.dims if name in data.coords]
@@ -295,10 +291,12 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     except Exception as error:  # (of many kinds)
         if isinstance(error, FileNotFoundError) and not sizes:
             return None
-        text = f"'{address}' is no store of results, or only begun ({error!r})"
-        raise DefinitionError(f"{text}: choose another name, or delete it.") from error
+        raise DefinitionError(
+            f"'{address}' is no store of results, or only begun ({error!r}): choose another name, "
+            "or delete it."
+        ) from error
     change = difference(json.loads(json.dumps(job.description)), theirs)
-    if (change) is not None:
+    if change is not None:
         raise DefinitionError(
             f"'{address}' holds other results: {change}. Choose another store."
         )
@@ -335,9 +333,8 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         )
 
     with _writing(address), warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # (Zarr announces that its format of texts may change.)
+        # (Zarr announces that its format of texts may change.)
+        warnings.simplefilter("ignore")
         group = _group(address, "a")
         for name, x in layout.variables.items():
             dims, shape = layout.array(name)
@@ -356,9 +353,8 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        beside = [
-            x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])
-        ]
+        dims = {name: tuple(x[0]) for name, x in layout.constants.items()}
+        beside = [name for name in layout.coordinates if dims[name] != (name,)]
         if beside:
             group.attrs["coordinates"] = " ".join(beside)
         about = {
@@ -391,15 +387,13 @@ def _sizes(address: str) -> dict[str, int]:
     """
     if "://" in address:
         return {}
-    tree = (
-        (at, name)
-        for at, *names in os.walk(address)
-        for name in itertools.chain(*names)
-    )
+    paths = [address] if os.path.lexists(address) else []
+    for folder, *names in os.walk(address):
+        paths += [os.path.join(folder, name) for name in itertools.chain(*names)]
     sizes = {}
-    for path in [address, *itertools.starmap(os.path.join, tree)]:
-        about = os.lstat(path) if os.path.lexists(path) else None
-        if about is None or stat.S_ISDIR(about.st_mode):
+    for path in paths:
+        about = os.lstat(path)
+        if stat.S_ISDIR(about.st_mode):
             continue
         if not stat.S_ISREG(about.st_mode):
             raise DefinitionError(
