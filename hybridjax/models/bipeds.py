@@ -286,38 +286,54 @@ class FiveLinkBiped(HybridSystem):
     def _step(self, t, state, u):
         q = state[:5]
         v = state[5:]
-        stride = self.stride
-        lift = self.lift
-        leg = (q[0] + q[1]) / 2
-        leg_rate = (v[0] + v[1]) / 2
-        # The swing knee bends while the stance leg passes from -stride to stride.
-        bend = lift * (1 - (leg / stride) ** 2)
-        slope = -2 * lift * leg / stride**2
-        knee = held(q[0] - q[1] - self.knee, v[0] - v[1], self.stiffness)
-        torso = held(q[2] - self.lean, v[2], self.stiffness)
-        mirrored = held(
-            (q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, self.stiffness
-        )
-        error = q[4] - q[3] - self.knee - bend
-        rate = v[4] - v[3] - slope * leg_rate
-        swing_knee = (
-            held(error, rate, self.stiffness) - 2 * lift * (leg_rate / stride) ** 2
-        )
-        desired = [
-            knee / 2,
-            -knee / 2,
-            torso,
-            mirrored - swing_knee / 2,
-            mirrored + swing_knee / 2,
-        ]
-        unit = jnp.ones_like(slope)
-        goal = jnp.stack(desired)
-        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        desired, direction = self._constrained(q, v)
         torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
         a = accelerations_under_feedback(
-            self.mechanism(), q, v, goal, direction, torque
+            self.mechanism(), q, v, desired, direction, torque
         )
         return jnp.concatenate([v, a])
+
+    def _constrained(self, q, v):
+        """Accelerations that hold the four virtual constraints while the stance leg keeps its
+        rate, and what they gain for each unit of its acceleration."""
+        shin, thigh, torso, swing_thigh, swing_shin = q
+        shin_rate, thigh_rate, torso_rate, swing_thigh_rate, swing_shin_rate = v
+        leg = (shin + thigh) / 2
+        leg_rate = (shin_rate + thigh_rate) / 2
+        # The swing knee bends while the stance leg passes from -stride to stride.
+        part = leg / self.stride
+        bend = self.lift * (1 - part**2)
+        slope = -2 * self.lift * part / self.stride
+        curvature = -2 * self.lift / self.stride**2
+
+        stance_knee = held(
+            shin - thigh - self.knee, shin_rate - thigh_rate, self.stiffness
+        )
+        lean = held(torso - self.lean, torso_rate, self.stiffness)
+        swing_leg = held(
+            (swing_thigh + swing_shin) / 2 + leg,
+            (swing_thigh_rate + swing_shin_rate) / 2 + leg_rate,
+            self.stiffness,
+        )
+        swing_knee = held(
+            swing_shin - swing_thigh - self.knee - bend,
+            swing_shin_rate - swing_thigh_rate - slope * leg_rate,
+            self.stiffness,
+        )
+        swing_knee = swing_knee + curvature * leg_rate**2
+
+        desired = jnp.stack(
+            [
+                stance_knee / 2,
+                -stance_knee / 2,
+                lean,
+                swing_leg - swing_knee / 2,
+                swing_leg + swing_knee / 2,
+            ]
+        )
+        unit = jnp.ones_like(slope)
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        return desired, direction
 
     def transitions(self):
         def height(t, q, u):

@@ -56,9 +56,10 @@ class Returns(MultiplierEstimate):
     bound: float = eqx.field(static=True)
 
     def _about(self) -> str:
-        more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
+        count = len(self.coordinates)
         return (
-            f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+            f"{count - len(self.multipliers)} more below {self.bound:.1g}; {count} coordinates, "
+            f"residual {self.residual:.1g}"
         )
 
 
@@ -395,9 +396,11 @@ class SettledCycle:
         )
 
     def __repr__(self) -> str:
-        names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        about = f"period {self.period:.9g}, {len(self.cycle_outputs)} sections, {names}"
-        return folded(f"SettledCycle({type(self.plant).__name__}: {about})")
+        return folded(
+            f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
+            f"{len(self.cycle_outputs)} sections, {listed(self.inputs)} -> "
+            f"{listed(self.outputs)})"
+        )
 
 
 @checked

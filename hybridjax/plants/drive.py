@@ -188,6 +188,7 @@ class Drive:
         began = self.t
         armed = not phase.crossings
         by_clock = armed and not phase.axes
+        stops = by_clock and not self.fixed
         lands = self.sets and not self.fixed and not by_clock
         reached = 1e-9 * self.dt if by_clock else 0.0  # (rounding is no step)
         # (A step may cross two sections.)
@@ -199,22 +200,24 @@ class Drive:
                 raise ComputationError(
                     f"a section was not reached within {self.longest:.4g}"
                 )
-            last = At(self.t, self.z)
+            last = self._point(points, lands)
             before = level
-            if lands or points is not None:
-                last = self.here()
-            if points is not None:
-                points.append(last)
-            duration = self.dt
-            if by_clock and not self.fixed:
-                duration = min(level, self.dt)
-            self.step(u, duration)
+            self.step(u, min(level, self.dt) if stops else self.dt)
             level = phase.level(k, self.t, self.z)
             armed = armed or level > 0
         if lands and level < 0 < before:
             return self._landed(u, k, last)
         self.last = last
         return self._interpolated(last, before, level)
+
+    def _point(self, points: list[At] | None, with_state: bool) -> At:
+        """The present point, which is appended to `points`, if there are any, with its state."""
+        if points is None and not with_state:
+            return At(self.t, self.z)
+        point = self.here()
+        if points is not None:
+            points.append(point)
+        return point
 
     def _landed(self, u: Sequence[float], k: int, last: At) -> At:
         """Repeat the step after `last` with the length at which it ends on section k."""

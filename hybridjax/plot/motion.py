@@ -202,26 +202,29 @@ def animate(
     """
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / (_RATE * (speed or 1.0)))
-    if isinstance(motion, LimitCycle):
-        motion.require_found()
-    beside = _beside(motion, sections, perturbed)
-    if sections is None and beside is None:
-        if isinstance(motion, LimitCycle):
-            motion = _both_halves(motion)
-    elif not isinstance(motion, LimitCycle):
-        raise DefinitionError(
-            "`sections` and `perturbed` are for limit cycles: animate the cycle."
-        )
+    motion, beside = _motions(motion, sections, perturbed)
     s = motion.structure
     require_same_system(s, sections, beside)
-    everywhere = s.states_everywhere()
-    has_picture = drawing_of(s, 0) is not None
     plane = None
-    if len(everywhere) > 1 or (x and y):
+    if len(s.states_everywhere()) > 1 or (x and y):
         plane = plane_of(s, x, y)
     if traces is None:
-        traces = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
+        traces = _default_traces(s, plane)
     names = s.resolve_outputs(traces).names
+    return _film(motion, beside, sections, plane, names, speed)
+
+
+def _film(
+    motion: LimitCycle | Trajectory,
+    beside: Trajectory | None,
+    sections: PlacedSections | None,
+    plane: tuple[str, str] | None,
+    names: Sequence[str],
+    speed: float | None,
+) -> Motion:
+    """The animation, of which each panel gives the parts that move."""
+    s = motion.structure
+    has_picture = drawing_of(s, 0) is not None
     tracks, pace, note = _tracks(motion, beside, speed)
     events = [track.events(0.2 * pace) for track in tracks]
     with style():
@@ -237,11 +240,7 @@ def animate(
         has_circle = isinstance(motion, LimitCycle) and len(motion.multipliers) > 0
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
-            if isinstance(motion, LimitCycle):
-                draw_cycle(
-                    motion, *plane, sections=sections, perturbed=beside, ax=panel
-                )
-                panel.legend([], [])
+            _draw_orbit(panel, motion, plane, sections, beside)
             parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
             _unit_circle(figure.add_subplot(grid[1, 1]), motion)
@@ -249,6 +248,31 @@ def animate(
         interval = (times[1] - times[0]) / pace
         title = f"motion of {type(s.system).__name__}"
         return Motion(figure, parts, times, interval, title)
+
+
+def _default_traces(s: Structure, plane: tuple[str, str] | None) -> Sequence[str]:
+    """The first state of the plane beside a picture, up to four states without one."""
+    if drawing_of(s, 0) is None:
+        return s.state_names()[:4]
+    return (plane or s.states_everywhere())[:1]
+
+
+def _motions(
+    motion: Any, sections: Any, perturbed: Any
+) -> tuple[LimitCycle | Trajectory, Trajectory | None]:
+    """The motion to animate, a cycle as a whole, and the one beside it."""
+    is_cycle = isinstance(motion, LimitCycle)
+    if is_cycle:
+        motion.require_found()
+    beside = _beside(motion, sections, perturbed)
+    is_alone = sections is None and beside is None
+    if not is_alone and not is_cycle:
+        raise DefinitionError(
+            "`sections` and `perturbed` are for limit cycles: animate the cycle."
+        )
+    if is_alone and is_cycle:
+        motion = _both_halves(motion)
+    return motion, beside
 
 
 def _beside(motion: Any, sections: Any, perturbed: Any) -> Trajectory | None:
@@ -292,6 +316,13 @@ def _column(figure: Figure, cell: Any, count: int) -> list[Axes]:
     """So many Axes one above the other."""
     cells = cell.subgridspec(count, 1, hspace=0.05)
     return [figure.add_subplot(cells[i]) for i in range(count)]
+
+
+def _draw_orbit(ax: Axes, motion: Any, plane, sections, beside) -> None:
+    """The orbit of a limit cycle, with its events and sections, but without a legend."""
+    if isinstance(motion, LimitCycle):
+        draw_cycle(motion, *plane, sections=sections, perturbed=beside, ax=ax)
+        ax.legend([], [])
 
 
 def _unit_circle(ax: Axes, cycle: LimitCycle) -> None:

@@ -70,7 +70,8 @@ def _corners(scene: Drawing) -> Float[np.ndarray, "k 2"]:
     """Places between which a picture lies, without its ground."""
     places = [line for name, line in scene.lines.items() if name != "ground"]
     for circle in scene.circles.values():
-        center, radius = circle[:2], circle[2]
+        center = circle[:2]
+        radius = circle[2]
         places += [center - radius, center + radius]
     return np.vstack([*places, *scene.points.values()])
 

@@ -191,7 +191,8 @@ def _zoom(
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
+    order = np.lexsort((-true.imag, -np.abs(true)))
+    leading = complex(true[order[0]])
     reaches = [1e-12]
     for z in series.values():
         reaches.append(np.abs(z - leading).min())

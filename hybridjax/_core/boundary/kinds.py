@@ -76,6 +76,7 @@ _PLAIN = {
 }
 _SEQUENCES: dict[Any, dict[str, Any]] = {
     list: {"form": list},
+    tuple: {"form": tuple},
     collections.abc.Sequence: {},
     collections.abc.Iterable: {"iterable": True},
     collections.abc.Collection: {"iterable": True},
@@ -104,26 +105,19 @@ def kind_of(hint: Any) -> Kind | None:
         return _either(arguments)
     if origin is collections.abc.Callable:
         return values.FUNCTION
-    if origin is tuple and arguments:
-        return _tuple(arguments)
-    if origin in _SEQUENCES or origin in _MAPPINGS:
-        return _container(origin, *map(kind_of, arguments))
+    if origin in _SEQUENCES:
+        return _sequence(origin, arguments)
+    if origin in _MAPPINGS:
+        return Table(*map(kind_of, arguments or (Any, Any)))
     if isinstance(origin, type):
         return _of_class(origin)
     raise TypeError(f"there is no kind for the annotation {hint}.")
 
 
-def _tuple(arguments: tuple[Any, ...]) -> Kind:
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return Items(kind_of(arguments[0]), form=tuple)
-    return Tuple(*map(kind_of, arguments))
-
-
-def _container(origin: Any, *inside: Kind | None) -> Kind:
-    if origin in _MAPPINGS:
-        key, value = inside or (None, None)
-        return Table(key, value)
-    (item,) = inside or (None,)
+def _sequence(origin: Any, arguments: tuple[Any, ...]) -> Kind:
+    if origin is tuple and arguments and arguments[-1] is not Ellipsis:
+        return Tuple(*map(kind_of, arguments))
+    item = kind_of(arguments[0]) if arguments else None
     return Items(item, **_SEQUENCES[origin])
 
 
