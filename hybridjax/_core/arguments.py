@@ -42,7 +42,10 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
 
 
 def input_and_output_names(
-    inputs: Collection[str] | None, outputs: Collection[str] | None, nu: int, ny: int
+    inputs: Collection[str] | None,
+    outputs: Collection[str] | None,
+    nu: int,
+    ny: int,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """`names` of nu inputs and of ny outputs.
 
@@ -107,7 +110,10 @@ def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
 
 
 def require_among(
-    kind: str, names: Iterable[str], among: Collection[str], where: str = ""
+    kind: str,
+    names: Iterable[str],
+    among: Collection[str],
+    where: str = "",
 ) -> None:
     """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
 

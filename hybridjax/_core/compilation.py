@@ -394,7 +394,11 @@ def kernel(
 
 
 def _run_lanes(
-    program: Callable, arrays: list, lanes: int, *arguments, some=None
+    program: Callable,
+    arrays: list,
+    lanes: int,
+    *arguments,
+    some=None,
 ) -> np.ndarray:
     if some is not None:
         needed = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
@@ -415,7 +419,10 @@ def _run_lanes(
 
 
 def whole(
-    function: Callable, static: tuple, trees: Any, loops: bool = False
+    function: Callable,
+    static: tuple,
+    trees: Any,
+    loops: bool = False,
 ) -> Callable[..., Any]:
     """`function(*static, *trees, *arguments)` of any arguments and results as one program, with
     arrays of NumPy.
@@ -432,7 +439,12 @@ def whole(
 
 
 def _bound(
-    function, form, static, trees, lanes, loops: bool = False
+    function,
+    form,
+    static,
+    trees,
+    lanes,
+    loops: bool = False,
 ) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)

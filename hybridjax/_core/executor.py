@@ -108,7 +108,10 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
 
 
 def scan(
-    body: Callable, carry: Any, xs: Any, stack: Callable = np.stack
+    body: Callable,
+    carry: Any,
+    xs: Any,
+    stack: Callable = np.stack,
 ) -> tuple[Any, Any]:
     """`jax.lax.scan`; on the host results are joined by `stack`."""
     first = jax.tree_util.tree_leaves(xs)[0]

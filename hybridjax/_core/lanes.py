@@ -60,7 +60,10 @@ def _split_of(tree: Any, count: int) -> tuple[bool, ...]:
 
 
 def by_lane(
-    function: Callable, *trees: Any, quick: bool = False, by_row: bool = True
+    function: Callable,
+    *trees: Any,
+    quick: bool = False,
+    by_row: bool = True,
 ) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
@@ -281,7 +284,10 @@ def take_rows(x: Array, rows: Sequence[int]) -> Array:
 
 
 def put_rows(
-    x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array
+    x: Array,
+    rows: Sequence[int],
+    here: Bool[Array, " L"],
+    new: Array,
 ) -> Array:
     """x (W, L) with these rows replaced by those of `new` for the lanes `here`."""
     xp = namespace(x)

@@ -298,7 +298,10 @@ class Reading:
                 self._global(x, (name, ""), module, read.names)
 
     def _suspect(
-        self, x: types.FunctionType, names: frozenset[str], attributes: frozenset[str]
+        self,
+        x: types.FunctionType,
+        names: frozenset[str],
+        attributes: frozenset[str],
     ) -> None:
         """List reads that names show."""
         if names & _FRAMES:
@@ -317,7 +320,11 @@ class Reading:
         self.unread.append(text)
 
     def _global(
-        self, x: types.FunctionType, path: Names, value: Any, names: Names
+        self,
+        x: types.FunctionType,
+        path: Names,
+        value: Any,
+        names: Names,
     ) -> None:
         self._note(path[0])
         if self._is_hidden(x, path, value):

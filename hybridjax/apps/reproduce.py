@@ -133,7 +133,11 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
 
 
 def _identify(
-    name: str, cycle: LimitCycle, design: Design, discard: int, begin: float
+    name: str,
+    cycle: LimitCycle,
+    design: Design,
+    discard: int,
+    begin: float,
 ) -> Family:
     """Return all results with one family of sections."""
     apex = Crossing("vM", "falling")
@@ -166,7 +170,11 @@ def _identify(
 
 
 def _draw(
-    cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin
+    cycle: LimitCycle,
+    families: Mapping[str, Family],
+    out: Path,
+    formats,
+    begin,
 ) -> None:
     """Write the figures."""
     from .. import plot  # here, since it is heavy

@@ -96,7 +96,11 @@ def _cause(write: Callable[..., str], *arguments: Any) -> str:
 
 
 def _report(
-    files: list[Path], folder: Path, identify: Callable, reading: dict, formats
+    files: list[Path],
+    folder: Path,
+    identify: Callable,
+    reading: dict,
+    formats,
 ) -> str:
     """Identify the trials of one subject in one condition, and write the report.
 

@@ -204,7 +204,10 @@ def to_harmonic_state_space(
 
 
 def _toeplitz(
-    x: np.ndarray, order: int, angles: np.ndarray, weights: np.ndarray
+    x: np.ndarray,
+    order: int,
+    angles: np.ndarray,
+    weights: np.ndarray,
 ) -> Complex[np.ndarray, "rows columns"]:
     """The matrix with the Fourier coefficient m - n of x (p, k, i, j) in block (m, n), by a
     quadrature with these angles and weights (p, k)."""

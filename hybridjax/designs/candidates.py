@@ -193,7 +193,10 @@ class Measured(NamedTuple):
 
 
 def measured_htfs(
-    model: Model, cosines: Candidates, harmonics: Harmonics | None, noise: Noise
+    model: Model,
+    cosines: Candidates,
+    harmonics: Harmonics | None,
+    noise: Noise,
 ) -> Iterator[Measured]:
     r"""Yield the HTFs of each input that is used.
 

@@ -61,7 +61,11 @@ def criterion_of(
 
 
 def _multipliers(
-    goal: Multipliers, model: Model, cosines: Candidates, noise: Noise, power: Powers
+    goal: Multipliers,
+    model: Model,
+    cosines: Candidates,
+    noise: Noise,
+    power: Powers,
 ) -> LinearCriterion:
     multipliers = np.asarray(model.multipliers)
     if goal.estimator == "fit_ldtp":
@@ -131,7 +135,10 @@ def wanted_parts(
 
 
 def _parameters(
-    goal: Parameters, model: Model, lines: Candidates, noise: Noise
+    goal: Parameters,
+    model: Model,
+    lines: Candidates,
+    noise: Noise,
 ) -> LinearCriterion:
     free = tuple(goal.free)
     wanted = free if goal.wanted is None else tuple(goal.wanted)

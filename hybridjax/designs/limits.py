@@ -192,7 +192,10 @@ class PowerLimits(NamedTuple):
 
 
 def power_limits(
-    limits: Limits, models: list[Model], squares: list[Squares], usual: Powers
+    limits: Limits,
+    models: list[Model],
+    squares: list[Squares],
+    usual: Powers,
 ) -> PowerLimits:
     """Return the linear limits, which hold for each model. A peak is no smaller than an rms value.
 
@@ -220,7 +223,10 @@ def power_limits(
 
 
 def _levels(
-    limits: Limits, model: Model, square: Squares, usual: Powers
+    limits: Limits,
+    model: Model,
+    square: Squares,
+    usual: Powers,
 ) -> dict[str, float]:
     """The largest rms values of signals, of rates and of peaks, by their names."""
     signals = (*model.inputs, *model.outputs)
@@ -321,7 +327,10 @@ class Products(NamedTuple):
 
 
 def products(
-    limit: Distortion, cosines: Candidates, inputs: tuple[str, ...], usual: Powers
+    limit: Distortion,
+    cosines: Candidates,
+    inputs: tuple[str, ...],
+    usual: Powers,
 ) -> Products:
     """Return the distortion as a form of powers.
 

@@ -124,7 +124,10 @@ class Mechanism(eqx.Module):
         return change - force
 
     def acceleration(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], force: ArrayLike = 0.0
+        self,
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        force: ArrayLike = 0.0,
     ) -> Float[Array, " n"]:
         """a = dv/dt in M a + h = f, under generalized forces f: n numbers, or one for all."""
         return _solve(self.mass(q), force - self.bias(q, v))

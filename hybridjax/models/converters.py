@@ -33,7 +33,10 @@ class BuckConverter(HybridSystem):
     T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
 
     def control(
-        self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]
+        self,
+        t: ArrayLike,
+        q: Float[Array, "3"],
+        u: Float[Array, "1"],
     ) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]

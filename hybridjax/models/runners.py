@@ -196,7 +196,10 @@ class SLIPRunner(HybridSystem):
     angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
     def energy(
-        self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]
+        self,
+        t: ArrayLike,
+        q: Float[Array, " n"],
+        u: Float[Array, " l"],
     ) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q

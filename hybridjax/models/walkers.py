@@ -18,7 +18,10 @@ def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
 
 
 def _two_legs(
-    slope: Parameter, length: Parameter | float, stance: Array, swing: Array
+    slope: Parameter,
+    length: Parameter | float,
+    stance: Array,
+    swing: Array,
 ) -> Drawing:
     """Legs by their angles from the vertical, positive backward."""
 

@@ -298,7 +298,10 @@ def serve() -> None:
 
 
 def run_all(
-    drive: Drive, items: Iterable[Any], processes: int, limit: float
+    drive: Drive,
+    items: Iterable[Any],
+    processes: int,
+    limit: float,
 ) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
@@ -344,7 +347,10 @@ def run_all(
 
 
 def resume(
-    file: Any, about: str, count: int, run: Callable[[list[int]], Any]
+    file: Any,
+    about: str,
+    count: int,
+    run: Callable[[list[int]], Any],
 ) -> list[Trial]:
     """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 

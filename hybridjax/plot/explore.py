@@ -217,7 +217,10 @@ class Explorer:
         return Sliders(asked={"values": self.values, "gain": True, "number": 0})
 
     def _answer(
-        self, values: Mapping[str, float], gain: bool, number: int
+        self,
+        values: Mapping[str, float],
+        gain: bool,
+        number: int,
     ) -> dict[str, Any]:
         if values != self.values:
             self._follow(values)

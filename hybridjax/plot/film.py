@@ -60,7 +60,10 @@ class Easel:
 
 
 def frames(
-    figure: Figure, draw: Callable[[int], Sequence[Artist]], count: int, dpi: float
+    figure: Figure,
+    draw: Callable[[int], Sequence[Artist]],
+    count: int,
+    dpi: float,
 ) -> list[Image.Image]:
     """Images with one palette."""
     canvas = figure.canvas

@@ -291,7 +291,10 @@ def _columns(families) -> dict[str, list[HTF]]:
 
 @contextlib.contextmanager
 def _grid(
-    columns, rows: int, height: float, ax: AxesLike | None
+    columns,
+    rows: int,
+    height: float,
+    ax: AxesLike | None,
 ) -> Iterator[np.ndarray]:
     """Panels with a column for each family: labels at the edges of the grid and one legend."""
     size = {"width": COLUMN if len(columns) == 1 else PAGE, "height": height}
@@ -332,7 +335,10 @@ def _same(name: str, which: str | int, names: Sequence[str]) -> str | int:
 
 
 def _values(
-    htf: HTF, m: int, output: str | int, input: str | int
+    htf: HTF,
+    m: int,
+    output: str | int,
+    input: str | int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""

@@ -154,7 +154,12 @@ def axis_of(name: str, *, deviation: bool = False) -> str:
 
 
 def colored(
-    ax: Axes, x, y, values: np.ndarray, label: str, is_size: bool = False
+    ax: Axes,
+    x,
+    y,
+    values: np.ndarray,
+    label: str,
+    is_size: bool = False,
 ) -> None:
     """A map in colors with a bar: around zero, or of magnitudes from zero on."""
     top = np.abs(values).max()
@@ -162,7 +167,13 @@ def colored(
         {"cmap": "viridis", "vmin": 0} if is_size else {"cmap": "RdBu_r", "vmin": -top}
     )
     image = ax.pcolormesh(
-        x, y, values, **look, vmax=top, rasterized=True, shading="nearest"
+        x,
+        y,
+        values,
+        **look,
+        vmax=top,
+        rasterized=True,
+        shading="nearest",
     )
     cast(Any, ax.figure).colorbar(image, ax=ax, label=label)
 

@@ -381,7 +381,11 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
     ax.autoscale_view()
     ax.set(
-        xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title
+        xticks=[],
+        yticks=[],
+        aspect="equal",
+        adjustable="datalim",
+        title=track.title,
     )
     ax.spines[:].set_visible(False)
     (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
@@ -426,7 +430,10 @@ def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray,
 
 
 def _marks(
-    lines, pictures: Pictures, at, size: float
+    lines,
+    pictures: Pictures,
+    at,
+    size: float,
 ) -> list[Float[np.ndarray, "2 n"]]:
     """Places on the ground, at equal distances from one that moves with it."""
     stride = abs(float(pictures.stride[0]))
@@ -439,7 +446,10 @@ def _marks(
 
 
 def _traces(
-    axes: list[Axes], tracks: list[Track], names: Sequence[str], events
+    axes: list[Axes],
+    tracks: list[Track],
+    names: Sequence[str],
+    events,
 ) -> list[Part]:
     """Signals over time, where they are now, and the names of events."""
     times = tracks[0].times - tracks[0].times[0]
@@ -494,7 +504,10 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
 
 
 def portrait(
-    above: Axes, below: Axes, s: Structure, plane: tuple[str, str]
+    above: Axes,
+    below: Axes,
+    s: Structure,
+    plane: tuple[str, str],
 ) -> Portrait:
     """A function that draws a cycle anew in the same Axes: its orbit, colored by chart, dashed if
     it is unstable, its events, and its multipliers."""

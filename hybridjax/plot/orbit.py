@@ -88,17 +88,29 @@ def cycle(
             _sections(panel, s, sections, (x, y), center)
         if perturbed is not None:
             panel.plot(
-                [], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed"
+                [],
+                [],
+                "s-",
+                ms=3.5,
+                lw=0.7,
+                color=COLORS["red"],
+                label="perturbed",
             )
         panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
         panel.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=4,
+            columnspacing=1.2,
         )
     return Plot(axes)
 
 
 def _arrow(
-    ax: Axes, orbit: Trajectory, t: np.ndarray, points: Float[np.ndarray, "p 2"]
+    ax: Axes,
+    orbit: Trajectory,
+    t: np.ndarray,
+    points: Float[np.ndarray, "p 2"],
 ) -> None:
     """An arrow of the direction, in the middle of the longest time without events."""
     ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])

@@ -82,7 +82,10 @@ def branch(
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
         panel.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=4,
+            columnspacing=1.2,
         )
     return Plot(axes)
 

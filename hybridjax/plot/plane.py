@@ -187,7 +187,10 @@ def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
 
 
 def _zoom(
-    ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders
+    ax: Axes,
+    true: np.ndarray,
+    series: Mapping[str, np.ndarray],
+    borders,
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""

@@ -52,7 +52,12 @@ def forest(
 
 @checked
 def paired(
-    population: Population, quantity: str, a: str, b: str, *, ax: AxesLike | None = None
+    population: Population,
+    quantity: str,
+    a: str,
+    b: str,
+    *,
+    ax: AxesLike | None = None,
 ) -> Plot:
     """Draw the estimates of two conditions or groups as dots with standard errors, those of a
     subject joined by a line, beside the means with 95 % intervals.

@@ -288,9 +288,17 @@ def _rounded(map: ReturnMap) -> ReturnMap:
 
 
 def _with(
-    map: ReturnMap, anchor: Any, expected: Any, scale: Any, conserved: Any
+    map: ReturnMap,
+    anchor: Any,
+    expected: Any,
+    scale: Any,
+    conserved: Any,
 ) -> ReturnMap:
     settings = dataclasses.replace(map.settings, scale=scale)
     return dataclasses.replace(
-        map, anchor=anchor, expected=expected, settings=settings, conserved=conserved
+        map,
+        anchor=anchor,
+        expected=expected,
+        settings=settings,
+        conserved=conserved,
     )

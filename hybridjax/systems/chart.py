@@ -59,7 +59,10 @@ class Chart(eqx.Module):
 
     @abc.abstractmethod
     def field(
-        self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        u: Float[Array, " l"],
     ) -> Any:
         """The vector field dq/dt = f(t, q, u), eq. (2).
 

@@ -362,7 +362,10 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
 
 
 def _check_names(
-    what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()
+    what: str,
+    kind: str,
+    names: Sequence[str],
+    units: Sequence[str] = (),
 ) -> None:
     """Check that names are distinct, and units as many, or none."""
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):

@@ -154,7 +154,10 @@ class Quotient(Derived):
         return made + [self._transition(x, self.swap, 0.0) for x in self._halves()]
 
     def _transition(
-        self, x: Transition, images: Mapping[str, str], clock: float
+        self,
+        x: Transition,
+        images: Mapping[str, str],
+        clock: float,
     ) -> Transition:
         """A transition, with the state in the image of its target; the clock is multiplied."""
         chart = self._reduced(x.source)

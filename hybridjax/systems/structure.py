@@ -257,7 +257,12 @@ class Structure:
         return make() if name is None else self.once(name, trees, make)
 
     def kernel(
-        self, function: Callable, form, *static: Hashable, trees=(), lanes=1
+        self,
+        function: Callable,
+        form,
+        *static: Hashable,
+        trees=(),
+        lanes=1,
     ) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation.py`)."""
@@ -452,7 +457,11 @@ class Structure:
         return tr.sign * jnp.asarray(value, float)
 
     def guard_values(
-        self, kinds: Sequence[Kind], t: Array, q: Array, u: Array
+        self,
+        kinds: Sequence[Kind],
+        t: Array,
+        q: Array,
+        u: Array,
     ) -> list[jax.Array]:
         """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is
         the only one of its kind."""
@@ -469,7 +478,11 @@ class Structure:
         return as_vector(tr.reset(t, q, self._input_of(tr, t, u)))
 
     def enabled(
-        self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array
+        self,
+        g: int | Member,
+        t: ArrayLike,
+        q: ArrayLike,
+        u: Array,
     ) -> jax.Array:
         tr = self.transition(g)
         if tr.enabled is None:

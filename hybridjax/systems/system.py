@@ -176,7 +176,12 @@ class Guess(eqx.Module):
     after: str | None = eqx.field(static=True, default=None)
 
     def __init__(
-        self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None
+        self,
+        chart: str,
+        state: Vector,
+        time: Scalar = 0.0,
+        *,
+        after: str | None = None,
     ):
         self.chart = chart
         self.state = real(state)
@@ -245,7 +250,10 @@ class HybridSystem(Definition):
     time_unit: ClassVar[str] = ""
 
     solver: Solver | Method | ByChart | None = eqx.field(
-        static=True, default=None, kw_only=True, converter=solvers
+        static=True,
+        default=None,
+        kw_only=True,
+        converter=solvers,
     )
 
     def __init_subclass__(cls, **options):
@@ -286,7 +294,10 @@ class HybridSystem(Definition):
         return None
 
     def draw(
-        self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]
+        self,
+        chart: str,
+        t: Float[Array, ""],
+        q: Mapping[str, Any],
     ) -> Drawing | None:
         """What the system looks like in a chart, for `hj.plot.animate`: a `Drawing`, written for
         one state as a vector field is. `q` holds the states of the chart and the values of those

@@ -64,7 +64,11 @@ class Items(Kind):
     `form`, it is brought to that form; with `iterable`, whatever can be iterated over is taken."""
 
     def __init__(
-        self, item: Kind | None, *, form: type | None = None, iterable: bool = False
+        self,
+        item: Kind | None,
+        *,
+        form: type | None = None,
+        iterable: bool = False,
     ):
         self.item, self.form, self.iterable = item, form, iterable
         if item is None:
@@ -135,7 +139,11 @@ class Names(Kind):
     them. Without `empty` there must be one. With `units`, they may be the units by name."""
 
     def __init__(
-        self, other: type | None = None, *, empty: bool = False, units: bool = False
+        self,
+        other: type | None = None,
+        *,
+        empty: bool = False,
+        units: bool = False,
     ):
         self.empty, self.units = empty, units
         self.types = (str,) if other is None else (str, other)

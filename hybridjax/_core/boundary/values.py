@@ -29,7 +29,11 @@ class Misfit(Exception):
     """
 
     def __init__(
-        self, problem: str | Callable[[], str], *, near: bool = False, path: str = ""
+        self,
+        problem: str | Callable[[], str],
+        *,
+        near: bool = False,
+        path: str = "",
     ):
         self._problem, self.near, self.path = problem, near, path
 
@@ -360,7 +364,10 @@ class Reals(Kind):
             self._refuse_any(values < 0, values, "zero or positive")
 
     def _refuse_any(
-        self, bad: np.ndarray | np.bool_, values: np.ndarray, allowed: str
+        self,
+        bad: np.ndarray | np.bool_,
+        values: np.ndarray,
+        allowed: str,
     ) -> None:
         if not bad.any():
             return

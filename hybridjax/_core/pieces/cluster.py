@@ -34,7 +34,10 @@ _lock = threading.Lock()
 
 
 def run_on(
-    client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+    client: Any,
+    job: Any,
+    store: ArrayStore | ZarrStore,
+    missing: Sequence[int],
 ) -> None:
     """Compute pieces on the workers of a client.
 
@@ -56,7 +59,10 @@ def run_on(
 
 
 def _run(
-    client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+    client: Client,
+    job: Any,
+    store: ArrayStore | ZarrStore,
+    missing: Sequence[int],
 ) -> None:
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))

@@ -320,7 +320,11 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
     common = {"compressors": [Crc32cCodec()], "config": {"write_empty_chunks": True}}
 
     def constant(
-        group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None
+        group: Any,
+        name: str,
+        dims: Sequence[str],
+        values: Any,
+        attributes: Any = None,
     ):
         values = np.asarray(values)
         group.create_array(
