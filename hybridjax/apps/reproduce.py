@@ -4,6 +4,7 @@ Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import time
@@ -87,20 +88,19 @@ def reproduce(
     """
     cycles = [f"fig1_cycle_{family}" for family in _FAMILIES]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
-    files = [f"{figure}.{format}" for figure in figures for format in formats]
-    saved = [f"{result}_{family}.npz" for family in _FAMILIES for result in _SAVED]
-    with results_folder(
-        Path(out), "reproduce", ["summary.json", *saved, *files]
-    ) as folder:
+    files = ["summary.json"]
+    files += map(".".join, itertools.product(figures, formats))
+    files += [f"{x}_{family}.npz" for family, x in itertools.product(_FAMILIES, _SAVED)]
+    with results_folder(Path(out), "reproduce", files) as folder:
         return _reproduce(folder, protocol, formats)
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
     begin = time.time()
     # Lines without second-order products on them need many experiments.
-    division: Literal["random", "sum-free"] = (
-        "sum-free" if protocol.experiments >= 80 else "random"
-    )
+    division: Literal["random", "sum-free"] = "random"
+    if protocol.experiments >= 80:
+        division = "sum-free"
     design = paper_design(
         periods=protocol.keep,
         seed=protocol.seed,
