@@ -214,11 +214,11 @@ class Quotient(Derived):
         charts = self.charts()
         outputs = []
         for x in self.system.outputs():
-            functions = x.function
-            if callable(functions):
-                functions = dict.fromkeys(charts, functions)
-            kept = [name for name in functions if name in charts]
-            lifted = {name: charts[name].lifted(functions[name]) for name in kept}
+            lifted = {}
+            for name, chart in charts.items():
+                function = x.in_chart(name)
+                if function is not None:
+                    lifted[name] = chart.lifted(function)
             outputs.append(Output(x.name, lifted, x.unit))
         return outputs
 
@@ -324,9 +324,7 @@ class Quotient(Derived):
 
     def _output_parts(self, name, at):
         for x in self.system.outputs():
-            function = x.function
-            if not callable(function):
-                function = function.get(name)
+            function = x.in_chart(name)
             if function is not None:
                 yield f"output '{x.name}'", at(function)
 

@@ -623,9 +623,7 @@ class Outputs:
     def _function(self, item: str | Output, a: int):
         if isinstance(item, str):
             return self.structure.state_function(item, a)
-        function = item.function
-        if not callable(function):
-            function = function.get(self.structure.names[a])
+        function = item.in_chart(self.structure.names[a])
         if function is None:
             return None
         return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))

@@ -47,6 +47,12 @@ class Output(Definition):
 
     __repr__ = fields
 
+    def in_chart(self, name: str) -> Callable[..., Any] | None:
+        """The function of a chart, `None` where the output is not defined."""
+        if callable(self.function):
+            return self.function
+        return self.function.get(name)
+
 
 OutputNames = Annotated[Sequence[str | Output] | str | Output, Names(Output)]
 """States and outputs: one, or several distinct ones; names, or `Output`s in their place."""
@@ -377,7 +383,7 @@ def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
         yield from _parts_of_transition(x, inputs[x.source])
     for x in system.outputs():
         for name in charts:
-            function = x.function if callable(x.function) else x.function.get(name)
+            function = x.in_chart(name)
             if function is not None:
                 at = ft.partial(function, *inputs[name])
                 about = f"the output '{x.name}' in chart '{name}'"

@@ -121,10 +121,12 @@ class ArrayStore:
 
     def __init__(self, layout: Layout):
         self.layout = layout
-        self._arrays = {}
+        arrays: dict[str, Any] = dict(layout.constants)
         for name, x in layout.variables.items():
-            _, shape = layout.array(name)
-            self._arrays[name] = np.full(shape, x.fill, x.dtype)
+            dims, shape = layout.array(name)
+            arrays[name] = dims, np.full(shape, x.fill, x.dtype), x.attributes
+        data = package("xarray").Dataset(arrays).set_coords(layout.coordinates)
+        self._data = data.assign_attrs({_ABOUT: json.dumps(layout.description)})
 
     def missing(self) -> list[int]:
         """Return all pieces."""
@@ -132,18 +134,12 @@ class ArrayStore:
 
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""
-        for name, array in self._arrays.items():
-            array[self.layout.blocks.slices(k)] = values[name]
+        for name in self.layout.variables:
+            self._data[name].values[self.layout.blocks.slices(k)] = values[name]
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`."""
-        layout = self.layout
-        arrays: dict[str, Any] = dict(layout.constants)
-        for name, x in self._arrays.items():
-            dims, _ = layout.array(name)
-            arrays[name] = dims, x, layout.variables[name].attributes
-        data = package("xarray").Dataset(arrays).set_coords(layout.coordinates)
-        return data.assign_attrs({_ABOUT: json.dumps(layout.description)})
+        return self._data
 
 
 class ZarrStore:
