@@ -88,9 +88,8 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
         raise PermissionError(f"'{programs}' was not made in this place: move it away")
     for path in jax_compat.kept_programs(programs):
         about = path.lstat()
-        is_ours = (
-            about.st_uid == here.st_uid and about.st_nlink == 1
-        )  # and no link to others'
+        # (A file with several links may be another user's, too.)
+        is_ours = about.st_uid == here.st_uid and about.st_nlink == 1
         if not (stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST and is_ours):
             raise PermissionError(f"'{path}' is no compiled program: move it away")
     return programs

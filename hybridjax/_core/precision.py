@@ -49,12 +49,10 @@ def real(x: Any) -> jax.Array:
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
     that a definition may be built before. Arrays of JAX remain what they are.
     """
-    made_by_jax = any(
-        isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x)
-    )
+    leaves = jax.tree_util.tree_leaves(x)
+    made_by_jax = any(isinstance(leaf, jax.Array) for leaf in leaves)
     if made_by_jax or is_inside_program():
         return jnp.asarray(x, float)
-    with jax.enable_x64(
-        True
-    ):  # (No program is compiled for numbers of Python and NumPy.)
+    # (No program is compiled for numbers of Python and NumPy.)
+    with jax.enable_x64(True):
         return jax.device_put(np.asarray(x, float))

@@ -76,9 +76,8 @@ def certify(
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
     best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
-    if (
-        best.x is None
-    ):  # the tangent of a quadratic limit may leave some powers unbounded
+    if best.x is None:
+        # The tangent of a quadratic limit may leave some powers unbounded.
         return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
     relative = gain / gain.max() / np.where(price > 0, price, np.nan)

@@ -152,9 +152,8 @@ def _root(
             f"{unknowns[lost[0]]} changes no response: drop it or add an output."
         )
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
-    if (
-        not values[0] > ROUNDING
-    ):  # relative to the largest, for combinations of matrices
+    # (Relative to the largest one, for combinations of matrices.)
+    if not values[0] > ROUNDING:
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)

@@ -53,9 +53,8 @@ class Easel:
     def image(self, moving: Sequence[Artist]) -> Image.Image:
         self._agg.restore_region(self._still)
         for artist in sorted(moving, key=lambda x: x.get_zorder()):
-            artist.draw(
-                self._agg.get_renderer()
-            )  # (marimo gives the figure another canvas)
+            # (Marimo gives the figure another canvas.)
+            artist.draw(self._agg.get_renderer())
         return Image.fromarray(np.array(self._agg.buffer_rgba())[..., :3])
 
 

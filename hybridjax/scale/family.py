@@ -172,9 +172,8 @@ class Family:
         """Return the units of the parameters, "" if unknown."""
         units = dict.fromkeys(self.names, "")
         for name in self.names:
-            with contextlib.suppress(
-                AttributeError, KeyError
-            ):  # a parameter of a function
+            # (A parameter of a function has no unit.)
+            with contextlib.suppress(AttributeError, KeyError):
                 units[name] = unit_of_parameter(system, name)
         return units
 

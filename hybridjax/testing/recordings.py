@@ -60,9 +60,8 @@ def random_force(
         raise DefinitionError(
             f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
         )
-    transient = (
-        4 * rate / bandwidth
-    )  # samples cut off at either end, where the filter starts
+    # Samples that are cut off at either end, where the filter starts.
+    transient = 4 * rate / bandwidth
     samples = duration * rate + 2 * transient
     if not samples <= PERIODS:
         raise DefinitionError(
@@ -121,7 +120,8 @@ def simulate_recording(
     cycles = 1 << (-(-(n - 1) // K) - 1).bit_length()
     x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
-    u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
+    change = np.diff(x, axis=1)[:, :, None]
+    u = x[:, :-1, None] + change * middle[:, None]
     response = response_function(cycle, ClockPhase(K * steps), outputs)
     y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
     names = inputs + recorded.names

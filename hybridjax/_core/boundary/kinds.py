@@ -124,9 +124,8 @@ def _sequence(origin: Any, arguments: tuple[Any, ...]) -> Kind:
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
     arrays = [kind for kind in kinds if isinstance(kind, Reals)]
-    if (
-        len(arrays) > 1 and arrays[0].form is not None
-    ):  # of NumPy or of JAX: stay what they are
+    if len(arrays) > 1 and arrays[0].form is not None:
+        # (Arrays of NumPy or of JAX stay what they are.)
         arrays[0].form = None
         kinds = [kind for kind in kinds if kind not in arrays[1:]]
     if len(kinds) == 1:
