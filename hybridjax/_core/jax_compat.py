@@ -70,9 +70,8 @@ def inner_programs(equation: Equation) -> list[Program]:
     """
     programs = []
     for option in equation.params.values():
-        for part in option if isinstance(option, tuple) else (option,):
-            if is_program(part):
-                programs.append(closed(part).jaxpr)
+        parts = option if isinstance(option, tuple) else (option,)
+        programs += [closed(part).jaxpr for part in parts if is_program(part)]
     return programs
 
 

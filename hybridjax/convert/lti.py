@@ -190,7 +190,8 @@ def to_harmonic_state_space(
     ]
     angles = 2 * np.pi * flow.after(map) / period
     weights = flow.length[:, None] * rule().weights / period
-    for n in (order,) if order else _ORDERS:
+    orders = _ORDERS if order is None else (order,)
+    for n in orders:
         m = np.arange(-n, n + 1)
         blocks = [_toeplitz(x, n, angles, weights) for x in series]
         blocks[0] = blocks[0] - np.diag(np.repeat(2j * np.pi * m / period, s.d))

@@ -1,5 +1,6 @@
 """Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
 
+import itertools
 import math
 from typing import Literal
 
@@ -95,7 +96,8 @@ class TwoLeggedBar(HybridSystem):
         return 0.0
 
     def transitions(self):
-        return tuple(self._step(leg, legs) for legs in _CHARTS for leg in _LEGS)
+        steps = itertools.product(_CHARTS, _LEGS)
+        return tuple(self._step(leg, legs) for legs, leg in steps)
 
     def _step(self, leg: Leg, legs: Legs) -> Transition:
         """Touchdown or liftoff of a leg, while these legs stand."""

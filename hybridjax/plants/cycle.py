@@ -467,16 +467,17 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     drive.longest = 2 * (at[-1].t - start.t)
     turns = [_turn(drive, family, points) for _ in range(cycles + 1)]
     columns = list(drive.columns)
-    values = np.array([[x.z for x in at] for _, at in turns])[..., columns]
+    signals_there = [_signals_at(at) for _, at in turns]
+    values = np.stack(signals_there)[..., columns]
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
-    size = np.ptp([x.z for x in points], axis=0)[columns]
+    size = np.ptp(_signals_at(points), axis=0)[columns]
     if cycles > 1:
         _require_settled(values, size)
     if drive.sets:
         drive.restore(drive.start)
         _, again = _turn(drive, family, points)
-        change = np.abs(np.array([x.z for x in again]) - [x.z for x in at])
+        change = np.abs(_signals_at(again) - _signals_at(at))
         if (change[:, columns] > 1e-6 * size).any():
             raise DefinitionError(
                 "`set_state` does not continue as before: save all of the state."
@@ -494,6 +495,10 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
         drive=drive,
         seed=seed,
     )
+
+
+def _signals_at(points: Sequence[At]) -> Float[np.ndarray, "n signals"]:
+    return np.array([x.z for x in points], float)
 
 
 def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:

@@ -138,7 +138,8 @@ class Explorer:
             system = with_parameters(self.cycle.system, mixed)
             cycle = find_limit_cycle(system, away_from_events(self.cycle), throw=False)
             if cycle.result == Result.OK:
-                self.cycle, share = cycle, at
+                self.cycle = cycle
+                share = at
             elif step > 1 / 16:
                 step /= 4
             else:

@@ -204,7 +204,8 @@ def _curves(
 ) -> list[_Curve]:
     inputs = range(len(htf.inputs)) if input is None else [input]
     curves = []
-    for name in htf.outputs if outputs is None else outputs:
+    names = htf.outputs if outputs is None else outputs
+    for name in names:
         output = _pick("output", name, htf.outputs)
         for which in inputs:
             pushed = _pick("input", which, htf.inputs)

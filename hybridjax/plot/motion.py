@@ -69,8 +69,11 @@ class Motion(FuncAnimation):
         interval: float,
         title: str,
     ):
-        self.figure, self.times, self.interval = figure, times, interval
-        self._parts, self._title = parts, title
+        self.figure = figure
+        self.times = times
+        self.interval = interval
+        self._parts = parts
+        self._title = title
         self._draw(0)
         # (What windows do by `blit` is one more drawing for files and notebooks.)
         has_window = figure.canvas.required_interactive_framework is not None

@@ -152,8 +152,9 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
-            note = rf"multipliers $\lambda = z^{{{first.n_sections}}}$"
-            lower.set_xlabel(f"{lower.get_xlabel()}  ({note})")
+            lower.set_xlabel(
+                rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{first.n_sections}}}$)"
+            )
         legend(axes[0, 0], "upper center", ncols=4 if len(outputs) > 1 else 2)
         letters(axes)
     return Plot(axes)

@@ -86,12 +86,10 @@ class FieldChart(Chart):
     absent: Mapping[str, float] = eqx.field(default_factory=dict)  # type: ignore[misc]
 
     def __init__(self, function, states, units=(), solver=None, absent=None):
-        self.function, self.states, self.units, self.solver = (
-            function,
-            states,
-            units,
-            solver,
-        )
+        self.function = function
+        self.states = states
+        self.units = units
+        self.solver = solver
         self.absent = absent or {}
 
     def field(self, t, q, u):

@@ -144,7 +144,7 @@ def _check_all_names(s: Structure) -> None:
     _check_names(kind, "transitions", [tr.name for tr in s.transitions])
     outputs = [output.name for output in s.system.outputs()]
     _check_names(kind, "states and outputs", (*map(str, states), *outputs))
-    absent = [name for chart in s.charts for name in chart.absent]
+    absent = itertools.chain(*(chart.absent for chart in s.charts))
     require_inputs_apart(kind, s.inputs, [*states, *absent, *outputs])
 
 

@@ -70,7 +70,9 @@ class Items(Kind):
         form: type | None = None,
         iterable: bool = False,
     ):
-        self.item, self.form, self.iterable = item, form, iterable
+        self.item = item
+        self.form = form
+        self.iterable = iterable
         if item is None:
             self.allowed = "a sequence"
         else:
@@ -121,7 +123,8 @@ class Table(Kind):
     """A mapping all of whose keys and values are of one kind each."""
 
     def __init__(self, key: Kind | None, value: Kind | None):
-        self.key, self.value = key, value
+        self.key = key
+        self.value = value
         self.allowed = "a mapping such as {name: value}"
 
     def take(self, value):
@@ -145,7 +148,8 @@ class Names(Kind):
         empty: bool = False,
         units: bool = False,
     ):
-        self.empty, self.units = empty, units
+        self.empty = empty
+        self.units = units
         self.types = (str,) if other is None else (str, other)
         self.allowed = "a name, or a sequence of distinct names"
         if other is not None:
@@ -208,7 +212,8 @@ class _Checked:
     """An iterable whose items are checked each time that it is iterated over."""
 
     def __init__(self, stream: Stream, value: Iterable):
-        self._stream, self._value = stream, value
+        self._stream = stream
+        self._value = value
 
     def __iter__(self) -> Iterator[Any]:
         item = self._stream.item

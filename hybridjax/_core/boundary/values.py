@@ -35,7 +35,9 @@ class Misfit(Exception):
         near: bool = False,
         path: str = "",
     ):
-        self._problem, self.near, self.path = problem, near, path
+        self._problem = problem
+        self.near = near
+        self.path = path
 
     @property
     def problem(self) -> str:
@@ -219,7 +221,8 @@ class Plain(Kind):
     """What passes a test."""
 
     def __init__(self, allowed: str, fits: Callable[[Any], bool]):
-        self.allowed, self.fits = allowed, fits
+        self.allowed = allowed
+        self.fits = fits
 
 
 TEXT = Plain("a string", lambda value: isinstance(value, str))
@@ -289,7 +292,9 @@ class Reals(Kind):
     ):
         self.shape = tuple(shape.split())
         self.sign = sign
-        self.missing, self.infinite, self.form = missing, infinite, form
+        self.missing = missing
+        self.infinite = infinite
+        self.form = form
         if sign != "any":
             self.single = f"a {sign} number"
             self.items = f"{sign} numbers"

@@ -114,7 +114,8 @@ def _sincos(x):
 
 @_sincos.defjvp
 def _(xs, dxs):
-    (x,), (dx,) = xs, dxs
+    (x,) = xs
+    (dx,) = dxs
     s, c = _sincos(x)
     return (s, c), (dx * c, -dx * s)
 
