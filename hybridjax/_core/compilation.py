@@ -264,7 +264,7 @@ def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Pr
     leaves, structure = jax.tree_util.tree_flatten(arrays)
 
     def run(leaves):
-        arrays = structure.unflatten(leaves)
+        arrays = jax.tree_util.tree_unflatten(structure, leaves)
         return function(*eqx.combine(arrays, static))
 
     if key not in _by_kind:
@@ -486,7 +486,7 @@ def _kernel_program(function, form, static, structure, leaves, options) -> Calla
         leaves = list(still)
         for k, x in zip(places, arrays, strict=True):
             leaves[k] = x
-        trees = structure.unflatten(leaves)
+        trees = jax.tree_util.tree_unflatten(structure, leaves)
         return form(ft.partial(function, *static), *trees)(*arguments)
 
     # (One for each number of lanes, as it is for arrays of one shape.)

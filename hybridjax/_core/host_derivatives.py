@@ -81,7 +81,7 @@ def by_columns(
             return _compiled_derivatives(compiled, arguments, tangents)
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
-        directions = structure.unflatten(parts)
+        directions = jax.tree_util.tree_unflatten(structure, parts)
         try:
             with on_the_cpu(), jax_compat.outside(), uncollected(), at_ease():
                 result, columns = along(to_host(arguments), directions)

@@ -304,9 +304,8 @@ def _is_smooth(equation: Equation, moves: Sequence[bool]) -> bool:
             return not moves[1]
         case name:
             # (JAX 0.11 leaves calls without results in a program.)
-            real = all(
-                jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars
-            )
+            results: list[Any] = equation.outvars
+            real = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in results)
             return is_call(equation) or (name in _SMOOTH and real)
 
 

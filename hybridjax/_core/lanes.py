@@ -35,7 +35,9 @@ class PerLane(eqx.Module):
     def axes(self) -> Any:
         """Return the axes of lanes in the form that `jax.vmap` takes: -1 or None for each array."""
         structure = jax.tree_util.tree_structure(eqx.filter(self.tree, eqx.is_array))
-        return structure.unflatten([-1 if x else None for x in self.split])
+        return jax.tree_util.tree_unflatten(
+            structure, [-1 if x else None for x in self.split]
+        )
 
 
 def shared(tree: Any) -> Any:
@@ -51,7 +53,7 @@ def one_lane(tree: Any) -> Any:
     for x, split in zip(leaves, _split_of(tree, len(leaves)), strict=True):
         shape = x.shape[:-1] if split else x.shape
         shapes.append(jax.ShapeDtypeStruct(shape, x.dtype))
-    return eqx.combine(structure.unflatten(shapes), static)
+    return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
 def _split_of(tree: Any, count: int) -> tuple[bool, ...]:
@@ -157,7 +159,9 @@ def _join_common(tree, mapped, size: int, L: int):
         return tree
     for k in np.flatnonzero(either):
         leaves[k] = _join(leaves[k], mapped[k], split[k], size, L)
-    return PerLane(eqx.combine(structure.unflatten(leaves), static), either)
+    return PerLane(
+        eqx.combine(jax.tree_util.tree_unflatten(structure, leaves), static), either
+    )
 
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:

@@ -80,7 +80,7 @@ def first_of(x: Thing) -> Thing:
 
 def _mark(x: Any, digest: str) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(x)
-    marked = structure.unflatten(leaves)
+    marked = jax.tree_util.tree_unflatten(structure, leaves)
     object.__setattr__(marked, "code_digest", digest)
     return marked
 

@@ -174,7 +174,7 @@ class Reading:
         self._note(kind.__qualname__)
         if is_tracer(x):
             return self._note(str(x.aval))
-        reader: Any = _reader_of(kind)
+        reader: Any = _reader_of(kind)  # type: ignore[arg-type]  # (a class)
         return reader(self, x)
 
     def _table(self, x: dict) -> None:
@@ -701,7 +701,7 @@ def is_of_package(path: str) -> bool:
 @ft.cache
 def _recorded(folder: pathlib.Path) -> frozenset[str]:
     """Names of what pip has put into a folder (with `--target`)."""
-    names = set()
+    names: set[str] = set()
     for package in importlib.metadata.distributions(path=[str(folder)]):
         record = package.read_text("RECORD") or ""
         names.update(re.split("[/,]", line)[0] for line in record.splitlines())

@@ -276,8 +276,8 @@ def bodes(
 
 
 def _columns(families) -> dict[str, list[HTF]]:
-    columns = {}
-    outputs = set()
+    columns: dict[str, tuple] = {}
+    outputs: set[tuple[str, ...]] = set()
     for name, htfs in dict(families).items():
         columns[name] = (htfs,) if isinstance(htfs, Transfer) else tuple(htfs)
         outputs.update(htf.outputs for htf in columns[name])

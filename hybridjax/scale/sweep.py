@@ -203,7 +203,7 @@ class SweepJob:
         """Return the job with the beginning that another process computed."""
         blank = self._blank()
         structure = jax.tree_util.tree_structure(blank.parts())
-        of_map, index, solved = structure.unflatten(arrays)
+        of_map, index, solved = jax.tree_util.tree_unflatten(structure, arrays)
         begun = Begun(_with(blank.map, *of_map), index, solved)
         return dataclasses.replace(self, begun=begun, variables=layout.variables)
 

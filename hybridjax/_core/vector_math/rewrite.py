@@ -72,7 +72,8 @@ def vectorized(
         program = _replaced(program, trigonometry)
         run = jax_compat.as_function(jax_compat.with_program(whole, program))
         values = map(jnp.asarray, run(*jax.tree_util.tree_leaves(arguments)))
-        return jax.tree_util.tree_structure(shapes).unflatten(values)
+        structure = jax.tree_util.tree_structure(shapes)
+        return jax.tree_util.tree_unflatten(structure, values)
 
     return call
 
@@ -185,11 +186,11 @@ def _solved(equation: Equation, factors: set) -> Equation | None:
 def _ours(equation: Equation, trigonometry: bool) -> Equation | None:
     """Our equation in place of one of JAX, if we have one for its types."""
     function = function_of(equation)
+    types: list[Any] = [v.aval for v in equation.invars]
     if function in _FACTORIZATIONS:
-        matrix = equation.invars[0].aval
-        rows, columns = matrix.shape[-2:]
+        rows, columns = types[0].shape[-2:]
         square = rows == columns and 0 < rows <= factorizations.MOST_ROWS
-        if not square or not jnp.issubdtype(matrix.dtype, jnp.floating):
+        if not square or not jnp.issubdtype(types[0].dtype, jnp.floating):
             return None
         form = jax_compat.form_of_factors(equation)
         return _in_place_of(equation, _FACTORIZATIONS[function], form)
@@ -197,7 +198,7 @@ def _ours(equation: Equation, trigonometry: bool) -> Equation | None:
         return None
     if jax_compat.is_rounded(equation):
         return None
-    if any(v.aval.dtype != jnp.float64 for v in equation.invars):
+    if any(x.dtype != jnp.float64 for x in types):
         return None
     return _in_place_of(equation, _TRIGONOMETRY[function])
 
