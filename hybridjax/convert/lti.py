@@ -193,9 +193,9 @@ def to_harmonic_state_space(
     orders = _ORDERS if order is None else (order,)
     for n in orders:
         m = np.arange(-n, n + 1)
-        blocks = [_toeplitz(x, n, angles, weights) for x in series]
-        blocks[0] = blocks[0] - np.diag(np.repeat(2j * np.pi * m / period, s.d))
-        space = HarmonicStateSpace(*blocks, order=n, error=np.nan)
+        A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
+        A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
+        space = HarmonicStateSpace(A, B, C, D, n, error=np.nan)
         truncated = space.transfer(_TRIED, period)[:, n - 1 : n + 2]
         error = np.abs(truncated - exact).max() / np.abs(exact).max()
         space = space._replace(error=float(error))

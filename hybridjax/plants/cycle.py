@@ -526,11 +526,12 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     items: Any = getattr(family, "items", ())
     if items and all(map(_is_of_a_signal, items)):
         return _at_crossings(drive, items)
-    anchored = not isinstance(getattr(family, "anchor", None), Crossing)
-    if anchored and period is not None and type(family) is families.ClockPhase:
-        return Phase(family.n_sections, period, float(family.anchor) * period)
-    if anchored and type(family) is families.KinematicPhase:
-        return _by_angle(drive, family, turns)
+    anchor: Any = getattr(family, "anchor", None)
+    is_number = not isinstance(anchor, Crossing)
+    if is_number and period is not None and type(family) is families.ClockPhase:
+        return Phase(family.n_sections, period, float(anchor) * period)
+    if is_number and type(family) is families.KinematicPhase:
+        return _by_angle(drive, family, float(anchor), turns)
     raise DefinitionError(
         "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`; an "
         "`anchor` must be a number."
@@ -551,7 +552,9 @@ def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> Phase:
     return Phase(len(rows), crossings=rows)
 
 
-def _by_angle(drive: Drive, family: families.KinematicPhase, turns: float) -> Phase:
+def _by_angle(
+    drive: Drive, family: families.KinematicPhase, anchor: float, turns: float
+) -> Phase:
     """Sections by the angle of two signals, whose sense so many turns show."""
     pair = family.position, family.velocity
     require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
@@ -570,5 +573,5 @@ def _by_angle(drive: Drive, family: families.KinematicPhase, turns: float) -> Ph
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
     phase.sense = float(np.sign(phase.turns - began))
-    phase.first = float(family.anchor)
+    phase.first = anchor
     return phase

@@ -240,13 +240,14 @@ def _film(
             cells = grid[0, 0].subgridspec(1, len(tracks))
             for i, track in enumerate(tracks):
                 parts += _picture(figure.add_subplot(cells[i]), track)
-        has_circle = isinstance(motion, LimitCycle) and len(motion.multipliers) > 0
+        multipliers = getattr(motion, "multipliers", ())
+        has_circle = len(multipliers) > 0
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
             _draw_orbit(panel, motion, plane, sections, beside)
             parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
-            _unit_circle(figure.add_subplot(grid[1, 1]), motion)
+            _unit_circle(figure.add_subplot(grid[1, 1]), multipliers)
         times = tracks[0].times - tracks[0].times[0]
         interval = (times[1] - times[0]) / pace
         title = f"motion of {type(s.system).__name__}"
@@ -296,15 +297,16 @@ def _tracks(
     motion: LimitCycle | Trajectory, beside: Trajectory | None, speed: float | None
 ) -> tuple[list[Track], float, str]:
     """What is animated, units of the system's time in a second of playback, and a note on it."""
-    path = motion
-    period = math.inf
     if isinstance(motion, LimitCycle):
         path = motion.trajectory()
         period = float(motion.period)
+    else:
+        path = motion
+        period = math.inf
     longest = beside or path
     length = float(np.ptp(longest.t))
-    if beside is None and isinstance(motion, LimitCycle):
-        length = period
+    if beside is None:
+        length = min(length, period)
     pace, note = _pace(length, motion.system.time_unit, speed)
     count = max(12, round(length / pace * _RATE))
     times = longest.t[0] + np.linspace(0, length, count, endpoint=False)
@@ -328,9 +330,9 @@ def _draw_orbit(ax: Axes, motion: Any, plane, sections, beside) -> None:
         ax.legend([], [])
 
 
-def _unit_circle(ax: Axes, cycle: LimitCycle) -> None:
+def _unit_circle(ax: Axes, multipliers: Any) -> None:
     """The multipliers. (A formula as a label would take a twentieth of a second.)"""
-    draw_multipliers(cycle, zoom=False, ax=ax)
+    draw_multipliers(multipliers, zoom=False, ax=ax)
     ticks = [-1, 0, 1]
     ax.set(xticks=ticks, yticks=ticks, xlabel="Re λ", ylabel="Im λ")
 
@@ -418,7 +420,7 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
 _NOWHERE = np.full(3, np.nan)
 
 
-def _shape(ax: Axes, places: Sequence[np.ndarray], **look: Any) -> Part:
+def _shape(ax: Axes, places: Sequence[Any] | np.ndarray, **look: Any) -> Part:
     """A line that has other places (2, n) in each frame."""
     (line,) = ax.plot([], [], **look)
     return line, line.set_data, places

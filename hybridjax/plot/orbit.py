@@ -193,7 +193,7 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
 def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn,
     to which its own are added."""
-    note = ax.annotate(
+    note: Any = ax.annotate(
         text,
         point,
         xytext=(0, 0),

@@ -94,7 +94,7 @@ def drawn(
         for row, numbers in zip(rows, values.T, strict=True):
             parts = np.split(numbers, ends[:-1])
             shapes = [x.reshape(y.shape) for x, y in zip(parts, leaves, strict=True)]
-            drawings[row] = form.unflatten(shapes)
+            drawings[row] = jax.tree_util.tree_unflatten(form, shapes)
     return drawings
 
 

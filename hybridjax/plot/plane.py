@@ -101,7 +101,7 @@ class _Markers(NamedTuple):
             ends = []
             if np.ptp(border.imag) == 0:
                 ends = [int(border.real.argmin()), int(border.real.argmax())]
-            edge = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
+            edge: Any = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
             ax.plot(border.real, border.imag, color=look["color"], **edge)
 
 

@@ -268,7 +268,7 @@ def _check_shape(
 def _rounded_to(program: Program, moving: Sequence[bool]) -> str:
     """A type of few digits in which a program computes with arguments that are `moving`; "" for
     none. (Constants of such a type are exact.)"""
-    depends = dict(zip(program.invars, moving, strict=True))
+    depends: dict[Any, bool] = dict(zip(program.invars, moving, strict=True))
     for equation in program.eqns:
         inputs = [is_variable(x) and depends.get(x, False) for x in equation.invars]
         depends |= dict.fromkeys(equation.outvars, any(inputs))
@@ -280,7 +280,8 @@ def _rounded_to(program: Program, moving: Sequence[bool]) -> str:
             low = _rounded_to(inner, inputs)
             if low:
                 return low
-        for x in equation.outvars:
+        results: list[Any] = equation.outvars
+        for x in results:
             bits = jax_compat.bits_of(x)
             if bits is not None and bits < 64:
                 return x.aval.dtype.name
