@@ -55,7 +55,8 @@ def save(path: FilePath, thing: Saved) -> None:
     **Raises:** `DefinitionError` for other objects, traced or batched ones, another suffix, and
     where the file cannot be written; `PrecisionError` in single precision.
     """
-    path, kind = Path(path), type(thing).__name__
+    path = Path(path)
+    kind = type(thing).__name__
     if type(thing) is not KINDS.get(kind):
         raise DefinitionError(
             f"save takes {', '.join(KINDS)}; it cannot write a {kind}."

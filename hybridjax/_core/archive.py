@@ -45,7 +45,8 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     written.
     """
     kind = type(thing).__name__
-    if (wrong := _wrong_field(thing)) is not None:
+    wrong = _wrong_field(thing)
+    if wrong is not None:
         raise DefinitionError(
             f"this {kind} cannot be saved: its {wrong}, a wrong type or shape."
         )
@@ -124,9 +125,13 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     other = ValueError(f"its fields are not those of {kind.__name__}")
     if not isinstance(static, dict):
         raise other
-    static, arrays, values = dict(static), dict(arrays), {}
+    static = dict(static)
+    arrays = dict(arrays)
+    values = {}
     for field in dataclasses.fields(kind):
-        name, inner, item = field.name, _module_in(field.type), _item_of(field.type)
+        name = field.name
+        inner = _module_in(field.type)
+        item = _item_of(field.type)
         if field.metadata.get("static", False):
             if name in static:
                 values[name] = static.pop(name)
@@ -147,7 +152,8 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     if static or arrays:
         raise other
     module = kind(**values)
-    if (wrong := _wrong_field(module)) is not None:
+    wrong = _wrong_field(module)
+    if wrong is not None:
         raise ValueError(wrong)
     return module
 
@@ -177,7 +183,8 @@ def _read_header(
         if array is None or array.nbytes > limits.TEXT:
             raise ValueError
         header = json.loads(array.item())
-        name, version = header["format"], header["format_version"]
+        name = header["format"]
+        version = header["format_version"]
     except (AttributeError, ValueError, TypeError, KeyError, RecursionError):
         name = None
     if name != _FORMAT:
@@ -185,17 +192,18 @@ def _read_header(
             f"'{path}' was not written by `hj.save`, whose files alone are read."
         )
     if version != _VERSION:
-        text = f"format version {version}, not {_VERSION}: use hybridjax"
-        raise FileFormatError(f"'{path}' has {text} {header.get('package_version')}.")
+        raise FileFormatError(
+            f"'{path}' has format version {version}, not {_VERSION}: use hybridjax "
+            f"{header.get('package_version')}."
+        )
     kind = header.get("kind")
     if not isinstance(kind, str) or kind not in kinds:
         raise FileFormatError(
             f"'{path}' holds a {kind!r}; `load` reads {', '.join(kinds)} only."
         )
     header.setdefault("units", {})  # (files written before units were kept)
-    if not all(
-        isinstance(header.get(part), dict) for part in ("static", "arrays", "units")
-    ):
+    parts = [header.get(part) for part in ("static", "arrays", "units")]
+    if not all(isinstance(part, dict) for part in parts):
         raise damaged(path, "its header is incomplete")
     return header
 
@@ -204,8 +212,10 @@ def signals_in(value: Any) -> Iterator[Signal]:
     """All names with a unit."""
     if isinstance(value, Signal) and value.unit:
         yield value
-    elif isinstance(value, dict | tuple):
-        for part in value.values() if isinstance(value, dict) else value:
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    if isinstance(value, tuple):
+        for part in value:
             yield from signals_in(part)
 
 
@@ -215,11 +225,9 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
         return {key: restored(part, units) for key, part in value.items()}
     if isinstance(value, list):
         return tuple(restored(part, units) for part in value)
-    return (
-        Signal(value, str(units[value]))
-        if isinstance(value, str) and value in units
-        else value
-    )
+    if isinstance(value, str) and value in units:
+        return Signal(value, str(units[value]))
+    return value
 
 
 def _wrong_field(thing: eqx.Module) -> str | None:
@@ -228,22 +236,19 @@ def _wrong_field(thing: eqx.Module) -> str | None:
         for field in dataclasses.fields(thing):
             value = getattr(thing, field.name)
             if not _matches(value, field.type):
-                what = (
-                    f"{value.dtype}{value.shape}"
-                    if hasattr(value, "dtype")
-                    else repr(value)
-                )
-                return f"{field.name} is {what}"
-            if (
-                isinstance(value, eqx.Module)
-                and (wrong := _wrong_field(value)) is not None
-            ):
-                return f"{field.name}.{wrong}"
+                if hasattr(value, "dtype"):
+                    return f"{field.name} is {value.dtype}{value.shape}"
+                return f"{field.name} is {value!r}"
+            if isinstance(value, eqx.Module):
+                wrong = _wrong_field(value)
+                if wrong is not None:
+                    return f"{field.name}.{wrong}"
     return None
 
 
 def _matches(value: Any, hint: Any) -> bool:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if origin is typing.Annotated:
         return _matches(value, arguments[0])
     if origin is typing.Literal:
@@ -296,7 +301,8 @@ def damaged(path: Path, reason: str) -> FileFormatError:
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
-    size, most = sum(m.file_size for m in members), limits.unpacked(packed)
+    size = sum(m.file_size for m in members)
+    most = limits.unpacked(packed)
     if size > most:
         raise ValueError(
             f"it declares arrays of {size} bytes, but packs them into {packed}"

@@ -20,6 +20,9 @@ else:
     and `float` to the promotion of static type checkers, which checks at run time do not know.)"""
 
 
+_LETTERS = {"inputs": "u", "outputs": "y", "references": "r"}
+
+
 def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ...]:
     """`count` names, with units where these are given; by default `u`, `y` or `r` for one, and
     `u0, u1, ...` for several.
@@ -27,8 +30,10 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
     **Raises:** `DefinitionError` if `given` has another length.
     """
     if given is None:
-        letter = {"inputs": "u", "outputs": "y", "references": "r"}[kind]
-        return (letter,) if count == 1 else tuple(f"{letter}{i}" for i in range(count))
+        letter = _LETTERS[kind]
+        if count == 1:
+            return (letter,)
+        return tuple(f"{letter}{i}" for i in range(count))
     if len(given) != count:
         raise DefinitionError(
             f"{count} {kind} need {count} names, but `{kind}` is {given}."
@@ -37,20 +42,25 @@ def names(kind: str, given: Collection[str] | None, count: int) -> tuple[str, ..
 
 
 def input_and_output_names(
-    inputs: Collection[str] | None, outputs: Collection[str] | None, nu: int, ny: int
+    inputs: Collection[str] | None,
+    outputs: Collection[str] | None,
+    nu: int,
+    ny: int,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """`names` of nu inputs and of ny outputs.
 
     **Raises:** `DefinitionError` as `names`, and for an output that is an input.
     """
-    u, y = names("inputs", inputs, nu), names("outputs", outputs, ny)
+    u = names("inputs", inputs, nu)
+    y = names("outputs", outputs, ny)
     require_apart(u, y)
     return u, y
 
 
 def require_apart(inputs: Collection[str], outputs: Collection[str]) -> None:
     """**Raises:** `DefinitionError` for an output that is an input."""
-    if shared := [name for name in outputs if name in inputs]:
+    shared = [name for name in outputs if name in inputs]
+    if shared:
         raise DefinitionError(
             f"'{shared[0]}' is in `inputs` and in `outputs`: name it in one."
         )
@@ -90,15 +100,20 @@ def require_axes(what: str, array: Any, *axes: Mapping[str, int]) -> None:
     empty for a single number.
     """
     if np.shape(array) not in [tuple(x.values()) for x in axes]:
-        written = (", ".join(f"{n} {axis}" for axis, n in x.items()) for x in axes)
-        allowed = " or ".join(f"of shape ({x})" if x else "one number" for x in written)
+        shapes = []
+        for sizes in axes:
+            written = ", ".join(f"{n} {axis}" for axis, n in sizes.items())
+            shapes.append(f"of shape ({written})" if sizes else "one number")
         raise DefinitionError(
-            f"{what} must be {allowed}, not of shape {np.shape(array)}."
+            f"{what} must be {' or '.join(shapes)}, not of shape {np.shape(array)}."
         )
 
 
 def require_among(
-    kind: str, names: Iterable[str], among: Collection[str], where: str = ""
+    kind: str,
+    names: Iterable[str],
+    among: Collection[str],
+    where: str = "",
 ) -> None:
     """**Raises:** `DefinitionError` for the first name that is not among those of a kind (a noun).
 
@@ -133,8 +148,10 @@ def searching(place: str, errors: tuple = (ComputationError,)) -> Iterator[None]
     try:
         yield
     except errors as error:
-        text = "These arguments are those of `find_limit_cycle`: call it, and give its cycle"
-        raise type(error)(f"{error} ({text} {place}.)") from error
+        raise type(error)(
+            f"{error} (These arguments are those of `find_limit_cycle`: call it, and give its "
+            f"cycle {place}.)"
+        ) from error
 
 
 def package(name: str) -> ModuleType:

@@ -11,9 +11,8 @@ import stat
 import tempfile
 import warnings
 
-import jax
-
 from ..errors import DefinitionError
+from . import jax_compat
 from .boundary.checked import checked
 from .boundary.kinds import FilePath
 
@@ -51,14 +50,8 @@ def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | N
             raise DefinitionError(f"{problem}: give another folder.") from error
         warnings.warn(f"{problem}; nothing is kept.", stacklevel=3)
         return None
-    jax.config.update("jax_compilation_cache_dir", str(programs))
-    # Also the smallest programs: those of users' functions are the first that a process needs.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # XLA prints two errors, a page each, for each program that it loads on a processor with
-    # AVX-512. Its only switch is the level of all its messages, which JAX ties to that of its own.
-    level = getattr(jax.config, "jax_logging_level")  # noqa: B009 (JAX does not declare it)
-    jax.config.update("jax_logging_level", "CRITICAL")
-    jax.config.update("jax_logging_level", level)
+    jax_compat.keep_programs_in(programs)
+    jax_compat.silence_xla()
     return programs
 
 
@@ -93,11 +86,10 @@ def _private_folder(given: str | os.PathLike[str] | None) -> pathlib.Path:
     marks = [path.name for path in programs.glob(f"{_MARK}*")]
     if marks != [f"{_MARK}{here.st_ino}"]:
         raise PermissionError(f"'{programs}' was not made in this place: move it away")
-    for path in programs.glob("*-[ac]*e"):  # the only files that JAX reads or writes
+    for path in jax_compat.kept_programs(programs):
         about = path.lstat()
-        is_ours = (
-            about.st_uid == here.st_uid and about.st_nlink == 1
-        )  # and no link to others'
+        # (A file with several links may be another user's, too.)
+        is_ours = about.st_uid == here.st_uid and about.st_nlink == 1
         if not (stat.S_ISREG(about.st_mode) and about.st_size <= _LARGEST and is_ours):
             raise PermissionError(f"'{path}' is no compiled program: move it away")
     return programs
@@ -115,7 +107,8 @@ def _refuse_others(path: pathlib.Path, is_above: bool) -> None:
     rename what is not theirs."""
     if not hasattr(os, "geteuid"):
         return
-    about, user = path.lstat(), os.geteuid()
+    about = path.lstat()
+    user = os.geteuid()
     is_open = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     is_alone = is_open == stat.S_IWGRP and _is_alone(about.st_gid)
     if is_above and (about.st_mode & stat.S_ISVTX or is_alone):
@@ -130,7 +123,8 @@ def _is_alone(number: int) -> bool:
     import pwd
 
     try:
-        group, user = grp.getgrgid(number), pwd.getpwuid(os.geteuid()).pw_name
+        group = grp.getgrgid(number)
+        user = pwd.getpwuid(os.geteuid()).pw_name
     except KeyError:
         return False
     return group.gr_name == user and set(group.gr_mem) <= {user}

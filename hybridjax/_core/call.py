@@ -46,7 +46,8 @@ def _frame_of_user() -> types.FrameType | None:
 def public_call() -> Iterator[None]:
     """A context of a call: a public call of its own, or a part of the one that is running if no
     code of the user stands between them."""
-    frame, call = _frame_of_user(), _running.get()
+    frame = _frame_of_user()
+    call = _running.get()
     if call is not None and call.frame is frame:
         yield
         return
@@ -63,7 +64,8 @@ def once_in_call(key: Hashable, owner: Any, make: Callable[[], Value]) -> Value:
 
     **Arguments:** `owner`: the object whose `id` is part of the key, which lives as long.
     """
-    frame, call = _frame_of_user(), _running.get()
+    frame = _frame_of_user()
+    call = _running.get()
     # (A thread has no frame of the user: several would share the values.)
     if frame is None or call is None or call.frame is not frame:
         return make()

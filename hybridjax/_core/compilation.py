@@ -22,25 +22,15 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_context
 
 from ..errors import ComputationError
-from . import executor
+from . import executor, jax_compat
 from .executor import as_numpy, from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .meaning import program_digest
 from .progress import say_compiling
 
 
-# No optimization passes of LLVM, and the older of XLA's two code generators: compiles in a third of
-# the time.
-_QUICK: dict[str, Any] = {
-    "xla_backend_optimization_level": 0,
-    "xla_cpu_use_fusion_emitters": False,
-}
-# XLA divides a program among its threads: dividing a small one takes a fifth longer.
-_UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
@@ -48,17 +38,6 @@ WORTH_COMPILING = 6.0
 # time. Less: it waits at its end for the compiling thread longer than it has computed. More:
 # repeated calls stay slow for longer.
 _WORTH_OPTIMIZING = 8.0
-# XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
-# is 1024.
-_LOOP_KERNELS = (
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
-)
-# JAX's settings by which the same function becomes another program.
-_SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_numpy_dtype_promotion",
-)
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
 
@@ -80,49 +59,15 @@ def enable_loop_kernels() -> None:
     this option.
     """
     before = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = " ".join(dict.fromkeys([*before.split(), _LOOP_KERNELS]))
-    if jax.default_backend() == "cpu" and not _loops_are_kernels():
+    os.environ["XLA_FLAGS"] = " ".join(
+        dict.fromkeys([*before.split(), jax_compat.LOOP_KERNELS])
+    )
+    if jax.default_backend() == "cpu" and not jax_compat.loops_are_kernels():
         os.environ["XLA_FLAGS"] = before
         raise ComputationError(
             "XLA has read its options already (call `enable_loop_kernels()` before JAX computes "
             "anything), or is of another version."
         )
-
-
-def _loops_are_kernels() -> bool:
-    """Return whether XLA makes one kernel of a loop above its own limit."""
-
-    def loop(x, count):
-        return jax.lax.fori_loop(0, count, lambda _, x: x * x[0], x)
-
-    return "xla_cpu_small_call" in str(
-        jax.jit(loop).lower(jnp.ones(1000), 9).compile().as_text()
-    )
-
-
-@ft.cache
-def compiler_options(small: bool = False) -> dict[str, Any]:
-    """Return XLA's options for quick compilation, also of a `small` program."""
-    options = _QUICK | _UNDIVIDED if small else _QUICK
-    return {name: value for name, value in options.items() if _is_known(name, value)}
-
-
-@ft.cache
-def loop_options() -> dict[str, Any]:
-    """Return XLA's options for programs that run through loops many times. (The older code
-    generator compiles in half of the time; without optimization loops take ten times as long.)"""
-    options = {"xla_cpu_use_fusion_emitters": False}
-    return {name: value for name, value in options.items() if _is_known(name, value)}
-
-
-@ft.cache
-def _is_known(name: str, value: Any) -> bool:
-    """Return whether this version of XLA has an option."""
-    try:
-        jax.jit(lambda: 0, compiler_options={name: value})()
-    except Exception:  # its type depends on the version
-        return False
-    return True
 
 
 @contextlib.contextmanager
@@ -158,9 +103,8 @@ def quick_jit(function: Callable) -> Callable:
 
     @ft.cache
     def quick() -> Any:
-        options: Any = {
-            "compiler_options": compiler_options()
-        }  # handed on to `jax.jit`
+        # (`filter_jit` hands options on to `jax.jit`.)
+        options: Any = {"compiler_options": jax_compat.quick_options()}
         return eqx.filter_jit(traced, **options)
 
     @ft.wraps(function)
@@ -174,7 +118,10 @@ def quick_jit(function: Callable) -> Callable:
             say_compiling(False)
             return result
 
-    lower = lambda *arguments: (quick() if on_cpu() else plain).lower(*arguments)  # noqa: E731
+    def lower(*arguments):
+        program = quick() if on_cpu() else plain
+        return program.lower(*arguments)
+
     setattr(call, "lower", lower)  # noqa: B010 (that of a function is not declared)
     return call
 
@@ -183,7 +130,14 @@ def one_program(function: Callable) -> Callable:
     """A function that runs on the host, and where JAX traces its arguments, as one program (there,
     single operations would be compiled one by one)."""
     program = quick_jit(function)
-    return ft.wraps(function)(lambda *x: (program if is_hidden(x) else function)(*x))
+
+    @ft.wraps(function)
+    def call(*arguments):
+        if is_hidden(arguments):
+            return program(*arguments)
+        return function(*arguments)
+
+    return call
 
 
 def host_first(
@@ -196,7 +150,8 @@ def host_first(
 
     Inside of a transformation of JAX this is `quick_jit`, or that `derived`, as by `by_columns`.
     """
-    transformed = derived(compiled := quick_jit(function))
+    compiled = quick_jit(function)
+    transformed = derived(compiled)
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 
@@ -213,13 +168,14 @@ def host_first(
             return on_host(*arguments)
 
     def on_host(*arguments):
-        key, begin = kind(arguments), time.thread_time()
+        key = kind(arguments)
         before = spent[key]
+        begin = time.thread_time()
         if key in programs:
             return programs[key](*arguments)
         try:
             with (
-                eval_context(),
+                jax_compat.outside(),
                 uncollected(),
                 at_ease(),
                 executor.at_most(WORTH_COMPILING),
@@ -247,7 +203,7 @@ def kind(arguments) -> tuple:
     JAX's settings (in a thread: those of all threads)."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     types = ((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
-    return structure, *(getattr(jax.config, name) for name in _SETTINGS), *types
+    return structure, *jax_compat.settings_of_programs(), *types
 
 
 class TwoTiers:
@@ -260,7 +216,8 @@ class TwoTiers:
     """
 
     def __init__(self, function: Callable, large: bool):
-        self._function, self.large = function, large
+        self._function = function
+        self.large = large
         self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -278,20 +235,20 @@ class TwoTiers:
 
 
 class OneTier:
-    """`function(*arguments)`, compiled once by options that suit it.
+    """`function(*arguments)`, compiled once by options for loops.
 
     For functions that compile in about a second: of these a quick executable is no gain.
     """
 
-    def __init__(self, function: Callable, options: dict[str, Any]):
-        self._function, self._options = function, options
+    def __init__(self, function: Callable):
+        self._function = function
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_hidden(arguments):
             return one_tier(self._function, True)(*arguments)
         _, leaves, program = _program_of(self._function, arguments)
         with _choosing:
-            executable = program.only(self._options)
+            executable = program.only()
         return program.run(executable, leaves)
 
 
@@ -326,12 +283,12 @@ def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
         if len(_by_kind) >= _KEPT:
             _by_kind.clear()
             _by_text.clear()
-        lowered = jax.jit(run).lower(leaves)
-        text = lowered.as_text()
-        digest = key[0], hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(
-            digest, _Program(lowered, "@lapack_" in text)
-        )
+        traced = jax.jit(run).trace(leaves)
+        lowered = traced.lower()
+        text = hashlib.sha256(lowered.as_text().encode()).digest()
+        needed, _ = jax_compat.needed_part(traced.jaxpr.jaxpr)
+        program = _Program(lowered, alone=jax_compat.calls_lapack(needed))
+        _by_kind[key] = _by_text.setdefault((key[0], text), program)
     return _by_kind[key]
 
 
@@ -345,10 +302,12 @@ class _Program:
     """A program that is lowered, and its executables."""
 
     def __init__(self, lowered: jax.stages.Lowered, alone: bool):
-        self._lowered, self._alone = lowered, alone
+        self._lowered = lowered
+        self._alone = alone
         self._quick: jax.stages.Compiled | None = None
         self._full: jax.stages.Compiled | None = None
-        self._seconds, self._lock = 0.0, threading.Lock()
+        self._seconds = 0.0
+        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def choose(self, large: bool) -> jax.stages.Compiled:
@@ -357,15 +316,16 @@ class _Program:
         if large or self._full is not None:
             return self._optimize()
         if self._quick is None:
-            self._quick = self._lowered.compile(compiler_options=compiler_options())
+            options = jax_compat.quick_options()
+            self._quick = self._lowered.compile(compiler_options=options)
         return self._quick
 
-    def only(self, options: dict[str, Any]) -> jax.stages.Compiled:
-        """The executable that these options give, of a program that has no other."""
+    def only(self) -> jax.stages.Compiled:
+        """The executable of a program of loops, which has no other."""
         if self._full is None:
-            known = {name: x for name, x in options.items() if _is_known(name, x)}
             say_compiling(True)
-            self._full = self._lowered.compile(compiler_options=known)
+            options = jax_compat.loop_options()
+            self._full = self._lowered.compile(compiler_options=options)
             say_compiling(False)
         return self._full
 
@@ -392,8 +352,7 @@ def _is_simple() -> bool:
     """Return whether JAX computes on the first CPU, and runs programs as they are."""
     device = executor.default_device()
     first = device in (None, "cpu") or device == jax.local_devices(backend="cpu")[0]
-    names = "jax_disable_jit", "jax_debug_nans", "jax_debug_infs"
-    return on_cpu() and first and not any(getattr(jax.config, name) for name in names)
+    return on_cpu() and first and jax_compat.runs_programs_as_they_are()
 
 
 # XLA hands factorizations that are left in a program (`vector_math/rewrite.py`) to LAPACK, on the
@@ -435,26 +394,35 @@ def kernel(
 
 
 def _run_lanes(
-    program: Callable, arrays: list, lanes: int, *arguments, some=None
+    program: Callable,
+    arrays: list,
+    lanes: int,
+    *arguments,
+    some=None,
 ) -> np.ndarray:
     if some is not None:
-        arguments = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
-        values = _run_lanes(program, arrays, lanes, *arguments)
+        needed = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
+        values = _run_lanes(program, arrays, lanes, *needed)
         return values[..., np.maximum(np.cumsum(some) - 1, 0)]
     L = max(x.shape[-1] for x in arguments)
     if L == lanes == 1:
         return np.asarray(program(arrays, *arguments))
     filled = -(-L // lanes) * lanes
-    arguments = [_fill(x, L, filled) for x in arguments]
+    columns = [_fill(x, L, filled) for x in arguments]
     if filled == lanes:
-        return np.asarray(program(arrays, *arguments))[..., :L]
-    blocks = [slice(k, k + lanes) for k in range(0, filled, lanes)]
-    parts = [program(arrays, *[x[..., block] for x in arguments]) for block in blocks]
+        return np.asarray(program(arrays, *columns))[..., :L]
+    parts = []
+    for begin in range(0, filled, lanes):
+        block = [x[..., begin : begin + lanes] for x in columns]
+        parts.append(program(arrays, *block))
     return np.concatenate(parts, axis=-1)[..., :L]
 
 
 def whole(
-    function: Callable, static: tuple, trees: Any, loops: bool = False
+    function: Callable,
+    static: tuple,
+    trees: Any,
+    loops: bool = False,
 ) -> Callable[..., Any]:
     """`function(*static, *trees, *arguments)` of any arguments and results as one program, with
     arrays of NumPy.
@@ -471,19 +439,21 @@ def whole(
 
 
 def _bound(
-    function, form, static, trees, lanes, loops: bool = False
+    function,
+    form,
+    static,
+    trees,
+    lanes,
+    loops: bool = False,
 ) -> tuple[Callable, list]:
     """The program of a kernel, and the arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
-    # (Arrays of an accelerator are copied once, by way of NumPy, and not in each call.)
-    is_near = lambda x: getattr(getattr(x, "device", None), "platform", "") == "cpu"  # noqa: E731
-    arrays = [
-        x if is_near(x) else jax.device_put(np.asarray(x))
-        for x in leaves
-        if _is_array(x)
-    ]
+    arrays = [_nearby(x) for x in leaves if _is_array(x)]
     key = function, form, static, lanes, identity(trees)
-    options = loop_options() if loops else compiler_options(small=True)
+    if loops:
+        options = jax_compat.loop_options()
+    else:
+        options = jax_compat.quick_options(small=True)
     with _kernels_lock:
         if key not in _kernels:
             _kernels[key] = _kernel_program(
@@ -493,6 +463,15 @@ def _bound(
         while len(_kernels) > _KEPT:
             _kernels.popitem(last=False)
         return _kernels[key], arrays
+
+
+def _nearby(x: Any) -> jax.Array:
+    """An array on the CPU. (One of an accelerator is copied once, by way of NumPy, and not in each
+    call.)"""
+    device = getattr(x, "device", None)
+    if getattr(device, "platform", "") == "cpu":
+        return x
+    return jax.device_put(np.asarray(x))
 
 
 _kernels: collections.OrderedDict[tuple, Callable] = collections.OrderedDict()
@@ -523,7 +502,8 @@ def identity(trees: Any) -> tuple:
 
 
 def _identity_of_part(x: Any) -> Hashable:
-    if digest := program_digest(x):
+    digest = program_digest(x)
+    if digest:
         arrays = filter(_is_array, jax.tree_util.tree_leaves(x))
         return digest, *((y.shape, y.dtype) for y in arrays)
     # (1, 1.0 and True are equal, and not the same.)

@@ -87,11 +87,12 @@ def core_count() -> int:
 # they compute. Only the libraries in the wheels of NumPy and SciPy are known; others (Accelerate,
 # MKL, those of distributions) are left alone. Their functions have 64-bit or 32-bit integers, and a
 # prefix or none.
-_NAMES = [
-    f"{prefix}openblas_{{}}_num_threads{bits}"
-    for prefix in ("scipy_", "")
-    for bits in ("64_", "")
-]
+_NAMES = (
+    "scipy_openblas_{}_num_threads64_",
+    "scipy_openblas_{}_num_threads",
+    "openblas_{}_num_threads64_",
+    "openblas_{}_num_threads",
+)
 _lock = threading.Lock()
 _before: list[int] = []
 _inside = 0

@@ -17,8 +17,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import core
-from jax.extend.core import get_opaque_trace_state
+
+from . import jax_compat
 
 
 if TYPE_CHECKING:
@@ -108,7 +108,10 @@ def while_loop(going: Callable, body: Callable, carry: Any) -> Any:
 
 
 def scan(
-    body: Callable, carry: Any, xs: Any, stack: Callable = np.stack
+    body: Callable,
+    carry: Any,
+    xs: Any,
+    stack: Callable = np.stack,
 ) -> tuple[Any, Any]:
     """`jax.lax.scan`; on the host results are joined by `stack`."""
     first = jax.tree_util.tree_leaves(xs)[0]
@@ -123,11 +126,9 @@ def scan(
 
 def for_each_row(function: Callable, rows: Any) -> Any:
     """`jax.vmap` of a function of one row."""
-    return (
-        np.stack([function(x) for x in rows])
-        if on_host(rows)
-        else jax.vmap(function)(rows)
-    )
+    if on_host(rows):
+        return np.stack([function(x) for x in rows])
+    return jax.vmap(function)(rows)
 
 
 def put(x: Array, index: Any, value: Any) -> Array:
@@ -141,11 +142,9 @@ def put(x: Array, index: Any, value: Any) -> Array:
 
 def lane(x: Array, i: Array) -> Array:
     """Lane i of x, as the only one."""
-    return (
-        x[..., i : i + 1]
-        if on_host(x)
-        else jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
-    )
+    if on_host(x):
+        return x[..., i : i + 1]
+    return jax.lax.dynamic_slice_in_dim(x, i, 1, axis=-1)
 
 
 def solve(matrices: Array, right: Array) -> Array:
@@ -177,7 +176,7 @@ def stop_gradient(x: Array) -> Array:
 
 def is_tracer(x: Any) -> bool:
     """Return whether JAX traces x."""
-    return isinstance(x, core.Tracer)
+    return jax_compat.is_tracer(x)
 
 
 def is_traced(*trees: Any) -> bool:
@@ -185,16 +184,13 @@ def is_traced(*trees: Any) -> bool:
     return any(map(is_tracer, jax.tree_util.tree_leaves(trees)))
 
 
-# The state outside of all transformations, where no program is traced. In others an operation
-# tells, as the state differs under `vmap` and `jvp`, too, which compute values.
-with core.eval_context():
-    _OUTSIDE = get_opaque_trace_state()
-
-
 def is_inside_program() -> bool:
     """Return whether JAX traces a program (of `jit`, `scan`, `cond` ...) at the moment: whatever is
     computed then becomes part of it, even a constant."""
-    return get_opaque_trace_state() != _OUTSIDE and is_traced(jax.device_put(0.0))
+    if jax_compat.is_outside():
+        return False
+    # (`vmap` and `jvp` compute values: an operation tells whether they belong to a program.)
+    return is_tracer(jax.device_put(0.0))
 
 
 def is_hidden(*trees: Any) -> bool:
@@ -205,7 +201,7 @@ def is_hidden(*trees: Any) -> bool:
 
 def default_device() -> Any:
     """Return the device of `jax.default_device`: a device, the name of a platform, or None."""
-    return getattr(jax.config, "jax_default_device")  # noqa: B009 (JAX does not declare it)
+    return jax_compat.default_device()
 
 
 def on_cpu() -> bool:
@@ -220,11 +216,7 @@ _AS_IT_IS = contextlib.nullcontext()
 def as_numpy() -> contextlib.AbstractContextManager:
     """A context in which JAX combines arrays of different ranks and types as NumPy does, on which
     this package relies. (Users may forbid it for their own lines, which are outside.)"""
-    config: Any = jax.config
-    if (
-        config.jax_numpy_rank_promotion == "allow"
-        and config.jax_numpy_dtype_promotion == "standard"
-    ):
+    if jax_compat.combines_as_numpy():
         return _AS_IT_IS
     both = contextlib.ExitStack()
     both.enter_context(jax.numpy_rank_promotion("allow"))

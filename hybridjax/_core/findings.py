@@ -28,8 +28,10 @@ class Finding(eqx.Module):
     )
 
     def __repr__(self) -> str:
-        action = "" if self.action == "warned" else f" ({self.action})"
-        return f"{self.cause[0].upper()}{self.cause[1:]}{action}: {self.text}"
+        head = f"{self.cause[0].upper()}{self.cause[1:]}"
+        if self.action != "warned":
+            head += f" ({self.action})"
+        return f"{head}: {self.text}"
 
     def __str__(self) -> str:
         return textwrap.fill(repr(self), 98, subsequent_indent="  ")

@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_context
 from jax.flatten_util import ravel_pytree
 
 from ..errors import DefinitionError
+from . import jax_compat
 from .compilation import at_ease, uncollected
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
@@ -66,8 +66,13 @@ def by_columns(
     @derived.def_jvp
     def rule(arguments, tangents):
         moved = relevant(tangents[0]), *tangents[1:]
-        still = lambda t: t is None  # noqa: E731
-        values = lambda t, x: None if still(t) else x  # noqa: E731
+
+        def still(t):
+            return t is None
+
+        def values(t, x):
+            return None if still(t) else x
+
         moving = jax.tree_util.tree_map(values, moved, arguments, is_leaf=still)
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
@@ -78,7 +83,7 @@ def by_columns(
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
         directions = jax.tree_util.tree_unflatten(structure, parts)
         try:
-            with on_the_cpu(), eval_context(), uncollected(), at_ease():
+            with on_the_cpu(), jax_compat.outside(), uncollected(), at_ease():
                 result, columns = along(to_host(arguments), directions)
         except NotOnHostError:
             require_program()

@@ -51,10 +51,7 @@ def card(kind: str, of: str, *parts: str) -> str:
 
 def facts(pairs: Mapping[str, str]) -> str:
     """A table of values by name."""
-    rows = (
-        f"<tr><th>{escape(x)}</th><td>{escape(text)}</td></tr>"
-        for x, text in pairs.items()
-    )
+    rows = [_row("td", [text], head=name) for name, text in pairs.items()]
     return f'<table class="plain">{"".join(rows)}</table>'
 
 
@@ -72,30 +69,34 @@ def text(lines: str) -> str:
     return f"<pre>{escape(lines)}</pre>" if lines else ""
 
 
-def _row(cell: str, texts: Sequence[str]) -> str:
-    return f"<tr>{''.join(f'<{cell}>{escape(x)}</{cell}>' for x in texts)}</tr>"
+def _row(cell: str, texts: Sequence[str], head: str | None = None) -> str:
+    """A row of cells (`td`, `th`), after a head if there is one."""
+    cells = [f"<{cell}>{escape(x)}</{cell}>" for x in texts]
+    if head is not None:
+        cells.insert(0, f"<th>{escape(head)}</th>")
+    return f"<tr>{''.join(cells)}</tr>"
 
 
 def complex_number(z: complex, digits: int = 6) -> str:
     """A number such as `-0.248983 + 0.699333i`."""
+    real = f"{z.real:.{digits}g}"
     if not z.imag:
-        return f"{z.real:.{digits}g}"
-    return f"{z.real:.{digits}g} {'-' if z.imag < 0 else '+'} {abs(z.imag):.{digits}g}i"
+        return real
+    sign = "-" if z.imag < 0 else "+"
+    return f"{real} {sign} {abs(z.imag):.{digits}g}i"
 
 
 def multiplier_table(
     values: Complex[np.ndarray, " d"], errors: Float[np.ndarray, " d"] | None = None
 ) -> str:
     """The multipliers, their standard errors if they are given, and their moduli."""
-    columns = {
-        "multiplier": [complex_number(z, 6 if errors is None else 8) for z in values]
-    }
+    digits = 6 if errors is None else 8
+    columns = {"multiplier": [complex_number(z, digits) for z in values]}
     if errors is not None:
-        columns["± standard error"] = [
-            f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors
-        ]
+        known = [f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors]
+        columns["± standard error"] = known
     columns["modulus"] = [f"{abs(z):.6g}" for z in values]
-    return table(tuple(columns), list(zip(*columns.values(), strict=True)))
+    return table(tuple(columns), zip(*columns.values(), strict=True))
 
 
 class Curve(NamedTuple):
@@ -115,14 +116,10 @@ def unit_circle(
 ) -> str:
     """A picture of multipliers, with the borders of their confidence regions."""
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
-    curves = [
-        Curve(np.real(circle), np.imag(circle), color=COLORS[-1]),
-        *(
-            Curve(np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3), color=COLORS[0])
-            for z in regions
-        ),
-        Curve(np.real(values), np.imag(values), color=COLORS[1], points=True),
-    ]
+    curves = [Curve(circle.real, circle.imag, color=COLORS[-1])]
+    for z in regions:
+        curves.append(Curve(z.real.clip(-3, 3), z.imag.clip(-3, 3), color=COLORS[0]))
+    curves.append(Curve(values.real, values.imag, color=COLORS[1], points=True))
     return picture(curves, "real part", "imaginary part", square=True)
 
 

@@ -5,7 +5,7 @@ passed as it is; where each lane has its own, it is marked by `PerLane`.
 """
 
 import functools as ft
-import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -49,16 +49,23 @@ def one_lane(tree: Any) -> Any:
     """Return the part of a tree that belongs to a single lane, with shapes in place of arrays."""
     arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
-    split = tree.split if isinstance(tree, PerLane) else (False,) * len(leaves)
-    shapes = [
-        jax.ShapeDtypeStruct(x.shape[:-1] if s else x.shape, x.dtype)
-        for x, s in zip(leaves, split, strict=True)
-    ]
+    shapes = []
+    for x, split in zip(leaves, _split_of(tree, len(leaves)), strict=True):
+        shape = x.shape[:-1] if split else x.shape
+        shapes.append(jax.ShapeDtypeStruct(shape, x.dtype))
     return eqx.combine(jax.tree_util.tree_unflatten(structure, shapes), static)
 
 
+def _split_of(tree: Any, count: int) -> tuple[bool, ...]:
+    """Which of a tree's arrays, of which there are so many, have one entry for each lane."""
+    return tree.split if isinstance(tree, PerLane) else (False,) * count
+
+
 def by_lane(
-    function: Callable, *trees: Any, quick: bool = False, by_row: bool = True
+    function: Callable,
+    *trees: Any,
+    quick: bool = False,
+    by_row: bool = True,
 ) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
@@ -83,10 +90,9 @@ def by_lane(
     def call(*arguments):
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
-        arguments = [
-            x[..., 0] if c else x for x, c in zip(arguments, common, strict=True)
-        ]
-        return program(common, lanes >= _VECTOR_LANES and not quick)(arrays, *arguments)
+        points = [x[..., 0] if x.shape[-1] < lanes else x for x in arguments]
+        many = lanes >= _VECTOR_LANES and not quick
+        return program(common, many)(arrays, *points)
 
     return call
 
@@ -109,15 +115,21 @@ def vmap_to_lanes(function: Callable[[tuple, Any], Any]) -> Callable[[tuple, Any
         def rule(size, batched, arrays):
             (batched,) = batched
             common, lanes = eqx.combine(arrays, static)
+            mapped_common, mapped_lanes = batched
             L = jax.tree_util.tree_leaves(lanes)[0].shape[-1]
-            joined = tuple(
-                _join_common(tree, mapped, size, L)
-                for tree, mapped in zip(common, batched[0], strict=True)
-            )
-            join = lambda x, mapped: _join(x, mapped, True, size, L)  # noqa: E731
-            out = call(joined, jax.tree_util.tree_map(join, lanes, batched[1]))
-            split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, L), -2, 0)  # noqa: E731
-            out = jax.tree_util.tree_map(split, out)
+
+            def join_common(tree, mapped):
+                return _join_common(tree, mapped, size, L)
+
+            def join(x, mapped):
+                return _join(x, mapped, True, size, L)
+
+            def split(x):
+                return jnp.moveaxis(x.reshape(*x.shape[:-1], size, L), -2, 0)
+
+            joined = tuple(map(join_common, common, mapped_common))
+            more_lanes = jax.tree_util.tree_map(join, lanes, mapped_lanes)
+            out = jax.tree_util.tree_map(split, call(joined, more_lanes))
             return out, jax.tree_util.tree_map(lambda _: True, out)
 
         return run(arrays)
@@ -131,24 +143,24 @@ def _join(x, mapped: bool, by_lane: bool, size: int, L: int):
         x = jnp.moveaxis(x, 0, -2 if by_lane else -1)
     elif by_lane:
         x = x[..., None, :]
-    x = x if by_lane else x[..., None]
-    return jnp.broadcast_to(x, (*x.shape[:-2], size, L)).reshape(
-        *x.shape[:-2], size * L
-    )
+    if not by_lane:
+        x = x[..., None]
+    shape = x.shape[:-2]
+    return jnp.broadcast_to(x, (*shape, size, L)).reshape(*shape, size * L)
 
 
 def _join_common(tree, mapped, size: int, L: int):
-    mapped = jax.tree_util.tree_leaves(mapped)
-    split = tree.split if isinstance(tree, PerLane) else (False,) * len(mapped)
-    if not any(split) and not any(mapped):
-        return tree
     arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
-    flags = zip(leaves, mapped, split, strict=True)
-    joined = [_join(x, m, s, size, L) if m or s else x for x, m, s in flags]
-    either = tuple(m or s for m, s in zip(mapped, split, strict=True))
+    mapped = jax.tree_util.tree_leaves(mapped)
+    split = _split_of(tree, len(leaves))
+    either = tuple(map(operator.or_, mapped, split))
+    if not any(either):
+        return tree
+    for k in np.flatnonzero(either):
+        leaves[k] = _join(leaves[k], mapped[k], split[k], size, L)
     return PerLane(
-        eqx.combine(jax.tree_util.tree_unflatten(structure, joined), static), either
+        eqx.combine(jax.tree_util.tree_unflatten(structure, leaves), static), either
     )
 
 
@@ -170,37 +182,27 @@ def lane_jvp(
     function itself would store and read again all that happens in it. And where JAX asks for
     several tangents, they all use one Jacobian.
     """
-    has_tangent = lambda x, t: t is not None and eqx.is_inexact_array(x)  # noqa: E731
-    has = [
-        jax.tree_util.tree_map(has_tangent, x, t, is_leaf=lambda x: x is None)
-        for x, t in (lane, shared)
-    ]
-    moving, fixed_lane = eqx.partition(lane[0], has[0])
-    common, fixed_shared = eqx.partition(shared[0], has[1])
-    t_moving, t_common = (
-        eqx.filter(t, h) for t, h in ((lane[1], has[0]), (shared[1], has[1]))
-    )
+
+    moving, still, t_moving = _moving(*lane)
+    common, still_common, t_common = _moving(*shared)
 
     def of(moving, common):
-        return function(
-            eqx.combine(moving, fixed_lane), eqx.combine(common, fixed_shared)
-        )
+        return function(eqx.combine(moving, still), eqx.combine(common, still_common))
 
     leaves = jax.tree_util.tree_leaves
-    sizes = [math.prod(x.shape[:-1]) for x in leaves(moving)] + [
-        x.size for x in leaves(common)
-    ]
-    if not sizes or sum(sizes) > JACOBIAN_COLUMNS:
+    point = jax.tree_util.tree_map(lambda x: x[..., 0], moving), common
+    total = sum(x.size for x in leaves(point))
+    if not 0 < total <= JACOBIAN_COLUMNS:
         return jax.jvp(of, (moving, common), (t_moving, t_common))
 
-    total = sum(sizes)
-    _, parts = ravel_pytree(
-        (jax.tree_util.tree_map(lambda x: x[..., 0], moving), common)
-    )
+    _, parts = ravel_pytree(point)
 
     def push(direction):
         of_lane, of_all = parts(direction)
-        spread = lambda t, x: jnp.broadcast_to(t[..., None], x.shape)  # noqa: E731
+
+        def spread(t, x):
+            return jnp.broadcast_to(t[..., None], x.shape)
+
         tangents = jax.tree_util.tree_map(spread, of_lane, moving), of_all
         return jax.jvp(of, (moving, common), tangents)
 
@@ -213,11 +215,22 @@ def lane_jvp(
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
 
     def contract(column):
-        return jnp.sum(
-            column * weights.reshape(total, *[1] * (column.ndim - 2), lanes), axis=0
-        )
+        ones = (1,) * (column.ndim - 2)
+        return jnp.sum(column * weights.reshape(total, *ones, lanes), axis=0)
 
     return end, jax.tree_util.tree_map(contract, columns)
+
+
+def _moving(primal: Any, tangent: Any) -> tuple[Any, Any, Any]:
+    """The part of a tree that has tangents, the other part, and the tangents."""
+
+    def has_tangent(x, t):
+        return t is not None and eqx.is_inexact_array(x)
+
+    has = jax.tree_util.tree_map(
+        has_tangent, primal, tangent, is_leaf=lambda x: x is None
+    )
+    return *eqx.partition(primal, has), eqx.filter(tangent, has)
 
 
 def by_jacobian(function: Callable) -> Callable:
@@ -233,12 +246,8 @@ def by_jacobian(function: Callable) -> Callable:
 
     @derived.def_jvp
     def rule(arguments, tangents):
-        (tree,), (tangent,) = arguments, tangents
-        has = jax.tree_util.tree_map(
-            lambda x, t: t is not None, tree, tangent, is_leaf=lambda x: x is None
-        )
-        moving, still = eqx.partition(tree, has)
-        along, _ = ravel_pytree(eqx.filter(tangent, has))
+        moving, still, t_moving = _moving(*arguments, *tangents)
+        along, _ = ravel_pytree(t_moving)
 
         def with_columns(moving):
             numbers, back = ravel_pytree(moving)
@@ -255,7 +264,10 @@ def by_jacobian(function: Callable) -> Callable:
             return eqx.combine(smooth, rest), columns
 
         value, columns = by_jacobian(with_columns)(moving)
-        contract = lambda column: jnp.tensordot(along, column, 1)  # noqa: E731
+
+        def contract(column):
+            return jnp.tensordot(along, column, 1)
+
         return value, jax.tree_util.tree_map(contract, columns)
 
     return derived
@@ -276,7 +288,10 @@ def take_rows(x: Array, rows: Sequence[int]) -> Array:
 
 
 def put_rows(
-    x: Array, rows: Sequence[int], here: Bool[Array, " L"], new: Array
+    x: Array,
+    rows: Sequence[int],
+    here: Bool[Array, " L"],
+    new: Array,
 ) -> Array:
     """x (W, L) with these rows replaced by those of `new` for the lanes `here`."""
     xp = namespace(x)
@@ -286,9 +301,10 @@ def put_rows(
     place[np.array(rows, int)] = np.arange(len(rows))
     if on_host(x) or len(x) > _FEW:
         return xp.where(here & (place >= 0)[:, None], new[place], x)
-    return xp.stack(
-        [x[r] if k < 0 else xp.where(here, new[k], x[r]) for r, k in enumerate(place)]
-    )
+    changed = list(x)
+    for k, row in enumerate(rows):
+        changed[row] = xp.where(here, new[k], x[row])
+    return xp.stack(changed)
 
 
 def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, TypeVar, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.tree_util import keystr, tree_leaves_with_path
 
 from ..errors import DefinitionError
+from . import jax_compat
 from .call import once_in_call
 from .executor import Definition
 from .memo import Memory
@@ -60,7 +60,8 @@ def current(x: Thing) -> Thing:
     """
     if not isinstance(x, Definition):
         return x
-    digest, thing = code_digest(x), cast(Any, x)
+    digest = code_digest(x)
+    thing = cast(Any, x)
     if x.code_digest == digest:
         return thing
     return _marked.recall(x, digest, lambda: _mark(x, digest))
@@ -175,7 +176,10 @@ def _keep(table: collections.OrderedDict[str, Any], key: str, value: Any) -> Non
 
 def _shapes(x: Definition) -> Any:
     """Shapes of the arrays of a definition."""
-    shape = lambda y: jax.ShapeDtypeStruct(y.shape, y.dtype)  # noqa: E731
+
+    def shape(y):
+        return jax.ShapeDtypeStruct(y.shape, y.dtype)
+
     return jax.tree_util.tree_map(shape, eqx.filter(x, eqx.is_array))
 
 
@@ -223,7 +227,10 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         digests = Digests(program, [*arguments, "t", "q", "u"])
         rule = ""
         if digests.rules:
-            along = lambda a, *y: jax.jvp(lambda *z: every(a, *z), y, y)  # noqa: E731
+
+            def along(a, *y):
+                return jax.jvp(lambda *z: every(a, *z), y, y)
+
             pushed = jax.make_jaxpr(along)(arrays, *point)
             rule = digest_of_words(
                 *Digests(pushed, [*arguments, "t", "q", "u"]).results
@@ -261,7 +268,7 @@ def _failure(error: Exception, reading: Reading) -> str:
 def _own_traces() -> contextlib.AbstractContextManager:
     """A context in which JAX uses no trace from outside: it remembers traces by the words that
     belong to their operations, too."""
-    return cast(Any, set_xla_metadata(hybridjax=str(next(_calls))))
+    return jax_compat.own_traces(str(next(_calls)))
 
 
 def _require_the_same(
@@ -308,14 +315,16 @@ def change_of(x: Definition) -> str | None:
     digest = code_digest(x)
     if digest == x.code_digest:
         return None
-    before, after = _programs.get(x.code_digest, {}), _programs.get(digest, {})
+    before = _programs.get(x.code_digest, {})
+    after = _programs.get(digest, {})
     part = "a function, or a value that it reads,"
     if before and after:
         part = different(before, after)[0]
     name = getattr(x, "name", None)
-    title = (
-        f"{type(x).__name__} '{name}'" if isinstance(name, str) else type(x).__name__
-    )
+    if isinstance(name, str):
+        title = f"{type(x).__name__} '{name}'"
+    else:
+        title = type(x).__name__
     return f"{part} of {title}"
 
 
@@ -337,14 +346,20 @@ def _without_arrays(x: Definition) -> Any:
 
 def _with_forms(x: Definition) -> Any:
     """A definition with types and shapes in place of its arrays."""
-    form = lambda y: f"{y.dtype}{y.shape}" if eqx.is_array(y) else y  # noqa: E731
+
+    def form(y):
+        return f"{y.dtype}{y.shape}" if eqx.is_array(y) else y
+
     return jax.tree_util.tree_map(form, x)
 
 
 def require_as_made(things: Any, made: str) -> None:
     """**Raises:** `DefinitionError` if a definition in a tree of things that were `made` at some
     time, as in "this response function was made", computes something else now."""
-    is_definition = lambda x: isinstance(x, Definition)  # noqa: E731
+
+    def is_definition(x):
+        return isinstance(x, Definition)
+
     for x in jax.tree_util.tree_leaves(things, is_leaf=is_definition):
         if not is_definition(x) or not x.code_digest:
             continue

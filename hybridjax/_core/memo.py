@@ -45,7 +45,8 @@ class remembered:  # noqa: N801 (a decorator, as `property` is)
     """A property that is computed once for each object."""
 
     def __init__(self, function: Callable[[Any], Any]):
-        self._function, self.memory = function, Memory()
+        self._function = function
+        self.memory = Memory()
         functools.update_wrapper(cast(Callable, self), function)
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:

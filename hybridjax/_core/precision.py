@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import PrecisionError
+from . import jax_compat
 from .executor import is_inside_program
 
 
@@ -17,7 +18,7 @@ def enable_x64() -> None:
     anything is computed. Models, guesses, sections and settings may be built earlier; arrays of
     `jax.numpy` that were made earlier stay 32 bit, and raise an error.
     """
-    jax.config.update("jax_enable_x64", True)
+    jax_compat.use_double_precision()
 
 
 def require_x64(*trees: Any) -> None:
@@ -26,7 +27,7 @@ def require_x64(*trees: Any) -> None:
     **Raises:** `PrecisionError` if JAX runs in 32-bit mode, or if a floating-point leaf of one
     of `trees` is of less than 64 bits (an array of JAX that was made before `enable_x64()`).
     """
-    if not jax.config.read("jax_enable_x64"):
+    if not jax_compat.has_double_precision():
         raise PrecisionError(
             "JAX is in 32-bit mode: call `hybridjax.enable_x64()` first."
         )
@@ -36,8 +37,10 @@ def require_x64(*trees: Any) -> None:
             continue
         if dtype not in (jnp.float64, jnp.complex128):
             name = jax.tree_util.keystr(path[1:]).lstrip(".") or "argument"
-            text = "it was built before `hybridjax.enable_x64()`: build it again"
-            raise PrecisionError(f"`{name}` is {dtype}: {text}.")
+            raise PrecisionError(
+                f"`{name}` is {dtype}: it was built before `hybridjax.enable_x64()`: build it "
+                "again."
+            )
 
 
 def real(x: Any) -> jax.Array:
@@ -46,12 +49,10 @@ def real(x: Any) -> jax.Array:
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
     that a definition may be built before. Arrays of JAX remain what they are.
     """
-    made_by_jax = any(
-        isinstance(leaf, jax.Array) for leaf in jax.tree_util.tree_leaves(x)
-    )
+    leaves = jax.tree_util.tree_leaves(x)
+    made_by_jax = any(isinstance(leaf, jax.Array) for leaf in leaves)
     if made_by_jax or is_inside_program():
         return jnp.asarray(x, float)
-    with jax.enable_x64(
-        True
-    ):  # (No program is compiled for numbers of Python and NumPy.)
+    # (No program is compiled for numbers of Python and NumPy.)
+    with jax.enable_x64(True):
         return jax.device_put(np.asarray(x, float))

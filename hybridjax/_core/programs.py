@@ -11,16 +11,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from . import jax_compat
 from .executor import is_tracer
+from .jax_compat import ClosedProgram, Equation, Program, is_variable
 from .memo import Memory
 
 
-# Operations that are a program and nothing more.
-_CALLS = frozenset("jit pjit closed_call core_call remat checkpoint".split())
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 
@@ -31,53 +30,51 @@ class Digests:
     a function of Python: both are not part of the program.
     """
 
-    def __init__(self, program: jex.ClosedJaxpr, arguments: Sequence[str]):
+    def __init__(self, program: ClosedProgram, arguments: Sequence[str]):
         self.rules = False
         self.hosted = False
         self._inner: dict[int, str] = {}
         given = [digest_of_words("argument", x) for x in arguments]
         self.results = self._of(program, given)
 
-    def _of(self, program: jex.ClosedJaxpr, arguments: Sequence[str]) -> list[str]:
-        jaxpr = program.jaxpr
-        known: dict[Any, str] = dict(zip(jaxpr.invars, arguments, strict=True))
-        needed = _needed(jaxpr)
-        for x, value in zip(jaxpr.constvars, program.consts, strict=True):
+    def _of(self, closed: ClosedProgram, arguments: Sequence[str]) -> list[str]:
+        program = closed.jaxpr
+        known: dict[Any, str] = dict(zip(program.invars, arguments, strict=True))
+        needed = _needed(program)
+        for x, value in zip(program.constvars, closed.consts, strict=True):
             if x in needed:
                 known[x] = digest_of_array(value)
 
         def digest(x: Any) -> str:
-            if isinstance(x, jex.Literal):
+            if jax_compat.is_constant(x):
                 # (Its text has eight digits.)
                 return digest_of_array(x.val)
             return known[x]
 
-        for equation in jaxpr.eqns:
+        for equation in program.eqns:
             if any(x in needed for x in equation.outvars):
                 values = self._apply(equation, [digest(x) for x in equation.invars])
                 known.update(zip(equation.outvars, values, strict=True))
-        return [digest(x) for x in jaxpr.outvars]
+        return [digest(x) for x in program.outvars]
 
-    def _apply(self, equation: Any, arguments: list[str]) -> list[str]:
+    def _apply(self, equation: Equation, arguments: list[str]) -> list[str]:
         """Digests of the results of an operation."""
-        name, options = equation.primitive.name, equation.params
-        if name in _CALLS and len(arguments) == len(
-            _program(options["jaxpr"]).in_avals
-        ):
-            return self._of(_program(options["jaxpr"]), arguments)
-        if name.startswith("custom_jvp_call"):
-            self.rules = True
-        elif name.startswith("custom_vjp_call") or "callback" in options:
-            self.hosted = True
+        options = equation.params
+        if jax_compat.is_call(equation):
+            called = jax_compat.closed(options["jaxpr"])
+            if len(called.in_avals) == len(arguments):
+                return self._of(called, arguments)
+        self.rules |= jax_compat.has_rule(equation)
+        self.hosted |= jax_compat.is_hosted(equation)
         words = [f"{key}={self._option(options[key])}" for key in sorted(options)]
-        whole = digest_of_words(name, *words, *arguments)
+        whole = digest_of_words(equation.primitive.name, *words, *arguments)
         if len(equation.outvars) == 1:
             return [whole]
         return [f"{whole}.{k}" for k in range(len(equation.outvars))]
 
     def _option(self, x: Any) -> str:
-        if isinstance(x, jex.ClosedJaxpr | jex.Jaxpr):
-            return self._program(_program(x))
+        if jax_compat.is_program(x):
+            return self._program(jax_compat.closed(x))
         if isinstance(x, tuple | list):
             return f"({','.join(map(self._option, x))})"
         if hasattr(x, "dtype") and hasattr(x, "shape"):
@@ -87,7 +84,7 @@ class Digests:
             return "function"  # (see `rules` and `hosted`)
         return _ADDRESS.sub("", repr(x))
 
-    def _program(self, x: jex.ClosedJaxpr) -> str:
+    def _program(self, x: ClosedProgram) -> str:
         """The digest of a program that is part of an operation, as of a loop."""
         if id(x.jaxpr) not in self._inner:
             places = [f"{k}:{aval}" for k, aval in enumerate(x.in_avals)]
@@ -101,16 +98,12 @@ def digest_of_words(*words: str) -> str:
     return hashlib.blake2b("\0".join(words).encode(), digest_size=12).hexdigest()
 
 
-def _program(x: Any) -> jex.ClosedJaxpr:
-    return x if isinstance(x, jex.ClosedJaxpr) else jex.ClosedJaxpr(x, [])
-
-
-def _needed(jaxpr: Any) -> set[Any]:
+def _needed(program: Program) -> set[Any]:
     """Variables of a program on which its results depend."""
-    needed = {x for x in jaxpr.outvars if isinstance(x, jex.Var)}
-    for equation in reversed(jaxpr.eqns):
-        if any(x in needed for x in equation.outvars):
-            needed.update(x for x in equation.invars if isinstance(x, jex.Var))
+    needed = set(filter(is_variable, program.outvars))
+    for equation in reversed(program.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            needed.update(filter(is_variable, equation.invars))
     return needed
 
 

@@ -40,11 +40,10 @@ class Call:
 
     def __str__(self) -> str:
         """The current step."""
-        step = (
-            self.step
-            if self.total is None
-            else f"{self.done} of {self.total} {self.name}"
-        )
+        if self.total is None:
+            step = self.step
+        else:
+            step = f"{self.done} of {self.total} {self.name}"
         return " ".join(filter(None, (step, "(compiling)" if self.compiling else "")))
 
 
@@ -70,7 +69,8 @@ def working(name: str, total: int | None = None) -> Iterator[Call]:
     **Arguments:** `name` of the function; or of the things of which there are `total`, whose number
     `done` is for the caller to raise.
     """
-    call, outermost = Call(name, total), not _running
+    call = Call(name, total)
+    outermost = not _running
     _running.append(call)
     try:
         with _line() if outermost and _is_watched() else contextlib.nullcontext():
@@ -100,22 +100,18 @@ def say_compiling(compiling: bool) -> None:
 
 
 def _is_watched() -> bool:
-    return (
-        (_display() is not None or sys.stderr.isatty())
-        if _enabled is None
-        else _enabled
-    )
+    if _enabled is None:
+        return _display() is not None or sys.stderr.isatty()
+    return _enabled
 
 
 def _display() -> Callable[..., Any] | None:
     """IPython's `display`; `None` outside of Jupyter."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
-    return (
-        None
-        if ipython is None or not hasattr(shell, "kernel")
-        else ipython.display.display
-    )
+    if ipython is None or not hasattr(shell, "kernel"):
+        return None
+    return ipython.display.display
 
 
 @contextlib.contextmanager
@@ -158,7 +154,9 @@ class _Cell(io.StringIO):
 
     def __init__(self, display: Callable[..., Any]):
         super().__init__()
-        self._display, self._handle, self._shown = display, None, ""
+        self._display = display
+        self._handle = None
+        self._shown = ""
 
     def write(self, text: str) -> int:
         shown = text.strip()

@@ -16,10 +16,10 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
             return find(name)
         except AttributeError as error:
             close = difflib.get_close_matches(name, names, n=1)
-            suggestion = f"; did you mean {close[0]!r}?" if close else ""
-            text = f"module {package!r} has no attribute {name!r}{suggestion}"
-            raise AttributeError(
-                text, name=""
-            ) from error  # (else Python suggests it again)
+            text = f"module {package!r} has no attribute {name!r}"
+            if close:
+                text += f"; did you mean {close[0]!r}?"
+            # (With a `name` Python would suggest it again.)
+            raise AttributeError(text, name="") from error
 
     return __getattr__, listed, names

@@ -24,7 +24,7 @@ import sysconfig
 import threading
 import types
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -38,20 +38,6 @@ _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), rang
 # Objects of these types that are no more than their values, if a class is made of them.
 _VALUES = bool, int, float, complex, str, bytes
 _JITTED: Any = type(jax.jit(len))
-
-# What classes of C are made of.
-_OF_C = frozenset(
-    (
-        types.MethodDescriptorType,
-        types.ClassMethodDescriptorType,
-        types.WrapperDescriptorType,
-        types.GetSetDescriptorType,
-        types.MemberDescriptorType,
-    )
-)
-
-# Objects without a value, which `functools.cached_property` holds.
-_LOCKS = type(threading.Lock()), type(threading.RLock())
 
 # Functions that read files, the names of values, or the system.
 _HIDDEN = re.compile(
@@ -173,7 +159,7 @@ class Reading:
             self._visit(x)
 
     def _visit_items(self, items: Iterable[tuple[Any, Any]]) -> None:
-        self._visit_all(part for item in items for part in item)
+        self._visit_all(itertools.chain.from_iterable(items))
 
     def _visit(self, x: Any) -> None:
         kind = type(x)
@@ -188,53 +174,48 @@ class Reading:
         self._note(kind.__qualname__)
         if is_tracer(x):
             return self._note(str(x.aval))
-        if kind in (list, tuple):
-            return self._visit_all(x)
-        if kind is dict:
-            return self._visit_items(x.items())
-        if kind in (set, frozenset):
-            return self._set(x)
-        if kind is np.ndarray or isinstance(x, np.generic | jax.Array):
-            return self._array(x)
-        match x:
-            case types.FunctionType():
-                self._function(x)
-            case types.CodeType():
-                self._note(_code(x))
-            case types.CellType():
-                with contextlib.suppress(ValueError):  # an empty cell
-                    self._visit(x.cell_contents)
-            case type():
-                self._class(x)
-            case property():
-                self._visit_all((x.fget, x.fset))
-            case types.MethodType():
-                self._visit_all((x.__func__, x.__self__))
-            case types.ModuleType():  # read by other means than the names of its attributes
-                self._module(x)
-            case types.BuiltinFunctionType():
-                self._builtin(x)
-            case weakref.ref():
-                self._visit(x())
-            case contextvars.ContextVar():
-                with contextlib.suppress(LookupError):  # of one that is not set
-                    self._visit(x.get())
-            case memoryview():
-                self._note(x.format, x.shape, x.tobytes())
-            case np.ufunc():
-                self._note(x.__name__)
-                if (
-                    getattr(np, x.__name__, None) is not x
-                ):  # (made of a user's function)
-                    self.unread.append(f"`{x.__name__}`")
-            case _ if kind in _OF_C:
-                self._note(x.__name__, x.__objclass__.__qualname__)
-            case np.dtype():
-                self._note(str(x))
-            case _ if kind in _LOCKS:
-                pass
-            case _:
-                self._object(x)
+        reader: Any = _reader_of(kind)  # type: ignore[arg-type]  # (a class)
+        return reader(self, x)
+
+    def _table(self, x: dict) -> None:
+        self._visit_items(x.items())
+
+    def _code_object(self, x: types.CodeType) -> None:
+        self._note(_code(x))
+
+    def _cell(self, x: types.CellType) -> None:
+        with contextlib.suppress(ValueError):  # an empty cell
+            self._visit(x.cell_contents)
+
+    def _property(self, x: property) -> None:
+        self._visit_all((x.fget, x.fset))
+
+    def _method(self, x: types.MethodType) -> None:
+        self._visit_all((x.__func__, x.__self__))
+
+    def _reference(self, x: weakref.ref) -> None:
+        self._visit(x())
+
+    def _variable(self, x: contextvars.ContextVar) -> None:
+        with contextlib.suppress(LookupError):  # of one that is not set
+            self._visit(x.get())
+
+    def _memory(self, x: memoryview) -> None:
+        self._note(x.format, x.shape, x.tobytes())
+
+    def _ufunc(self, x: np.ufunc) -> None:
+        self._note(x.__name__)
+        if getattr(np, x.__name__, None) is not x:  # (made of a user's function)
+            self.unread.append(f"`{x.__name__}`")
+
+    def _of_c(self, x: Any) -> None:
+        self._note(x.__name__, x.__objclass__.__qualname__)
+
+    def _dtype(self, x: np.dtype) -> None:
+        self._note(str(x))
+
+    def _lock(self, x: Any) -> None:
+        pass
 
     def _set(self, x: Any) -> None:
         parts = [Reading(y, marks=self._marks) for y in x]
@@ -317,7 +298,10 @@ class Reading:
                 self._global(x, (name, ""), module, read.names)
 
     def _suspect(
-        self, x: types.FunctionType, names: frozenset[str], attributes: frozenset[str]
+        self,
+        x: types.FunctionType,
+        names: frozenset[str],
+        attributes: frozenset[str],
     ) -> None:
         """List reads that names show."""
         if names & _FRAMES:
@@ -336,7 +320,11 @@ class Reading:
         self.unread.append(text)
 
     def _global(
-        self, x: types.FunctionType, path: Names, value: Any, names: Names
+        self,
+        x: types.FunctionType,
+        path: Names,
+        value: Any,
+        names: Names,
     ) -> None:
         self._note(path[0])
         if self._is_hidden(x, path, value):
@@ -480,6 +468,54 @@ class Reading:
         return self._visit_all(parts)
 
 
+# How objects of these types alone are read, and those of the types below and of their subclasses.
+_OF_THIS_TYPE: dict[type, Callable] = {
+    list: Reading._visit_all,
+    tuple: Reading._visit_all,
+    dict: Reading._table,
+    set: Reading._set,
+    frozenset: Reading._set,
+    np.ndarray: Reading._array,
+    # Objects without a value, which `functools.cached_property` holds.
+    type(threading.Lock()): Reading._lock,
+    type(threading.RLock()): Reading._lock,
+    # What classes of C are made of.
+    types.MethodDescriptorType: Reading._of_c,
+    types.ClassMethodDescriptorType: Reading._of_c,
+    types.WrapperDescriptorType: Reading._of_c,
+    types.GetSetDescriptorType: Reading._of_c,
+    types.MemberDescriptorType: Reading._of_c,
+}
+_OF_SUBTYPES: dict[type, Callable] = {
+    np.generic: Reading._array,
+    jax.Array: Reading._array,
+    types.FunctionType: Reading._function,
+    types.CodeType: Reading._code_object,
+    types.CellType: Reading._cell,
+    type: Reading._class,
+    property: Reading._property,
+    types.MethodType: Reading._method,
+    # (Read by other means than the names of its attributes.)
+    types.ModuleType: Reading._module,
+    types.BuiltinFunctionType: Reading._builtin,
+    weakref.ref: Reading._reference,
+    contextvars.ContextVar: Reading._variable,
+    memoryview: Reading._memory,
+    np.ufunc: Reading._ufunc,
+    np.dtype: Reading._dtype,
+}
+
+
+@ft.lru_cache(4096)
+def _reader_of(kind: type) -> Callable:
+    if kind in _OF_THIS_TYPE:
+        return _OF_THIS_TYPE[kind]
+    for type_, reader in _OF_SUBTYPES.items():
+        if issubclass(kind, type_):
+            return reader
+    return Reading._object
+
+
 def _moves(x: Any) -> bool:
     """Test for functions of packages that draw random numbers or read the clock."""
     if not callable(x):
@@ -507,13 +543,15 @@ def _state_of(x: Any) -> dict[str, Any]:
     state.pop("code_digest", None)
     for base in type(x).__mro__:
         slots = vars(base).get("__slots__", ())
-        for name in (slots,) if isinstance(slots, str) else slots:
+        if isinstance(slots, str):
+            slots = [slots]
+        for name in slots:
             if name in ("__dict__", "__weakref__"):
                 continue
-            hides = name.startswith("__") and not name.endswith("__")
-            inner = f"_{base.__name__.lstrip('_')}{name}" if hides else name
+            if name.startswith("__") and not name.endswith("__"):
+                name = f"_{base.__name__.lstrip('_')}{name}"  # (as Python keeps it)
             with contextlib.suppress(AttributeError):  # of a slot that is not filled
-                state[inner] = getattr(x, inner)
+                state[name] = getattr(x, name)
     if hasattr(x, "__wrapped__") and "__wrapped__" not in state:
         state["__wrapped__"] = x.__wrapped__
     return state
@@ -598,11 +636,9 @@ def _names(code: types.CodeType) -> _Names:
 def _version(package: str) -> str:
     """Return the version of an installed package, "" for others and Python's own."""
     try:
-        return (
-            ""
-            if package in sys.stdlib_module_names
-            else importlib.metadata.version(package)
-        )
+        if package in sys.stdlib_module_names:
+            return ""
+        return importlib.metadata.version(package)
     except (importlib.metadata.PackageNotFoundError, ValueError):  # or no name
         return str(getattr(sys.modules.get(package), "__version__", ""))
 
@@ -653,20 +689,20 @@ def is_packaged_class(x: type) -> bool:
 @ft.cache
 def is_of_package(path: str) -> bool:
     """Test whether a file belongs to Python or to a package, `hybridjax.models` excepted."""
+    if path.startswith(_MODELS):
+        return False
+    if _INSTALLED.match(path):
+        return True
     file = pathlib.Path(path)
-    recorded = (file.parts[-k] in _recorded(x) for k, x in enumerate(file.parents, 1))
-    return not path.startswith(_MODELS) and (
-        _INSTALLED.match(path) is not None or any(recorded)
-    )
+    names = zip(reversed(file.parts), file.parents, strict=False)
+    return any(name in _recorded(folder) for name, folder in names)
 
 
 @ft.cache
 def _recorded(folder: pathlib.Path) -> frozenset[str]:
     """Names of what pip has put into a folder (with `--target`)."""
-    records = [
-        x.read_text("RECORD")
-        for x in importlib.metadata.distributions(path=[str(folder)])
-    ]
-    return frozenset(
-        re.split("[/,]", y)[0] for x in records for y in (x or "").splitlines()
-    )
+    names: set[str] = set()
+    for package in importlib.metadata.distributions(path=[str(folder)]):
+        record = package.read_text("RECORD") or ""
+        names.update(re.split("[/,]", line)[0] for line in record.splitlines())
+    return frozenset(names)

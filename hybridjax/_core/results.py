@@ -15,7 +15,8 @@ class Result(enum.IntEnum):
 
     def __new__(cls, code: int, message: str = "") -> "Result":
         self = int.__new__(cls, code)
-        self._value_, self.message = code, message
+        self._value_ = code
+        self.message = message
         return self
 
     OK = 0, "ok"
@@ -42,20 +43,23 @@ class Result(enum.IntEnum):
     )
     STEP_COLLAPSE = (
         14,
-        "steps shrank to nothing: a field may jump only where a transition does",
+        "steps shrank to nothing although the state hardly moves: a field that jumps must do so at "
+        "the guard of a transition",
     )
     FIELD_NOT_FINITE = (
         15,
-        "NaN or infinity in a field, guard or reset: 1/0, or a matrix that is singular or not "
-        "positive",
+        "the field, a guard, its derivative or a reset is NaN or infinite: a division by zero, or "
+        "a mass matrix that is singular or not positive definite there",
     )
     GUARD_PASSED = (
         16,
-        "a reset put the state on a guard: what comes to rest there needs a chart",
+        "a reset put the state on a guard, through which it then went without an event: what comes "
+        "to rest there needs a chart of its own",
     )
     PULSE_PASSED = (
         17,
-        "steps pass over a pulse: begin and end it by transitions (`hj.Scheduled`)",
+        "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
+        "and end it by transitions (`hj.Scheduled` at known times)",
     )
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
     GUARD_BEYOND = (

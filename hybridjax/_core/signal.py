@@ -48,9 +48,9 @@ class Signal(str):
     __hash__ = str.__hash__
 
     def __repr__(self) -> str:
-        return (
-            f"{super().__repr__()} ({self.unit})" if self.unit else super().__repr__()
-        )
+        if self.unit:
+            return f"{super().__repr__()} ({self.unit})"
+        return super().__repr__()
 
     def __getnewargs__(self) -> Any:
         return str(self), self.unit
@@ -58,7 +58,8 @@ class Signal(str):
 
 def signals(names: Iterable[str], units: Iterable[str]) -> tuple[Signal, ...]:
     """Names with the units that stand beside them, in the same order: none, or one for each."""
-    names, units = tuple(names), tuple(units)
+    names = tuple(names)
+    units = tuple(units)
     return tuple(map(Signal, names, units or ("",) * len(names)))
 
 

@@ -47,11 +47,10 @@ def folded(text: str, indent: str = "") -> str:
     if len(text) <= _WIDTH:
         return text
     parts = re.split(r";\s+", text.replace(" ± ", "\0±\0"))  # (never apart)
-    lines = (
-        textwrap.fill(x, _WIDTH - 2 - len(indent), subsequent_indent="  ")
-        for x in parts
-    )
-    return ";\n".join(lines).replace("\0", " ").replace("\n", f"\n  {indent}")
+    width = _WIDTH - 2 - len(indent)
+    lines = [textwrap.fill(x, width, subsequent_indent="  ") for x in parts]
+    whole = ";\n".join(lines).replace("\0", " ")
+    return whole.replace("\n", f"\n  {indent}")
 
 
 def value(x: Any) -> str:
@@ -67,12 +66,12 @@ def value(x: Any) -> str:
         inside = ", ".join(map(value, x))
         return f"({inside},)" if len(x) == 1 else f"({inside})"
     text = getattr(x, "__name__", None) or repr(x)
-    if isinstance(x, eqx.Module) and (
-        "\n" in text or type(x).__repr__ is eqx.Module.__repr__
-    ):
-        leaves = jax.tree_util.tree_leaves(eqx.filter(x, eqx.is_array))
-        return f"{type(x).__name__}({sum(leaf.size for leaf in leaves)} numbers)"
-    return text
+    has_own_text = type(x).__repr__ is not eqx.Module.__repr__ and "\n" not in text
+    if has_own_text or not isinstance(x, eqx.Module):
+        return text
+    leaves = jax.tree_util.tree_leaves(eqx.filter(x, eqx.is_array))
+    count = sum(leaf.size for leaf in leaves)
+    return f"{type(x).__name__}({count} numbers)"
 
 
 def number(x: Any, digits: int = 6, unit: str = "") -> str:
@@ -80,39 +79,48 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
     if is_traced(x):
         return f"{value(x)} {unit}".rstrip()
     z = complex(x)
-    imaginary = f"{z.imag:+.{digits}g}j" if z.imag else ""
-    return f"{z.real:.{digits}g}{imaginary} {unit}".rstrip()
+    text = f"{z.real:.{digits}g}"
+    if z.imag:
+        text += f"{z.imag:+.{digits}g}j"
+    return f"{text} {unit}".rstrip()
 
 
 def signal_values(names: Iterable[str], values: Iterable[Any]) -> str:
     """Numbers of three digits after the names of signals, in their units."""
-    pairs = zip(names, values, strict=True)
-    return ", ".join(f"{name} {number(x, 3, unit_of(name))}" for name, x in pairs)
+    words = []
+    for name, x in zip(names, values, strict=True):
+        words.append(f"{name} {number(x, 3, unit_of(name))}")
+    return ", ".join(words)
 
 
 def fields(self: Any) -> str:
     """A module by its fields, without those that are None (a `__repr__`)."""
-    shown_fields = (field for field in dataclasses.fields(self) if field.repr)
-    named = ((field.name, getattr(self, field.name)) for field in shown_fields)
-    shown = [f"{name}={value(x)}" for name, x in named if x is not None]
-    kind, line = type(self).__name__, ", ".join(shown)
+    kind = type(self).__name__
+    shown = []
+    for field in dataclasses.fields(self):
+        content = getattr(self, field.name) if field.repr else None
+        if content is not None:
+            shown.append(f"{field.name}={value(content)}")
+    line = ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
         return f"{kind}({line})"
-    inside = (textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown)
-    return f"{kind}(\n  " + ",\n".join(inside).replace("\n", "\n  ") + ",\n)"
+    folded = [textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown]
+    inside = textwrap.indent(",\n".join(folded), "  ")
+    return f"{kind}(\n{inside},\n)"
 
 
 def _array(x: np.ndarray) -> str:
     if x.ndim == 0:
-        return f"{x.item():.6g}" if x.dtype.kind in "fc" else str(x.item())
+        return number(x) if x.dtype.kind in "fc" else str(x.item())
     if x.ndim == 1 and x.size <= _FEW:
         return value(tuple(x))
-    shape = " x ".join(map(str, x.shape)) + (" numbers" if x.ndim == 1 else "")
+    shape = " x ".join(map(str, x.shape))
+    if x.ndim == 1:
+        shape += " numbers"
     if x.dtype.kind not in "iuf" or not np.isfinite(x).any():
         return f"{shape} ({x.dtype})"
-    low, high = np.nanmin(x), np.nanmax(x)
-    return (
-        f"{shape}, all {low:.6g}"
-        if low == high
-        else f"{shape}, {low:.6g} to {high:.6g}"
-    )
+    low = np.nanmin(x)
+    high = np.nanmax(x)
+    if low == high:
+        return f"{shape}, all {low:.6g}"
+    return f"{shape}, {low:.6g} to {high:.6g}"

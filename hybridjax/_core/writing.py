@@ -82,9 +82,8 @@ def results_folder(folder: Path, kind: str, names: Iterable[str]) -> Iterator[Pa
         ) from error
     finally:
         shutil.rmtree(new, ignore_errors=True)
-        with contextlib.suppress(
-            OSError
-        ):  # those that were made in vain: they are empty
+        # (Those that were made in vain are empty.)
+        with contextlib.suppress(OSError):
             for path in made:
                 path.rmdir()
 

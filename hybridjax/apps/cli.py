@@ -344,11 +344,13 @@ def _identify(options) -> int:
             "--center and --scale are of the angle of --phase, which is not given"
         )
     named = [*options.input, *options.reference, *options.outputs]
-    if twice := ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1):
+    twice = ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1)
+    if twice:
         options.parser.error(
             f"{twice}: name it once (omit --reference without a controller)"
         )
-    if beside := {*options.input} & {*(options.phase or (options.crossing or ())[:1])}:
+    beside = {*options.input} & {*(options.phase or (options.crossing or ())[:1])}
+    if beside:
         options.parser.error(
             f"{', '.join(beside)} is an input: define the phase by another signal"
         )
@@ -379,6 +381,8 @@ def _reproduce(options) -> int:
 
 def _status(converged: bool) -> int:
     if not converged:
-        text = "a fit did not converge: do not rely on its numbers, which were written."
-        print(f"hybridjax: {text}", file=sys.stderr)
+        print(
+            "hybridjax: a fit did not converge: do not rely on its numbers, which were written.",
+            file=sys.stderr,
+        )
     return 0 if converged else 1

@@ -7,10 +7,11 @@ import base64
 import contextlib
 import csv
 import functools
+import itertools
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from .._core import html
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath
 from .._core.results import Result
+from .._core.signal import with_unit
 from .._core.text import listed
 from .._core.writing import Format, results_folder
 from ..io import save
@@ -143,9 +145,8 @@ def report_folder(
     ]
     for suffix in _suffixes(inputs):
         figures += [f"bode{suffix}", f"harmonics{suffix}"]
-    images = [
-        f"figures/{name}.{format}" for name in figures for format in with_png(formats)
-    ]
+    pairs = itertools.product(figures, with_png(formats))
+    images = [f"figures/{name}.{format}" for name, format in pairs]
     return results_folder(Path(folder), "report", [*files, *images])
 
 
@@ -156,7 +157,9 @@ def with_png(formats: Sequence[Format]) -> tuple[Format, ...]:
 
 def _suffixes(inputs: Sequence[str]) -> list[str]:
     """Return the ends of the names of each input's figures."""
-    return [f"_{x.replace('/', '-')}" for x in inputs] if len(inputs) > 1 else [""]
+    if len(inputs) == 1:
+        return [""]
+    return [f"_{x.replace('/', '-')}" for x in inputs]
 
 
 def write_results(
@@ -164,39 +167,37 @@ def write_results(
 ) -> None:
     """Write all results into a folder that is new."""
     (folder / "figures").mkdir()
-    data, recording = result.data, result.recording
+    data = result.data
     # 240 frequencies, up to the edge of the band that the inputs excited.
     edge = min(max(result.advice.band), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(result, htf):
-        image, *_ = look.save_and_close(
-            folder / "figures" / name, drawn, with_png(formats)
-        )
+        path = folder / "figures" / name
+        image, *_ = look.save_and_close(path, drawn, with_png(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
     save(folder / "htf.npz", htf)
     save(folder / "fit.npz", result.fit)
-    header = [
-        f"{n} ({u})" if u else n for n, u in zip(data.signals, data.units, strict=True)
-    ]
-    records = zip(data.records, data.times, data.trials, strict=True)
-    rows = (
-        (
-            recording.trials[trial].name,
-            k,
-            *divmod(record.first_section + i, data.n_sections),
-            *row,
-        )
-        for k, (record, times, trial) in enumerate(records)
-        for i, row in enumerate(_written(times[:, None], record.u, record.y))
-    )
+    header = list(map(with_unit, data.signals, data.units))
     first = ["trial", "record", "cycle", "section", "time (s)"]
-    _write_table(folder / "sections.csv", [*first, *header], rows)
-    cycle = enumerate(_written(data.cycle_inputs, data.cycle_outputs))
-    average = ((n, n / data.n_sections, *row) for n, row in cycle)
+    _write_table(folder / "sections.csv", [*first, *header], _samples(result))
+    average = []
+    for n, row in enumerate(_written(data.cycle_inputs, data.cycle_outputs)):
+        average.append((n, n / data.n_sections, *row))
     _write_table(folder / "cycle.csv", ["section", "phase (cycles)", *header], average)
     (folder / "summary.json").write_text(json.dumps(summarize(result), indent=1) + "\n")
     (folder / PAGE).write_text(_page(result, images), encoding="utf-8")
+
+
+def _samples(result: Identification) -> Iterator[tuple]:
+    """The rows of `sections.csv`."""
+    data = result.data
+    records = zip(data.records, data.times, data.trials, strict=True)
+    for k, (record, times, trial) in enumerate(records):
+        name = result.recording.trials[trial].name
+        rows = _written(times[:, None], record.u, record.y)
+        for section, row in enumerate(rows, record.first_section):
+            yield name, k, *divmod(section, data.n_sections), *row
 
 
 def page_of(title: str, parts: Iterable[str]) -> str:
@@ -211,8 +212,9 @@ def page_of(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def _written(*arrays: np.ndarray) -> Iterable[list[str]]:
-    return ([f"{x:.9g}" for x in row] for row in np.concatenate(arrays, axis=1))
+def _written(*arrays: np.ndarray) -> Iterator[list[str]]:
+    for row in np.concatenate(arrays, axis=1):
+        yield [f"{x:.9g}" for x in row]
 
 
 def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> None:
@@ -222,7 +224,9 @@ def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> Non
 
 def summarize(result: Identification) -> dict[str, Any]:
     """Return the numbers of the report, ready for JSON."""
-    data, fit, held = result.data, result.fit, result.held_out
+    data = result.data
+    fit = result.fit
+    held = result.held_out
     periods = np.concatenate(result.phase.periods)
     return {
         "version": __version__,
@@ -277,14 +281,15 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
 
 def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
-    data, recording, warnings = result.data, result.recording, result.advice.findings
+    data = result.data
+    recording = result.recording
+    warnings = result.advice.findings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.reference
-    method = (
-        f"instrumental variables of {escape(listed(loop))}"
-        if loop
-        else "output-error fit"
-    )
+    if loop:
+        method = f"instrumental variables of {escape(listed(loop))}"
+    else:
+        method = "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
     expected = zip(result.advice.strides, result.advice.expected, strict=True)

@@ -79,7 +79,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     def top(family, m):
         return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
 
-    iso, kin = families["isochron"], families["kinematic"]
+    iso = families["isochron"]
+    kin = families["kinematic"]
     ratio = top(iso, 0) / top(kin, 0)
     text = f"max|H_0| isochron / kinematic: {_pairs(ratio)}"
     note(
@@ -87,7 +88,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         np.all((ratio > 1.6) & (ratio < 2.5)),
         text,
     )
-    a, b = iso.rational, kin.rational
+    a = iso.rational
+    b = kin.rational
     moved = np.max(np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles)), axis=1)
     text = f"distance of the fitted poles in z: {_pairs(moved)}"
     note(

@@ -4,6 +4,7 @@ Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import time
@@ -87,20 +88,19 @@ def reproduce(
     """
     cycles = [f"fig1_cycle_{family}" for family in _FAMILIES]
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
-    files = [f"{figure}.{format}" for figure in figures for format in formats]
-    saved = [f"{result}_{family}.npz" for family in _FAMILIES for result in _SAVED]
-    with results_folder(
-        Path(out), "reproduce", ["summary.json", *saved, *files]
-    ) as folder:
+    files = ["summary.json"]
+    files += map(".".join, itertools.product(figures, formats))
+    files += [f"{x}_{family}.npz" for family, x in itertools.product(_FAMILIES, _SAVED)]
+    with results_folder(Path(out), "reproduce", files) as folder:
         return _reproduce(folder, protocol, formats)
 
 
 def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict:
     begin = time.time()
     # Lines without second-order products on them need many experiments.
-    division: Literal["random", "sum-free"] = (
-        "sum-free" if protocol.experiments >= 80 else "random"
-    )
+    division: Literal["random", "sum-free"] = "random"
+    if protocol.experiments >= 80:
+        division = "sum-free"
     design = paper_design(
         periods=protocol.keep,
         seed=protocol.seed,
@@ -133,10 +133,15 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
 
 
 def _identify(
-    name: str, cycle: LimitCycle, design: Design, discard: int, begin: float
+    name: str,
+    cycle: LimitCycle,
+    design: Design,
+    discard: int,
+    begin: float,
 ) -> Family:
     """Return all results with one family of sections."""
-    apex, N = Crossing("vM", "falling"), design.n_sections
+    apex = Crossing("vM", "falling")
+    N = design.n_sections
     sections: Any = ClockPhase(N, anchor=apex)
     if name == "kinematic":
         plane: Any = {
@@ -155,7 +160,8 @@ def _identify(
     _log(begin, f"{name}: experiments, {experiments}")
     data.require_ok()
     estimate = estimate_htf(data)
-    rational, rational_exact = fit_rational(estimate), fit_rational(exact)
+    rational = fit_rational(estimate)
+    rational_exact = fit_rational(exact)
     structured = fit_multipliers(estimate, ldtp)
     _log(begin, f"{name}: HTF estimate, 2-pole 1-zero fits, structured fit")
     return Family(
@@ -164,7 +170,11 @@ def _identify(
 
 
 def _draw(
-    cycle: LimitCycle, families: Mapping[str, Family], out: Path, formats, begin
+    cycle: LimitCycle,
+    families: Mapping[str, Family],
+    out: Path,
+    formats,
+    begin,
 ) -> None:
     """Write the figures."""
     from .. import plot  # here, since it is heavy
@@ -177,7 +187,8 @@ def _draw(
 
 def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> Iterator:
     """Fig. 1 for each family of sections; Figs. 3 and 4, multipliers, poles and zeros with all."""
-    perturbed, estimates = _perturbed(cycle), dict[str, Any]()
+    perturbed = _perturbed(cycle)
+    estimates = dict[str, Any]()
     for name, family in families.items():
         drawn = plot.cycle(cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn

@@ -9,7 +9,7 @@ import itertools
 import json
 import multiprocessing
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,8 @@ _COLUMNS = {
     "period_error": "period_standard_error",
 }
 _FILES = ("subjects.csv", "population.csv", "population.html")
+# The file of a report that says of which files and options it was made.
+_JOB = "job.json"
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -86,32 +88,36 @@ def _cause(write: Callable[..., str], *arguments: Any) -> str:
     try:
         return write(*arguments)
     except Exception as error:
-        kind = "" if isinstance(error, HybridJaxError) else f"{type(error).__name__}: "
-        return f"{kind}{error}"
+        if isinstance(error, HybridJaxError):
+            return str(error)
+        return f"{type(error).__name__}: {error}"
 
 
 def _report(
-    files: list[Path], folder: Path, identify: Callable, reading: dict, formats
+    files: list[Path],
+    folder: Path,
+    identify: Callable,
+    reading: dict,
+    formats,
 ) -> str:
     """Identify the trials of one subject in one condition, and write the report.
 
     **Returns:** the cause of a failure, or "". Results of the same files and options are kept.
     """
-    stats = [
-        (str(x), x.stat().st_size, x.stat().st_mtime_ns) for x in files if x.exists()
-    ]
-    key = json.dumps([__version__, stats, digest_of(identify), reading, formats])
-    mark, *needed = (
-        folder / name for name in ("job.json", PAGE, "fit.npz", "summary.json")
-    )
-    if mark.is_file() and mark.read_text() == key and all(x.is_file() for x in needed):
+    sources = []
+    for file in filter(Path.exists, files):
+        about = file.stat()
+        sources.append((str(file), about.st_size, about.st_mtime_ns))
+    job = json.dumps([__version__, sources, digest_of(identify), reading, formats])
+    needed = [folder / name for name in (_JOB, PAGE, "fit.npz", "summary.json")]
+    if all(x.is_file() for x in needed) and needed[0].read_text() == job:
         return ""
     enable_x64()
     result = identify(read_recording(*files, **reading))
     converged = result.fit.result == Result.OK
     with report_folder(folder, result.data.inputs, formats) as new:
         write_results(new, result, formats)
-        (new / mark.name).write_text(key if converged else "")
+        (new / _JOB).write_text(job if converged else "")
     return "" if converged else "the fit did not converge."
 
 
@@ -177,8 +183,9 @@ def identify_subjects(
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
     all subjects fail.
     """
-    rows, root = _rows(Path(table)), Path(folder)
-    calls: dict[str, Any] = {}
+    rows = _rows(Path(table))
+    root = Path(folder)
+    jobs: dict[str, Callable[[], str]] = {}
     reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
         if (trials[["subject", *factors_of(rows)]].nunique() > 1).any():
@@ -186,30 +193,17 @@ def identify_subjects(
                 f"two subjects would have the report '{name}': rename one."
             )
         files = [Path(table).parent / file for file in trials["file"]]
-        job = functools.partial(
+        jobs[name] = functools.partial(
             _cause, _report, files, root / name, identify, reading, formats
         )
-        calls[name] = client.submit(job).result if client else job
-    causes = {
-        name: _cause(calls[name])
-        for name in counted(list(calls), "subjects", len(calls))
-    }
-    failures = {name: text for name, text in causes.items() if text}
-    frame = rows[~rows["report"].isin(failures)].drop_duplicates(
-        "report", ignore_index=True
-    )
+    failures = _failures(jobs, client)
+    is_identified = ~rows["report"].isin(failures)
+    frame = rows[is_identified].drop_duplicates("report", ignore_index=True)
     if not len(frame):
-        raise ComputationError(
-            "all subjects fail: " + "; ".join(map(": ".join, failures.items()))
-        )
-    fits: Any = tuple(load(root / name / "fit.npz") for name in frame["report"])
-    texts = [(root / name / "summary.json").read_text() for name in frame["report"]]
-    for name, key in _COLUMNS.items():
-        frame[name] = [float(json.loads(text)[key]) for text in texts]
-    population = Population.from_fits(
-        fits, frame.drop(columns=["file", "trial"], errors="ignore")
-    )
-    parts = [package("pandas").DataFrame()]
+        causes = "; ".join(f"{name}: {cause}" for name, cause in failures.items())
+        raise ComputationError(f"all subjects fail: {causes}")
+    population, fits = _population(frame, root)
+    parts = []
     try:
         parts.append(population.mean("modulus"))
         for factor in factors_of(frame):
@@ -217,32 +211,58 @@ def identify_subjects(
             parts += [population.difference("modulus", a, b) for a, b in pairs]
     except DefinitionError as error:  # too few subjects: the report shows its text
         failures["population"] = str(error)
-    results = package("pandas").concat(parts, ignore_index=True)
+    pandas = package("pandas")
+    results = pandas.concat([pandas.DataFrame(), *parts], ignore_index=True)
     study = Study(population, fits, failures, results, root)
-    _write(study, dict.fromkeys(part.attrs["methods"] for part in parts[1:]), formats)
+    methods = dict.fromkeys(part.attrs["methods"] for part in parts)
+    _write(study, methods, formats)
     return study
+
+
+def _failures(jobs: Mapping[str, Callable[[], str]], client: Any) -> dict[str, str]:
+    """Do the jobs, here or by a client, and return the causes of those that failed."""
+    calls = dict(jobs)
+    if client:
+        calls = {name: client.submit(job).result for name, job in jobs.items()}
+    failures = {}
+    for name in counted(list(calls), "subjects", len(calls)):
+        cause = _cause(calls[name])
+        if cause:
+            failures[name] = cause
+    return failures
+
+
+def _population(frame: Any, root: Path) -> tuple[Population, tuple[SeriesFit, ...]]:
+    """The fits in the reports of a table's rows, and a population of them."""
+    folders = [root / name for name in frame["report"]]
+    fits: Any = tuple(load(folder / "fit.npz") for folder in folders)
+    summaries = [json.loads((x / "summary.json").read_text()) for x in folders]
+    for name, key in _COLUMNS.items():
+        frame[name] = [float(summary[key]) for summary in summaries]
+    facts = frame.drop(columns=["file", "trial"], errors="ignore")
+    return Population.from_fits(fits, facts), fits
 
 
 def _rows(path: Path) -> Any:
     """Return the table with the names of reports; columns with numbers in all rows as numbers."""
-    text = dict.fromkeys(("file", "subject", "group", "condition"), str)
-    how = {
-        "dtype": text,
-        "keep_default_na": False,
-        "skipinitialspace": True,
-        "index_col": False,
-    }
     try:
-        rows = package("pandas").read_csv(path, encoding="utf-8-sig", **how)
+        rows = package("pandas").read_csv(
+            path,
+            encoding="utf-8-sig",
+            dtype=dict.fromkeys(("file", "subject", "group", "condition"), str),
+            keep_default_na=False,
+            skipinitialspace=True,
+            index_col=False,
+        )
     except (OSError, ValueError) as why:
         raise DefinitionError(
             f"cannot read '{path}': {getattr(why, 'strerror', why)}."
         ) from None
-    if not all(
-        name in rows and len(rows) and rows[name].all() for name in ("file", "subject")
-    ):
-        text = "'file' and 'subject' in each row, separated by commas."
-        raise DefinitionError(f"the table '{path}' needs {text}")
+    needed = rows.reindex(columns=["file", "subject"], fill_value="")
+    if rows.empty or not needed.all(axis=None):
+        raise DefinitionError(
+            f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
+        )
     rows = table_of(rows, len(rows))
     names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
     rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])
@@ -251,30 +271,25 @@ def _rows(path: Path) -> Any:
 
 def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
     """Write the tables, and the report for all."""
-    population, results = study.population, study.results
-    links = (
-        f'<li><a href="{n}/{PAGE}">{escape(n)}</a></li>'
-        for n in population.table["report"]
-    )
+    population = study.population
+    results = study.results
+    parts = [f'<p class="warn">{escape(x)}</p>' for x in study.remarks]
+    names = [escape(name) for name in population.table["report"]]
+    links = [f'<li><a href="{name}/{PAGE}">{name}</a></li>' for name in names]
+    parts.append(f"<ul>{''.join(links)}</ul>")
+    numbers = "{:.4g}".format
+    parts.append(results.T.to_html(header=False, float_format=numbers, na_rep=""))
+    parts += [f"<p>{escape(x)}</p>" for x in methods]
     errors = {f"{name}_error": error for name, error in population.errors.items()}
-    parts = [
-        *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
-        f"<ul>{''.join(links)}</ul>",
-        results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
-        *(f"<p>{escape(x)}</p>" for x in methods),
-    ]
+    subjects = population.table.assign(**population.values, **errors)
     with results_folder(study.folder, "population", _FILES) as new:
         with contextlib.suppress(DefinitionError):  # for too few subjects
-            save_and_close(
-                new / "forest", plot.forest(population, "modulus"), with_png(formats)
-            )
+            figure = plot.forest(population, "modulus")
+            save_and_close(new / "forest", figure, with_png(formats))
             parts.append(
                 '<img alt="Modulus of the leading multiplier" src="forest.png">'
             )
-        population.table.assign(**population.values, **errors).to_csv(
-            new / _FILES[0], index=False
-        )
+        subjects.to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)
-        (new / _FILES[2]).write_text(
-            page_of(f"{len(study.fits)} reports", parts), encoding="utf-8"
-        )
+        page = page_of(f"{len(study.fits)} reports", parts)
+        (new / _FILES[2]).write_text(page, encoding="utf-8")

@@ -4,6 +4,7 @@ Lifting (Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2) stacks the i
 all sections of a period.
 """
 
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -47,25 +48,21 @@ def to_lti(model: LDTP) -> LDTP:
     **Raises:** `PrecisionError` in single precision.
     """
     require_x64(model)
-    A, B, C, D, d, ny = (
-        model.A,
-        model.B,
-        model.C,
-        model.D,
-        model.A.shape[-1],
-        len(model.outputs),
-    )
+    A = model.A
+    B = model.B
+    C = model.C
+    D = model.D
+    d = model.A.shape[-1]
+    ny = len(model.outputs)
     N, _, nu = B.shape
 
     def advance(carry, section):
         # The state at section n: from that at section 0, and from the inputs since then.
         from_state, from_inputs = carry
         n, A, B, C, D = section
-        rows = C @ from_state, jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
-        return (
-            A @ from_state,
-            jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B),
-        ), rows
+        outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
+        states = jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B)
+        return (A @ from_state, states), (C @ from_state, outputs)
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
     (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
@@ -82,9 +79,8 @@ def to_lti(model: LDTP) -> LDTP:
 
 
 def _at_sections(names: tuple[str, ...], n_sections: int) -> tuple[str, ...]:
-    return tuple(
-        Signal(f"{x}[{n}]", unit_of(x)) for n in range(n_sections) for x in names
-    )
+    pairs = itertools.product(range(n_sections), names)
+    return tuple(Signal(f"{x}[{n}]", unit_of(x)) for n, x in pairs)
 
 
 @checked
@@ -102,17 +98,20 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     """
     if isinstance(thing, LDTP):
         lti = to_lti(thing)
-        names = {
-            "inputs": list(map(str, lti.inputs)),
-            "outputs": list(map(str, lti.outputs)),
-        }
-        return package("control").StateSpace(*_matrices(lti), period, **names)
+        return package("control").StateSpace(
+            *_matrices(lti),
+            period,
+            inputs=list(map(str, lti.inputs)),
+            outputs=list(map(str, lti.outputs)),
+        )
+    pairs = itertools.product(thing.harmonics, thing.outputs)
+    outputs = [f"{y}[{m}]" for m, y in pairs]
     inputs = list(map(str, thing.inputs))
-    outputs = [f"{y}[{m}]" for m in thing.harmonics for y in thing.outputs]
     H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
     frequencies = 2 * np.pi * np.asarray(thing.f) / period
-    about = {"inputs": inputs, "outputs": outputs, "sysname": "HTF"}
-    return package("control").FrequencyResponseData(H, frequencies, **about)
+    return package("control").FrequencyResponseData(
+        H, frequencies, inputs=inputs, outputs=outputs, sysname="HTF"
+    )
 
 
 class HarmonicStateSpace(NamedTuple):
@@ -132,9 +131,11 @@ class HarmonicStateSpace(NamedTuple):
     ) -> Complex[np.ndarray, "f M ny nu"]:
         """Responses of all harmonics to inputs of frequencies in cycles per period."""
         M = 2 * self.order + 1
+        # (Inputs have the harmonic 0 only.)
         B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
         rates = 2j * np.pi * np.asarray(f, float).reshape(-1, 1, 1) / period
-        H = self.C @ np.linalg.solve(rates * np.eye(len(self.A)) - self.A, B[None]) + D
+        resolvent = rates * np.eye(len(self.A)) - self.A
+        H = self.C @ np.linalg.solve(resolvent, B[None]) + D
         return H.reshape(len(rates), M, -1, D.shape[-1])
 
 
@@ -169,38 +170,54 @@ def to_harmonic_state_space(
     """
     exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
     map = hosted(cycle).return_map
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
     sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
-        text = "events at which deviations jump, which no finite number of harmonics represents"
         raise DefinitionError(
-            f"{type(s.system).__name__} has {text}: use `cycle.htf` (exact)."
+            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
+            "number of harmonics represents: use `cycle.htf` (exact)."
         )
     _, by_state, by_input = linear_outputs(s, flow, z)
-    series = (
+    series = [
         flow.by_state,
         flow.by_input[..., columns],
         by_state,
         by_input[..., columns],
-    )
-    for n in [order] if order else _ORDERS:
-        m, k = np.arange(-n, n + 1), np.arange(-2 * n, 2 * n + 1)
-        waves = np.exp(-2j * np.pi * k[:, None, None] * flow.after(map) / period)
-        waves = waves * flow.length[:, None] * rule().weights / period
-        parts = [
-            np.einsum("mpk,pkij->mij", waves, x)[m[:, None] - m + 2 * n] for x in series
-        ]
-        A, B, C, D = (x.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1) for x in parts)
+    ]
+    angles = 2 * np.pi * flow.after(map) / period
+    weights = flow.length[:, None] * rule().weights / period
+    orders = _ORDERS if order is None else (order,)
+    for n in orders:
+        m = np.arange(-n, n + 1)
+        A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
         A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
-        space = HarmonicStateSpace(A, B, C, D, n, 0.0)
-        off = np.abs(space.transfer(_TRIED, period)[:, n - 1 : n + 2] - exact).max()
-        space = space._replace(error=float(off / np.abs(exact).max()))
+        space = HarmonicStateSpace(A, B, C, D, n, error=np.nan)
+        truncated = space.transfer(_TRIED, period)[:, n - 1 : n + 2]
+        error = np.abs(truncated - exact).max() / np.abs(exact).max()
+        space = space._replace(error=float(error))
         if order or space.error < tolerance:
             return space
     raise ComputationError(f"order {n} has the error {space.error:.1e}: set `order`.")
+
+
+def _toeplitz(
+    x: np.ndarray,
+    order: int,
+    angles: np.ndarray,
+    weights: np.ndarray,
+) -> Complex[np.ndarray, "rows columns"]:
+    """The matrix with the Fourier coefficient m - n of x (p, k, i, j) in block (m, n), by a
+    quadrature with these angles and weights (p, k)."""
+    k = np.arange(-2 * order, 2 * order + 1)
+    waves = weights * np.exp(-1j * k[:, None, None] * angles)
+    coefficients = np.einsum("mpk,pkij->mij", waves, x)
+    m = np.arange(-order, order + 1)
+    blocks = coefficients[m[:, None] - m + 2 * order]
+    return blocks.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1)
 
 
 @checked

@@ -91,12 +91,15 @@ def from_xarray(dataset: Any) -> Saved:
         header = json.loads(dataset.attrs[_HEADER])
         kind = KINDS[header["kind"]]
     except (AttributeError, KeyError, TypeError, ValueError):
-        text = f"an xarray.Dataset that `to_xarray` made of a {', '.join(KINDS)}."
-        raise DefinitionError(f"`dataset` must be {text}") from None
+        raise DefinitionError(
+            "`dataset` must be an xarray.Dataset that `to_xarray` made of a "
+            f"{', '.join(KINDS)}."
+        ) from None
     static = restored(header["static"], header["units"])
     try:
         for dimension, size in header["sizes"].items():
-            order, whole = dataset[dimension].values, dimension == "section"
+            order = dataset[dimension].values
+            whole = dimension == "section"
             late = order[0] % (size if whole else static["n_sections"])
             if late or (np.diff(order) != 1).any() or (whole and len(order) < size):
                 raise DefinitionError(
@@ -108,48 +111,45 @@ def from_xarray(dataset: Any) -> Saved:
             if f"{dimension}_unit" in dataset.coords:
                 units = dataset[f"{dimension}_unit"].values
                 static[field] = tuple(map(Signal, static[field], map(str, units)))
-        arrays = {
-            str(name): np.asarray(
-                dataset[name].transpose(*_axes(kind, str(name))).values
-            )
-            for name in {*dataset.data_vars, *({"f"} & set(dataset.coords))}
-        }
+        names = set(dataset.data_vars)
+        if "f" in dataset.coords:
+            names.add("f")
+        arrays = {}
+        for name in map(str, names):
+            array = dataset[name].transpose(*_axes(kind, name))
+            arrays[name] = np.asarray(array.values)
         return put_together(kind, static, arrays)
     except (
         HybridJaxError,
-        IndexError,
-        KeyError,
+        LookupError,
         TypeError,
         ValueError,
         AttributeError,
     ) as error:
-        text = f"was changed since `to_xarray` made it of a {header['kind']}: {error}"
-        raise DefinitionError(f"`dataset` {text}") from error
+        raise DefinitionError(
+            f"`dataset` was changed since `to_xarray` made it of a {header['kind']}: {error}"
+        ) from error
 
 
 def _from_module(module: eqx.Module) -> Any:
     static, arrays = taken_apart(module)
     coordinates: dict[str, Any] = {}
     for dimension, field in _COORDINATES.items():
-        if (values := static.pop(field, None)) is not None:
+        values = static.pop(field, None)
+        if values is not None:
             coordinates[dimension] = [
                 str(x) if isinstance(x, str) else int(x) for x in values
             ]
             if isinstance(values[0], str):
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
-    variables = {
-        name: (_axes(type(module), name), array) for name, array in arrays.items()
-    }
-    coordinates |= {name: variables.pop(name) for name in {"f"} & set(variables)}
+    kind = type(module)
+    variables = {name: (_axes(kind, name), x) for name, x in arrays.items()}
+    if "f" in variables:
+        coordinates["f"] = variables.pop("f")
     units = {str(name): name.unit for name in signals_in(static)}
     dataset = package("xarray").Dataset(variables, coordinates)
     sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}
-    header = {
-        "kind": type(module).__name__,
-        "static": static,
-        "units": units,
-        "sizes": sizes,
-    }
+    header = {"kind": kind.__name__, "static": static, "units": units, "sizes": sizes}
     text = json.dumps(header, default=lambda x: x.item())
     order = {x: np.arange(n) for x, n in sizes.items()}
     return dataset.assign_coords(order).assign_attrs({_HEADER: text})
@@ -176,45 +176,41 @@ def _axes(kind: type, name: str) -> tuple[str, ...]:
 def _from_recording(recording: Recording) -> Any:
     trials = recording.trials
     variables = _signals(recording, np.concatenate([t.values for t in trials]))
-    events = [
-        (s, name, time)
-        for s, trial in enumerate(trials)
-        for name, times in trial.events.items()
-        for time in times
-    ]
-    variables["event"] = "occurrence", np.array([name for _, name, _ in events], str)
+    event = list[str]()
+    event_time = list[float]()
+    event_trial = list[int]()
+    for s, trial in enumerate(trials):
+        for name, times in trial.events.items():
+            event += [name] * len(times)
+            event_time += list(times)
+            event_trial += [s] * len(times)
+    variables["event"] = "occurrence", np.array(event, str)
+    lengths = [len(trial.time) for trial in trials]
+    time = np.concatenate([trial.time for trial in trials])
+    seconds = {"units": "s"}
     coordinates = {
-        "time": ("sample", np.concatenate([t.time for t in trials]), {"units": "s"}),
-        "trial": (
-            "sample",
-            np.repeat(np.arange(len(trials)), [len(t.time) for t in trials]),
-        ),
-        "event_time": (
-            "occurrence",
-            np.array([x for *_, x in events], float),
-            {"units": "s"},
-        ),
-        "event_trial": ("occurrence", np.array([s for s, *_ in events], int)),
+        "time": ("sample", time, seconds),
+        "trial": ("sample", np.repeat(np.arange(len(trials)), lengths)),
+        "event_time": ("occurrence", np.array(event_time, float), seconds),
+        "event_trial": ("occurrence", np.array(event_trial, int)),
     }
     return package("xarray").Dataset(variables, coordinates)
 
 
 def _from_section_data(data: SectionData) -> Any:
-    records, N = data.records, data.n_sections
+    records = data.records
+    N = data.n_sections
     lengths = [len(r.u) for r in records]
     values = [np.concatenate([r.u, r.y], axis=1) for r in records]
     variables = _signals(data, np.concatenate(values))
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
     variables["average_cycle"] = ("phase", "signal"), cycle
-    sections = [
-        (r.first_section + np.arange(n)) % N
-        for r, n in zip(records, lengths, strict=True)
-    ]
+    samples = [r.first_section + np.arange(len(r.u)) for r in records]
     coordinates = {
         "time": ("sample", np.concatenate(data.times), {"units": "s"}),
         "trial": ("sample", np.repeat(data.trials, lengths)),
         "record": ("sample", np.repeat(np.arange(len(records)), lengths)),
-        "section": ("sample", np.concatenate(sections)),
+        "section": ("sample", np.concatenate(samples) % N),
         "phase": np.arange(N) / N,
         "signal": list(map(str, data.signals)),
     }
@@ -256,7 +252,8 @@ def _signals(data: Recording | SectionData, values: np.ndarray) -> dict[str, Any
 
     **Raises:** `DefinitionError` for signals that are called like a coordinate.
     """
-    if reserved := _RESERVED & set(data.signals):
+    reserved = _RESERVED & set(data.signals)
+    if reserved:
         raise DefinitionError(
             f"'{min(reserved)}' is also the name of a coordinate: rename it."
         )

@@ -76,9 +76,8 @@ def certify(
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
     best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
-    if (
-        best.x is None
-    ):  # the tangent of a quadratic limit may leave some powers unbounded
+    if best.x is None:
+        # The tangent of a quadratic limit may leave some powers unbounded.
         return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
     relative = gain / gain.max() / np.where(price > 0, price, np.nan)
@@ -104,7 +103,8 @@ def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Alloca
 
     power = floored(start)
     shares = len(limits.use(power))
-    prices, length = np.full(shares, 1 / shares), _LONGER
+    prices = np.full(shares, 1 / shares)
+    length = _LONGER
     now = criterion.bound(power)
     for step in range(_MAX_STEPS + 1):
         if step % _CHECK == 0:
@@ -117,7 +117,9 @@ def allocate(criterion: Criterion, limits: PowerLimits, start: Powers) -> Alloca
         trial = floored(limits.scaled(power * (floored(target) / power) ** length))
         bound = criterion.bound(trial)
         if bound.criterion <= now.criterion:
-            power, now, length = trial, bound, length * _LONGER
+            power = trial
+            now = bound
+            length = length * _LONGER
         else:
             length = 1.0 if length > 1 else length / 2
     return Allocation(power, now, certificate)
@@ -182,7 +184,8 @@ def to_design(
     share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
     member, experiment = np.nonzero(share)
     order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
-    member, experiment = member[order], experiment[order]
+    member = member[order]
+    experiment = experiment[order]
     part = share[member, experiment] / share.sum(axis=1)[member]
     return Design(
         experiment=experiment,

@@ -57,13 +57,15 @@ class Candidates(NamedTuple):
         """
         half = is_half_integer(design.line, design.periods)
         if half.any():
-            text = f"f = {design.f[half][0]:g} is a multiple of 1/2"
-            raise DefinitionError(f"{text}: use a `design` without such lines.")
+            raise DefinitionError(
+                f"f = {design.f[half][0]:g} is a multiple of 1/2: use a `design` without such "
+                "lines."
+            )
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
-            text = "use division='random' or 'disjoint'"
             raise DefinitionError(
-                f"the `design` excites several inputs with one line: {text}."
+                "the `design` excites several inputs with one line: use division='random' or "
+                "'disjoint'."
             )
         line, channel = np.unique(np.stack([design.line, design.channel]), axis=1)
         return cls(line, channel, design.periods, design.n_sections, design.cycles(0))
@@ -87,10 +89,9 @@ class Candidates(NamedTuple):
         """Return the index of the cosine that each line of a design is."""
         inputs = self.channel.max() + 1
         key = self.line * inputs + self.channel
+        wanted = design.line * inputs + design.channel
         order = np.argsort(key)
-        return order[
-            np.searchsorted(key, design.line * inputs + design.channel, sorter=order)
-        ]
+        return order[np.searchsorted(key, wanted, sorter=order)]
 
     def powers_in(self, design: Design) -> Float[np.ndarray, "E K"]:
         """Return the mean square of each cosine in each experiment of a design."""
@@ -110,21 +111,22 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     The rate is the change from one section to the next: a cosine of f changes by
     $2 \\sin(\\pi f / N)$ times its amplitude.
     """
-    inputs = {
-        n: (cosines.channel == i).astype(float) for i, n in enumerate(model.inputs)
-    }
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
-    rates = {f"rate of {name}": square * change for name, square in inputs.items()}
-    H = cosines.responses(model)
-    outputs = dict(zip(model.outputs, (np.abs(H) ** 2).sum(axis=1).T, strict=True))
-    return {**inputs, **outputs, **rates}
+    squares: Squares = {}
+    for i, name in enumerate(model.inputs):
+        squares[name] = (cosines.channel == i).astype(float)
+        squares[f"rate of {name}"] = squares[name] * change
+    outputs = (np.abs(cosines.responses(model)) ** 2).sum(axis=1)
+    return squares | dict(zip(model.outputs, outputs.T, strict=True))
 
 
 def rms_of(squares: list[Squares], names: list[str], power: Powers) -> dict[str, float]:
     """Return rms values of signals; of several models the root of the mean square."""
-    return {
-        n: float(np.sqrt(np.mean([each[n] @ power for each in squares]))) for n in names
-    }
+    rms = {}
+    for name in names:
+        mean_square = np.mean([each[name] @ power for each in squares])
+        rms[name] = float(np.sqrt(mean_square))
+    return rms
 
 
 class Noise(NamedTuple):
@@ -145,7 +147,8 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
 
     **Raises:** `DefinitionError` for outputs that do not exist, and spectra that are not positive.
     """
-    outputs, N = model.outputs, model.n_sections
+    outputs = model.outputs
+    N = model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
     require_among("output", noise, outputs, "`noise`: ")
@@ -156,18 +159,25 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     measured = {name: noise[name] for name in outputs if name in noise}
 
     def spectrum(f: np.ndarray, harmonics: tuple[int, ...]) -> np.ndarray:
-        folded = np.abs((f + np.array(harmonics)[:, None] + N / 2) % N - N / 2)
+        shifted = f + np.array(harmonics)[:, None]
+        folded = np.abs((shifted + N / 2) % N - N / 2)
         levels = np.empty((*folded.shape, len(measured)))
         for k, (name, level) in enumerate(measured.items()):
-            value = np.asarray(level(folded) if callable(level) else level)
-            fits = value.dtype.kind in "fiu" and value.shape in ((), folded.shape)
-            if not fits or not ((value > 0) & np.isfinite(value)).all():
-                text = f"`noise` of {name} must be positive: one real number, or one per frequency."
-                raise DefinitionError(text)
-            levels[..., k] = value
+            levels[..., k] = _noise_level(name, level, folded)
         return levels**2
 
     return Noise(np.array([outputs.index(name) for name in measured]), spectrum)
+
+
+def _noise_level(name: str, level: Any, f: np.ndarray) -> np.ndarray:
+    """The standard deviation at frequencies, of a number or of a function of frequency."""
+    value = np.asarray(level(f) if callable(level) else level)
+    is_real = value.dtype.kind in "fiu" and value.shape in ((), f.shape)
+    if not is_real or not ((value > 0) & np.isfinite(value)).all():
+        raise DefinitionError(
+            f"`noise` of {name} must be positive: one real number, or one per frequency."
+        )
+    return value
 
 
 class Measured(NamedTuple):
@@ -183,7 +193,10 @@ class Measured(NamedTuple):
 
 
 def measured_htfs(
-    model: Model, cosines: Candidates, harmonics: Harmonics | None, noise: Noise
+    model: Model,
+    cosines: Candidates,
+    harmonics: Harmonics | None,
+    noise: Noise,
 ) -> Iterator[Measured]:
     r"""Yield the HTFs of each input that is used.
 
@@ -195,16 +208,16 @@ def measured_htfs(
         members = np.flatnonzero(cosines.channel == i)
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
-        variance: Any = 2 * spectrum[..., None] / (cosines.n_sections * cosines.strides)
+        samples = cosines.n_sections * cosines.strides
+        variance: Any = 2 * spectrum[..., None] / samples
         H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
-        outputs = tuple(htf.outputs[k] for k in noise.outputs)
         larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0
         htf = dataclasses.replace(
             htf,
             H=H,
             variance=larger * variance,
             inputs=htf.inputs[i : i + 1],
-            outputs=outputs,
+            outputs=tuple(htf.outputs[k] for k in noise.outputs),
         )
         yield Measured(htf, members, int(i), float(np.sqrt(larger)))
 
@@ -221,14 +234,16 @@ def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
 
     **Raises:** `DefinitionError` if hardly any are stable.
     """
-    rng, models, root = np.random.default_rng(seed), [], fit._spread.root
+    rng = np.random.default_rng(seed)
+    models = []
+    root = fit._spread.root
     for _ in range(_TRIES * count):
         moved = fit._coordinates.moved(root @ rng.normal(size=root.shape[1]))
         if np.abs(np.linalg.eigvals(moved.monodromy())).max() < 1:
             models.append(moved.to_ldtp(fit._scale, fit.inputs, fit.outputs))
         if len(models) == count:
             return models
-    text = f"only {len(models)} of {_TRIES * count} models in its confidence region are stable"
     raise DefinitionError(
-        f"`fit` is uncertain, {text}: measure more before a design is made."
+        f"`fit` is uncertain, only {len(models)} of {_TRIES * count} models in its confidence "
+        "region are stable: measure more before a design is made."
     )

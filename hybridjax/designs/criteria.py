@@ -61,7 +61,11 @@ def criterion_of(
 
 
 def _multipliers(
-    goal: Multipliers, model: Model, cosines: Candidates, noise: Noise, power: Powers
+    goal: Multipliers,
+    model: Model,
+    cosines: Candidates,
+    noise: Noise,
+    power: Powers,
 ) -> LinearCriterion:
     multipliers = np.asarray(model.multipliers)
     if goal.estimator == "fit_ldtp":
@@ -71,16 +75,18 @@ def _multipliers(
         if goal.which is not None and goal.which < len(multipliers):
             apart = np.abs(minimal - multipliers[goal.which])
             if not apart.min() < _SAME * np.abs(multipliers).max():
-                text = f"multiplier {multipliers[goal.which]:.4g}: add an input or an output"
                 raise DefinitionError(
-                    f"no input excites, or no output has, the {text}."
+                    f"no input excites, or no output has, the multiplier "
+                    f"{multipliers[goal.which]:.4g}: add an input or an output."
                 )
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
         wanted, names, part = wanted_parts(goal, minimal, c)
         return matrices.criterion(wanted @ slopes, names, part)
     c = np.poly(multipliers).real[1:]
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
-    channels = [channel for x in htfs for channel in _channels(x, c, goal.overhang)]
+    channels = list[Channel]()
+    for measured in htfs:
+        channels += _channels(measured, c, goal.overhang)
     wanted, names, part = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return LinearCriterion(names, unknowns, tuple(channels), wanted, part)
@@ -100,20 +106,28 @@ def wanted_parts(
         )
     require_index("multiplier", goal.which or 0, d)
     slope = np.polyval(np.polyder(np.array([1.0, *c])), multipliers)
-    wanted, names, part = list[np.ndarray](), list[str](), list[int]()
-    for k in range(d) if goal.which is None else [goal.which]:
+    wanted = list[np.ndarray]()
+    names = list[str]()
+    part = list[int]()
+    if goal.which is None:
+        chosen = np.flatnonzero(multipliers.imag >= 0)  # one of each pair
+    else:
+        chosen = np.array([goal.which])
+    for k in chosen:
         z = multipliers[k]
-        if goal.which is None and z.imag < 0:
-            continue
         if abs(slope[k]) < _SAME:
             raise DefinitionError(
                 f"the multiplier {z:.4g} is double: choose another `goal`."
             )
         gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
-        name = f"{z.real:.4g}" if z.imag == 0 else f"{z.real:.4g}{z.imag:+.4g}i"
-        rows = [gradient.real, gradient.imag][: 1 + (z.imag != 0)]
+        name = f"{z.real:.4g}"
+        rows = [gradient.real]
+        if z.imag != 0:
+            name += f"{z.imag:+.4g}i"
+            rows.append(gradient.imag)
         if goal.part == "modulus":
-            rows, name = [(z.conj() * gradient).real / abs(z)], f"|{name}|"
+            rows = [(z.conj() * gradient).real / abs(z)]
+            name = f"|{name}|"
         part += [len(names)] * len(rows)
         wanted += rows
         names.append(name)
@@ -121,7 +135,10 @@ def wanted_parts(
 
 
 def _parameters(
-    goal: Parameters, model: Model, lines: Candidates, noise: Noise
+    goal: Parameters,
+    model: Model,
+    lines: Candidates,
+    noise: Noise,
 ) -> LinearCriterion:
     free = tuple(goal.free)
     wanted = free if goal.wanted is None else tuple(goal.wanted)
@@ -151,11 +168,9 @@ def _channels(
     **Raises:** `DefinitionError` if the HTFs have too few frequencies.
     """
     for group in grouped(x.htf, len(c), overhang):
-        delays = range(1, len(c) + 1)
-        slopes = [
-            group.weighted(c, group.period_delay[:, None] ** j * group.data)
-            for j in delays
-        ]
+        delay = group.period_delay[:, None]
+        powers = range(1, len(c) + 1)
+        slopes = [group.weighted(c, delay**j * group.data) for j in powers]
         size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
         cosines = np.tile(x.cosines[group.line], 2)
         slope = x.weight * np.concatenate(slopes, axis=1)

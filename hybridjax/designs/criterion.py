@@ -96,7 +96,8 @@ class LinearCriterion(eqx.Module):
         cosine = [np.repeat(x.cosine, x.slopes.shape[1] // d) for x in self.channels]
         half = _root(rows @ rows.T, self.unknowns)
         spread = self.wanted @ half
-        influence, variances = spread @ half.T @ rows, (spread**2).sum(axis=1)
+        influence = spread @ half.T @ rows
+        variances = (spread**2).sum(axis=1)
         squares = np.bincount(
             np.concatenate(cosine), (influence**2).sum(axis=0), len(power)
         )
@@ -151,9 +152,8 @@ def _root(
             f"{unknowns[lost[0]]} changes no response: drop it or add an output."
         )
     values, vectors = np.linalg.eigh(matrix / size / size[:, None])
-    if (
-        not values[0] > ROUNDING
-    ):  # relative to the largest, for combinations of matrices
+    # (Relative to the largest one, for combinations of matrices.)
+    if not values[0] > ROUNDING:
         direction = vectors[:, 0] / size
         largest = np.abs(direction).max()
         named = zip(direction, unknowns, strict=True)

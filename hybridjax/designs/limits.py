@@ -111,13 +111,15 @@ class Limits(eqx.Module):
         periods = design.periods
         count = design.experiments if self.strides is None else self.strides // periods
         if count == 0:
-            text = (
-                f"`limit` allows {self.strides} strides, fewer than one experiment has"
+            raise DefinitionError(
+                f"`limit` allows {self.strides} strides, fewer than one experiment has, {periods}: "
+                "allow more."
             )
-            raise DefinitionError(f"{text}, {periods}: allow more.")
         if count > cosines:
-            text = f"take a `design` with more lines, or fewer experiments than {count}"
-            raise DefinitionError(f"the `design` has {cosines} cosines: {text}.")
+            raise DefinitionError(
+                f"the `design` has {cosines} cosines: take a `design` with more lines, or fewer "
+                f"experiments than {count}."
+            )
         return count
 
 
@@ -153,11 +155,11 @@ class PowerLimits(NamedTuple):
 
         **Arguments:** `level`: factor by which the quadratic forms may exceed 1. Default: 1.
         """
-        slope, use = self.curved @ power, self.use_of_curved(power)
-        slope = slope / np.where(use > 0, use * level, 1.0)[:, None]
-        return PowerLimits(
-            self.names, np.concatenate([self.cost, slope]), self.curved[:0]
-        )
+        use = self.use_of_curved(power)
+        norm = np.where(use > 0, use * level, 1.0)
+        slope = self.curved @ power / norm[:, None]
+        cost = np.concatenate([self.cost, slope])
+        return PowerLimits(self.names, cost, self.curved[:0])
 
     def scaled(self, power: Powers) -> Powers:
         """Return the same proportions, as large as the limits allow."""
@@ -183,12 +185,17 @@ class PowerLimits(NamedTuple):
         alone = np.diagonal(self.curved, axis1=1, axis2=2)
         free = np.concatenate([self.cost, alone]).max(axis=0) == 0
         if free.any():
-            text = f"cosine {int(np.argmax(free))} of the design moves no signal of `limit`"
-            raise DefinitionError(f"{text}: limit the input, too.")
+            raise DefinitionError(
+                f"cosine {int(np.argmax(free))} of the design moves no signal of `limit`: limit "
+                "the input, too."
+            )
 
 
 def power_limits(
-    limits: Limits, models: list[Model], squares: list[Squares], usual: Powers
+    limits: Limits,
+    models: list[Model],
+    squares: list[Squares],
+    usual: Powers,
 ) -> PowerLimits:
     """Return the linear limits, which hold for each model. A peak is no smaller than an rms value.
 
@@ -196,39 +203,47 @@ def power_limits(
 
     **Raises:** `DefinitionError` for names that do not exist, and limits that nothing satisfies.
     """
-    inputs, outputs = models[0].inputs, models[0].outputs
-    if isinstance(limits.rms, str):
-        names = inputs if limits.rms == "input" else outputs
-        levels = [
-            {n: float(np.sqrt(square[n] @ usual)) for n in names} for square in squares
-        ]
-    else:
-        require_among("signal", limits.rms, (*inputs, *outputs), "`limit`: ")
-        if not (limits.rms or limits.rate or limits.peak or limits.distortion):
-            raise DefinitionError(
-                "`limit` is empty: name a signal, such as rms={'u': 0.1}."
-            )
-        levels = [{str(n): float(x) for n, x in limits.rms.items()} for _ in squares]
-    limits.require_inputs(inputs)
-    for level in levels:
-        level |= {f"rate of {n}": float(x) for n, x in limits.rate.items()}
-        level |= {f"peak of {n}": float(x) for n, x in limits.peak.items()}
-    if silent := [n for level in levels for n, rms in level.items() if rms == 0]:
-        raise DefinitionError(
-            f"the `design` does not move {silent[0]}: leave it out of `limit`."
-        )
-    names = [n for level in levels for n in level]
-    rows = [
-        square[n.removeprefix("peak of ")] / rms**2
-        for square, level in zip(squares, levels, strict=True)
-        for n, rms in level.items()
-    ]
+    rows = list[Powers]()
+    names = list[str]()
+    for model, square in zip(models, squares, strict=True):
+        for name, level in _levels(limits, model, square, usual).items():
+            if level == 0:
+                raise DefinitionError(
+                    f"the `design` does not move {name}: leave it out of `limit`."
+                )
+            names.append(name)
+            rows.append(square[name.removeprefix("peak of ")] / level**2)
     K = len(usual)
     cost = np.reshape(rows, (-1, K))
-    distinct = np.sort(np.unique(cost, axis=0, return_index=True)[1])
+    _, first = np.unique(cost, axis=0, return_index=True)
+    distinct = np.sort(first)
     return PowerLimits(
         tuple(names[i] for i in distinct), cost[distinct], np.zeros((0, K, K))
     )
+
+
+def _levels(
+    limits: Limits,
+    model: Model,
+    square: Squares,
+    usual: Powers,
+) -> dict[str, float]:
+    """The largest rms values of signals, of rates and of peaks, by their names."""
+    signals = (*model.inputs, *model.outputs)
+    if isinstance(limits.rms, str):
+        names = model.inputs if limits.rms == "input" else model.outputs
+        levels = {name: float(np.sqrt(square[name] @ usual)) for name in names}
+    else:
+        require_among("signal", limits.rms, signals, "`limit`: ")
+        levels = {str(name): float(x) for name, x in limits.rms.items()}
+        if not (levels or limits.rate or limits.peak or limits.distortion):
+            raise DefinitionError(
+                "`limit` is empty: name a signal, such as rms={'u': 0.1}."
+            )
+    limits.require_inputs(model.inputs)
+    levels |= {f"rate of {name}": float(x) for name, x in limits.rate.items()}
+    levels |= {f"peak of {name}": float(x) for name, x in limits.peak.items()}
+    return levels
 
 
 def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
@@ -237,13 +252,15 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
     phase = np.array(design.phase)
     for e in range(design.experiments):
         lines = np.flatnonzero(design.experiment == e)
-        parts = {
-            n: getattr(design, n)[lines]
-            for n in ("line", "channel", "amplitude", "phase")
-        }
         # (Alone, so that a line that occurs in several experiments may have any phase.)
         single = dataclasses.replace(
-            design, experiment=0 * lines, experiments=1, **parts
+            design,
+            experiment=0 * lines,
+            experiments=1,
+            line=design.line[lines],
+            channel=design.channel[lines],
+            amplitude=design.amplitude[lines],
+            phase=design.phase[lines],
         )
         phase[lines] = optimize_phases(single, seed).phase
     design = dataclasses.replace(design, phase=phase)
@@ -282,22 +299,20 @@ class Products(NamedTuple):
             if name not in model.outputs:
                 continue
             expected = H_model[:, model.outputs.index(name)]
-            difference, size = np.linalg.norm(H - expected), np.linalg.norm(expected)
+            difference = np.linalg.norm(H - expected)
+            size = np.linalg.norm(expected)
             if difference > _DIFFERENT * size:
                 share = difference / max(size, np.finfo(float).tiny)
-                text = (
-                    f"differ in H_0 (to {name}, by {share:.0%}): use the same sections"
-                )
                 raise DefinitionError(
-                    f"the model and the distortion of `limit` {text}."
+                    f"the model and the distortion of `limit` differ in H_0 (to {name}, by "
+                    f"{share:.0%}): use the same sections."
                 )
 
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""
         if phases:
-            return np.sqrt(
-                np.mean(self.quadratic.second_order(design.inputs()) ** 2, axis=(0, 1))
-            )
+            second = self.quadratic.second_order(design.inputs())
+            return np.sqrt(np.mean(second**2, axis=(0, 1)))
         power = self.cosines.powers_in(design)
         squares = np.einsum("ek,okl,el->o", power, self.expected, power, optimize=True)
         return np.sqrt(np.maximum(squares, 0) / design.experiments)
@@ -312,7 +327,10 @@ class Products(NamedTuple):
 
 
 def products(
-    limit: Distortion, cosines: Candidates, inputs: tuple[str, ...], usual: Powers
+    limit: Distortion,
+    cosines: Candidates,
+    inputs: tuple[str, ...],
+    usual: Powers,
 ) -> Products:
     """Return the distortion as a form of powers.
 

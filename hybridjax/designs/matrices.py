@@ -4,6 +4,7 @@ They are taken in the local coordinates of `fit_ldtp`, in combinations for which
 the usual design is the identity; combinations that it does not determine are left out.
 """
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -52,9 +53,8 @@ class Matrices(NamedTuple):
 
         **Raises:** `DefinitionError` if the usual design does not determine them.
         """
-        shown, hidden = (
-            np.bincount(part, ((wanted @ r) ** 2).sum(axis=1)) for r in self.spread
-        )
+        variances = [((wanted @ root) ** 2).sum(axis=1) for root in self.spread]
+        shown, hidden = (np.bincount(part, x) for x in variances)
         if (hidden > _MISSED * (shown + hidden)).any():
             raise DefinitionError(
                 "`design` does not determine the `goal`: add harmonics or lines."
@@ -80,14 +80,15 @@ def ldtp_matrices(
     **Raises:** `DefinitionError` for a model that is no `LDTP`.
     """
     if not isinstance(model, LDTP):
-        text = "needs an `LDTP`: the `model` of a fit of `fit_ldtp` or `fit_series`."
-        raise DefinitionError(f"a goal of `fit_ldtp` {text}")
+        raise DefinitionError(
+            "a goal of `fit_ldtp` needs an `LDTP`: the `model` of a fit of `fit_ldtp` or "
+            "`fit_series`."
+        )
     lags = 2 * default_horizon(model.n_sections) + 1
     response = np.asarray(model.impulse_response(lags))[:, :, noise.outputs]
     htfs = list(measured_htfs(model, cosines, harmonics, noise))
-    scale = np.sqrt(
-        np.mean([check_values(measured.htf) ** 2 for measured in htfs], axis=0)
-    )
+    squares = [check_values(measured.htf) ** 2 for measured in htfs]
+    scale = np.sqrt(np.mean(squares, axis=0))
     direct = bool(response[:, 0].any())
     coordinates = local_coordinates(PeriodicModel.of(realized(response), scale), direct)
     gram = np.zeros((coordinates.size, coordinates.size))
@@ -95,7 +96,8 @@ def ldtp_matrices(
         flat = _flat(rows * np.sqrt(power[lines])[:, None, None])
         gram += flat @ flat.T
     spread = NormalEquations(gram, np.zeros(len(gram))).spread()
-    cosine, slopes = [], []
+    cosine = []
+    slopes = []
     for lines, rows in _rows(coordinates, htfs, scale):
         cosine.append(np.repeat(lines, rows.shape[2]))
         slopes.append(spread.root.T @ _flat(rows))
@@ -133,7 +135,8 @@ def response_criterion(
 
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
-    N, (low, high) = cosines.n_sections, goal.band
+    N = cosines.n_sections
+    (low, high) = goal.band
     if high > N / 2:
         raise DefinitionError(
             f"`band` must lie within 0 and {N / 2:g}, not {goal.band}."
@@ -145,18 +148,14 @@ def response_criterion(
     parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
     slopes = np.concatenate(parts, axis=2)
     size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
-    slopes = (
-        np.stack([np.real(slopes), np.imag(slopes)], axis=3) / size / np.sqrt(_POINTS)
-    )
-    names = [
-        f"H_{m} of {model.outputs[i]}{f' from {u}' * (len(model.inputs) > 1)}"
-        for m in harmonics
-        for i in noise.outputs
-        for u in model.inputs
-    ]
-    each = slopes.transpose(1, 4, 5, 2, 3, 0).reshape(
-        len(names), -1, matrices.coordinates.size
-    )
+    slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3)
+    slopes = slopes / size / np.sqrt(_POINTS)
+    names = []
+    for m, i, u in itertools.product(harmonics, noise.outputs, model.inputs):
+        name = f"H_{m} of {model.outputs[i]}"
+        names.append(name if len(model.inputs) == 1 else f"{name} from {u}")
+    each = slopes.transpose(1, 4, 5, 2, 3, 0)
+    each = each.reshape(len(names), -1, matrices.coordinates.size)
     # As few rows of each quantity as have the same sum of squares, up to rounding.
     _, values, vectors = np.linalg.svd(each, full_matrices=False)
     kept = values**2 > np.finfo(float).eps * values[:, :1] ** 2

@@ -95,7 +95,8 @@ class OptimalDesign(eqx.Module):
     @property
     def usual_name(self) -> str:
         """The name of the design that it improves, in prints and figures."""
-        size, channel = self.usual.amplitude, self.usual.channel
+        size = self.usual.amplitude
+        channel = self.usual.channel
         relative = size / (np.bincount(channel, size) / np.bincount(channel))[channel]
         # (Amplitudes are larger in experiments with fewer lines.)
         return "equal amplitudes" if np.ptp(relative) < 0.2 else "the given amplitudes"
@@ -141,9 +142,10 @@ class OptimalDesign(eqx.Module):
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
         text = f"one stride of this design replaces {saved:g} with {self.usual_name}."
-        text = (
-            text if self.saved > _WORTH_IT else f"{self.usual_name} are nearly optimal."
-        )
+        if self.saved > _WORTH_IT:
+            text = text
+        else:
+            text = f"{self.usual_name} are nearly optimal."
         return f"With the {limits} limited, {text}"
 
     def __repr__(self) -> str:
@@ -216,14 +218,12 @@ class Rules(NamedTuple):
         each = self.cosines.powers_in(design)
         power = each.mean(axis=0)
         kept = np.flatnonzero(power)
-        power, share = power[kept], each[:, kept] / power[kept]
-        limits = self.linear.only(kept)._replace(
-            curved=self.distortion.divided(kept, share)
-        )
+        power = power[kept]
+        curved = self.distortion.divided(kept, each[:, kept] / power)
+        limits = self.linear.only(kept)._replace(curved=curved)
+        best = allocate(criterion.only(kept), limits, power)
         factor = np.ones(len(self.cosines.line))
-        factor[kept] = np.sqrt(
-            allocate(criterion.only(kept), limits, power).power / power
-        )
+        factor[kept] = np.sqrt(best.power / power)
         amplitude = design.amplitude * factor[self.cosines.places(design)]
         return self.scaled(dataclasses.replace(design, amplitude=amplitude))
 
@@ -232,14 +232,13 @@ class Rules(NamedTuple):
         use: dict[str, float] = {}
         shares = self.linear.cost @ self.cosines.power_of(design)
         for name, share in zip(self.linear.names, shares, strict=True):
-            use[name] = max(
-                use.get(name, 0.0), np.inf if name.startswith("peak of ") else share
-            )
+            if name.startswith("peak of "):
+                share = np.inf
+            use[name] = max(use.get(name, 0.0), share)
         if self.distortion is not None:
-            levels = zip(
-                self.distorted(design).items(), self.distortion.level, strict=True
-            )
-            use |= {name: rms / level for (name, rms), level in levels}
+            rms = self.distorted(design)
+            for name, level in zip(rms, self.distortion.level, strict=True):
+                use[name] = rms[name] / level
         return tuple(name for name, share in use.items() if share > 1 / (1 + ENOUGH))
 
 
@@ -298,18 +297,19 @@ def optimal_design(
     models = [model] if isinstance(model, Model) else list(model)
     if not models:
         raise DefinitionError("`model` must be one model or more, not an empty list.")
-    usual = (
-        multisine(models[0].n_sections, inputs=models[0].inputs)
-        if design is None
-        else design
-    )
+    if design is None:
+        usual = multisine(models[0].n_sections, inputs=models[0].inputs)
+    else:
+        usual = design
     _check_alike(models, usual)
-    given, cosines = as_limits(limit), Candidates.of(usual)
+    given = as_limits(limit)
+    cosines = Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]
     linear = power_limits(given, models, squares, cosines.power_of(usual))
 
     count = given.experiments(usual, len(cosines.line))
-    distortion, limits = None, linear
+    distortion = None
+    limits = linear
     if given.distortion is not None:
         power = cosines.power_of(usual)
         distortion = products(given.distortion, cosines, models[0].inputs, power)
@@ -365,7 +365,9 @@ def _check_alike(models: list[Model], design: Design) -> None:
     for k, model in enumerate(models):
         require_same(f"model {k} and model 0", model, first)
         if (np.abs(model.multipliers) >= 1).any():
-            text = "has no periodic response: give a stable loop, `model.feedback(controller)`."
-            raise DefinitionError(f"model {k} is unstable, so that it {text}")
+            raise DefinitionError(
+                f"model {k} is unstable, so that it has no periodic response: give a stable loop, "
+                "`model.feedback(controller)`."
+            )
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
     require_equal("design and model", "inputs", design.input_names, first.inputs)

@@ -104,7 +104,8 @@ class Study(eqx.Module):
     _history: History = eqx.field(default_factory=History, kw_only=True)
 
     def __check_init__(self):
-        first, goal = self.first, self.goal
+        first = self.first
+        goal = self.goal
         if len(first.input_names) > 1:
             raise DefinitionError(
                 "`first` must have a single input: study one at a time."
@@ -120,7 +121,8 @@ class Study(eqx.Module):
                 "a study ends at `standard_error`: leave strides out of `limit`."
             )
         limits.require_inputs(first.input_names)
-        named, signals = limits.rms, (*first.input_names, *self.outputs)
+        named = limits.rms
+        signals = (*first.input_names, *self.outputs)
         if not isinstance(named, str):
             require_among(
                 "signal", named, signals, "`limit` (`outputs` names those to come): "
@@ -208,9 +210,9 @@ class Study(eqx.Module):
         blocks = (*self._history.blocks, block)
         best = estimate(blocks, self.order, self.goal)
         if are_alike(best.fit.correlation, best.fit.dof):
-            text = f"the data show more than {self.order} multipliers"
             raise DefinitionError(
-                f"{text}: add the blocks to a study with a larger `order`."
+                f"the data show more than {self.order} multipliers: add the blocks to a study with "
+                "a larger `order`."
             )
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
@@ -224,9 +226,10 @@ class Study(eqx.Module):
         width = max(map(len, errors_so_far))
         padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
         strides = sum(block.strides for block in blocks)
-        plan = (
-            None if best.objection else self._next(best, errors, strides, len(blocks))
-        )
+        if best.objection:
+            plan = None
+        else:
+            plan = self._next(best, errors, strides, len(blocks))
         history = History(blocks, np.array(padded), best, plan)
         return eqx.tree_at(
             lambda s: s._history, self, history, is_leaf=lambda x: x is None
@@ -251,7 +254,8 @@ class Study(eqx.Module):
                 seed=self.seed + blocks,
             )
 
-        plan, periods = planned(self.limit), self.first.periods
+        plan = planned(self.limit)
+        periods = self.first.periods
         # Precisions of independent blocks add.
         now = (errors**2).sum()
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
@@ -286,10 +290,10 @@ class Study(eqx.Module):
         return card("Study", self._state(), multipliers, strides, text(self._outlook()))
 
     def _state(self) -> str:
+        wanted = f"standard error {self.standard_error:.2g} requested"
         if self.fit is None:
-            return f"standard error {self.standard_error:.2g} requested; nothing measured yet"
-        state = "reached" if self.done else "not yet reached"
-        return f"standard error {self.standard_error:.2g} requested: {state}"
+            return f"{wanted}; nothing measured yet"
+        return f"{wanted}: {'reached' if self.done else 'not yet reached'}"
 
     def _rows(self) -> list[tuple[str, str]]:
         rows = []
@@ -304,7 +308,8 @@ class Study(eqx.Module):
         return rows
 
     def _outlook(self) -> str:
-        best, plan = self._history.estimate, self.plan
+        best = self._history.estimate
+        plan = self.plan
         if plan is None or best is None:
             return (
                 f"next: the first design again, since {best.objection if best else ''}"
@@ -321,11 +326,10 @@ class Study(eqx.Module):
 def _standard_errors(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
     """Return standard errors of the multipliers of a goal, those of a conjugate pair once."""
     z = np.asarray(fit.multipliers)
-    wanted = (
-        np.flatnonzero(np.imag(z) >= 0)
-        if goal.which is None
-        else np.array([goal.which])
-    )
+    if goal.which is None:
+        wanted = np.flatnonzero(np.imag(z) >= 0)
+    else:
+        wanted = np.array([goal.which])
     covariance = fit.multiplier_covariances[wanted]
     if goal.part == "position":
         return np.sqrt(np.trace(covariance, axis1=1, axis2=2))

@@ -53,28 +53,33 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
     require_deviations(data.records)
     each = []
     for s in np.flatnonzero(data.ok):
-        u, y = data.u[s : s + 1], data.y[s : s + 1]
+        one = slice(s, s + 1)
         single = dataclasses.replace(
-            data, u=u, y=y, result=data.result[s : s + 1], simulated=None
+            data,
+            u=data.u[one],
+            y=data.y[one],
+            result=data.result[one],
+            simulated=None,
         )
         each.append(spectral_sums(single, goal.fitted_harmonics, repeats=repeats))
-    N, P, f = (
-        data.n_sections,
-        data.periods,
-        np.concatenate([sums.line for sums in each]),
-    )
+    N = data.n_sections
+    P = data.periods
+    line = np.concatenate([sums.line for sums in each])
     power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
-    H = (
-        np.concatenate([sums.along[:, 0] for sums in each], axis=0).swapaxes(0, 1)
-        / power
-    )
-    variance = np.broadcast_to((N * P / repeats / power)[..., None], (*H.shape, 1))
-    names = data.inputs, data.outputs
+    along = np.concatenate([sums.along[:, 0] for sums in each])
+    H = (along.swapaxes(0, 1) / power)[..., None]
+    variance = np.broadcast_to((N * P / repeats / power)[..., None], H.shape)
     htf = HTF(
-        np.arange(len(f)), H[..., None], each[0].harmonics, N, *names, variance=variance
+        np.arange(len(line)),
+        H,
+        each[0].harmonics,
+        N,
+        data.inputs,
+        data.outputs,
+        variance=variance,
     )
     # Frequencies may occur several times, measured each time on their own.
-    htf = eqx.tree_at(lambda htf: htf.f, htf, from_host(f / P))
+    htf = eqx.tree_at(lambda htf: htf.f, htf, from_host(line / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
 
 
@@ -110,24 +115,20 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     where these are few; and from the levels of the noise, as if it were white.
     """
     htfs = to_host([block.htf for block in blocks])
-    f, H = (
-        np.concatenate([x.f for x in htfs]),
-        np.concatenate([x.H for x in htfs], axis=1),
-    )
+    f = np.concatenate([x.f for x in htfs])
+    H = np.concatenate([x.H for x in htfs], axis=1)
     member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
     # To begin with, all of it may be noise.
-    square = [
-        np.mean(np.abs(htf.H) ** 2 / htf.variance, axis=(0, 1, 3)) for htf in htfs
-    ]
-    noise, c = np.sqrt(square), None
+    relative = [np.abs(htf.H) ** 2 / htf.variance for htf in htfs]
+    noise = np.sqrt([np.mean(x, axis=(0, 1, 3)) for x in relative])
+    c = None
 
     def weighted() -> tuple[HTF, list[HTFGroup]]:
         """Return all lines of all blocks, one after the other, with their variances."""
-        each = [
-            htf.variance * std[:, None] ** 2
-            for htf, std in zip(htfs, noise, strict=True)
-        ]
-        values = f, H, np.concatenate(each, axis=1)
+        variances = []
+        for htf, std in zip(htfs, noise, strict=True):
+            variances.append(htf.variance * std[:, None] ** 2)
+        values = f, H, np.concatenate(variances, axis=1)
         htf = from_host(eqx.tree_at(lambda x: (x.f, x.H, x.variance), htfs[0], values))
         return htf, grouped(htf, order, goal.overhang)
 
@@ -135,14 +136,16 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         _, groups = weighted()
         c, _ = maximum_likelihood(groups, order, c)
         # The rms residual of each block and output, in units of the supposed noise.
-        left, freedom = np.zeros(noise.shape), np.zeros(noise.shape)
+        left = np.zeros(noise.shape)
+        freedom = np.zeros(noise.shape)
         for group in groups:
-            misfit, block = misfit_of(group, c), member[group.line]
+            misfit = misfit_of(group, c)
+            block = member[group.line]
+            free = (1 - misfit.leverage).sum(axis=0)
             for k, output in enumerate(group.channel[:, 0]):
-                np.add.at(
-                    left[:, output], block, (misfit.residual[:, :, k] ** 2).sum(axis=0)
-                )
-                np.add.at(freedom[:, output], block, (1 - misfit.leverage).sum(axis=0))
+                squares = (misfit.residual[:, :, k] ** 2).sum(axis=0)
+                np.add.at(left[:, output], block, squares)
+                np.add.at(freedom[:, output], block, free)
         change = np.sqrt(left / freedom)
         noise = noise * change
         if np.abs(np.log(change)).max() < ENOUGH:
@@ -181,21 +184,24 @@ def refuse_transient(
 
     **Raises:** `DefinitionError` if more is left.
     """
-    N, P, y = data.n_sections, data.periods, data.y[data.ok]
+    N = data.n_sections
+    P = data.periods
+    y = data.y[data.ok]
     before = y.shape[1] // N - P * repeats
     if not before:
         return
     k = min(1, before - 1)
-    early, late = (y[:, N * n : N * (n + 1)] for n in (k, k + P))
+    cycles = y[:, : y.shape[1] // N * N].reshape(len(y), -1, N, y.shape[2])
+    early = cycles[:, k]
+    late = cycles[:, k + P]
     excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
     threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / early[..., 0].size)
     size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
-    left = np.where(excess > threshold, size, 0).max() * np.abs(multipliers).max() ** (
-        before - k
-    )
+    decay = np.abs(multipliers).max() ** (before - k)
+    left = np.where(excess > threshold, size, 0).max() * decay
     if left > allowed:
-        text = f"{left:.1g} of the start's transient is left (allowed: {allowed:.1g})"
-        remedy = "use `hj.identify.remove_transient(data).data`, or start='steady'"
         raise DefinitionError(
-            f"after {before} discarded cycles a part of {text}: {remedy}."
+            f"after {before} discarded cycles a part of {left:.1g} of the start's transient is "
+            f"left (allowed: {allowed:.1g}): use `hj.identify.remove_transient(data).data`, or "
+            "start='steady'."
         )

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core as jex
 from jaxtyping import Float
 
+from .._core import jax_compat
 from .._core.compilation import kind
 from .._core.reading import is_of_package
 from ..systems.solver import Method
@@ -20,16 +20,9 @@ from .cubic import interpolate
 from .settings import ROUNDING, Settings
 
 
-# Operations on real numbers without kinks, jumps and pulses.
-_SMOOTH = frozenset(
-    "add sub mul neg sin cos square add_any dot_general reduce_sum copy "
-    "broadcast_in_dim concatenate convert_element_type expand_dims gather pad reshape slice "
-    "dynamic_slice squeeze stack unstack split transpose".split()
-)
-_CALLS = frozenset("jit pjit closed_call core_call".split())
-# Operations that may have poles. Beside these, values fall as the inverse or the inverse square of
-# the distance, which few points in a step see, unless the program has powers beyond squares.
-_POLES = frozenset(("div", "integer_pow"))
+# Words of `jax_compat.suddenness`. Beside poles values fall as the inverse, or its square, of the
+# distance, which few points in a step see, unless the program has powers beyond squares.
+_POLES = frozenset(["pole"])
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
 _PIECES, _FEW = 64, 8
@@ -43,11 +36,8 @@ _NEAR = 1e-5
 # Points of a call, and steps whose points are kept at once. Fewer: more calls. More: few points
 # take longer, and many more memory.
 _POINTS = 1024
-# Operations with jumps, and with kinks.
-_DECISIONS = frozenset(
-    "sign floor ceil round rem atan2 gt lt ge le eq ne is_finite".split()
-)
-_KINKS = _DECISIONS | frozenset("max min abs clamp select_n cond".split())
+# Operations with jumps or kinks.
+_KINKS = frozenset(["decision", "kink"])
 # A field jumps if it changes by this part of itself between points that are so many times closer,
 # in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
 # errors of multipliers are as large. Farther points: steep functions are refused that steps
@@ -61,34 +51,32 @@ Points = Float[np.ndarray, "P 1+n"]
 """Times and states."""
 
 
-def program_of(s: Structure, a: int, function: Callable | None = None) -> jex.Jaxpr:
+def program_of(s: Structure, a: int, function: Callable | None = None):
     """The program of a function of chart a. Default: its field."""
     real = jnp.result_type(float)
     point = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (s.dims[a],), (s.nu,))]
     return jax.make_jaxpr(function or ft.partial(s.field, a))(*point).jaxpr
 
 
-def sudden(program: jex.Jaxpr) -> Iterator[tuple[str, Any]]:
-    """Names of the operations of a program that depend on its arguments, and may jump or have
-    pulses, each with the equation, or the call, by which the program does it."""
+def sudden(program: jax_compat.Program) -> Iterator[tuple[str, Any]]:
+    """The operations of a program that depend on its arguments, and may jump or have pulses: how
+    (`jax_compat.suddenness`), with the equation, or the call, by which the program does it."""
     moving = set(program.invars)
     for equation in program.eqns:
-        moves = [isinstance(x, jex.Var) and x in moving for x in equation.invars]
+        moves = [jax_compat.is_variable(x) and x in moving for x in equation.invars]
         if any(moves):
             moving.update(equation.outvars)
-            if equation.params.get("name") == "solve_positive":
-                yield "div", equation  # (it decides only whether the solution is NaN)
+            if jax_compat.solves_scalars_only(equation):
+                yield "pole", equation
                 continue
-            calls = jex.jaxprs_in_params(equation.params)
-            yield from ((name, equation) for call in calls for name, _ in sudden(call))
-            if not _is_smooth(equation, moves):
-                yield equation.primitive.name, equation
-            if abs(equation.params.get("y", 0)) > 2:
-                yield "power", equation  # (in a denominator it makes pulses)
+            for call in jax_compat.inner_programs(equation):
+                yield from ((how, equation) for how, _ in sudden(call))
+            for how in jax_compat.suddenness(equation, moves):
+                yield how, equation
 
 
 def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
-    """Names of the `sudden` operations of a function (structure, chart, *point) of a module."""
+    """How operations of a module's function (structure, chart, *point) are `sudden`."""
     key = function, a, kind(s)
     if key not in _sudden:
         names = (
@@ -101,25 +89,6 @@ def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
 
 
 _sudden: dict[tuple, frozenset[str]] = {}
-
-
-def _is_smooth(equation: Any, moves: list[bool]) -> bool:
-    """Test whether an equation neither jumps nor has pulses, if these of its arguments move."""
-    match equation.primitive.name:
-        case "div":
-            return not moves[1]
-        case "select_n":
-            return not moves[0]
-        case "integer_pow":
-            return equation.params["y"] > 0
-        case "scatter-add":
-            return not moves[1]
-        case name:
-            # (JAX 0.11 leaves calls without results in a program.)
-            real = all(
-                jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars
-            )
-            return name in _CALLS or (name in _SMOOTH and real)
 
 
 def passed_over(
@@ -270,7 +239,7 @@ def values_at(
 
 
 def may_have_pulses(s: Structure, a: int) -> frozenset[str]:
-    """Names of the operations by which the field or a guard of chart a may jump or have pulses."""
+    """How the field or a guard of chart a may jump or have pulses."""
     return may_be_sudden(s, a, Structure.field) | may_be_sudden(s, a, _guards)
 
 
@@ -335,7 +304,7 @@ def lines_of_jumps(s: Structure, a: int) -> list[str]:
     lines = [
         (name, _line_of(x)) for name, x in sudden(program_of(s, a)) if name != "power"
     ]
-    decisions = [x for x in lines if x[0] in _DECISIONS]
+    decisions = [x for x in lines if x[0] == "decision"]
     return [
         line for line in dict.fromkeys(line for _, line in decisions or lines) if line
     ]
@@ -343,8 +312,7 @@ def lines_of_jumps(s: Structure, a: int) -> list[str]:
 
 def _line_of(equation: Any) -> str:
     """The line of a user's file that wrote an equation, for messages."""
-    traceback = equation.source_info.traceback
-    for frame in traceback.frames if traceback else ():
-        if not is_of_package(frame.file_name):
-            return f" ({frame.file_name}:{frame.line_num})"
+    for file, line in jax_compat.lines_of(equation):
+        if not is_of_package(file):
+            return f" ({file}:{line})"
     return ""

@@ -383,5 +383,4 @@ def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
     return jax.tree_util.tree_map(ft.partial(jnp.where, mask), yes, no)
 
 
-# (XLA's newer code generator compiles these programs for twice as long.)
-program = OneTier(follow_table, {"xla_cpu_use_fusion_emitters": False})
+program = OneTier(follow_table)

@@ -113,13 +113,21 @@ class Mechanism(eqx.Module):
 
     def bias(self, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         """h(q, v) = C(q, v) v + G(q): the forces that keep the velocities as they are."""
-        lagrangian = lambda q, v: jnp.asarray(self.kinetic(q, v) - self.potential(q))  # noqa: E731
-        slopes = lambda q: jax.grad(lagrangian, (0, 1))(q, v)  # noqa: E731
+
+        def lagrangian(q, v):
+            return jnp.asarray(self.kinetic(q, v) - self.potential(q))
+
+        def slopes(q):
+            return jax.grad(lagrangian, (0, 1))(q, v)
+
         (force, _), (_, change) = jax.jvp(slopes, (q,), (v,))
         return change - force
 
     def acceleration(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], force: ArrayLike = 0.0
+        self,
+        q: Float[Array, " n"],
+        v: Float[Array, " n"],
+        force: ArrayLike = 0.0,
     ) -> Float[Array, " n"]:
         """a = dv/dt in M a + h = f, under generalized forces f: n numbers, or one for all."""
         return _solve(self.mass(q), force - self.bias(q, v))
@@ -138,14 +146,21 @@ class Mechanism(eqx.Module):
         States should satisfy c = const. and J v = 0. An error in these is not corrected: J v keeps
         its value up to rounding, and c drifts accordingly.
         """
-        place = lambda q: as_vector(contact(q)).ravel()  # noqa: E731
-        speed = lambda q: jax.jvp(place, (q,), (v,))[1]  # noqa: E731
+
+        def place(q):
+            return as_vector(contact(q)).ravel()
+
+        def speed(q):
+            return jax.jvp(place, (q,), (v,))[1]
+
         # (The drift is the part of the contact's acceleration that the velocities make.)
-        jacobian, drift = jax.jacfwd(place)(q), jax.jvp(speed, (q,), (v,))[1]
+        jacobian = jax.jacfwd(place)(q)
+        drift = jax.jvp(speed, (q,), (v,))[1]
         solved = _solve(
             self.mass(q), jnp.concatenate([(force - self.bias(q, v))[None], jacobian])
         )
-        free, by_force = solved[0], solved[1:].T
+        free = solved[0]
+        by_force = solved[1:].T
         constraint = _solve(jacobian @ by_force, -(drift + jacobian @ free), _DEPENDENT)
         return Constrained(free + by_force @ constraint, constraint)
 
@@ -180,7 +195,10 @@ class Mechanism(eqx.Module):
         A biped whose coordinates are those of the hip and angles of its links becomes one that
         stands on a foot: `biped.along(lambda angles: [*hip_above_foot(angles), *angles])`.
         """
-        place = lambda p: as_vector(placement(p))  # noqa: E731
+
+        def place(p):
+            return as_vector(placement(p))
+
         return Mechanism(
             lambda p, v: self.kinetic(*jax.jvp(place, (p,), (v,))),
             lambda p: self.potential(place(p)),

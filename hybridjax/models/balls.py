@@ -26,11 +26,15 @@ class BouncingBall(HybridSystem):
     restitution: Parameter = parameter(0.7, doc="speed kept at a bounce")
 
     def charts(self):
-        fall = lambda t, q, u: (q[1], u[0] - self.g)  # noqa: E731
+        def fall(t, q, u):
+            return (q[1], u[0] - self.g)
+
         return {"fall": FieldChart(fall, ("y", "v"), ("m", "m/s"))}
 
     def transitions(self):
-        bounced = lambda t, q, u: (0.0, -self.restitution * q[1])  # noqa: E731
+        def bounced(t, q, u):
+            return (0.0, -self.restitution * q[1])
+
         return (
             Transition("bounce", "fall", "fall", lambda t, q, u: q[0], reset=bounced),
         )
@@ -65,7 +69,8 @@ class PaddleJuggler(HybridSystem):
 
     def exact(self):
         """Time of the impact, height and speed of the ball right after it, and the multipliers."""
-        a, v = self.restitution, self.g * self.T / 2
+        a = self.restitution
+        v = self.g * self.T / 2
         speed = (1 - a) * v / (1 + a)
         t = jnp.arccos(speed / (self.A * self.rate)) / self.rate
         y, _ = self.paddle(t)
@@ -83,10 +88,13 @@ class PaddleJuggler(HybridSystem):
 
     def transitions(self):
         def bounce(t, q, u):
-            a, (_, speed) = self.restitution, self.paddle(t)
+            a = self.restitution
+            (_, speed) = self.paddle(t)
             return q[0], -a * q[1] + (1 + a) * (speed + u[0])
 
-        above = lambda t, q, u: q[0] - self.paddle(t)[0]  # noqa: E731
+        def above(t, q, u):
+            return q[0] - self.paddle(t)[0]
+
         return (Transition("impact", "fall", "fall", guard=above, reset=bounce),)
 
     def period(self):
@@ -119,7 +127,8 @@ class ChainContact(eqx.Module):
         return q[self.i] - self.table(t)[0]
 
     def impact(self, t, q, u):
-        e, n = self.chain.restitution, self.chain.n
+        e = self.chain.restitution
+        n = self.chain.n
         _, speed = self.table(t)
         return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
 
@@ -159,7 +168,8 @@ class BouncingChain(HybridSystem):
         }
 
     def _flight(self, t, q, u):
-        y, v = q[: self.n], q[self.n :]
+        y = q[: self.n]
+        v = q[self.n :]
         stretch = self.k * jnp.diff(y) + self.c * jnp.diff(v)
         force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
         return jnp.concatenate([v, force / self.m - self.g])

@@ -133,21 +133,22 @@ class TorsoWalker(HybridSystem):
         return {"step": FieldChart(self._step, states, ("rad",) * 3 + ("rad/s",) * 3)}
 
     def _step(self, t, state, u):
-        q, v = state[:3], state[3:]
+        q = state[:3]
+        v = state[3:]
         upright = held(q[2] - self.lean, v[2], self.stiffness)
         mirrored = held(q[0] + q[1], v[0] + v[1], self.stiffness)
         desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
-        direction, torque = (
-            jnp.array([1.0, -1.0, 0.0]),
-            u[0] * jnp.array([0.0, -1.0, 1.0]),
-        )
+        direction = jnp.array([1.0, -1.0, 0.0])
+        torque = u[0] * jnp.array([0.0, -1.0, 1.0])
         a = accelerations_under_feedback(
             self.mechanism(), q, v, desired, direction, torque
         )
         return jnp.concatenate([v, a])
 
     def transitions(self):
-        angle = lambda t, q, u: q[0] - self.stride  # noqa: E731
+        def angle(t, q, u):
+            return q[0] - self.stride
+
         return (
             Transition("touchdown", "step", "step", angle, "rising", self._touchdown),
         )
@@ -283,37 +284,64 @@ class FiveLinkBiped(HybridSystem):
         return {"step": FieldChart(self._step, states, ("rad",) * 5 + ("rad/s",) * 5)}
 
     def _step(self, t, state, u):
-        q, v, stride, lift = state[:5], state[5:], self.stride, self.lift
-        leg, leg_rate = (q[0] + q[1]) / 2, (v[0] + v[1]) / 2
-        # The swing knee bends while the stance leg passes from -stride to stride.
-        bend, slope = lift * (1 - (leg / stride) ** 2), -2 * lift * leg / stride**2
-        knee = held(q[0] - q[1] - self.knee, v[0] - v[1], self.stiffness)
-        torso = held(q[2] - self.lean, v[2], self.stiffness)
-        mirrored = held(
-            (q[3] + q[4]) / 2 + leg, (v[3] + v[4]) / 2 + leg_rate, self.stiffness
-        )
-        error, rate = q[4] - q[3] - self.knee - bend, v[4] - v[3] - slope * leg_rate
-        swing_knee = (
-            held(error, rate, self.stiffness) - 2 * lift * (leg_rate / stride) ** 2
-        )
-        desired = [
-            knee / 2,
-            -knee / 2,
-            torso,
-            mirrored - swing_knee / 2,
-            mirrored + swing_knee / 2,
-        ]
-        unit, goal = jnp.ones_like(slope), jnp.stack(desired)
-        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        q = state[:5]
+        v = state[5:]
+        desired, direction = self._constrained(q, v)
         torque = u[0] * jnp.array([0.0, 0.0, 1.0, -1.0, 0.0])
         a = accelerations_under_feedback(
-            self.mechanism(), q, v, goal, direction, torque
+            self.mechanism(), q, v, desired, direction, torque
         )
         return jnp.concatenate([v, a])
 
+    def _constrained(self, q, v):
+        """Accelerations that hold the four virtual constraints while the stance leg keeps its
+        rate, and what they gain for each unit of its acceleration."""
+        shin, thigh, torso, swing_thigh, swing_shin = q
+        shin_rate, thigh_rate, torso_rate, swing_thigh_rate, swing_shin_rate = v
+        leg = (shin + thigh) / 2
+        leg_rate = (shin_rate + thigh_rate) / 2
+        # The swing knee bends while the stance leg passes from -stride to stride.
+        part = leg / self.stride
+        bend = self.lift * (1 - part**2)
+        slope = -2 * self.lift * part / self.stride
+        curvature = -2 * self.lift / self.stride**2
+
+        stance_knee = held(
+            shin - thigh - self.knee, shin_rate - thigh_rate, self.stiffness
+        )
+        lean = held(torso - self.lean, torso_rate, self.stiffness)
+        swing_leg = held(
+            (swing_thigh + swing_shin) / 2 + leg,
+            (swing_thigh_rate + swing_shin_rate) / 2 + leg_rate,
+            self.stiffness,
+        )
+        swing_knee = held(
+            swing_shin - swing_thigh - self.knee - bend,
+            swing_shin_rate - swing_thigh_rate - slope * leg_rate,
+            self.stiffness,
+        )
+        swing_knee = swing_knee + curvature * leg_rate**2
+
+        desired = jnp.stack(
+            [
+                stance_knee / 2,
+                -stance_knee / 2,
+                lean,
+                swing_leg - swing_knee / 2,
+                swing_leg + swing_knee / 2,
+            ]
+        )
+        unit = jnp.ones_like(slope)
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        return desired, direction
+
     def transitions(self):
-        height = lambda t, q, u: self._swing_foot(q)[1]  # noqa: E731
-        ahead = lambda t, q, u: self._swing_foot(q)[0] > 0  # noqa: E731
+        def height(t, q, u):
+            return self._swing_foot(q)[1]
+
+        def ahead(t, q, u):
+            return self._swing_foot(q)[0] > 0
+
         landing = Transition(
             "touchdown", "step", "step", height, "falling", self._touchdown, ahead
         )
@@ -321,7 +349,10 @@ class FiveLinkBiped(HybridSystem):
 
     def _touchdown(self, t, state, u):
         q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
-        foot = lambda q: q[5:] + self._swing_foot(q[:5])  # noqa: E731
+
+        def foot(q):
+            return q[5:] + self._swing_foot(q[:5])
+
         return jnp.concatenate(
             [q[4::-1], self.mechanism().impact(q, v, foot).velocity[4::-1]]
         )
@@ -330,8 +361,10 @@ class FiveLinkBiped(HybridSystem):
         return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")
 
     def guess(self):
-        s, k = self.stride, self.knee / 2
-        rate, bend = 1.5, 2 * self.lift / self.stride
+        s = self.stride
+        k = self.knee / 2
+        rate = 1.5
+        bend = 2 * self.lift / self.stride
         angles = -s + k, -s - k, self.lean, s - k, s + k
         rates = rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)
         return Guess("step", (*angles, *rates), after="touchdown")

@@ -33,7 +33,10 @@ class BuckConverter(HybridSystem):
     T: Parameter = parameter(400e-6, unit="s", doc="period of the ramp")
 
     def control(
-        self, t: ArrayLike, q: Float[Array, "3"], u: Float[Array, "1"]
+        self,
+        t: ArrayLike,
+        q: Float[Array, "3"],
+        u: Float[Array, "1"],
     ) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
         return self.gain * (q[0] - self.Vref - u[0]) - q[2]
@@ -51,7 +54,10 @@ class BuckConverter(HybridSystem):
 
     def transitions(self):
         tick = Scheduled(self.T)
-        anew = lambda t, q, u: (q[0], q[1], self.lower)  # noqa: E731
+
+        def anew(t, q, u):
+            return (q[0], q[1], self.lower)
+
         return (
             Transition("switch on", "open", "closed", self.control),
             Transition(
@@ -113,7 +119,10 @@ class CukConverter(HybridSystem):
 
     def transitions(self):
         tick = Scheduled(self.T)
-        left = lambda t, q, u: self.Iref + u[0] - q[0] - q[2]  # noqa: E731
+
+        def left(t, q, u):
+            return self.Iref + u[0] - q[0] - q[2]
+
         return (
             Transition("switch off", "closed", "open", left),
             Transition("switch on", "open", "closed", tick),

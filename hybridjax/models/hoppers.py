@@ -1,5 +1,6 @@
 """The vertical hopper of the paper, the same on compliant ground, and a coupled pair of them."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import ClassVar
@@ -19,9 +20,12 @@ _MASSES = ("yM", "vM", "ym", "vm"), ("m", "m/s", "m", "m/s")
 
 def _hopper(i: int, yM: Array, ym: Array) -> tuple[dict, dict]:
     """Lines and circles of hopper i. (Its foot has a radius of 0.1 m.)"""
-    x, tag = 1.5 * i, f" {i + 1}" if i else ""
-    circles = {f"body{tag}": (x, yM, 0.3), f"foot{tag}": (x, ym + 0.1, 0.1)}
-    return {f"leg{tag}": Drawing.spring((x, ym + 0.2), (x, yM - 0.3))}, circles
+    x = 1.5 * i
+    number = f" {i + 1}" if i else ""
+    leg = Drawing.spring((x, ym + 0.2), (x, yM - 0.3))
+    body = (x, yM, 0.3)
+    foot = (x, ym + 0.1, 0.1)
+    return {"leg" + number: leg}, {"body" + number: body, "foot" + number: foot}
 
 
 class VerticalHopper(HybridSystem):
@@ -79,10 +83,18 @@ class VerticalHopper(HybridSystem):
         return field
 
     def transitions(self):
-        height = lambda t, q, u: q[2]  # noqa: E731
-        landed = lambda t, q, u: (q[0], self.retention * q[1])  # noqa: E731
-        force = lambda t, q, u: self.leg(t, q[0], 0.0) + self.m * self.g  # noqa: E731
-        lifted = lambda t, q, u: (q[0], q[1], 0.0, 0.0)  # noqa: E731
+        def height(t, q, u):
+            return q[2]
+
+        def landed(t, q, u):
+            return (q[0], self.retention * q[1])
+
+        def force(t, q, u):
+            return self.leg(t, q[0], 0.0) + self.m * self.g
+
+        def lifted(t, q, u):
+            return (q[0], q[1], 0.0, 0.0)
+
         return (
             Transition("touchdown", "flight", "stance", height, reset=landed),
             Transition("liftoff", "stance", "flight", force, reset=lifted),
@@ -121,7 +133,9 @@ class CompliantHopper(VerticalHopper):
         return {"flight": self._flight(), "contact": contact}
 
     def transitions(self):
-        force = lambda t, q, u: self.ground(q[2], q[3])  # noqa: E731
+        def force(t, q, u):
+            return self.ground(q[2], q[3])
+
         return (
             Transition("touchdown", "flight", "contact", lambda t, q, u: q[2]),
             Transition("liftoff", "contact", "flight", force),
@@ -140,7 +154,8 @@ _PAIR_CHARTS = {(): "air", (0,): "first", (1,): "second", (0, 1): "both"}
 
 def _absent(down: tuple[int, ...]) -> dict[str, float]:
     """States of the feet that stand."""
-    return {name: 0.0 for i in down for name in _FEET[i]}
+    names = itertools.chain(*(_FEET[i] for i in down))
+    return dict.fromkeys(names, 0.0)
 
 
 def _part(down: tuple[int, ...], whole: Sequence) -> list:
@@ -182,12 +197,11 @@ class HopperPair(VerticalHopper):
         def field(t, q, u):
             whole = _whole(down, q)
             pull = self.coupling * (whole[2] - whole[0])
-            bodies, feet = [], []
+            bodies = []
+            feet = []
             for i, between in enumerate((pull, -pull)):
-                (y, v), (ym, vm) = (
-                    whole[2 * i : 2 * i + 2],
-                    whole[2 * i + 4 : 2 * i + 6],
-                )
+                (y, v) = whole[2 * i : 2 * i + 2]
+                (ym, vm) = whole[2 * i + 4 : 2 * i + 6]
                 leg = self.leg(t - i * self.lag, y, ym)
                 bodies += [v, (leg + between + u[i]) / self.M - self.g]
                 feet += [vm, -(leg + self.b * vm) / self.m - self.g]
@@ -198,7 +212,8 @@ class HopperPair(VerticalHopper):
         return FieldChart(field, states, units, absent=_absent(down))
 
     def transitions(self):
-        return tuple(self._step(i, down) for down in _PAIR_CHARTS for i in (0, 1))
+        steps = itertools.product(_PAIR_CHARTS, (0, 1))
+        return tuple(self._step(i, down) for down, i in steps)
 
     def _step(self, i: int, down: tuple[int, ...]) -> Transition:
         """Touchdown or liftoff of hopper i, while these feet are down."""
@@ -222,16 +237,11 @@ class HopperPair(VerticalHopper):
         )
 
     def draw(self, chart, t, q):
-        hoppers = [_hopper(i, q[f"yM{i + 1}"], q[f"ym{i + 1}"]) for i in (0, 1)]
-        (first, circles), (second, more) = hoppers
-        between = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
-        lines = {
-            "ground": [(-1.0, 0.0), (2.5, 0.0)],
-            **first,
-            **second,
-            "coupling": between,
-        }
-        return Drawing(lines, circles={**circles, **more})
+        first, circles = _hopper(0, q["yM1"], q["ym1"])
+        second, more_circles = _hopper(1, q["yM2"], q["ym2"])
+        lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **first, **second}
+        lines["coupling"] = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
+        return Drawing(lines, circles={**circles, **more_circles})
 
     def guess(self):
         """The states of two uncoupled hoppers: the first is about to lift off, the second is

@@ -30,7 +30,9 @@ class DrivenNeuron(HybridSystem):
         """The state after a spike."""
 
     def transitions(self):
-        below = lambda t, q, u: self.peak - q[0]  # noqa: E731
+        def below(t, q, u):
+            return self.peak - q[0]
+
         return (
             Transition("spike", "membrane", "membrane", below, reset=self.after_spike),
         )

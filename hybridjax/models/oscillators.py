@@ -15,7 +15,8 @@ def _block(
 ) -> Drawing:
     """A block at x on a spring, whose rest length is twice the `reach`, above a ground that moves
     with this speed."""
-    half, wall = 0.25 * reach, -2 * reach
+    half = 0.25 * reach
+    wall = -2 * reach
     corners = (-1, 0), (-1, 2), (1, 2), (1, 0), (-1, 0)
     lines = {
         "ground": [(wall, 0.0), (-wall, 0.0)],
@@ -115,7 +116,9 @@ class RotorFlap(HybridSystem):
         return {"blade": FieldChart(self._blade, ("b", "vb"), ("rad", ""))}
 
     def _blade(self, t, q, u):
-        (b, vb), lock, mu = q, self.lock / 8, self.mu
+        (b, vb) = q
+        lock = self.lock / 8
+        mu = self.mu
         damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))
         stiffness = self.p**2 + lock * (
             4 / 3 * mu * jnp.cos(t) + mu**2 * jnp.sin(2 * t)
@@ -148,7 +151,8 @@ class HopfOscillator(HybridSystem):
 
     def _plane(self, t, q, u):
         x, y = q
-        growth, rate = self.mu - x**2 - y**2, 2 * jnp.pi / self.T
+        growth = self.mu - x**2 - y**2
+        rate = 2 * jnp.pi / self.T
         return growth * x - rate * y + u[0], rate * x + growth * y
 
     def guess(self):
@@ -247,9 +251,10 @@ class ChuaCircuit(HybridSystem):
     def _slab(self, side: float) -> FieldChart:
         def field(t, q, u):
             x, y, z = q
-            resistor = (
-                self.outer * (x - side) + self.inner * side if side else self.inner * x
-            )
+            if side:
+                resistor = self.outer * (x - side) + self.inner * side
+            else:
+                resistor = self.inner * x
             return self.alpha * (y - resistor) + u[0], x - y + z, -self.beta * y
 
         return FieldChart(field, ("x", "y", "z"))

@@ -1,5 +1,6 @@
 """Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
 
+import itertools
 import math
 from typing import Literal
 
@@ -95,17 +96,25 @@ class TwoLeggedBar(HybridSystem):
         return 0.0
 
     def transitions(self):
-        return tuple(self._step(leg, legs) for legs in _CHARTS for leg in _LEGS)
+        steps = itertools.product(_CHARTS, _LEGS)
+        return tuple(self._step(leg, legs) for legs, leg in steps)
 
     def _step(self, leg: Leg, legs: Legs) -> Transition:
         """Touchdown or liftoff of a leg, while these legs stand."""
-        lands, source = leg not in legs, _CHARTS[legs]
+        lands = leg not in legs
+        source = _CHARTS[legs]
         after: Legs = tuple(x for x in _LEGS if (x in legs) != (x == leg))
         name = f"{leg} {'lands' if lands else 'lifts'} ({source})"
-        length = lambda t, q, u: self.length(leg, t, q)  # noqa: E731
+
+        def length(t, q, u):
+            return self.length(leg, t, q)
+
         if not lands:
             return Transition(name, source, _CHARTS[after], length, "rising")
-        impact = lambda t, q, u: self._impact(leg, t, q)  # noqa: E731
+
+        def impact(t, q, u):
+            return self._impact(leg, t, q)
+
         return Transition(name, source, _CHARTS[after], length, "falling", impact)
 
     def _impact(self, leg, t, state):
@@ -189,7 +198,10 @@ class SLIPRunner(HybridSystem):
     angle: Parameter = parameter(math.radians(68.0), unit="rad", doc="angle of attack")
 
     def energy(
-        self, t: ArrayLike, q: Float[Array, " n"], u: Float[Array, " l"]
+        self,
+        t: ArrayLike,
+        q: Float[Array, " n"],
+        u: Float[Array, " l"],
     ) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q
@@ -200,7 +212,9 @@ class SLIPRunner(HybridSystem):
         return (Output("energy", self.energy, "J"),)
 
     def charts(self):
-        flight = lambda t, q, u: (q[2], 0.0 * q[1], -self.g)  # noqa: E731
+        def flight(t, q, u):
+            return (q[2], 0.0 * q[1], -self.g)
+
         return {
             "flight": FieldChart(flight, ("y", "vx", "vy"), ("m", "m/s", "m/s")),
             "stance": FieldChart(
@@ -215,11 +229,21 @@ class SLIPRunner(HybridSystem):
         return vx, vy, push * x, push * y - self.g
 
     def transitions(self):
-        height = lambda t, q, u: q[0] - self.l0 * jnp.sin(self.angle + u[0])  # noqa: E731
-        landed = lambda t, q, u: (-self.l0 * jnp.cos(self.angle + u[0]), *q)  # noqa: E731
-        down = lambda t, q, u: q[2] < 0  # noqa: E731
-        stretch = lambda t, q, u: jnp.hypot(q[0], q[1]) - self.l0  # noqa: E731
-        lifted = lambda t, q, u: q[1:]  # noqa: E731
+        def height(t, q, u):
+            return q[0] - self.l0 * jnp.sin(self.angle + u[0])
+
+        def landed(t, q, u):
+            return (-self.l0 * jnp.cos(self.angle + u[0]), *q)
+
+        def down(t, q, u):
+            return q[2] < 0
+
+        def stretch(t, q, u):
+            return jnp.hypot(q[0], q[1]) - self.l0
+
+        def lifted(t, q, u):
+            return q[1:]
+
         return (
             Transition(
                 "touchdown", "flight", "stance", height, reset=landed, enabled=down
@@ -229,7 +253,8 @@ class SLIPRunner(HybridSystem):
 
     def draw(self, chart, t, q):
         """In flight, the leg has the angle at which it will touch down."""
-        y, flies = q["y"], chart == "flight"
+        y = q["y"]
+        flies = chart == "flight"
         x = -self.l0 * jnp.cos(self.angle) if flies else q["x"]
         foot = y - self.l0 * jnp.sin(self.angle) if flies else 0.0
         speed = (q["vx"], 0.0) if flies else (0.0, 0.0)

@@ -18,10 +18,16 @@ def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
 
 
 def _two_legs(
-    slope: Parameter, length: Parameter | float, stance: Array, swing: Array
+    slope: Parameter,
+    length: Parameter | float,
+    stance: Array,
+    swing: Array,
 ) -> Drawing:
     """Legs by their angles from the vertical, positive backward."""
-    way = lambda angle: length * jnp.stack([-jnp.sin(angle), jnp.cos(angle)])  # noqa: E731
+
+    def way(angle):
+        return length * jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
+
     hip = way(stance)
     foot = hip - way(swing)
     lines = {
@@ -68,11 +74,14 @@ class RimlessWheel(HybridSystem):
         return w, jnp.cos(2 * self.alpha) ** 2
 
     def charts(self):
-        swing = lambda t, q, u: (q[1], self.rate * jnp.sin(q[0]) + u[0])  # noqa: E731
+        def swing(t, q, u):
+            return (q[1], self.rate * jnp.sin(q[0]) + u[0])
+
         return {"swing": FieldChart(swing, ("th", "w"), ("rad", "rad/s"))}
 
     def transitions(self):
-        angle = lambda t, q, u: q[0] - self.slope - self.alpha  # noqa: E731
+        def angle(t, q, u):
+            return q[0] - self.slope - self.alpha
 
         def after(t, q, u):
             return (
@@ -125,8 +134,12 @@ class SimplestWalker(HybridSystem):
         return w, p, stance, stance + swing + u[0]
 
     def transitions(self):
-        foot = lambda t, q, u: q[1] - 2 * q[0]  # noqa: E731
-        ahead = lambda t, q, u: q[0] < 0  # noqa: E731
+        def foot(t, q, u):
+            return q[1] - 2 * q[0]
+
+        def ahead(t, q, u):
+            return q[0] < 0
+
         return (
             Transition(
                 "heelstrike", "step", "step", foot, "rising", _heelstrike, ahead
@@ -192,14 +205,21 @@ class CompassGait(HybridSystem):
 
     def _step(self, t, q, u):
         n, s, vn, vs = q
-        m, mH, a, b, length = self.m, self.mH, self.a, self.b, self.l
+        m = self.m
+        mH = self.mH
+        a = self.a
+        b = self.b
+        length = self.l
         coupling = m * length * b
-        c, d = jnp.cos(s - n), coupling * jnp.sin(s - n)
+        c = jnp.cos(s - n)
+        d = coupling * jnp.sin(s - n)
         gravity = self.g * (mH * length + m * a + m * length)
         torque_n = -d * vs**2 - m * self.g * b * jnp.sin(n) + u[0]
         torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
         # The inverse of [[A, B], [B, D]].
-        A, B, D = m * b**2, -coupling * c, (mH + m) * length**2 + m * a**2
+        A = m * b**2
+        B = -coupling * c
+        D = (mH + m) * length**2 + m * a**2
         det = A * D - B**2
         return (
             vn,
@@ -209,8 +229,12 @@ class CompassGait(HybridSystem):
         )
 
     def transitions(self):
-        foot = lambda t, q, u: q[0] + q[1] + 2 * self.slope  # noqa: E731
-        ahead = lambda t, q, u: q[1] < 0  # noqa: E731
+        def foot(t, q, u):
+            return q[0] + q[1] + 2 * self.slope
+
+        def ahead(t, q, u):
+            return q[1] < 0
+
         hit = Transition(
             "heelstrike", "step", "step", foot, reset=self._heelstrike, enabled=ahead
         )
@@ -219,18 +243,21 @@ class CompassGait(HybridSystem):
     def _heelstrike(self, t, q, u):
         """Angular momentum about the new foot, and of the new swing leg about the hip, are kept."""
         n, s, vn, vs = q
-        m, mH, a, b, length = self.m, self.mH, self.a, self.b, self.l
+        m = self.m
+        mH = self.mH
+        a = self.a
+        b = self.b
+        length = self.l
         c = jnp.cos(s - n)
         whole = (
             -m * a * b * vn
             + (-m * a * b + (mH * length**2 + 2 * m * a * length) * c) * vs
         )
         leg = -m * a * b * vs
-        A, B = (
-            m * b * (b - length * c),
-            m * length * (length - b * c) + m * a**2 + mH * length**2,
-        )
-        C, D = m * b**2, -m * b * length * c
+        A = m * b * (b - length * c)
+        B = m * length * (length - b * c) + m * a**2 + mH * length**2
+        C = m * b**2
+        D = -m * b * length * c
         det = A * D - B * C
         return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det
 

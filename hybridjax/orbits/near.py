@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import eval_context
 
 from .._core.compilation import at_ease, identity, whole
 from .._core.executor import from_host, is_traced, is_tracer, on_the_cpu
+from .._core.jax_compat import outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
@@ -58,7 +58,7 @@ def route_near(guess: LimitCycle) -> Route | None:
         return None
     if not has_route(guess.return_map):
         return None
-    with eval_context(), on_the_cpu(), at_ease():  # (also while a program is traced)
+    with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)
         guess = hosted(guess)
         if verdict(guess).refused:  # (flags compare with what was recorded)
             return None

@@ -31,9 +31,14 @@ class _Made:
 
 
 def _numbered(names: Sequence[str], sizes: Any) -> list[str]:
-    """Return a name for each number."""
-    pairs = zip(names, sizes, strict=True)
-    return [x if n == 1 else f"{x}[{k}]" for x, n in pairs for k in range(n)]
+    """Return a name for each number: several of the same name get an index."""
+    numbered = []
+    for name, size in zip(names, sizes, strict=True):
+        if size == 1:
+            numbered.append(name)
+        else:
+            numbered += [f"{name}[{k}]" for k in range(size)]
+    return numbered
 
 
 @checked
@@ -67,7 +72,8 @@ class MuJoCoPlant(_Made):
     substeps: Count = 1
 
     def __post_init__(self) -> None:
-        mujoco, model = package("mujoco"), self.model
+        mujoco = package("mujoco")
+        model = self.model
         if not isinstance(model, mujoco.MjModel):
             raise DefinitionError(
                 "`model` must be a `mujoco.MjModel`: see `from_xml_path`."
@@ -75,46 +81,58 @@ class MuJoCoPlant(_Made):
         actuators = [model.actuator(i).name for i in range(model.nu)]
         require_among("actuator", list(self.inputs), actuators, "MuJoCoPlant: ")
         self._actuators = [actuators.index(name) for name in self.inputs]
-        self.data, self.dt = mujoco.MjData(model), model.opt.timestep * self.substeps
+        self.data = mujoco.MjData(model)
+        self.dt = model.opt.timestep * self.substeps
         joints = [model.joint(i).name or f"joint{i}" for i in range(model.njnt)]
+        rates = [f"{name}_rate" for name in joints]
         sensors = [model.sensor(i).name or f"sensor{i}" for i in range(model.nsensor)]
-        q = _numbered(joints, np.diff([*model.jnt_qposadr, model.nq]))
-        v = _numbered(
-            [f"{x}_rate" for x in joints], np.diff([*model.jnt_dofadr, model.nv])
-        )
-        self._names = [*q, *v, *_numbered(sensors, model.sensor_dim)]
-        self.states = ("time", *q, *v, *(f"act{i}" for i in range(model.na)))
+        positions = _numbered(joints, np.diff([*model.jnt_qposadr, model.nq]))
+        velocities = _numbered(rates, np.diff([*model.jnt_dofadr, model.nv]))
+        readings = _numbered(sensors, model.sensor_dim)
+        self._names = [*positions, *velocities, *readings]
+        activations = [f"act{i}" for i in range(model.na)]
+        self.states = ("time", *positions, *velocities, *activations)
         # (With the memory of controllers, and where the solver of contacts begins.)
         self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
         # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
-        self._integrate = (
-            mujoco.mj_step if model.opt.integrator == 1 else mujoco.mj_step2
-        )
+        if model.opt.integrator == 1:
+            self._integrate = mujoco.mj_step
+        else:
+            self._integrate = mujoco.mj_step2
         self._mujoco = mujoco
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at the first keyframe."""
-        self._mujoco.mj_resetDataKeyframe(
-            self.model, self.data, 0
-        )  # (or `qpos0` if there is none)
+        # (MuJoCo takes `qpos0` if there is no keyframe.)
+        self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self._mujoco.mj_step1(self.model, self.data)
         return self._observe()
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Hold the inputs for some time."""
-        model, data, whole = self.model, self.data, self.dt / self.substeps
-        steps = int(duration / whole + 1e-9)
-        for h in [whole] * steps + [duration - steps * whole] * (
-            duration > (steps + 1e-9) * whole
-        ):
-            model.opt.timestep = h
-            data.ctrl[:] = 0.0 if self.control is None else self.control(model, data)
-            data.ctrl[self._actuators] += u
-            self._integrate(model, data)
-            self._mujoco.mj_step1(model, data)
-        model.opt.timestep = whole
+        whole_step = self.dt / self.substeps
+        # (A duration of n steps, up to rounding, is n steps, and no step is shorter than that.)
+        count = int(duration / whole_step + 1e-9)
+        rest = duration - count * whole_step
+        for _ in range(count):
+            self._step_once(u)
+        if rest > 1e-9 * whole_step:
+            self.model.opt.timestep = rest
+            self._step_once(u)
+            self.model.opt.timestep = whole_step
         return self._observe()
+
+    def _step_once(self, u: Sequence[float]) -> None:
+        """Set the controls, integrate over one time step of the model, and update positions of
+        bodies, contacts and sensors to the new state."""
+        controls = self.data.ctrl
+        controls[:] = 0.0
+        if self.control is not None:
+            controls[:] = self.control(self.model, self.data)
+        controls[self._actuators] += u
+        self._integrate(self.model, self.data)
+        self._mujoco.mj_step1(self.model, self.data)
 
     def _observe(self) -> Mapping[str, float]:
         values = self.data.qpos, self.data.qvel, self.data.sensordata
@@ -157,7 +175,8 @@ class FMUPlant(_Made):
     period: Positive | None = None
 
     def __post_init__(self) -> None:
-        fmpy, self.file = package("fmpy"), os.path.abspath(self.file)
+        fmpy = package("fmpy")
+        self.file = os.path.abspath(self.file)
         try:
             about = fmpy.read_model_description(self.file)
             can = about.coSimulation if about.fmiVersion.startswith("2.") else None
@@ -168,18 +187,16 @@ class FMUPlant(_Made):
                 f"'{self.file}' is no FMU of FMI 2.0 for co-simulation."
             )
         self.fixed_step = not can.canHandleVariableCommunicationStepSize
-        real, names = (
-            {x.name: x for x in about.modelVariables if x.type == "Real"},
-            self.signals,
-        )
-        require_among("real variable", [*self.inputs, *names], real, "FMUPlant: ")
-        self._at = [
-            [real[x].valueReference for x in group] for group in (self.inputs, names)
-        ]
-        self.units = {x: real[x].unit for x in names if real[x].unit}
+        real = {x.name: x for x in about.modelVariables if x.type == "Real"}
+        names = [*self.inputs, *self.signals]
+        require_among("real variable", names, real, "FMUPlant: ")
+        self._inputs = [real[x].valueReference for x in self.inputs]
+        self._signals = [real[x].valueReference for x in self.signals]
+        self.units = {x: real[x].unit for x in self.signals if real[x].unit}
         folder = fmpy.extract(self.file)
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._slave, self._t = fmpy.instantiate_fmu(folder, about, "CoSimulation"), 0.0
+        self._slave = fmpy.instantiate_fmu(folder, about, "CoSimulation")
+        self._t = 0.0
 
     def reset(self, seed: int) -> Mapping[str, float]:
         """Begin at time 0."""
@@ -193,13 +210,14 @@ class FMUPlant(_Made):
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Hold the inputs for some time."""
         if u:
-            self._slave.setReal(self._at[0], list(u))
+            self._slave.setReal(self._inputs, list(u))
         self._slave.doStep(self._t, duration)
         self._t += duration
         return self._observe()
 
     def _observe(self) -> Mapping[str, float]:
-        return dict(zip(self.signals, self._slave.getReal(self._at[1]), strict=True))
+        values = self._slave.getReal(self._signals)
+        return dict(zip(self.signals, values, strict=True))
 
 
 @checked
@@ -238,11 +256,13 @@ class GymnasiumPlant(_Made):
 
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Take one step."""
-        action = np.array(u) + (0.0 if self.policy is None else self.policy(self._z))
+        action = np.array(u)
+        if self.policy is not None:
+            action = action + self.policy(self._z)
         action = action.astype(self._made.action_space.dtype)
         self._z, _, terminated, truncated, _ = self._made.step(action)
-        if terminated or truncated:
-            raise ComputationError(
-                f"the episode was {'terminated' if terminated else 'truncated'}"
-            )
+        if terminated:
+            raise ComputationError("the episode was terminated")
+        if truncated:
+            raise ComputationError("the episode was truncated")
         return dict(zip(self.signals, self._z.tolist(), strict=True))

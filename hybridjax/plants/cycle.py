@@ -1,9 +1,9 @@
 """The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import starmap
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -60,9 +60,10 @@ class Returns(MultiplierFit):
         return None
 
     def _about(self) -> str:
-        more = f"{len(self.coordinates) - len(self.multipliers)} more below {self.bound:.1g}"
+        count = len(self.coordinates)
         return (
-            f"{more}; {len(self.coordinates)} coordinates, residual {self.residual:.1g}"
+            f"{count - len(self.multipliers)} more below {self.bound:.1g}; {count} coordinates, "
+            f"residual {self.residual:.1g}"
         )
 
 
@@ -71,7 +72,8 @@ class Recorded(system.HybridSystem):
 
     states: tuple[str, ...] = eqx.field(static=True)
     picture: Callable[[Any], Any] | None = eqx.field(static=True)
-    time_unit, inputs = "s", ()
+    time_unit = "s"
+    inputs = ()
 
     def charts(self):
         return {"plant": chart.FieldChart(lambda t, q, u: 0 * q, self.states)}
@@ -80,56 +82,69 @@ class Recorded(system.HybridSystem):
         return None if self.picture is None else self.picture(q)
 
 
-class _Map:
+class _ReturnMap:
     """The return map of some coordinates of a plant on section 0, and its fixed point.
 
     **Fields:** `names`: of the coordinates. `x`: their values, first those of the settled state.
-    `size`: their ranges on the cycle. `noise`: of returns. `h`: steps of differences.
+    `size`: their ranges on the cycle. `noise`: of returns. `h`: steps of differences. The last
+    three are known after `measure`.
     """
 
-    def __init__(self, cycle: Any, names: Any = None):
-        self.drive, plant = cycle.drive, cycle.plant
+    def __init__(self, cycle: "SettledCycle", names: SignalNames | None = None):
+        plant = cycle.plant
+        self.drive = cycle.drive
         if not self.drive.sets or self.drive.fixed:
             raise DefinitionError(
                 "use a plant whose state can be set, with steps of any size."
             )
         self.base = np.array(cycle.state, float)
-        states = tuple(
-            getattr(plant, "states", [f"x{i}" for i in range(self.base.size)])
-        )
+        numbered = [f"x{i}" for i in range(self.base.size)]
+        states = tuple(getattr(plant, "states", numbered))
         period = getattr(plant, "period", None)
-        timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
-        names = names or [x for x in states if not (timeless and x == "time")]
+        if not names:
+            timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
+            names = tuple(x for x in states if not (timeless and x == "time"))
         require_among("coordinate", names, states, "perturbed_returns: ")
-        self.names, self.columns = tuple(names), [states.index(x) for x in names]
-        turn = 0.0 if period is None else round(cycle.period / period) * period
-        self.shift = turn * np.array([x == "time" for x in names])
-        self.x, self.n = self.base[self.columns], cycle.sections.n_sections
+        self.names = tuple(names)
+        self.columns = [states.index(x) for x in names]
+        self.shift = np.zeros(len(names))
+        if period is not None and "time" in names:
+            turns = round(cycle.period / period)
+            self.shift[names.index("time")] = turns * period
+        self.x = self.base[self.columns]
+        self.n = cycle.sections.n_sections
         # (A perturbed state before a crossing must not return to it at once.)
         self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
-        points = list[At]()
-        self(self.x, points)
-        rows = np.array([x.state for x in points], float)[:, self.columns]
-        size, top = np.ptp(rows, axis=0), np.abs(rows).max(axis=0)
-        self.size = np.where(
-            size > 1e-9 * top, size, np.where(self.x, np.abs(self.x), 1.0)
-        )
-        self.noise = self._noise()
-        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives; at most one percent of the range.
-        self.h = self.size * min((self.noise / self.size).max() ** 0.2 / 2, 0.01)
 
     def __call__(
-        self, x: Float[np.ndarray, " d"], points: Any = None
+        self, x: Float[np.ndarray, " d"], points: list[At] | None = None
     ) -> Float[np.ndarray, " d"]:
         """Return the coordinates after one cycle, and append the points of its steps."""
-        state, drive = self.base.copy(), self.drive
+        drive = self.drive
+        state = self.base.copy()
         state[self.columns] = x
         drive.restore(drive.start._replace(state=state))
         drive.phase.begin(drive.t, drive.z, on_section=True)
-        drive.pass_time(self.free if points is None else 0.0)
+        if points is None:
+            drive.pass_time(self.free)
         drive.advance(drive.zero, self.n, points)
         return np.array(drive.here().state, float)[self.columns] - self.shift
+
+    def measure(self) -> None:
+        """Measure the ranges of the coordinates and the noise of returns, in 46 cycles."""
+        points = list[At]()
+        self(self.x, points)
+        rows = np.array([x.state for x in points], float)[:, self.columns]
+        size = np.ptp(rows, axis=0)
+        largest = np.abs(rows).max(axis=0)
+        # (A coordinate that does not move has the size of its value.)
+        rest = np.where(self.x, np.abs(self.x), 1.0)
+        self.size = np.where(size > 1e-9 * largest, size, rest)
+        self.noise = self._noise()
+        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
+        # derivatives; at most one percent of the range.
+        step = (self.noise / self.size).max() ** 0.2 / 2
+        self.h = self.size * min(step, 0.01)
 
     def _noise(self) -> Float[np.ndarray, " d"]:
         """Return the standard deviation of returns from nearly equal states.
@@ -140,19 +155,22 @@ class _Map:
         """
         noise = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
         signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
-        for along in np.array([[1e-6], [1e-4], [1e-3]]) * self.size * signs:
+        for spacing, sign in zip([1e-6, 1e-4, 1e-3], signs, strict=True):
+            along = spacing * self.size * sign
             line = [self(self.x + j * along) for j in range(-7, 8)]
-            noise = np.maximum(
-                noise, np.sqrt((np.diff(line, 4, axis=0) ** 2 / 70).mean(axis=0))
-            )
+            differences = np.diff(line, 4, axis=0)
+            noise = np.maximum(noise, np.sqrt((differences**2 / 70).mean(axis=0)))
         return noise
 
-    def slopes(self, steps: float) -> Any:
+    def slopes(self, steps: float) -> Float[np.ndarray, "d d"]:
         """Return central differences of second order with so many steps."""
-        moves = counted(np.diag(steps * self.h), "coordinates", len(self.x))
-        return np.array(
-            [(self(self.x + e) - self(self.x - e)) / (2 * e.sum()) for e in moves]
-        ).T
+        columns = []
+        for k in counted(range(len(self.x)), "coordinates", len(self.x)):
+            move = np.zeros(len(self.x))
+            move[k] = steps * self.h[k]
+            change = self(self.x + move) - self(self.x - move)
+            columns.append(change / (2 * move[k]))
+        return np.stack(columns, axis=1)
 
     def solve(self) -> float:
         """Move x to the fixed point by Newton's method, and return the largest residual, in units
@@ -161,27 +179,41 @@ class _Map:
             residual = (self(self.x) - self.x) / self.size
             if k == 8 or (np.abs(residual) <= 3 * self.noise / self.size).all():
                 break
-            J = (self.slopes(1) - np.eye(len(self.x))) * self.size / self.size[:, None]
+            J = self.slopes(1) - np.eye(len(self.x))
+            J = J * self.size / self.size[:, None]
             # (A multiplier of 1 leaves its direction as it is.)
-            self.x = self.x - self.size * np.linalg.lstsq(J, residual, rcond=1e-6)[0]
+            step = np.linalg.lstsq(J, residual, rcond=1e-6)[0]
+            self.x = self.x - self.size * step
         return float(np.abs(residual).max())
 
 
-def _resolved(J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]) -> Any:
-    """Return the eigenvalues that differ from 0 by three standard errors, the covariance of their
-    polynomial's coefficients, and a bound of the others, from draws within the errors."""
+class _Resolved(NamedTuple):
+    """Multipliers (k,) that differ from 0, the coefficients (k,) of their polynomial, the
+    covariance of these, and the largest modulus that the other multipliers may have."""
+
+    multipliers: np.ndarray
+    coefficients: np.ndarray
+    covariance: np.ndarray
+    bound: float
+
+
+def _resolved(
+    J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]
+) -> _Resolved:
+    """Eigenvalues that differ from 0 by three standard errors, by draws within the errors."""
     draws = error * np.random.default_rng(0).standard_normal((1000, *J.shape))
     each = np.linalg.eigvals(np.concatenate([J[None], J + draws])).astype(complex)
     each = np.take_along_axis(each, np.argsort(-np.abs(each), axis=1), axis=1)
-    values, sizes = each[0], np.abs(each)
+    values = each[0]
+    sizes = np.abs(each)
     spread = np.sqrt(((sizes - sizes[0]) ** 2).mean(axis=0))
     count = int(np.cumprod(sizes[0] > 3 * spread).sum())
     if 0 < count < len(values) and values[count - 1].imag > 0 > values[count].imag:
-        count -= 1
-    coefficients = np.array([np.atleast_1d(np.poly(x[:count])).real[1:] for x in each])
-    covariance = np.cov(coefficients[1:], rowvar=False).reshape(count, count)
-    bound = float((sizes[0] + 3 * spread)[count:].max(initial=0))
-    return values[:count], coefficients[0], covariance, bound
+        count -= 1  # (both of a pair, or none)
+    polynomials = [np.atleast_1d(np.poly(x[:count])).real[1:] for x in each]
+    covariance = np.cov(polynomials[1:], rowvar=False).reshape(count, count)
+    largest = (sizes[0] + 3 * spread)[count:].max(initial=0)
+    return _Resolved(values[:count], polynomials[0], covariance, float(largest))
 
 
 @checked_methods
@@ -248,26 +280,28 @@ class SettledCycle:
 
         def run(rows: list[int]) -> Iterator[Trial]:
             items = ((self.seed + 1 + s, u[s].tolist()) for s in rows)
-            many = run_all(self.drive, items, count, limit) if count else None
-            yield from counted(
-                many or starmap(self.drive.run, items), "experiments", len(rows)
-            )
+            if count:
+                trials = run_all(self.drive, items, count, limit)
+            else:
+                trials = starmap(self.drive.run, items)
+            yield from counted(trials, "experiments", len(rows))
 
         with working("run_experiments"):
             about = ""
             if store is not None:
-                self.drive.reset(
-                    self.seed
-                )  # (its state would be another one at each call)
+                # (After experiments the plant's state would be another one at each call.)
+                self.drive.reset(self.seed)
                 cycle = self.outputs, self.cycle_outputs, self.sections, self.seed
                 about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
         rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
-        for s, (values, _) in enumerate(trials):
+        failed_at = np.full(len(u), -1)
+        for s, (values, cause) in enumerate(trials):
             rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[-1]))
+            if cause:
+                failed_at[s] = len(values)
         causes = tuple(cause for _, cause in trials)
-        failed_at = np.array([len(values) if cause else -1 for values, cause in trials])
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
             failed_at, None, self.sections.label, rows[..., -1], causes
@@ -302,18 +336,29 @@ class SettledCycle:
         **Raises:** `DefinitionError` for a plant whose state cannot be set, or unknown names;
         `ComputationError` if a perturbed state does not return.
         """
-        map = _Map(self, coordinates)
+        map = _ReturnMap(self, coordinates)
+        map.measure()
         residual = map.solve()
-        fine, middle, wide = (map.slopes(k) for k in (1, 2, 4))
-        J, coarse = (4 * fine - middle) / 3, (4 * middle - wide) / 3
+        fine = map.slopes(1)
+        middle = map.slopes(2)
+        wide = map.slopes(4)
+        J = (4 * fine - middle) / 3
+        coarse = (4 * middle - wide) / 3
         # (Weights 8/12 and -1/12 of four returns, each with this noise.)
         noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
         # (A jump of the second derivative leaves in J an error as large as this difference.)
-        error, scale = np.hypot(noise, J - coarse), map.size / map.size[:, None]
-        values, coefficients, spread, bound = _resolved(J * scale, error * scale)
-        # (10: eleven differences in each line.)
+        error = np.hypot(noise, J - coarse)
+        scale = map.size / map.size[:, None]
+        resolved = _resolved(J * scale, error * scale)
         return Returns(
-            values, coefficients, spread, 10.0, map.noise, map.names, residual, bound
+            resolved.multipliers,
+            resolved.coefficients,
+            resolved.covariance,
+            10.0,  # (eleven differences in each line)
+            map.noise,
+            map.names,
+            residual,
+            resolved.bound,
         )
 
     def trajectory(
@@ -332,30 +377,34 @@ class SettledCycle:
 
         **Raises:** any other error of the plant.
         """
-        u = (
-            np.zeros((self.sections.n_sections, len(self.inputs)))
-            if u is None
-            else np.asarray(u)
-        )
-        drive, points, result = self.drive, list[At](), Result.OK
+        if u is None:
+            u = np.zeros((self.sections.n_sections, len(self.inputs)))
+        drive = self.drive
+        points = list[At]()
+        result = Result.OK
         drive.begin(self.seed)
         try:
-            for k, held in enumerate(u.tolist(), 1):
+            for k, held in enumerate(np.asarray(u).tolist(), 1):
                 drive.advance(held, k, points)
             points.append(drive.here())
         except ComputationError:
             result = Result.PLANT_STOPPED
-        q, t = np.array([x.z for x in points]), np.array([x.t for x in points])
-        n, s = len(t), Structure(Recorded(drive.names, draw))
-        rates, events = np.gradient(q, t, axis=0) if n > 1 else 0 * q, np.full(n, -1)
+        q = np.array([x.z for x in points])
+        t = np.array([x.t for x in points])
+        n = len(t)
+        s = Structure(Recorded(drive.names, draw))
+        rates = np.gradient(q, t, axis=0) if n > 1 else 0 * q
+        events = np.full(n, -1)
         return Trajectory(
             s, t - t[0], np.zeros(n, int), q, q, rates, rates, events, result
         )
 
     def __repr__(self) -> str:
-        names = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        about = f"period {self.period:.9g}, {len(self.cycle_outputs)} sections, {names}"
-        return folded(f"SettledCycle({type(self.plant).__name__}: {about})")
+        return folded(
+            f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
+            f"{len(self.cycle_outputs)} sections, {listed(self.inputs)} -> "
+            f"{listed(self.outputs)})"
+        )
 
 
 @checked
@@ -389,7 +438,8 @@ def settle(
     plant that does not continue from the state that it returned; `ComputationError` if the plant
     has not settled, or returns NaN. Errors of the plant pass through.
     """
-    family, drive = families.as_family(sections), Drive(plant)
+    family = families.as_family(sections)
+    drive = Drive(plant)
     drive.reset(seed)
     require_among("output", outputs, drive.names, "")
     drive.columns = tuple(map(drive.names.index, outputs))
@@ -401,97 +451,131 @@ def settle(
     # (One turn shows the sense of an angle; that of a guess is seen near it.)
     drive.phase = _bound(drive, family, 1.0 if guess is None else 0.01)
     drive.phase.begin(drive.t, drive.z)
-    for k in range(1 if guess is not None else cycles + 1):
+    settling = cycles if guess is None else 0
+    for k in range(settling + 1):
         drive.warmup = drive.t
         drive.advance(drive.zero, k * family.n_sections)
-    if guess is not None:
-        _Map(_measure(drive, family, 1, seed)).solve()
-    return _measure(drive, family, max(cycles // 4, 2) if guess is None else 2, seed)
+    if guess is None:
+        return _measure(drive, family, max(cycles // 4, 2), seed)
+    returns = _ReturnMap(_measure(drive, family, 1, seed))
+    returns.measure()
+    returns.solve()
+    return _measure(drive, family, 2, seed)
 
 
 def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
-    N, plant, points = family.n_sections, drive.plant, list[At]()
-
-    def turn() -> tuple[At, list[At]]:
-        start = drive.here()
-        drive.phase.begin(drive.t, drive.z, on_section=True)
-        return start, [drive.advance(drive.zero, k, points) for k in range(1, N + 1)]
-
-    start, at = turn()
+    plant = drive.plant
+    points = list[At]()
+    start, at = _turn(drive, family, points)
     drive.longest = 2 * (at[-1].t - start.t)
-    turns = [turn() for _ in range(cycles + 1)]
-    values = np.array(
-        [[[x.z[c] for c in drive.columns] for x in at] for _, at in turns]
-    )
+    turns = [_turn(drive, family, points) for _ in range(cycles + 1)]
+    columns = list(drive.columns)
+    signals_there = [_signals_at(at) for _, at in turns]
+    values = np.stack(signals_there)[..., columns]
     values = np.roll(values, 1, axis=1)  # (section 0 ends each cycle)
     drive.start, at = turns[-1]
-    half, size = (
-        len(values) // 2,
-        np.ptp([x.z for x in points], axis=0)[list(drive.columns)],
-    )
-    change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
-    # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
-    if (
-        cycles > 1
-        and (change > np.maximum(1e-4 * size, 1.6 * values.std(axis=0))).any()
-    ):
-        raise ComputationError(
-            "the plant has not settled: give more `cycles` or a `guess`."
-        )
+    size = np.ptp(_signals_at(points), axis=0)[columns]
+    if cycles > 1:
+        _require_settled(values, size)
     if drive.sets:
         drive.restore(drive.start)
-        change = np.abs(np.array([x.z for x in turn()[1]]) - [x.z for x in at])
-        if (change[:, list(drive.columns)] > 1e-6 * size).any():
+        _, again = _turn(drive, family, points)
+        change = np.abs(_signals_at(again) - _signals_at(at))
+        if (change[:, columns] > 1e-6 * size).any():
             raise DefinitionError(
                 "`set_state` does not continue as before: save all of the state."
             )
-    names, units = [drive.names[c] for c in drive.columns], getattr(plant, "units", {})
-    outputs = signals(names, [units.get(name, "") for name in names])
-    about = plant, family, Names(units=True, empty=True).take(plant.inputs), outputs
-    period = float(np.diff([at[-1].t for _, at in turns]).mean())
+    names = [drive.names[c] for c in columns]
+    units = getattr(plant, "units", {})
     return SettledCycle(
-        *about, period, values.mean(axis=0), drive.start.state, drive, seed
+        plant,
+        family,
+        inputs=Names(units=True, empty=True).take(plant.inputs),
+        outputs=signals(names, [units.get(name, "") for name in names]),
+        period=float(np.diff([at[-1].t for _, at in turns]).mean()),
+        cycle_outputs=values.mean(axis=0),
+        state=drive.start.state,
+        drive=drive,
+        seed=seed,
     )
+
+
+def _signals_at(points: Sequence[At]) -> Float[np.ndarray, "n signals"]:
+    return np.array([x.z for x in points], float)
+
+
+def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:
+    """One cycle from section 0 on: where it begins, and where it meets the sections."""
+    start = drive.here()
+    drive.phase.begin(drive.t, drive.z, on_section=True)
+    sections = range(1, family.n_sections + 1)
+    return start, [drive.advance(drive.zero, k, points) for k in sections]
+
+
+def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> None:
+    half = len(values) // 2
+    change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
+    # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
+    scatter = 1.6 * values.std(axis=0)
+    if (change > np.maximum(1e-4 * size, scatter)).any():
+        raise ComputationError(
+            "the plant has not settled: give more `cycles` or a `guess`."
+        )
 
 
 def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     """Return the sections as a plant is taken to them. An angle first makes so many turns."""
-    N, names, period = (
-        family.n_sections,
-        drive.names,
-        getattr(drive.plant, "period", None),
-    )
+    period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
-    if items and all(
-        isinstance(getattr(x, "function", None), str) and not x.charts for x in items
-    ):
-        require_among("signal", [x.function for x in items], names, "Crossing: ")
-        signs = {"falling": 1.0, "rising": -1.0}
-        rows = [
-            (names.index(x.function), signs[x.direction], float(x.value)) for x in items
-        ]
-        return Phase(N, crossings=rows)
-    kinds = [families.KinematicPhase, *[families.ClockPhase] * (period is not None)]
-    if type(family) not in kinds or isinstance(family.anchor, Crossing):
-        text = "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`"
-        raise DefinitionError(f"{text}; an `anchor` must be a number.")
-    if period is not None and isinstance(family, families.ClockPhase):
-        return Phase(N, period, float(family.anchor) * period)
+    if items and all(map(_is_of_a_signal, items)):
+        return _at_crossings(drive, items)
+    anchor: Any = getattr(family, "anchor", None)
+    is_number = not isinstance(anchor, Crossing)
+    if is_number and period is not None and type(family) is families.ClockPhase:
+        return Phase(family.n_sections, period, float(anchor) * period)
+    if is_number and type(family) is families.KinematicPhase:
+        return _by_angle(drive, family, float(anchor), turns)
+    raise DefinitionError(
+        "use KinematicPhase, Crossings of signals by name, or ClockPhase and a `period`; an "
+        "`anchor` must be a number."
+    )
+
+
+def _is_of_a_signal(crossing: Any) -> bool:
+    return isinstance(getattr(crossing, "function", None), str) and not crossing.charts
+
+
+def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> Phase:
+    names = drive.names
+    require_among("signal", [x.function for x in crossings], names, "Crossing: ")
+    rows = []
+    for x in crossings:
+        sign = 1.0 if x.direction == "falling" else -1.0
+        rows.append((names.index(x.function), sign, float(x.value)))
+    return Phase(len(rows), crossings=rows)
+
+
+def _by_angle(
+    drive: Drive, family: families.KinematicPhase, anchor: float, turns: float
+) -> Phase:
+    """Sections by the angle of two signals, whose sense so many turns show."""
     pair = family.position, family.velocity
-    require_among("signal", pair, names, "KinematicPhase(position, velocity): ")
-    center = [0.0, 0.0] if family.center is None else np.asarray(family.center).tolist()
-    scale = [1.0, 1.0] if family.scale is None else np.asarray(family.scale).tolist()
-    phase = Phase(N, axes=[*zip(map(names.index, pair), center, scale, strict=True)])
+    require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
+    columns = [drive.names.index(x) for x in pair]
+    center = np.zeros(2) if family.center is None else np.asarray(family.center)
+    scale = np.ones(2) if family.scale is None else np.asarray(family.scale)
+    axes = zip(columns, center.tolist(), scale.tolist(), strict=True)
+    phase = Phase(family.n_sections, axes=list(axes))
     phase.begin(drive.t, drive.z)
     began = phase.turns
     while abs(phase.turns - began) < turns:
         if drive.t > drive.longest:
             raise ComputationError(
-                f"{pair} do not circle around {center}: set `center`"
+                f"{pair} do not circle around {center.tolist()}: set `center`"
             )
         drive.step(drive.zero, drive.dt)
         phase.level(0, drive.t, drive.z)
     phase.sense = float(np.sign(phase.turns - began))
-    phase.first = float(family.anchor)
+    phase.first = anchor
     return phase

@@ -90,13 +90,9 @@ class Phase:
             c, sign, value = self.crossings[k % self.n]
             return sign * (z[c] - value)
         if self.axes:
-            (i, a, p), (j, b, q) = self.axes
-            angle = self.sense * (
-                math.atan2((z[j] - b) / q, (z[i] - a) / p) - self.first
-            )
-            self.turns = angle / (2 * math.pi) + round(
-                self.turns - angle / (2 * math.pi)
-            )
+            x, y = ((z[column] - center) / scale for column, center, scale in self.axes)
+            angle = self.sense * (math.atan2(y, x) - self.first) / (2 * math.pi)
+            self.turns = angle + round(self.turns - angle)
         else:
             self.turns = (t - self.first) / self.period
         return (self.start + k / self.n - self.turns) * self.period
@@ -130,23 +126,28 @@ class Drive:
     """
 
     def __init__(self, plant: Any):
-        self.plant, self.dt = plant, float(plant.dt)
+        self.plant = plant
+        self.dt = float(plant.dt)
         self.fixed = bool(getattr(plant, "fixed_step", False))
         self.sets = hasattr(plant, "get_state") and hasattr(plant, "set_state")
         self.zero = [0.0] * len(plant.inputs)
-        self.t, self.warmup, self.longest = 0.0, 0.0, 1e6 * self.dt
-        self.names, self.columns, self.z = (
-            tuple[str, ...](),
-            tuple[int, ...](),
-            tuple[float, ...](),
-        )
-        self.phase, self.start, self.last = Phase(1), At(0.0, ()), At(0.0, ())
+        self.t = 0.0
+        self.warmup = 0.0
+        self.longest = 1e6 * self.dt
+        self.names = tuple[str, ...]()
+        self.columns = tuple[int, ...]()
+        self.z = tuple[float, ...]()
+        self.phase = Phase(1)
+        self.start = At(0.0, ())
+        self.last = At(0.0, ())
 
     def _take(self, observation: Any, t: float) -> None:
-        names, self.t = tuple(observation), t
+        names = tuple(observation)
+        self.t = t
         if self.names and names != self.names:
             raise ComputationError(f"signals changed from {self.names} to {names}")
-        self.z, self.names = tuple(observation.values()), names
+        self.z = tuple(observation.values())
+        self.names = names
         for name, x in zip(names, self.z, strict=True):
             if not x - x == 0:
                 raise ComputationError(f"{name} became {x}")
@@ -170,7 +171,9 @@ class Drive:
     def restore(self, start: At) -> None:
         """Continue from a state that was kept."""
         self.plant.set_state(start.state)
-        self.t, self.z, self.last = start.t, tuple(start.z), At(0.0, ())
+        self.t = start.t
+        self.z = tuple(start.z)
+        self.last = At(0.0, ())
 
     def pass_time(self, duration: float) -> None:
         """Let the plant run without input."""
@@ -181,46 +184,68 @@ class Drive:
         """Hold the input until section k, and append the points before all steps. Steps end on the
         section if its time is known, or if the state can be set; steps of fixed length end after
         it. A crossing counts after a step that ends before it, so that none is counted twice."""
-        phase, began, armed = self.phase, self.t, not self.phase.crossings
-        clock = not phase.axes and armed
-        lands = self.sets and not self.fixed and not clock
-        last = (
-            self.last if self.last.z else At(self.t, self.z)
-        )  # (a step may cross two sections)
-        x, y = phase.level(k, last.t, last.z), phase.level(k, self.t, self.z)
-        while y > 1e-9 * self.dt * clock or not armed:  # (rounding is no step)
+        phase = self.phase
+        began = self.t
+        armed = not phase.crossings
+        by_clock = armed and not phase.axes
+        stops = by_clock and not self.fixed
+        lands = self.sets and not self.fixed and not by_clock
+        reached = 1e-9 * self.dt if by_clock else 0.0  # (rounding is no step)
+        # (A step may cross two sections.)
+        last = self.last if self.last.z else At(self.t, self.z)
+        before = phase.level(k, last.t, last.z)
+        level = phase.level(k, self.t, self.z)
+        while level > reached or not armed:
             if self.t - began > self.longest:
                 raise ComputationError(
                     f"a section was not reached within {self.longest:.4g}"
                 )
-            last, x = (
-                self.here() if lands or points is not None else At(self.t, self.z),
-                y,
-            )
-            if points is not None:
-                points.append(last)
-            self.step(u, min(y, self.dt) if clock and not self.fixed else self.dt)
-            y = phase.level(k, self.t, self.z)
-            armed = armed or y > 0
-        if lands and y < 0 < x:
-            from scipy import optimize
+            last = self._point(points, lands)
+            before = level
+            self.step(u, min(level, self.dt) if stops else self.dt)
+            level = phase.level(k, self.t, self.z)
+            armed = armed or level > 0
+        if lands and level < 0 < before:
+            return self._landed(u, k, last)
+        self.last = last
+        return self._interpolated(last, before, level)
 
-            def level(h: float) -> float:
-                self.restore(last)
-                if h > 0:
-                    self.step(u, h)
-                return phase.level(k, self.t, self.z)
-
-            level(optimize.brentq(level, 0.0, self.t - last.t, xtol=1e-11 * self.dt))  # type: ignore
+    def _point(self, points: list[At] | None, with_state: bool) -> At:
+        """The present point, which is appended to `points`, if there are any, with its state."""
+        if points is None and not with_state:
             return At(self.t, self.z)
-        self.last, share = last, x / (x - y) if x > y else 1.0
+        point = self.here()
+        if points is not None:
+            points.append(point)
+        return point
+
+    def _landed(self, u: Sequence[float], k: int, last: At) -> At:
+        """Repeat the step after `last` with the length at which it ends on section k."""
+        from scipy import optimize
+
+        def level(h: float) -> float:
+            self.restore(last)
+            if h > 0:
+                self.step(u, h)
+            return self.phase.level(k, self.t, self.z)
+
+        longest = self.t - last.t
+        h: Any = optimize.brentq(level, 0.0, longest, xtol=1e-11 * self.dt)
+        level(h)
+        return At(self.t, self.z)
+
+    def _interpolated(self, last: At, before: float, level: float) -> At:
+        """Where the line between the last two points meets the section, by their levels."""
+        share = before / (before - level) if before > level else 1.0
         at = last.t + share * (self.t - last.t)
-        values = tuple(a + share * (b - a) for a, b in zip(last.z, self.z, strict=True))
+        ends = zip(last.z, self.z, strict=True)
+        values = tuple(begin + share * (end - begin) for begin, end in ends)
         return At(at, values, self.t - at)
 
     def run(self, seed: int, u: Sequence[Sequence[float]]) -> Trial:
         """Run one experiment with inputs u (n, nu), each held until the next section."""
-        rows, ended = list[At](), ""
+        rows = list[At]()
+        ended = ""
         try:
             if self.begun(seed) != self.begun(seed):
                 raise ComputationError(
@@ -230,10 +255,14 @@ class Drive:
             for k, held in enumerate(u[:-1], 1):
                 rows.append(self.advance(held, k))
         except Exception as error:
-            told = isinstance(error, ComputationError)
-            kind = "" if told else f"the plant raised {type(error).__name__}: "
-            ended = f"{kind}{error} (t = {self.t:.6g})"
-        return [[*(float(x.z[c]) for c in self.columns), x.late] for x in rows], ended
+            ended = f"{error} (t = {self.t:.6g})"
+            if not isinstance(error, ComputationError):
+                ended = f"the plant raised {type(error).__name__}: {ended}"
+        values = []
+        for x in rows:
+            outputs = [float(x.z[c]) for c in self.columns]
+            values.append([*outputs, x.late])
+        return values, ended
 
     def begun(self, seed: int) -> Sequence[float]:
         """Return the signals after the first steps."""
@@ -269,33 +298,42 @@ def serve() -> None:
 
 
 def run_all(
-    drive: Drive, items: Iterable[Any], processes: int, limit: float
+    drive: Drive,
+    items: Iterable[Any],
+    processes: int,
+    limit: float,
 ) -> Iterator[Trial]:
     """Run experiments (seed, inputs) in processes with a limit of time, and yield them in order.
     Processes that ended are replaced.
     """
-    packed, local, begun = _pack(drive), threading.local(), list[Any]()
+    packed = _pack(drive)
+    local = threading.local()
+    begun = list[Any]()
 
     def run(item: tuple[int, Any]) -> Trial:
         local.worker = getattr(local, "worker", None) or _start(packed, begun)
-        worker, timer = local.worker, threading.Timer(limit, local.worker.kill)
+        worker = local.worker
+        timer = threading.Timer(limit, local.worker.kill)
         timer.start()
         try:
             pickle.dump(item, worker.stdin)
             worker.stdin.flush()
             answer = pickle.load(worker.stdout)
         except (EOFError, pickle.UnpicklingError, OSError):
-            local.worker, code, waits = None, worker.wait(), timer.is_alive()
-            ended = (
+            local.worker = None
+            code = worker.wait()
+            cause = (
                 f"the process ended with code {code} (its error is on standard error)"
             )
-            return [], ended if waits else f"no answer within the limit of {limit:g} s"
+            if not timer.is_alive():
+                cause = f"no answer within the limit of {limit:g} s"
+            return [], cause
         finally:
             timer.cancel()
         if isinstance(answer, str):
-            text = "define it in a module that can be imported, or use `processes=0`"
             raise DefinitionError(
-                f"another process cannot make the plant ({answer}): {text}."
+                f"another process cannot make the plant ({answer}): define it in a module that can "
+                "be imported, or use `processes=0`."
             )
         return answer
 
@@ -309,28 +347,27 @@ def run_all(
 
 
 def resume(
-    file: Any, about: str, count: int, run: Callable[[list[int]], Any]
+    file: Any,
+    about: str,
+    count: int,
+    run: Callable[[list[int]], Any],
 ) -> list[Trial]:
     """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
     """
+    table = "create table if not exists trials (about, s, trial, unique (about, s))"
+    rows = "select s, trial from trials where about = ?"
     try:
-        with contextlib.closing(
-            sqlite3.connect(file or ":memory:", isolation_level=None)
-        ) as base:
-            base.execute(
-                "create table if not exists trials (about, s, trial, unique (about, s))"
-            )
-            kept = dict(
-                base.execute("select s, trial from trials where about = ?", [about])
-            )
+        base = sqlite3.connect(file or ":memory:", isolation_level=None)
+        with contextlib.closing(base):
+            base.execute(table)
+            kept = dict(base.execute(rows, [about]))
             missing = [s for s in range(count) if s not in kept]
             for s, trial in zip(missing, run(missing), strict=True):
                 kept[s] = json.dumps(trial)
-                base.execute(
-                    "replace into trials values (?, ?, ?)", (about, s, kept[s])
-                )
+                row = about, s, kept[s]
+                base.execute("replace into trials values (?, ?, ?)", row)
     except sqlite3.Error as error:
         raise DefinitionError(
             f"'{file}' is no store of experiments ({error})."
@@ -347,7 +384,8 @@ def _start(packed: bytes, begun: list[Any]) -> Any:
         "from hybridjax.plants.drive import serve; serve()",
     ]
     changes = {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    pipe, environment = subprocess.PIPE, os.environ | changes
+    pipe = subprocess.PIPE
+    environment = os.environ | changes
     begun.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
     pickle.dump(packed, begun[-1].stdin)
     return begun[-1]
@@ -368,7 +406,6 @@ def _pack(drive: Drive) -> bytes:
                     packer.register_pickle_by_value(module)  # type: ignore
         return packer.dumps(drive)
     except Exception as error:
-        text = "give it `__getstate__`, or use `processes=0`"
         raise DefinitionError(
-            f"the plant cannot be pickled ({error}): {text}."
+            f"the plant cannot be pickled ({error}): give it `__getstate__`, or use `processes=0`."
         ) from error

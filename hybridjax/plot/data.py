@@ -65,13 +65,13 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     deviation. Right: for an input, its power against frequency; for an output, its deviations in
     successive cycles, at the section where they are largest.
     """
-    N, nu = data.n_sections, len(data.inputs)
+    N = data.n_sections
+    nu = len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
-    values = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in data.records])
-    at = np.concatenate(
-        [(r.first_section + np.arange(len(r.u))) % N for r in data.records]
-    )
+    values = np.concatenate([np.hstack([r.u, r.y]) for r in data.records])
+    samples = [r.first_section + np.arange(len(r.u)) for r in data.records]
+    at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
     f, power = input_spectrum(data)
     phase = np.arange(N) / N
@@ -90,11 +90,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
-                last.semilogy(
-                    f,
-                    np.maximum(power[:, i], 1e-12 * power[:, i].max()),
-                    color=CYCLE[1],
-                )
+                floor = 1e-12 * power[:, i].max()
+                last.semilogy(f, np.maximum(power[:, i], floor), color=CYCLE[1])
                 last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
             else:
                 last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
@@ -122,7 +119,8 @@ def impulse_responses(
 ) -> Plot:
     """Left: responses to a push against its phase and the time since. Right: those at the phases
     marked left, with bands of 95 %; dashed, those of a model with the same sections."""
-    ny, N = len(responses.outputs), len(responses.phase)
+    ny = len(responses.outputs)
+    N = len(responses.phase)
     pushing = channel_index("input", input, responses.inputs)
     theory = None if model is None else responses.of_model(model)
     with panels(ax, ny, 2, width=PAGE, height=0.4 + 1.9 * ny) as axes:
@@ -148,7 +146,8 @@ def impulse_responses(
                 )
                 if theory is not None:
                     curves.plot(responses.lag, theory[m, :, i, pushing], "k--", lw=0.8)
-                low, high = values[m] - band, values[m] + band
+                low = values[m] - band
+                high = values[m] + band
                 curves.fill_between(responses.lag, low, high, alpha=0.25, lw=0, **line)
             curves.axhline(0, color="black", lw=0.4)
         if theory is not None:
@@ -173,7 +172,8 @@ def phase_response(
     **Raises:** `DefinitionError` for inputs in different units.
     """
     curves = [curve] if model is None else [curve, model]
-    if all(units := [unit_of(x.input) for x in curves]):
+    units = [unit_of(x.input) for x in curves]
+    if all(units):
         require_equal("the inputs of both curves", "units", units[0], units[-1])
     with panels(ax, height=2.8) as axes:
         panel = axes[0, 0]
@@ -191,10 +191,8 @@ def phase_response(
             for phase in drawn.phase[np.isnan(drawn.values)]:
                 panel.axvline(phase, color=color, lw=0.8, ls=":")
         panel.axhline(0, color="black", lw=0.4)
-        name = f"response to {curve.input}"
-        panel.set(
-            xlabel="phase (cycles)", ylabel=f"{name}\n({curve.unit})", xlim=(0, 1)
-        )
+        response = f"response to {curve.input}\n({curve.unit})"
+        panel.set(xlabel="phase (cycles)", ylabel=response, xlim=(0, 1))
         panel.legend()
     return Plot(axes)
 
@@ -212,7 +210,8 @@ def experiment(
     """
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
-    index, time = index % S, np.arange(n) / data.n_sections
+    index = index % S
+    time = np.arange(n) / data.n_sections
     rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
     rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
     size = {"width": COLUMN, "height": 0.5 + 0.85 * len(rows)}
@@ -233,7 +232,8 @@ def experiment(
             panel.margins(x=0)
         axes[-1, 0].set_xlabel("time (cycles)")
         title = f"experiment {index}"
-        title += f": {Result(int(data.result[index])).message}" * (not data.ok[index])
+        if not data.ok[index]:
+            title += f": {Result(int(data.result[index])).message}"
         axes[0, 0].set_title(title, wrap=True)
     return Plot(axes)
 
@@ -251,7 +251,8 @@ def validation(
 
     **Arguments:** `cycles`: number of cycles to show. Default: 4.
     """
-    N, ny = validation.n_sections, len(validation.outputs)
+    N = validation.n_sections
+    ny = len(validation.outputs)
     shown = slice(max(len(validation.measured) - cycles * N, 0), None)
     time = (validation.first_section + np.arange(len(validation.measured)))[shown] / N
     limit = float(stats.norm.isf(0.005))
@@ -273,15 +274,10 @@ def validation(
             auto.set_title(
                 f"residuals\n{p_value(validation.whiteness[i])}", loc="right"
             )
-            for j, _ in enumerate(validation.inputs):
+            for j in range(len(validation.inputs)):
                 color = CYCLE[(1 + j) % len(CYCLE)]
-                _stems(
-                    cross,
-                    0.2 * j,
-                    validation.cross_correlation[:, :, i, j],
-                    color,
-                    limit,
-                )
+                correlation = validation.cross_correlation[:, :, i, j]
+                _stems(cross, 0.2 * j, correlation, color, limit)
             cross.set_title(
                 f"with the input\n{p_value(validation.independence[i])}", loc="right"
             )

@@ -93,7 +93,8 @@ def strides(
                 panel.plot(study.strides, error, marker="o", ms=3, lw=0.6, **style)
                 reached += study.strides.tolist()
         around = 1.5 if studies else 10.0
-        low, high = min(reached) / around, max(reached) * around
+        low = min(reached) / around
+        high = max(reached) * around
         for errors, cycles, color, label in (
             (
                 plan.usual_standard_errors,

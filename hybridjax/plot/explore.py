@@ -84,14 +84,15 @@ class Explorer:
     """
 
     def __init__(self, cycle: LimitCycle, sliders: list, plane: tuple[str, str]):
-        self.cycle, self.message, self._sliders, self._plane = cycle, "", sliders, plane
+        self.cycle = cycle
+        self.message = ""
+        self._sliders = sliders
+        self._plane = plane
         self.values = {
             name: float(parameter_of(cycle.system, name)) for name, *_ in sliders
         }
-        s, places = (
-            cycle.structure,
-            {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.84},
-        )
+        s = cycle.structure
+        places = {"left": 0.07, "right": 0.99, "bottom": 0.14, "top": 0.84}
         with style():
             # (A layout that is computed for each picture takes longer than the cycle.)
             self.figure, self._axes = pyplot.subplots(1, 3, figsize=(9.0, 3.2))
@@ -137,7 +138,8 @@ class Explorer:
             system = with_parameters(self.cycle.system, mixed)
             cycle = find_limit_cycle(system, away_from_events(self.cycle), throw=False)
             if cycle.result == Result.OK:
-                self.cycle, share = cycle, at
+                self.cycle = cycle
+                share = at
             elif step > 1 / 16:
                 step /= 4
             else:
@@ -153,7 +155,8 @@ class Explorer:
 
     def _draw(self, gain: bool = True) -> None:
         """Draw the cycle, and the gain, which takes as long to compute."""
-        cycle, s = self.cycle, self.cycle.structure
+        cycle = self.cycle
+        s = self.cycle.structure
         if gain and s.nu:
             f = _FREQUENCIES[(_FREQUENCIES % 1 > 0.01) | cycle.clocked]
             htf = cycle.htf(f, outputs=self._plane[0], inputs=s.inputs[0])
@@ -215,7 +218,10 @@ class Explorer:
         return Sliders(asked={"values": self.values, "gain": True, "number": 0})
 
     def _answer(
-        self, values: Mapping[str, float], gain: bool, number: int
+        self,
+        values: Mapping[str, float],
+        gain: bool,
+        number: int,
     ) -> dict[str, Any]:
         if values != self.values:
             self._follow(values)
@@ -270,7 +276,8 @@ def explore(
     with searching("as `system`", (ComputationError, DefinitionError)):
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
     cycle.require_found()
-    sliders, ranges = [], ranges or {}
+    sliders = []
+    ranges = ranges or {}
     for name in dict.fromkeys((*parameters, *ranges)):
         value = float(parameter_of(cycle.system, name))
         low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))

@@ -53,17 +53,20 @@ class Easel:
     def image(self, moving: Sequence[Artist]) -> Image.Image:
         self._agg.restore_region(self._still)
         for artist in sorted(moving, key=lambda x: x.get_zorder()):
-            artist.draw(
-                self._agg.get_renderer()
-            )  # (marimo gives the figure another canvas)
+            # (Marimo gives the figure another canvas.)
+            artist.draw(self._agg.get_renderer())
         return Image.fromarray(np.array(self._agg.buffer_rgba())[..., :3])
 
 
 def frames(
-    figure: Figure, draw: Callable[[int], Sequence[Artist]], count: int, dpi: float
+    figure: Figure,
+    draw: Callable[[int], Sequence[Artist]],
+    count: int,
+    dpi: float,
 ) -> list[Image.Image]:
     """Images with one palette."""
-    canvas, before = figure.canvas, figure.dpi
+    canvas = figure.canvas
+    before = figure.dpi
     try:
         easel = Easel(figure, draw(0), dpi)
         images = [easel.image(draw(k)) for k in range(count)]
@@ -87,7 +90,8 @@ def gif(images: Sequence[Image.Image], interval: float) -> bytes:
     """A GIF that repeats. Its times are whole hundredths of a second, which together last as long
     as the frames."""
     ends = np.round(100 * interval * np.arange(len(images) + 1))
-    file, durations = io.BytesIO(), [10 * max(2, int(x)) for x in np.diff(ends)]
+    file = io.BytesIO()
+    durations = [10 * max(2, int(x)) for x in np.diff(ends)]
     options: Any = {"save_all": True, "loop": 0, "disposal": 1}
     images[0].save(file, "gif", append_images=images[1:], duration=durations, **options)
     return file.getvalue()
@@ -100,7 +104,8 @@ def player(images: Sequence[Image.Image], interval: float, alt: str) -> str:
     pixels = np.stack([np.asarray(image) for image in images])
     usual = np.sort(pixels, axis=0)[len(pixels) // 2]
     # (The clear color is the last of the palette: browsers show one beyond its end as gray.)
-    clear, colors = len(_PALETTE), images[0].getpalette() or []
+    clear = len(_PALETTE)
+    colors = images[0].getpalette() or []
     palette = [*colors[: 3 * clear], 0, 0, 0]
 
     def encoded(pixels: np.ndarray, **options: Any) -> str:

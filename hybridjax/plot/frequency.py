@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -57,21 +58,24 @@ def magnitude(
     """
     if not harmonics:
         raise DefinitionError("`harmonics` must hold one harmonic or more.")
-    first, *_ = drawn = _exact_first(htfs)
-    name, pushed = (
-        _pick("output", output, first.outputs),
-        _pick("input", input, first.inputs),
-    )
+    drawn = _exact_first(htfs)
+    first = drawn[0]
+    name = _pick("output", output, first.outputs)
+    pushed = _pick("input", input, first.inputs)
     with panels(ax, height=2.2) as axes:
         panel = axes[0, 0]
         for htf in drawn:
             for m in harmonics:
-                at = _same(name, output, htf.outputs), _same(pushed, input, htf.inputs)
-                f, values, radius = _values(htf, m, *at)
-                size, style = np.abs(values), _harmonic_style(m, harmonics)
+                observed = _same(name, output, htf.outputs)
+                excited = _same(pushed, input, htf.inputs)
+                f, values, radius = _values(htf, m, observed, excited)
+                size = np.abs(values)
+                style = _harmonic_style(m, harmonics)
                 line = _line(htf, drawn, style, _name(m))
                 panel.plot(f, size, **line)
-                _band(panel, f, size, radius, line["color"], 0.3 * np.min(size))
+                if radius is not None:
+                    lowest = 0.3 * np.min(size)
+                    _band(panel, f, size, radius, line["color"], lowest)
         curve = _curve(name, pushed, first)
         label = with_unit(f"$|H_m|$, {curve}", ratio(name, pushed))
         panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
@@ -144,69 +148,100 @@ def bode(
     **Raises:** `DefinitionError` for a name or harmonic that is not there, and for fits that have
     none of the inputs.
     """
-    first, *_ = drawn = _exact_first(htfs)
-    names = first.outputs if outputs is None else outputs
-    chosen = range(len(first.inputs)) if input is None else [input]
-    curves = [
-        (
-            _pick("output", name, first.outputs),
-            _pick("input", which, first.inputs),
-            which,
-        )
-        for name in names
-        for which in chosen
-    ]
-    units = [ratio(name, pushed) for name, pushed, _ in curves]
-    same = (
-        units[0] if len(set(units)) == 1 else ""
-    )  # else the label of each curve has its own
+    drawn = _exact_first(htfs)
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     fitted = [fit.htf(drawn[-1].f) for fit in fits]
+    curves = _curves(drawn[0], outputs, input)
     for htf in fitted:
-        if all(pushed not in htf.inputs for _, pushed, _ in curves):
-            _pick("input", curves[0][1], htf.inputs)
+        if all(curve.input not in htf.inputs for curve in curves):
+            _pick("input", curves[0].input, htf.inputs)
+    units = {curve.unit for curve in curves}
+    # (Where units differ, the label of each curve has its own.)
+    same = units.pop() if len(units) == 1 else ""
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         upper, lower = axes[:, 0]
-        for number, (name, pushed, which) in enumerate(curves):
-            color, reference = _OUTPUTS[number % len(_OUTPUTS)], None
-            curve = _curve(name, pushed, first) if input is None else name
-            label = with_unit(curve, "" if same else units[number])
+        for number, curve in enumerate(curves):
+            color = _OUTPUTS[number % len(_OUTPUTS)]
+            label = with_unit(curve.label, "" if same else curve.unit)
+            reference = None
             for htf in drawn:
-                f, values, radius = _values(
-                    htf, harmonic, name, _same(pushed, which, htf.inputs)
+                line = _line(htf, drawn, {"color": color}, label)
+                reference = _response(
+                    upper, lower, htf, harmonic, curve, line, reference
                 )
-                size, line = np.abs(values), _line(htf, drawn, {"color": color}, label)
-                is_certain = np.full(len(f), True) if radius is None else radius < size
-                is_certain &= (
-                    np.convolve(is_certain, np.ones(3))[1:-1] > 1
-                )  # of a line, no points
-                phase = _phase(f, values, is_certain, reference)
-                reference = f[is_certain], phase[is_certain]
-                upper.plot(f, size, **line)
-                lower.plot(f, phase, **line)
-                _band(upper, f, size, radius, color, 0.3 * np.min(size))
-                if radius is not None:
-                    turn = np.degrees(
-                        np.arcsin(np.where(is_certain, radius, np.nan) / size)
-                    )
-                    _band(lower, f, phase, turn, color)
             for htf in fitted:
-                if pushed not in htf.inputs:
-                    continue
-                f, values, _ = _values(htf, harmonic, name, pushed)
-                phase = _phase(f, values, np.full(len(f), True), reference)
-                upper.plot(f, np.abs(values), **_FIT_STYLE, zorder=5)
-                lower.plot(f, phase, **_FIT_STYLE, zorder=5)
-        for fit in dict.fromkeys(type(fit) for fit in fits):
-            upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[fit])
+                if curve.input in htf.inputs:
+                    line = {**_FIT_STYLE, "zorder": 5}
+                    _response(upper, lower, htf, harmonic, curve, line, reference)
+        for kind in dict.fromkeys(map(type, fits)):
+            upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[kind])
         symbol = _name(harmonic)[1:-1]
         upper.set(yscale="log", ylabel=with_unit(f"$|{symbol}|$", same))
         lower.set(xlabel=FREQUENCY, ylabel=f"$\\angle {symbol}$ (degrees)")
-        _frequency_limits(upper, f)
-        _frequency_limits(lower, f)
+        for panel in (upper, lower):
+            _frequency_limits(panel, np.sort(drawn[-1].f))
         lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
         _legend(upper, drawn)
     return Plot(axes)
+
+
+class _Curve(NamedTuple):
+    """One output and one input of a Bode plot."""
+
+    output: str
+    input: str
+    which: str | int
+    """The input as the caller gave it: a loop's input has another name, that of its reference."""
+    label: str
+
+    @property
+    def unit(self) -> str:
+        return ratio(self.output, self.input)
+
+
+def _curves(
+    htf: HTF, outputs: Sequence[str] | None, input: str | int | None
+) -> list[_Curve]:
+    inputs = range(len(htf.inputs)) if input is None else [input]
+    curves = []
+    names = htf.outputs if outputs is None else outputs
+    for name in names:
+        output = _pick("output", name, htf.outputs)
+        for which in inputs:
+            pushed = _pick("input", which, htf.inputs)
+            label = _curve(output, pushed, htf) if input is None else output
+            curves.append(_Curve(output, pushed, which, label))
+    return curves
+
+
+def _response(
+    upper: Axes,
+    lower: Axes,
+    htf: HTF,
+    harmonic: int,
+    curve: _Curve,
+    line: dict[str, Any],
+    reference: tuple | None,
+) -> tuple:
+    """Draw magnitude and phase of one curve, with whole turns as in `reference`; return the next
+    reference: frequencies and phases that are certain."""
+    pushed = _same(curve.input, curve.which, htf.inputs)
+    f, values, radius = _values(htf, harmonic, curve.output, pushed)
+    size = np.abs(values)
+    is_certain = np.full(len(f), True)
+    if radius is not None:
+        is_certain = radius < size
+        # (Parts of a line, no single points.)
+        is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1
+    phase = _phase(f, values, is_certain, reference)
+    upper.plot(f, size, **line)
+    lower.plot(f, phase, **line)
+    if radius is not None:
+        color = line["color"]
+        sine = np.where(is_certain, radius, np.nan) / size
+        _band(upper, f, size, radius, color, 0.3 * np.min(size))
+        _band(lower, f, phase, np.degrees(np.arcsin(sine)), color)
+    return f[is_certain], phase[is_certain]
 
 
 @checked
@@ -225,7 +260,8 @@ def bodes(
 
     **Raises:** `DefinitionError` for fits of a family that is not there.
     """
-    columns, fits = _columns(families), dict(fits or {})
+    columns = _columns(families)
+    fits = dict(fits or {})
     require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, htfs) in enumerate(columns.items()):
@@ -240,13 +276,14 @@ def bodes(
 
 
 def _columns(families) -> dict[str, list[HTF]]:
-    columns = {
-        k: (v,) if isinstance(v, Transfer) else tuple(v)
-        for k, v in dict(families).items()
-    }
+    columns: dict[str, tuple] = {}
+    outputs: set[tuple[str, ...]] = set()
+    for name, htfs in dict(families).items():
+        columns[name] = (htfs,) if isinstance(htfs, Transfer) else tuple(htfs)
+        outputs.update(htf.outputs for htf in columns[name])
     if not columns or not all(columns.values()):
         raise DefinitionError("`families` must hold at least one HTF in each family.")
-    if len({htf.outputs for htfs in columns.values() for htf in htfs}) > 1:
+    if len(outputs) > 1:
         raise DefinitionError(
             "the families must have the same outputs to share a figure."
         )
@@ -255,7 +292,10 @@ def _columns(families) -> dict[str, list[HTF]]:
 
 @contextlib.contextmanager
 def _grid(
-    columns, rows: int, height: float, ax: AxesLike | None
+    columns,
+    rows: int,
+    height: float,
+    ax: AxesLike | None,
 ) -> Iterator[np.ndarray]:
     """Panels with a column for each family: labels at the edges of the grid and one legend."""
     size = {"width": COLUMN if len(columns) == 1 else PAGE, "height": height}
@@ -263,7 +303,8 @@ def _grid(
         yield axes
         for panel in axes.flat:
             panel.label_outer()
-            if panel is not axes[0, -1] and (legend := panel.get_legend()):
+            legend = panel.get_legend()
+            if legend is not None and panel is not axes[0, -1]:
                 legend.remove()
         for panel, family in zip(axes[0], columns, strict=True):
             panel.set_title(family)
@@ -295,23 +336,26 @@ def _same(name: str, which: str | int, names: Sequence[str]) -> str | int:
 
 
 def _values(
-    htf: HTF, m: int, output: str | int, input: str | int
+    htf: HTF,
+    m: int,
+    output: str | int,
+    input: str | int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
     order = np.argsort(htf.f)
-    at = (
-        channel_index("output", output, htf.outputs),
-        channel_index("input", input, htf.inputs),
-    )
-    values, radius = np.asarray(htf[m])[(order, *at)], None
+    i = channel_index("output", output, htf.outputs)
+    j = channel_index("input", input, htf.inputs)
+    values = np.asarray(htf[m])[order, i, j]
+    radius = None
     if htf.variance is not None:
-        radius = np.asarray(htf.select(m).confidence_radius())[(0, order, *at)]
+        radius = np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
     return np.asarray(htf.f)[order], values, radius
 
 
 def _frequency_limits(ax: Axes, f) -> None:
-    ax.set_xlim(min(0.0, f[0]), f[-1] + (f[1] - f[0] if len(f) > 1 else 1.0))
+    spacing = f[1] - f[0] if len(f) > 1 else 1.0
+    ax.set_xlim(min(0.0, f[0]), f[-1] + spacing)
 
 
 def _name(m: int) -> str:
@@ -327,19 +371,18 @@ def _harmonic_style(m: int, shown: Sequence[int]) -> dict:
 
 def _line(htf: HTF, htfs: Sequence[HTF], line: dict, label: str) -> dict:
     """Exact HTFs broad and pale, without a label where an estimate of the same curve has one."""
-    if htf.source == "exact":
-        label = "" if any(other.source != "exact" for other in htfs) else label
-        return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
-    return {**line, "lw": 0.9, "zorder": 3, "label": label}
+    if htf.source != "exact":
+        return {**line, "lw": 0.9, "zorder": 3, "label": label}
+    if any(other.source != "exact" for other in htfs):
+        label = ""
+    return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
 
 
 def _band(ax: Axes, f, middle, radius, color: str, floor: float = -np.inf) -> None:
-    if radius is not None:
-        radius = np.where(np.isfinite(radius), radius, np.nan)
-        low = np.maximum(middle - radius, floor)
-        ax.fill_between(
-            f, low, middle + radius, color=color, alpha=0.25, lw=0, zorder=2
-        )
+    radius = np.where(np.isfinite(radius), radius, np.nan)
+    low = np.maximum(middle - radius, floor)
+    high = middle + radius
+    ax.fill_between(f, low, high, color=color, alpha=0.25, lw=0, zorder=2)
 
 
 def _phase(f, values, known, reference: tuple | None) -> np.ndarray:

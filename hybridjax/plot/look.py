@@ -132,9 +132,8 @@ def panels(
         }
         with style():
             axes = pyplot.subplots(rows, columns, **size, **options)[1]
-            for (
-                panel
-            ) in axes.flat:  # here, since ticks are made when the figure is drawn
+            # (Here, since ticks are made when the figure is drawn.)
+            for panel in axes.flat:
                 panel.tick_params(labelsize=_STYLE["xtick.labelsize"])
             yield axes
             axes[0, 0].figure.align_ylabels(axes)
@@ -143,8 +142,9 @@ def panels(
     if not all(isinstance(panel, Axes) for panel in axes.flat):
         raise DefinitionError("`ax` must hold Axes of matplotlib, and nothing else.")
     if axes.size != rows * columns:
-        text = f"{rows} x {columns} Axes, one for each panel, not {axes.size}"
-        raise DefinitionError(f"`ax` must hold {text}.")
+        raise DefinitionError(
+            f"`ax` must hold {rows} x {columns} Axes, one for each panel, not {axes.size}."
+        )
     yield axes.reshape(rows, columns)
 
 
@@ -154,7 +154,12 @@ def axis_of(name: str, *, deviation: bool = False) -> str:
 
 
 def colored(
-    ax: Axes, x, y, values: np.ndarray, label: str, is_size: bool = False
+    ax: Axes,
+    x,
+    y,
+    values: np.ndarray,
+    label: str,
+    is_size: bool = False,
 ) -> None:
     """A map in colors with a bar: around zero, or of magnitudes from zero on."""
     top = np.abs(values).max()
@@ -162,7 +167,13 @@ def colored(
         {"cmap": "viridis", "vmin": 0} if is_size else {"cmap": "RdBu_r", "vmin": -top}
     )
     image = ax.pcolormesh(
-        x, y, values, **look, vmax=top, rasterized=True, shading="nearest"
+        x,
+        y,
+        values,
+        **look,
+        vmax=top,
+        rasterized=True,
+        shading="nearest",
     )
     cast(Any, ax.figure).colorbar(image, ax=ax, label=label)
 
@@ -193,9 +204,10 @@ def save(
 
     **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
     """
-    figure = (
-        cast(Figure, plot.get_figure(root=True)) if isinstance(plot, Axes) else plot
-    )
+    if isinstance(plot, Axes):
+        figure = cast(Figure, plot.get_figure(root=True))
+    else:
+        figure = plot
     figure = figure.figure if isinstance(figure, Plot) else figure
     path = Path(path)
     if path.suffix[1:] in get_args(Format):

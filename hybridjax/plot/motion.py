@@ -45,7 +45,10 @@ from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
 
 
+_RATE = 25  # frames per second
 _GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
+_MARKS: dict[str, Any] = {"marker": [(0, 0), (-3, -4)], "ms": 8}
+_LINK: dict[str, Any] = {"lw": 1.6, "zorder": 3, "solid_joinstyle": "round"}
 Part = tuple[Artist, Callable[[Any], Any], Sequence[Any] | np.ndarray]
 """An artist, a function that moves it, and its argument for each frame."""
 Portrait = Callable[[LimitCycle], list[Artist]]
@@ -66,22 +69,24 @@ class Motion(FuncAnimation):
         interval: float,
         title: str,
     ):
-        self.figure, self.times, self.interval = figure, times, interval
-        self._parts, self._title = parts, title
+        self.figure = figure
+        self.times = times
+        self.interval = interval
+        self._parts = parts
+        self._title = title
         self._draw(0)
         # (What windows do by `blit` is one more drawing for files and notebooks.)
-        options: Any = {
-            "blit": figure.canvas.required_interactive_framework is not None
-        }
-        options |= {
-            "frames": len(times),
-            "interval": 1000 * interval,
-            "cache_frame_data": False,
-        }
-        super().__init__(figure, self._draw, **options)
-        self._draw_was_started = (
-            True  # else matplotlib warns of animations that are only saved
+        has_window = figure.canvas.required_interactive_framework is not None
+        super().__init__(
+            figure,
+            self._draw,
+            frames=len(times),
+            interval=1000 * interval,  # type: ignore[arg-type]
+            blit=has_window,
+            cache_frame_data=False,
         )
+        # (Else matplotlib warns of animations that are only saved.)
+        self._draw_was_started = True
         close_in_notebook(figure)
 
     def _draw(self, k: int) -> list[Artist]:
@@ -113,9 +118,8 @@ class Motion(FuncAnimation):
                 new.write_text(self._repr_html_())
             else:
                 film = new.with_suffix(".mp4")
-                super().save(
-                    str(film), writer="ffmpeg", fps=round(1 / self.interval), dpi=172
-                )
+                rate = round(1 / self.interval)
+                super().save(str(film), writer="ffmpeg", fps=rate, dpi=172)
                 film.rename(new)
         return path
 
@@ -146,17 +150,18 @@ class Track(NamedTuple):
 
     def observed(self, names: Sequence[str], t: Float[np.ndarray, " p"]):
         """States or outputs (n, p) at times."""
-        path, at = self.trajectory, self.wrapped(t)
+        path = self.trajectory
+        at = self.wrapped(t)
         return observed(path.structure, names, at, *path.at(at))
 
     def events(self, flash: float) -> list[list[str]]:
         """Names of the events in so much time before each frame."""
-        path, rows = self.trajectory, np.flatnonzero(self.trajectory.event >= 0)
+        path = self.trajectory
+        rows = np.flatnonzero(path.event >= 0)
         names = [path.structure.transitions[g].name for g in path.event[rows]]
         ago = np.mod(self.times[:, None] - path.t[rows], self.period)
-        return [
-            list(itertools.compress(names, row)) for row in (ago >= 0) & (ago < flash)
-        ]
+        recent = (ago >= 0) & (ago < flash)
+        return [list(itertools.compress(names, row)) for row in recent]
 
 
 @checked
@@ -198,84 +203,144 @@ def animate(
     **Raises:** `DefinitionError` for a name that does not exist, a cycle that was not found, and
     sections or a perturbed motion of another system.
     """
-    rate = 25  # frames per second
     if isinstance(motion, Branch):
-        return _of_branch(motion, x, y, 1 / rate / (speed or 1.0))
-    cycle = motion if isinstance(motion, LimitCycle) else None
-    if cycle is not None:
-        cycle.require_found()
-    if isinstance(perturbed, ExperimentData):
-        if cycle is None or sections is None:
-            raise DefinitionError(
-                "data of experiments need a limit cycle and their `sections`."
-            )
-        from ..experiments.motion import (
-            perturbed_trajectory,
-        )  # (a thirtieth of a second)
+        return _of_branch(motion, x, y, 1 / (_RATE * (speed or 1.0)))
+    motion, beside = _motions(motion, sections, perturbed)
+    s = motion.structure
+    require_same_system(s, sections, beside)
+    plane = None
+    if len(s.states_everywhere()) > 1 or (x and y):
+        plane = plane_of(s, x, y)
+    if traces is None:
+        traces = _default_traces(s, plane)
+    names = s.resolve_outputs(traces).names
+    return _film(motion, beside, sections, plane, names, speed)
 
-        perturbed = perturbed_trajectory(
-            sections, perturbed.u[0, : 4 * sections.n_sections]
-        )
-    if cycle is not None and sections is perturbed is None:
-        motion = cycle = _both_halves(cycle)
-    s, unit = motion.structure, motion.system.time_unit
-    if cycle is None and not sections is perturbed is None:
-        raise DefinitionError(
-            "`sections` and `perturbed` are for limit cycles: animate the cycle."
-        )
-    require_same_system(s, sections, perturbed)
-    everywhere, has_picture = s.states_everywhere(), drawing_of(s, 0) is not None
-    plane = plane_of(s, x, y) if len(everywhere) > 1 or (x and y) else None
-    default = (plane or everywhere)[:1] if has_picture else s.state_names()[:4]
-    names = s.resolve_outputs(default if traces is None else traces).names
-    path = motion.trajectory() if isinstance(motion, LimitCycle) else motion
-    period = math.inf if cycle is None else float(cycle.period)
-    last = perturbed or path
-    length = (
-        period if cycle is not None and perturbed is None else float(np.ptp(last.t))
-    )
-    pace, note = _pace(length, unit, speed)
-    times = np.linspace(0, length, max(12, round(length / pace * rate)), endpoint=False)
-    begin = last.t[0] + times
-    tracks = [Track("cycle" if perturbed else "", CYCLE[0], path, begin, period)]
-    if perturbed is not None:
-        tracks.append(Track("perturbed", COLORS["red"], perturbed, begin))
+
+def _film(
+    motion: LimitCycle | Trajectory,
+    beside: Trajectory | None,
+    sections: PlacedSections | None,
+    plane: tuple[str, str] | None,
+    names: Sequence[str],
+    speed: float | None,
+) -> Motion:
+    """The animation, of which each panel gives the parts that move."""
+    s = motion.structure
+    has_picture = drawing_of(s, 0) is not None
+    tracks, pace, note = _tracks(motion, beside, speed)
     events = [track.events(0.2 * pace) for track in tracks]
     with style():
         figure, grid = _sheet()
-        cells = (grid[1, 0] if has_picture else grid[:, 0]).subgridspec(
-            len(names), 1, hspace=0.05
-        )
-        axes = [figure.add_subplot(cells[i]) for i in range(len(names))]
+        cells = grid[1, 0] if has_picture else grid[:, 0]
+        axes = _column(figure, cells, len(names))
         parts = _traces(axes, tracks, names, events)
         axes[0].set_title(note, loc="right")
         if has_picture:
             cells = grid[0, 0].subgridspec(1, len(tracks))
             for i, track in enumerate(tracks):
                 parts += _picture(figure.add_subplot(cells[i]), track)
-        has_circle = cycle is not None and len(cycle.multipliers) > 0
+        multipliers = getattr(motion, "multipliers", ())
+        has_circle = len(multipliers) > 0
         if plane is not None:
             panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
-            if cycle is not None:
-                draw_cycle(
-                    cycle, *plane, sections=sections, perturbed=perturbed, ax=panel
-                )
-                panel.legend([], [])
+            _draw_orbit(panel, motion, plane, sections, beside)
             parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
-            panel = figure.add_subplot(grid[1, 1])
-            draw_multipliers(cycle, zoom=False, ax=panel)
-            # (A formula as a label would take a twentieth of a second.)
-            panel.set(
-                xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="Re λ", ylabel="Im λ"
-            )
+            _unit_circle(figure.add_subplot(grid[1, 1]), multipliers)
+        times = tracks[0].times - tracks[0].times[0]
+        interval = (times[1] - times[0]) / pace
         title = f"motion of {type(s.system).__name__}"
-        return Motion(figure, parts, times, length / pace / len(times), title)
+        return Motion(figure, parts, times, interval, title)
+
+
+def _default_traces(s: Structure, plane: tuple[str, str] | None) -> Sequence[str]:
+    """The first state of the plane beside a picture, up to four states without one."""
+    if drawing_of(s, 0) is None:
+        return s.state_names()[:4]
+    return (plane or s.states_everywhere())[:1]
+
+
+def _motions(
+    motion: Any, sections: Any, perturbed: Any
+) -> tuple[LimitCycle | Trajectory, Trajectory | None]:
+    """The motion to animate, a cycle as a whole, and the one beside it."""
+    is_cycle = isinstance(motion, LimitCycle)
+    if is_cycle:
+        motion.require_found()
+    beside = _beside(motion, sections, perturbed)
+    is_alone = sections is None and beside is None
+    if not is_alone and not is_cycle:
+        raise DefinitionError(
+            "`sections` and `perturbed` are for limit cycles: animate the cycle."
+        )
+    if is_alone and is_cycle:
+        motion = _both_halves(motion)
+    return motion, beside
+
+
+def _beside(motion: Any, sections: Any, perturbed: Any) -> Trajectory | None:
+    """The motion beside a cycle: of data, that under the first inputs, for four periods."""
+    if not isinstance(perturbed, ExperimentData):
+        return perturbed
+    if sections is None or not isinstance(motion, LimitCycle):
+        raise DefinitionError(
+            "data of experiments need a limit cycle and their `sections`."
+        )
+    # (To import it takes a thirtieth of a second.)
+    from ..experiments.motion import perturbed_trajectory
+
+    return perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
+
+
+def _tracks(
+    motion: LimitCycle | Trajectory, beside: Trajectory | None, speed: float | None
+) -> tuple[list[Track], float, str]:
+    """What is animated, units of the system's time in a second of playback, and a note on it."""
+    if isinstance(motion, LimitCycle):
+        path = motion.trajectory()
+        period = float(motion.period)
+    else:
+        path = motion
+        period = math.inf
+    longest = beside or path
+    length = float(np.ptp(longest.t))
+    if beside is None:
+        length = min(length, period)
+    pace, note = _pace(length, motion.system.time_unit, speed)
+    count = max(12, round(length / pace * _RATE))
+    times = longest.t[0] + np.linspace(0, length, count, endpoint=False)
+    title = "" if beside is None else "cycle"
+    tracks = [Track(title, CYCLE[0], path, times, period)]
+    if beside is not None:
+        tracks.append(Track("perturbed", COLORS["red"], beside, times))
+    return tracks, pace, note
+
+
+def _column(figure: Figure, cell: Any, count: int) -> list[Axes]:
+    """So many Axes one above the other."""
+    cells = cell.subgridspec(count, 1, hspace=0.05)
+    return [figure.add_subplot(cells[i]) for i in range(count)]
+
+
+def _draw_orbit(ax: Axes, motion: Any, plane, sections, beside) -> None:
+    """The orbit of a limit cycle, with its events and sections, but without a legend."""
+    if isinstance(motion, LimitCycle):
+        draw_cycle(motion, *plane, sections=sections, perturbed=beside, ax=ax)
+        ax.legend([], [])
+
+
+def _unit_circle(ax: Axes, multipliers: Any) -> None:
+    """The multipliers. (A formula as a label would take a twentieth of a second.)"""
+    draw_multipliers(multipliers, zoom=False, ax=ax)
+    ticks = [-1, 0, 1]
+    ax.set(xticks=ticks, yticks=ticks, xlabel="Re λ", ylabel="Im λ")
 
 
 def _both_halves(cycle: LimitCycle) -> LimitCycle:
     """The cycle of the system itself, where a `Quotient` with `half_period` has a half of it."""
-    s, anchor = cycle.structure, to_host(cycle.anchor)
+    s = cycle.structure
+    anchor = to_host(cycle.anchor)
     a = int(anchor.chart[0])
     at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
     whole = cycle.system.whole(at) if isinstance(cycle.system, Quotient) else None
@@ -285,79 +350,95 @@ def _both_halves(cycle: LimitCycle) -> LimitCycle:
 def _sheet() -> tuple[Figure, Any]:
     """A figure and its cells, at fixed places, so that labels find theirs before it is drawn."""
     figure = pyplot.figure(figsize=(5.6, 3.6), dpi=86)
-    borders: dict[str, float] = {
-        "left": 0.13,
-        "right": 0.98,
-        "bottom": 0.11,
-        "top": 0.93,
-    }
-    ratios: Any = {"width_ratios": (1.15, 1), "height_ratios": (1.4, 1)}
-    return figure, figure.add_gridspec(
-        2, 2, **borders, **ratios, wspace=0.3, hspace=0.3
+    grid = figure.add_gridspec(
+        2,
+        2,
+        left=0.13,
+        right=0.98,
+        bottom=0.11,
+        top=0.93,
+        width_ratios=(1.15, 1),
+        height_ratios=(1.4, 1),
+        wspace=0.3,
+        hspace=0.3,
     )
+    return figure, grid
 
 
 def _pace(length: float, unit: str, speed: float | None) -> tuple[float, str]:
     """Units of the system's time in a second of playback, and a note if that is not real speed."""
-    pace, real = length / 2 * (speed or 1.0), length * SECONDS.get(unit, 0.0)
-    if real and (speed is not None or 0.25 <= real <= 20):
+    pace = length / 2 * (speed or 1.0)
+    seconds = length * SECONDS.get(unit, 0.0)
+    if seconds and (speed is not None or 0.25 <= seconds <= 20):
         pace = (speed or 1.0) / SECONDS[unit]
-    share = pace / length * real
-    return pace, f"{share:.2g} x real speed" if real and abs(share - 1) > 1e-9 else ""
+    share = pace / length * seconds
+    if not seconds or abs(share - 1) <= 1e-9:
+        return pace, ""
+    return pace, f"{share:.2g} x real speed"
 
 
 def _picture(ax: Axes, track: Track) -> list[Part]:
     """The mechanism."""
-    pictures, at = Pictures(track.trajectory, track.period), track.wrapped(track.times)
-    scenes, size = pictures.at(at), float(max(*(pictures.high - pictures.low), 1e-9))
+    pictures = Pictures(track.trajectory, track.period)
+    at = track.wrapped(track.times)
+    scenes = pictures.at(at)
+    size = float(max((pictures.high - pictures.low).max(), 1e-9))
     ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
     ax.autoscale_view()
     ax.set(
-        xticks=[], yticks=[], aspect="equal", adjustable="datalim", title=track.title
+        xticks=[],
+        yticks=[],
+        aspect="equal",
+        adjustable="datalim",
+        title=track.title,
     )
     ax.spines[:].set_visible(False)
-    (dots,), nowhere = ax.plot([], [], "ko", ms=2.5, zorder=5), np.full(3, np.nan)
-    points = [np.stack([nowhere[:2], *x.points.values()]).T for x in scenes]
+    (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
+    points = [np.array([_NOWHERE[:2], *x.points.values()]).T for x in scenes]
     parts: list[Part] = [(dots, dots.set_data, points)]
     colors = itertools.cycle(CYCLE[: 3 if len(scenes[0].lines) <= 4 else 1])
-    for name in dict.fromkeys(name for x in scenes for name in x.lines):
-        lines, look = [x.lines.get(name, nowhere[None, :2]) for x in scenes], _GROUND
+    for name in dict.fromkeys(itertools.chain(*(x.lines for x in scenes))):
+        lines = [x.lines.get(name, _NOWHERE[None, :2]) for x in scenes]
         if name == "ground":
             lines = [to_borders(line, size) for line in lines]
-            (marks,) = ax.plot(
-                [], [], ls="", marker=[(0, 0), (-3, -4)], ms=8, **_GROUND
-            )
-            parts.append((marks, marks.set_data, _marks(lines, pictures, at, size)))
+            marks = _marks(lines, pictures, at, size)
+            parts.append(_shape(ax, marks, ls="", **_MARKS, **_GROUND))
+            parts.append(_shape(ax, [line.T for line in lines], **_GROUND))
         else:
-            look = {
-                "color": next(colors),
-                "lw": 1.6,
-                "zorder": 3,
-                "solid_joinstyle": "round",
-            }
-        (shape,) = ax.plot([], [], **look)
-        parts.append((shape, shape.set_data, [line.T for line in lines]))
-    for name in dict.fromkeys(name for x in scenes for name in x.circles):
+            shapes = [line.T for line in lines]
+            parts.append(_shape(ax, shapes, color=next(colors), **_LINK))
+    for name in dict.fromkeys(itertools.chain(*(x.circles for x in scenes))):
         circle = ax.add_patch(Circle((0, 0), 1, fc=BODY, ec="black", lw=0.8, zorder=4))
-        about = [x.circles.get(name, nowhere) for x in scenes]
-        parts.append(
-            (circle, circle.update, [{"center": x[:2], "radius": x[2]} for x in about])
-        )
+        places = []
+        for x in scenes:
+            *center, radius = x.circles.get(name, _NOWHERE)
+            places.append({"center": center, "radius": radius})
+        parts.append((circle, circle.update, places))
     return parts
+
+
+_NOWHERE = np.full(3, np.nan)
+
+
+def _shape(ax: Axes, places: Sequence[Any] | np.ndarray, **look: Any) -> Part:
+    """A line that has other places (2, n) in each frame."""
+    (line,) = ax.plot([], [], **look)
+    return line, line.set_data, places
 
 
 def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray, "k 2"]:
     """A line with its ends beyond the borders of a picture of this size."""
-    first, last = line[0] - line[1], line[-1] - line[-2]
-    ends = [
-        x + 5 * size * way / np.hypot(*way)
-        for x, way in ((line[0], first), (line[-1], last))
-    ]
-    return np.vstack([ends[0], line[1:-1], ends[1]])
+    ways = line[[0, -1]] - line[[1, -2]]
+    lengths = np.linalg.norm(ways, axis=1, keepdims=True)
+    begin, end = line[[0, -1]] + 5 * size * ways / lengths
+    return np.vstack([begin, line[1:-1], end])
 
 
 def _marks(
-    lines, pictures: Pictures, at, size: float
+    lines,
+    pictures: Pictures,
+    at,
+    size: float,
 ) -> list[Float[np.ndarray, "2 n"]]:
     """Places on the ground, at equal distances from one that moves with it."""
     stride = abs(float(pictures.stride[0]))
@@ -370,23 +451,24 @@ def _marks(
 
 
 def _traces(
-    axes: list[Axes], tracks: list[Track], names: Sequence[str], events
+    axes: list[Axes],
+    tracks: list[Track],
+    names: Sequence[str],
+    events,
 ) -> list[Part]:
     """Signals over time, where they are now, and the names of events."""
-    times, unit = (
-        tracks[0].times - tracks[0].times[0],
-        tracks[0].trajectory.system.time_unit,
-    )
+    times = tracks[0].times - tracks[0].times[0]
+    unit = tracks[0].trajectory.system.time_unit
     fine = np.linspace(0, 2 * times[-1] - times[-2], 2000, endpoint=False)
     for track in tracks:
-        for ax, values in zip(
-            axes, track.observed(names, track.times[0] + fine), strict=True
-        ):
+        signals = track.observed(names, track.times[0] + fine)
+        for ax, values in zip(axes, signals, strict=True):
             ax.plot(fine, values, color=track.color, lw=0.9)
     text = axes[0].set_title("", loc="left", color=COLORS["red"])
-    texts = [
-        ", ".join(dict.fromkeys(itertools.chain(*x))) for x in zip(*events, strict=True)
-    ]
+    texts = []
+    for together in zip(*events, strict=True):
+        distinct = dict.fromkeys(itertools.chain(*together))
+        texts.append(", ".join(distinct))
     parts: list[Part] = [(text, text.set_text, texts)]
     for ax, name in zip(axes, names, strict=True):
         ax.set(ylabel=axis_of(name))
@@ -403,36 +485,40 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
     """Dots that move along the orbit, rings at events, and the section that was passed last."""
     ax.set(xlabel=axis_of(plane[0]), ylabel=axis_of(plane[1]))
     ax.locator_params(nbins=5)
-    marks, ring = list[tuple](), {"mfc": "none", "mew": 1.5, "zorder": 7}
+    parts = list[Part]()
+    ring: Any = {"mfc": "none", "mew": 1.5, "zorder": 7}
+
+    def mark(points: Float[np.ndarray, "n 2"], **look: Any) -> None:
+        parts.append(_shape(ax, points[..., None], ls="", marker="o", **look))
+
     for track, names in zip(tracks, events, strict=True):
         if np.isinf(track.period) and len(tracks) == 1:
             for line in by_chart(track.trajectory, *plane).values():
                 ax.plot(*line, color=track.color, lw=0.6, zorder=1)
         points = track.observed(plane, track.times).T
-        marks.append(
-            (points, {"ms": 6, "mfc": track.color, "mec": "white", "zorder": 8})
-        )
-        rings = np.where([[bool(x)] for x in names], points, np.nan)
-        marks.append((rings, {"ms": 13, "mec": track.color, **ring}))
+        mark(points, ms=6, mfc=track.color, mec="white", zorder=8)
+        at_event = np.array([len(x) > 0 for x in names])
+        rings = np.where(at_event[:, None], points, np.nan)
+        mark(rings, ms=13, mec=track.color, **ring)
     if sections is not None:
-        ago = np.mod(tracks[0].times[:, None] - sections.lanes.t, tracks[0].period)
+        cycle = tracks[0]
+        ago = np.mod(cycle.times[:, None] - sections.lanes.t, cycle.period)
         passed = sections.observe(plane)[ago.argmin(axis=1)]
-        marks.append((passed, {"ms": 9, "mec": COLORS["green"], **ring}))
-    lines = [ax.plot([], [], "o", **look)[0] for _, look in marks]
-    return [
-        (x, x.set_data, p[..., None]) for x, (p, _) in zip(lines, marks, strict=True)
-    ]
+        mark(passed, ms=9, mec=COLORS["green"], **ring)
+    return parts
 
 
 def portrait(
-    above: Axes, below: Axes, s: Structure, plane: tuple[str, str]
+    above: Axes,
+    below: Axes,
+    s: Structure,
+    plane: tuple[str, str],
 ) -> Portrait:
     """A function that draws a cycle anew in the same Axes: its orbit, colored by chart, dashed if
     it is unstable, its events, and its multipliers."""
-    colors = zip(itertools.cycle(CHARTS), s.names, strict=False)
-    orbits = [
-        above.plot([], [], color=color, lw=1.8, label=name)[0] for color, name in colors
-    ]
+    orbits = []
+    for color, name in zip(itertools.cycle(CHARTS), s.names, strict=False):
+        orbits += above.plot([], [], color=color, lw=1.8, label=name)
     (marks,) = above.plot([], [], "ko", ms=4, zorder=5)
     about: Any = {"xytext": (4, 5), "textcoords": "offset points", "zorder": 6}
     notes = [above.annotate(x.name, (0, 0), **about) for x in s.transitions]
@@ -453,14 +539,11 @@ def portrait(
         curve = np.array(path(*plane)[1:])
         center = (np.nanmin(curve, axis=1) + np.nanmax(curve, axis=1)) / 2
         for g, end in zip(events, ends, strict=True):
-            x, y = np.where(
-                center > end, 5, -5
-            )  # the name stands on the side of the center
-            sides = {
-                "ha": "left" if x > 0 else "right",
-                "va": "bottom" if y > 0 else "top",
-            }
-            notes[g].set(position=(x, y), **sides)
+            # (The name stands on the side of the center.)
+            x, y = np.where(center > end, 5, -5)
+            notes[g].set_position((x, y))
+            notes[g].set_ha("left" if x > 0 else "right")
+            notes[g].set_va("bottom" if y > 0 else "top")
             notes[g].xy = end
         points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
         return [*orbits, marks, *notes, points]
@@ -481,36 +564,31 @@ def widened(ax: Axes) -> bool:
 def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) -> Motion:
     """At most 100 cycles of a branch, one after the other."""
     rows = np.unique(np.linspace(0, len(branch) - 1, 100).round().astype(int))
-    cycles, values = [branch[int(k)] for k in rows], branch.values[rows]
+    cycles = [branch[int(k)] for k in rows]
+    values = branch.values[rows]
     plane = plane_of(cycles[0].structure, x, y)
     with style():
         figure, grid = _sheet()
-        left, above, below = (
-            figure.add_subplot(x) for x in (grid[:, 0], grid[0, 1], grid[1, 1])
-        )
+        left = figure.add_subplot(grid[:, 0])
+        above = figure.add_subplot(grid[0, 1])
+        below = figure.add_subplot(grid[1, 1])
         draw_branch(branch, output=plane[0], ax=left)
         left.legend()
         cursor = left.axvline(values[0], color="black", lw=0.8)
         draw_cycle = portrait(above, below, cycles[0].structure, plane)
-        for cycle in cycles:
-            above.plot(
-                *cycle.trajectory()(*plane)[1:], color=COLORS["gray"], lw=0.3, alpha=0.3
-            )
+        texts = []
+        for value, cycle in zip(values, cycles, strict=True):
+            _, *orbit = cycle.trajectory()(*plane)
+            above.plot(*orbit, color=COLORS["gray"], lw=0.3, alpha=0.3)
             moved = draw_cycle(cycle)
             widened(below)
-        text = above.set_title("", loc="left")
-        unstable = ["" if x.stable else ", unstable" for x in cycles]
-        texts = [
-            f"{branch.parameter} = {x:.4g}{y}"
-            for x, y in zip(values, unstable, strict=True)
-        ]
+            text = f"{branch.parameter} = {value:.4g}"
+            texts.append(text if cycle.stable else f"{text}, unstable")
+        head = above.set_title("", loc="left")
         parts: list[Part] = [(x, lambda _: None, values) for x in moved]
-        parts += [
-            (text, text.set_text, texts),
-            (cursor, cursor.set_xdata, values[:, None]),
-        ]
+        parts.append((head, head.set_text, texts))
+        parts.append((cursor, cursor.set_xdata, values[:, None]))
         parts.append((moved[0], draw_cycle, cycles))
         interval = max(interval, 4 / len(values))
-        return Motion(
-            figure, parts, values, interval, f"branch along {branch.parameter}"
-        )
+        title = f"branch along {branch.parameter}"
+        return Motion(figure, parts, values, interval, title)

@@ -77,19 +77,10 @@ def cycle(
         look = {"lw": 1.8, "zorder": 3, "solid_capstyle": "butt"}
         for a, line in by_chart(orbit, x, y).items():
             panel.plot(*line, color=CHARTS[a % len(CHARTS)], label=s.names[a], **look)
-        t, px, py = orbit(x, y)
-        center = np.array([(np.nanmin(v) + np.nanmax(v)) / 2 for v in (px, py)])
-        # An arrow of the direction, in the middle of the longest time without events.
-        ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])
-        k = int(
-            np.searchsorted(
-                t, (ends[:-1] + np.diff(ends) / 2)[np.argmax(np.diff(ends))]
-            )
-        )
-        arrow = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
-        panel.annotate(
-            "", (px[k + 1], py[k + 1]), (px[k], py[k]), arrowprops=arrow, zorder=6
-        )
+        t, *curve = orbit(x, y)
+        points = np.stack(curve, axis=1)
+        center = (np.nanmin(points, axis=0) + np.nanmax(points, axis=0)) / 2
+        _arrow(panel, orbit, t, points)
         panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
         panel.locator_params(axis="x", nbins=6)
@@ -97,13 +88,37 @@ def cycle(
             _sections(panel, s, sections, (x, y), center)
         if perturbed is not None:
             panel.plot(
-                [], [], "s-", ms=3.5, lw=0.7, color=COLORS["red"], label="perturbed"
+                [],
+                [],
+                "s-",
+                ms=3.5,
+                lw=0.7,
+                color=COLORS["red"],
+                label="perturbed",
             )
         panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
         panel.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=4,
+            columnspacing=1.2,
         )
     return Plot(axes)
+
+
+def _arrow(
+    ax: Axes,
+    orbit: Trajectory,
+    t: np.ndarray,
+    points: Float[np.ndarray, "p 2"],
+) -> None:
+    """An arrow of the direction, in the middle of the longest time without events."""
+    ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])
+    durations = np.diff(ends)
+    longest = np.argmax(durations)
+    k = int(np.searchsorted(t, ends[longest] + durations[longest] / 2))
+    look = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
+    ax.annotate("", points[k + 1], points[k], arrowprops=look, zorder=6)
 
 
 def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
@@ -149,7 +164,8 @@ def at_events(
     path: Trajectory, *names: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transitions (e,) of the events, and the points (e, n) before and after each."""
-    rows, s = np.flatnonzero(path.event >= 0), path.structure
+    rows = np.flatnonzero(path.event >= 0)
+    s = path.structure
     before = observed(s, names, path.t[rows], path.chart[rows - 1], path.before[rows]).T
     after = observed(s, names, path.t[rows], path.chart[rows], path.after[rows]).T
     return path.event[rows], before, after
@@ -162,13 +178,8 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not np.all(np.isfinite([before, after])):
             continue
         if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
-            ax.plot(
-                *np.stack([before, after], axis=1),
-                "--",
-                color="black",
-                lw=0.8,
-                zorder=2,
-            )
+            reset = np.stack([before, after], axis=1)
+            ax.plot(*reset, "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
         ax.plot(*before, "o", ms=4, color="black", zorder=5)
         if not any(name in there for there in texts.values()):
@@ -182,7 +193,7 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
 def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn,
     to which its own are added."""
-    note = ax.annotate(
+    note: Any = ax.annotate(
         text,
         point,
         xytext=(0, 0),
@@ -194,28 +205,34 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     inwards = np.arctan2(*(to - at)[::-1])
 
     def covered(turn: float) -> int:
-        x, y = np.cos(inwards + turn), np.sin(inwards + turn)
-        note.set(
-            position=(9 * x, 9 * y),
-            ha="left" if x > 0.35 else "right" if x < -0.35 else "center",
-            va="bottom" if y > 0.35 else "top" if y < -0.35 else "center",
-        )
+        x = np.cos(inwards + turn)
+        y = np.sin(inwards + turn)
+        note.set_position((9 * x, 9 * y))
+        note.set_ha(_side(x, "right", "left"))
+        note.set_va(_side(y, "top", "bottom"))
         box = note.get_window_extent()
-        outside = 4 - ax.bbox.count_contains(
-            box.corners()
-        )  # a corner counts as 20 points
+        # (A corner outside of the picture counts as 20 points.)
+        outside = 4 - ax.bbox.count_contains(box.corners())
         return 20 * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
     box = note.get_window_extent()
-    drawn += [(x, y) for x in np.linspace(box.x0, box.x1, 20) for y in (box.y0, box.y1)]
+    for x in np.linspace(box.x0, box.x1, 20):
+        drawn += [(x, box.y0), (x, box.y1)]
+
+
+def _side(x: float, below: Any, above: Any) -> Any:
+    """How a text is aligned that lies in the direction x from its point."""
+    if abs(x) <= 0.35:
+        return "center"
+    return above if x > 0 else below
 
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:
-    figure: Any = ax.get_figure(root=True)
-    width, height = ax.get_position().size * figure.get_size_inches()
+    width, height = ax.get_window_extent().size
     unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
-    bars, step = [], max(1, round(placed.n_sections / 8))
+    bars = []
+    step = max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
         bars += [point - _BAR * along, point + _BAR * along, (np.nan, np.nan)]
         if i % step == 0:  # at the end of the bar that is outside of the loop
@@ -229,27 +246,35 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
 def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tuple]:
     """Yield the point of the cycle at each section, and a step of length 1 on the page along the
     section, in the units of the axes."""
-    lanes, normals = placed.lanes, np.asarray(placed.normal)
-    charts, times, states = (np.asarray(v) for v in (lanes.chart, lanes.t, lanes.q))
-    points, rates = np.empty((2, len(charts), 2))
+    lanes = placed.lanes
+    charts = np.asarray(lanes.chart)
+    times = np.asarray(lanes.t)
+    states = np.asarray(lanes.q)
+    points = np.empty((len(charts), 2))
+    rates = np.empty((len(charts), 2))
     items = tuple(s.resolve_outputs(names).items)
     for a in np.unique(charts).tolist():
         mask = charts == a
         at = times[mask], states[: s.dims[a], mask], np.zeros((s.nu, 1))
         flow = kernels.field(s, a, *at)[:, 0]
-        points[mask], by_time, *by_state = kernels.outputs(s, a, items, *at).transpose(
-            1, 2, 0
-        )
-        rates[mask] = by_time + sum(
-            x * f[:, None] for x, f in zip(by_state, flow, strict=False)
-        )
-    for a, normal, point, rate in zip(charts, normals, points, rates, strict=True):
-        states = s.charts[a].states
-        inside = [1 + states.index(name) for name in names if name in states]
-        beyond = np.delete(normal, inside)
-        curve = (
-            len(inside) == 2 and np.any(normal) and not np.any(np.abs(beyond) > 1e-12)
-        )
-        x, y = normal[inside] * unit if curve else rate / unit
-        step = np.array([-y, x])
-        yield point, unit * step / (np.linalg.norm(step) or 1.0)
+        values = kernels.outputs(s, a, items, *at)
+        points[mask], by_time, *by_state = values.transpose(1, 2, 0)
+        rates[mask] = by_time
+        for slope, rate in zip(by_state, flow, strict=False):
+            rates[mask] += slope * rate[:, None]
+    for k, normal in enumerate(np.asarray(placed.normal)):
+        across = rates[k] / unit
+        curve = _normal_in_plane(normal, s.charts[charts[k]].states, names)
+        if curve is not None:
+            across = curve * unit
+        along = np.array([-across[1], across[0]])
+        yield points[k], unit * along / (np.linalg.norm(along) or 1.0)
+
+
+def _normal_in_plane(normal: np.ndarray, states: Any, names: Any) -> np.ndarray | None:
+    """The normal of a section that is a curve in the plane of two states; None for others."""
+    inside = [1 + states.index(name) for name in names if name in states]
+    beyond = np.delete(normal, inside)
+    if len(inside) < 2 or not normal.any() or np.abs(beyond).max(initial=0.0) > 1e-12:
+        return None
+    return normal[inside]

@@ -49,7 +49,8 @@ def branch(
             f"branches in one figure need one parameter, not {sorted(names)}."
         )
     with panels(ax) as axes:
-        panel, shown = axes[0, 0], set()
+        panel = axes[0, 0]
+        shown = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
             first = b[0].structure.charts[int(b[0].anchor.chart[0])].states[0]
             name = first if output is None else output
@@ -81,7 +82,10 @@ def branch(
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
         panel.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=4,
+            columnspacing=1.2,
         )
     return Plot(axes)
 

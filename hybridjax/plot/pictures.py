@@ -28,29 +28,23 @@ class Pictures:
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
         place = np.array([drawing.place for drawing in drawings])
-        self._t, self._velocity = (
-            t,
-            np.array([drawing.velocity for drawing in drawings]),
-        )
+        self._t = t
+        self._velocity = np.array([drawing.velocity for drawing in drawings])
         # Over an event the body stays; between events the origin moves by its velocity.
-        moves = 0.5 * (self._velocity[1:] + self._velocity[:-1]) * np.diff(t)[:, None]
-        moves = np.where((np.diff(t) == 0)[:, None], place[:-1] - place[1:], moves)
+        durations = np.diff(t)[:, None]
+        mean_velocity = (self._velocity[1:] + self._velocity[:-1]) / 2
+        jumps = place[:-1] - place[1:]
+        moves = np.where(durations == 0, jumps, mean_velocity * durations)
         self._origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
-        self.period = min(period, t[-1] - t[0])
-        self.stride = self._origin[-1] + self._velocity[-1] * (
-            self.period - (t[-1] - t[0])
-        )
+        length = t[-1] - t[0]
+        self.period = min(period, length)
+        self.stride = self._origin[-1] + self._velocity[-1] * (self.period - length)
         if np.isinf(period):
             self.stride += place[-1] - place[0]
-        places: list[Any] = []  # between which pictures lie, without their ground
-        for x in self._seen(t, self._origin, drawings):
-            places += [line for name, line in x.lines.items() if name != "ground"]
-            places += [
-                z[:2] + side * z[2] for z in x.circles.values() for side in (-1, 1)
-            ]
-            places += x.points.values()
-        corners = np.vstack(places)
-        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
+        scenes = self._seen(t, self._origin, drawings)
+        corners = np.vstack([_corners(x) for x in scenes])
+        self.low = corners.min(axis=0)
+        self.high = corners.max(axis=0)
 
     def at(self, t: Float[np.ndarray, " n"]) -> list[Drawing]:
         """The pictures at times of the trajectory."""
@@ -65,10 +59,21 @@ class Pictures:
 
     def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
         ways = np.pad(origin - self.camera(t), ((0, 0), (0, 1)))  # (a radius stays)
-        return [
-            jax.tree_util.tree_map(lambda x, way=way: x + way[: x.shape[-1]], drawing)
-            for drawing, way in zip(drawings, ways, strict=True)
-        ]
+        return list(map(_moved, drawings, ways))
+
+
+def _moved(drawing: Drawing, way: Float[np.ndarray, "3"]) -> Drawing:
+    return jax.tree_util.tree_map(lambda x: x + way[: x.shape[-1]], drawing)
+
+
+def _corners(scene: Drawing) -> Float[np.ndarray, "k 2"]:
+    """Places between which a picture lies, without its ground."""
+    places = [line for name, line in scene.lines.items() if name != "ground"]
+    for circle in scene.circles.values():
+        center = circle[:2]
+        radius = circle[2]
+        places += [center - radius, center + radius]
+    return np.vstack([*places, *scene.points.values()])
 
 
 def drawn(
@@ -85,11 +90,10 @@ def drawn(
         leaves, form = jax.tree_util.tree_flatten(drawing_of(s, a))
         program = s.kernel(_flat, by_lane, a, code, lanes=4)
         values = program(t[rows], q[rows, : s.dims[a]].T)
-        parts = np.split(values.T, np.cumsum([x.size for x in leaves])[:-1], axis=1)
-        for k, row in enumerate(rows):
-            shapes = [
-                part[k].reshape(x.shape) for part, x in zip(parts, leaves, strict=True)
-            ]
+        ends = np.cumsum([x.size for x in leaves])
+        for row, numbers in zip(rows, values.T, strict=True):
+            parts = np.split(numbers, ends[:-1])
+            shapes = [x.reshape(y.shape) for x, y in zip(parts, leaves, strict=True)]
             drawings[row] = jax.tree_util.tree_unflatten(form, shapes)
     return drawings
 
@@ -101,11 +105,13 @@ def drawing_of(s: Structure, a: int) -> Any:
     """
     point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
     with evaluating(f"method `draw(self, chart, t, q)` of {type(s.system).__name__}"):
-        shapes = lambda: jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)  # noqa: E731
+
+        def shapes():
+            return jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)
+
         return s.once(("drawing", a), (), shapes)
 
 
 def _flat(a: int, code: str, s: Structure, t, q):
-    return jnp.concatenate(
-        [jnp.ravel(x) for x in jax.tree_util.tree_leaves(s.drawing(a, t, q))]
-    )
+    shapes = jax.tree_util.tree_leaves(s.drawing(a, t, q))
+    return jnp.concatenate([jnp.ravel(x) for x in shapes])

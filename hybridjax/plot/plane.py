@@ -1,7 +1,7 @@
 """Floquet multipliers, poles and zeros in the complex plane."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -54,38 +54,54 @@ def multipliers(
         raise DefinitionError("`true` holds no multiplier to draw.")
     series = _series(estimates or {})
     cross: dict[str, Any] = {"marker": "+", "ms": 9, "mew": 1.2, "color": "black"}
-    drawn = [(reference, reference, true, cross)]
+    markers = [_Markers(reference, true, cross)]
     for k, (label, z) in enumerate(series.items()):
-        marker, color = _MARKERS[k % len(_MARKERS)], CYCLE[k % len(CYCLE)]
-        text = rf"{label}: $|\Delta\lambda|$ = {compare_multipliers(z, true).max_error:.1e}"
-        line = {"marker": marker, "ms": 5, "mew": 1.0, "color": color, "mfc": "none"}
-        drawn.append((label, text, z, line))
+        error = compare_multipliers(z, true).max_error
+        look = {
+            "marker": _MARKERS[k % len(_MARKERS)],
+            "color": CYCLE[k % len(CYCLE)],
+            "label": rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
+        }
+        markers.append(_Markers(label, z, {"ms": 5, "mew": 1.0, "mfc": "none", **look}))
     with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
         panel = axes[0, 0]
         _unit_circle(panel)
-        far = 1.1 * max([1.0, *(np.abs(z).max() for z in (true, *series.values()))])
+        farthest = max(np.abs(x.values).max() for x in markers)
+        far = 1.1 * max(1.0, farthest)
         panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
         panel.locator_params(nbins=5)
-        inset = (
-            _zoom(panel, true, series, borders)
-            if zoom and (series or borders)
-            else None
-        )
-        for box in filter(None, (panel, inset)):
-            for label, text, z, line in drawn:
-                box.plot(np.real(z), np.imag(z), ls="", label=text, **line)
-                for border in borders.get(label, ()):
-                    # Of a real multiplier it is an interval, whose ends would not be seen.
-                    x, y = np.real(border), np.imag(border)
-                    ends = [] if np.ptp(y) else [int(x.argmin()), int(x.argmax())]
-                    edge = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
-                    box.plot(x, y, color=line["color"], **edge)
+        boxes = [panel]
+        if zoom and (series or borders):
+            boxes += _zoom(panel, true, series, borders)
+        for box in boxes:
+            for x in markers:
+                x.draw(box, borders.get(x.label, []))
         _complex_axes(panel, r"\lambda")
         if ax is None and series:
             legend(panel, "lower center")
         elif series:
             panel.legend()
     return Plot(axes)
+
+
+class _Markers(NamedTuple):
+    """Multipliers with the label of their source, and how they look."""
+
+    label: str
+    values: np.ndarray
+    look: dict[str, Any]
+
+    def draw(self, ax: Axes, borders: list[np.ndarray]) -> None:
+        """Draw them, with the borders of their confidence regions."""
+        look = {"label": self.label, **self.look}
+        ax.plot(self.values.real, self.values.imag, ls="", **look)
+        for border in borders:
+            # Of a real multiplier it is an interval, whose ends would not be seen.
+            ends = []
+            if np.ptp(border.imag) == 0:
+                ends = [int(border.real.argmin()), int(border.real.argmax())]
+            edge: Any = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
+            ax.plot(border.real, border.imag, color=look["color"], **edge)
 
 
 @checked
@@ -104,7 +120,8 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
         raise DefinitionError(
             "`fits` must hold one or more fits with the same outputs and N."
         )
-    outputs, N = (first := next(iter(fits.values()))).outputs, first.n_sections
+    first = next(iter(fits.values()))
+    outputs = first.outputs
     width = COLUMN if len(outputs) == 1 else PAGE
     with panels(ax, 2, len(outputs), width=width, height=4.0) as axes:
         for i, output in enumerate(outputs):
@@ -113,33 +130,29 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
                 _unit_circle(panel)
                 for k, (family, fit) in enumerate(fits.items()):
                     # Equal ones stay visible: each family is smaller than the one before.
-                    line = {
-                        "ls": "",
-                        "mfc": "none",
-                        "ms": 8 - 2.5 * (k % 3),
-                        "mew": 1.0,
-                    }
-                    line["color"] = CYCLE[k % len(CYCLE)]
-                    p, z = fit.poles[i], fit.zeros[i]
-                    panel.plot(
-                        p.real, p.imag, marker="x", label=f"poles, {family}", **line
-                    )
-                    panel.plot(
-                        z.real, z.imag, marker="o", label=f"zeros, {family}", **line
-                    )
+                    size = 8 - 2.5 * (k % 3)
+                    look = {"color": CYCLE[k % len(CYCLE)], "ms": size, "mew": 1.0}
+                    for name, z, marker in (
+                        ("poles", fit.poles[i], "x"),
+                        ("zeros", fit.zeros[i], "o"),
+                    ):
+                        look["marker"] = marker
+                        look["label"] = f"{name}, {family}"
+                        panel.plot(z.real, z.imag, ls="", mfc="none", **look)
             poles = np.concatenate([fit.poles[i] for fit in fits.values()])
             center = np.real(poles).mean()
             reach = 1.5 * np.abs(poles - center).max() or 1.0
             lower.set(xlim=(center - reach, center + reach), ylim=(-reach, reach))
             upper.set_aspect("equal", adjustable="datalim")
-            (x0, x1), (y0, y1) = lower.get_xlim(), lower.get_ylim()
+            (x0, x1) = lower.get_xlim()
+            (y0, y1) = lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
             upper.set_title(output)
             lower.set_title("enlarged: around the poles")
             _complex_axes(lower, "z")
             _complex_axes(upper, "z")
             lower.set_xlabel(
-                rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{N}}}$)"
+                rf"{lower.get_xlabel()}  (multipliers $\lambda = z^{{{first.n_sections}}}$)"
             )
         legend(axes[0, 0], "upper center", ncols=4 if len(outputs) > 1 else 2)
         letters(axes)
@@ -165,36 +178,40 @@ def _series(estimates: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def _borders(estimates: Mapping[str, Any]) -> dict[str, list[np.ndarray]]:
     """Return the borders of the confidence regions by label, where covariances are finite."""
-    return {
-        label: [fit.ellipse(i) for i in range(len(fit.multipliers))]
-        for label, fit in estimates.items()
-        if isinstance(fit, MultiplierFit) and np.isfinite(fit.covariance).all()
-    }
+    borders = {}
+    for label, fit in estimates.items():
+        if isinstance(fit, MultiplierFit) and np.isfinite(fit.covariance).all():
+            count = len(fit.multipliers)
+            borders[label] = [np.asarray(fit.ellipse(i)) for i in range(count)]
+    return borders
 
 
 def _zoom(
-    ax: Axes, true: np.ndarray, series: Mapping[str, np.ndarray], borders
-) -> Axes | None:
+    ax: Axes,
+    true: np.ndarray,
+    series: Mapping[str, np.ndarray],
+    borders,
+) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    leading = complex(true[np.lexsort((-np.imag(true), -np.abs(true)))[0]])
-    nearest = [z[np.argmin(np.abs(z - leading))] for z in series.values()]
-    # Of the region next to the leading multiplier, all of it.
-    regions = [
-        min(np.abs(x - leading).max() for x in region) for region in borders.values()
-    ]
-    reach = 1.35 * max([1e-12, *(np.abs(z - leading) for z in nearest), *regions])
-    side, far = 0.36, ax.get_xlim()[1]
+    order = np.lexsort((-true.imag, -np.abs(true)))
+    leading = complex(true[order[0]])
+    reaches = [1e-12]
+    for z in series.values():
+        reaches.append(np.abs(z - leading).min())
+    for region in borders.values():
+        # Of the region next to the leading multiplier, all of it.
+        reaches.append(min(np.abs(x - leading).max() for x in region))
+    reach = 1.35 * max(reaches)
+    side = 0.36
+    far = ax.get_xlim()[1]
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
     places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
-    room = (
-        np.abs((points - places[:, None])[..., None].view(float))
-        .max(axis=2)
-        .min(axis=1)
-    )
+    apart = points - places[:, None]
+    room = np.maximum(np.abs(apart.real), np.abs(apart.imag)).min(axis=1)
     place = places[int(room.argmax())]
     if 2 * reach > side * far or room.max() < side / 2:
-        return None
+        return []
     inset = ax.inset_axes(
         (place.real - side / 2, place.imag - side / 2, side, side),
         xlim=leading.real + np.array([-reach, reach]),
@@ -204,17 +221,11 @@ def _zoom(
         yticks=[],
     )
     # (Numbers at its ticks would be long and differ in their last digits.)
-    inset.text(
-        0.5,
-        0.02,
-        f"{2 * reach:.1e} wide",
-        transform=inset.transAxes,
-        ha="center",
-        size=6,
-    )
+    width = f"{2 * reach:.1e} wide"
+    inset.text(0.5, 0.02, width, transform=inset.transAxes, ha="center", size=6)
     inset.spines[:].set(visible=True, color="0.4")
     ax.indicate_inset_zoom(inset, edgecolor="0.4")
-    return inset
+    return [inset]
 
 
 def _unit_circle(ax: Axes) -> None:

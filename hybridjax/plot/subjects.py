@@ -16,15 +16,19 @@ def forest(
 ) -> Plot:
     """Draw the estimate of each subject with its 95 % interval, its prediction (open circle), and
     the mean of each group and condition (diamond: its 95 % interval)."""
-    means, subjects = population.mean(quantity), population.predictions(quantity)
-    names, at = [], 0
+    means = population.mean(quantity)
+    subjects = population.predictions(quantity)
+    names = []
+    at = 0
     with panels(ax, height=0.7 + 0.15 * (len(subjects) + 2 * len(means))) as axes:
-        panel, open_circle = axes[0, 0], {"ms": 4, "mfc": "none", "mew": 0.8}
+        panel = axes[0, 0]
+        open_circle = {"ms": 4, "mfc": "none", "mew": 0.8}
         cells = zip(
             means.itertuples(), subjects.groupby("cell", sort=False), strict=True
         )
         for k, (mean, (_, part)) in enumerate(cells):
-            rows, bottom = at - np.arange(len(part)), at - len(part)
+            rows = at - np.arange(len(part))
+            bottom = at - len(part)
             line = {"color": CYCLE[k % len(CYCLE)], "lw": 0.8}
             reach = 1.96 * part["standard_error"]
             panel.errorbar(part["estimate"], rows, xerr=reach, fmt="s", ms=3, **line)
@@ -48,7 +52,12 @@ def forest(
 
 @checked
 def paired(
-    population: Population, quantity: str, a: str, b: str, *, ax: AxesLike | None = None
+    population: Population,
+    quantity: str,
+    a: str,
+    b: str,
+    *,
+    ax: AxesLike | None = None,
 ) -> Plot:
     """Draw the estimates of two conditions or groups as dots with standard errors, those of a
     subject joined by a line, beside the means with 95 % intervals.
@@ -56,7 +65,8 @@ def paired(
     **Raises:** `DefinitionError` as `Population.difference`.
     """
     (test,) = population.difference(quantity, a, b).itertuples()
-    subjects, means = population.predictions(quantity), population.mean(quantity)
+    subjects = population.predictions(quantity)
+    means = population.mean(quantity)
     with panels(ax) as axes:
         panel = axes[0, 0]
         cells = zip(
@@ -98,18 +108,18 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
     """
     is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray
-    values, inside = size(result.values), result.significant
+    values = size(result.values)
+    inside = result.significant
     label = with_unit("response", result.unit)
     if len(result.axes) > 2:
         raise DefinitionError("a figure has at most two axes, but the maps have more.")
     with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
-        panel, (name, *other) = axes[0, 0], result.axes
+        panel = axes[0, 0]
+        (name, *other) = result.axes
         if not other:
-            x, low, high = (
-                result.axes[name],
-                values - result.reach,
-                values + result.reach,
-            )
+            x = result.axes[name]
+            low = values - result.reach
+            high = values + result.reach
             panel.plot(x, size(result.each).T, color=COLORS["gray"], lw=0.4, alpha=0.7)
             panel.plot(x, values, color=CYCLE[0], lw=1.5, zorder=3)
             panel.fill_between(x, low, high, color=CYCLE[0], alpha=0.3, lw=0, zorder=2)

@@ -92,9 +92,8 @@ class Draws:
     def begin(self) -> tuple["Draws", Layout]:
         """Return the job with the form of its results."""
         variables = self.first()
-        number: dict[str, Any] = {
-            "draw": (("draw",), np.arange(self.blocks.shape[0]), {})
-        }
+        numbers = np.arange(self.blocks.shape[0])
+        number: dict[str, Any] = {"draw": (("draw",), numbers, {})}
         layout = Layout(
             ("draw",), self.blocks, variables, number, ("draw",), self.description
         )
@@ -121,18 +120,21 @@ class Draws:
         """Return the draws of piece k."""
         (rows,) = self.blocks.slices(k)
         lost = dict.fromkeys(self.variables) | {"failed": np.array(1)}
-        drawn = map(self._draw, range(rows.start, rows.stop))
-        drawn = [
-            lost if isinstance(values, ComputationError) else values for values in drawn
-        ]
-        if other := {name for values in drawn for name in values.keys() ^ lost.keys()}:
-            raise DefinitionError(
-                f"`function` must always give the same names: `{min(other)}` is in some draws only."
-            )
-        return {
-            name: stacked(name, [values[name] for values in drawn], x)
-            for name, x in self.variables.items()
-        }
+        columns: dict[str, list] = {name: [] for name in self.variables}
+        for i in range(rows.start, rows.stop):
+            values = self._draw(i)
+            if isinstance(values, ComputationError):
+                values = lost
+            other = values.keys() ^ columns.keys()
+            if other:
+                raise DefinitionError(
+                    f"`function` must always give the same names: `{min(other)}` is in some draws "
+                    "only."
+                )
+            for name, value in values.items():
+                columns[name].append(value)
+        variables = self.variables.items()
+        return {name: stacked(name, columns[name], x) for name, x in variables}
 
     def _draw(self, i: int) -> dict[str, np.ndarray] | ComputationError:
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))

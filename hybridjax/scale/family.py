@@ -128,7 +128,8 @@ class Family:
     def __init__(
         self, model: HybridSystem | Callable[..., HybridSystem], names: Sequence[str]
     ):
-        self.model, self.names = model, tuple(names)
+        self.model = model
+        self.names = tuple(names)
         allowed, required = _parameters(model)
         if allowed is not None:
             require_among("parameter", self.names, allowed, "`model`: ")
@@ -159,9 +160,9 @@ class Family:
         """
         system = self.system({name: jnp.asarray(x) for name, x in values.items()})
         if not isinstance(system, HybridSystem):
-            text = "a system, or a function of parameters that returns one"
             raise DefinitionError(
-                f"`model` must be {text}, not a {type(system).__name__}."
+                "`model` must be a system, or a function of parameters that returns one, not a "
+                f"{type(system).__name__}."
             )
         require_x64(system)
         check_periodic(system)
@@ -171,9 +172,8 @@ class Family:
         """Return the units of the parameters, "" if unknown."""
         units = dict.fromkeys(self.names, "")
         for name in self.names:
-            with contextlib.suppress(
-                AttributeError, KeyError
-            ):  # a parameter of a function
+            # (A parameter of a function has no unit.)
+            with contextlib.suppress(AttributeError, KeyError):
                 units[name] = unit_of_parameter(system, name)
         return units
 

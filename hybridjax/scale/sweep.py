@@ -117,7 +117,8 @@ def sweep(
     family = Family(model, list(space.axes))
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
-    wanted, total = Wanted(want, system), math.prod(space.shape)
+    wanted = Wanted(want, system)
+    total = math.prod(space.shape)
     most = chunk or (_MEASURED if wanted.measures else max(total // _PIECES, _SMALLEST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
     description = {
@@ -176,8 +177,10 @@ class SweepJob:
         begun = self._blank()
         say("a coarse pass")
         solved, cycles = dataclasses.replace(self, begun=begun).coarse()
-        variables, units = self.wanted.variables(cycles), self.family.units(self.system)
-        points, states = self.space.constants(units), self.wanted.constants()
+        variables = self.wanted.variables(cycles)
+        units = self.family.units(self.system)
+        points = self.space.constants(units)
+        states = self.wanted.constants()
         layout = Layout(
             self.space.dims,
             self.blocks,
@@ -245,13 +248,15 @@ class SweepJob:
         base = np.resize(
             [2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31], len(self.blocks.shape)
         )[:, None]
-        k, power = np.arange(1, 1 + _COARSE)[:, None, None], base ** np.arange(16.0)
+        k = np.arange(1, 1 + _COARSE)[:, None, None]
+        power = base ** np.arange(16.0)
         unit = (k // power % base / (power * base)).sum(axis=2)
         index = tuple(
             np.unique((unit * np.array(self.blocks.shape)).astype(int), axis=0).T
         )
         index = self._points(0) if len(self.blocks) == 1 else index
-        n, d = len(index[0]), map.anchor.q.shape[0]
+        n = len(index[0])
+        d = map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(
             lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor
         )
@@ -270,7 +275,10 @@ class SweepJob:
 def _rounded(map: ReturnMap) -> ReturnMap:
     """Return the map with a state, a period and sizes without the last digits of the guess, which
     depend on how it was found."""
-    single = lambda x: np.asarray(x, np.float32).astype(float)  # noqa: E731
+
+    def single(x):
+        return np.asarray(x, np.float32).astype(float)
+
     scale = single(map.settings.scale)
     size = scale[np.asarray(map.anchor.chart)].T
     q = np.round(np.asarray(map.anchor.q) / size, _DIGITS) * size
@@ -280,9 +288,17 @@ def _rounded(map: ReturnMap) -> ReturnMap:
 
 
 def _with(
-    map: ReturnMap, anchor: Any, expected: Any, scale: Any, conserved: Any
+    map: ReturnMap,
+    anchor: Any,
+    expected: Any,
+    scale: Any,
+    conserved: Any,
 ) -> ReturnMap:
     settings = dataclasses.replace(map.settings, scale=scale)
     return dataclasses.replace(
-        map, anchor=anchor, expected=expected, settings=settings, conserved=conserved
+        map,
+        anchor=anchor,
+        expected=expected,
+        settings=settings,
+        conserved=conserved,
     )

@@ -1,5 +1,6 @@
 """Quantities that a sweep keeps of limit cycles."""
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
@@ -30,23 +31,18 @@ class Wanted:
         functions = [x for x in items if not isinstance(x, str)]
         self.measures = {getattr(f, "__name__", ""): f for f in functions}
         taken = {*get_args(Want), "result", "chart", "state_name", "state_unit"}
-        for name in self.measures:
-            if (
-                not name.isidentifier()
-                or name in taken
-                or len(functions) > len(self.measures)
-            ):
-                text = f"names of their own, other than {', '.join(sorted(taken))}"
-                raise DefinitionError(
-                    f"functions of `want` need {text}: define them by `def`."
-                )
+        own = [x for x in self.measures if x.isidentifier() and x not in taken]
+        if len(own) < len(functions):
+            raise DefinitionError(
+                "functions of `want` need names of their own, other than "
+                f"{', '.join(sorted(taken))}: define them by `def`."
+            )
         # (Words only: workers get a copy.)
         s = Structure(system)
-        self._charts, self._time_unit = tuple(s.names), str(system.time_unit or "")
+        self._charts = tuple(s.names)
+        self._time_unit = str(system.time_unit or "")
         self._states = [tuple(s.states(a)) for a in range(len(s.charts))]
-        self._all_states = list(
-            dict.fromkeys(x for names in self._states for x in names)
-        )
+        self._all_states = list(dict.fromkeys(itertools.chain(*self._states)))
 
     def variables(self, cycles: LimitCycles) -> dict[str, Variable]:
         """Return the form of results, given some cycles.
@@ -62,13 +58,12 @@ class Wanted:
             "period": {"units": self._time_unit} if self._time_unit else {},
             "chart": flags(self._charts),
         }
-        forms = {name: form(name, x[0]) for name, x in values.items()}
-        return {
-            name: x._replace(
-                dims=dims.get(name, x.dims), attributes=attributes.get(name, {})
-            )
-            for name, x in forms.items()
-        }
+        variables = {}
+        for name, array in values.items():
+            x = form(name, array[0])
+            about = attributes.get(name, {})
+            variables[name] = x._replace(dims=dims.get(name, x.dims), attributes=about)
+        return variables
 
     def constants(self) -> dict[str, Constant]:
         """Return the coordinates of results beside the parameters."""
@@ -92,10 +87,8 @@ class Wanted:
     def _values(self, cycles: LimitCycles) -> dict[str, np.ndarray]:
         """Return the quantities with a name."""
         ok = cycles.ok
-        q, chart = (
-            np.asarray(cycles.anchor.q)[..., 0],
-            np.asarray(cycles.anchor.chart)[:, 0],
-        )
+        q = np.asarray(cycles.anchor.q)[..., 0]
+        chart = np.asarray(cycles.anchor.chart)[:, 0]
         state = np.full((len(ok), len(self._all_states)), np.nan)
         for a, names in enumerate(self._states):
             rows = np.flatnonzero(ok & (chart == a))
@@ -122,8 +115,10 @@ class Wanted:
                 return as_numbers(name, measure(cycles[i]))
             except ComputationError as failure:
                 error = failure
-        text = f"{len(cycles)} points over all ({error or 'none has a limit cycle'})"
-        raise ComputationError(f"`{name}` succeeds on none of {text}.")
+        raise ComputationError(
+            f"`{name}` succeeds on none of {len(cycles)} points over all "
+            f"({error or 'none has a limit cycle'})."
+        )
 
 
 def _measured(
@@ -163,8 +158,8 @@ def stacked(
     rows = [np.full(variable.shape, variable.fill) if x is None else x for x in values]
     for x in rows:
         if x.shape != variable.shape or not np.can_cast(x.dtype, variable.dtype):
-            text = f"{variable.dtype} {variable.shape}, then {x.dtype.str} {x.shape}"
             raise DefinitionError(
-                f"`{name}` must always give one type and shape: first {text}."
+                f"`{name}` must always give one type and shape: first {variable.dtype} "
+                f"{variable.shape}, then {x.dtype.str} {x.shape}."
             )
     return np.array(rows, variable.dtype)

@@ -59,7 +59,10 @@ class Chart(eqx.Module):
 
     @abc.abstractmethod
     def field(
-        self, t: Float[Array, ""], q: Float[Array, " n"], u: Float[Array, " l"]
+        self,
+        t: Float[Array, ""],
+        q: Float[Array, " n"],
+        u: Float[Array, " l"],
     ) -> Any:
         """The vector field dq/dt = f(t, q, u), eq. (2).
 
@@ -83,12 +86,10 @@ class FieldChart(Chart):
     absent: Mapping[str, float] = eqx.field(default_factory=dict)  # type: ignore[misc]
 
     def __init__(self, function, states, units=(), solver=None, absent=None):
-        self.function, self.states, self.units, self.solver = (
-            function,
-            states,
-            units,
-            solver,
-        )
+        self.function = function
+        self.states = states
+        self.units = units
+        self.solver = solver
         self.absent = absent or {}
 
     def field(self, t, q, u):
@@ -104,6 +105,8 @@ class DerivedChart(Chart):
     """A chart made of another one, of which it has all that it does not define anew."""
 
     chart: Chart
-    states, units = attribute_of("chart", "states"), attribute_of("chart", "units")
-    inputs, absent = attribute_of("chart", "inputs"), attribute_of("chart", "absent")
+    states = attribute_of("chart", "states")
+    units = attribute_of("chart", "units")
+    inputs = attribute_of("chart", "inputs")
+    absent = attribute_of("chart", "absent")
     solver = attribute_of("chart", "solver")

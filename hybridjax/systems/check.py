@@ -9,20 +9,19 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr
 
+from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.executor import is_traced
+from .._core.jax_compat import Equation, Program, is_variable
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart
 from .structure import (
     Structure,
     hashable,
-    jaxprs,
     quoted,
     require_inputs_apart,
 )
@@ -48,73 +47,105 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
 
     **Raises:** `DefinitionError`, naming the chart, transition or parameter that is wrong.
     """
-    for name, leaf in arrays_of(system).items():
-        real = jnp.issubdtype(leaf.dtype, jnp.inexact) and not is_traced(leaf)
-        if real and not np.all(np.isfinite(leaf)):
-            text = (
-                f"parameter `{name}` of {type(system).__name__} is {np.asarray(leaf)}"
-            )
-            raise DefinitionError(f"{text}; every parameter must be finite.")
-    require_positive(system)
+    _check_parameters(system)
     leaves, structure = jax.tree_util.tree_flatten(system)
     parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
     form = hashable((structure, *parts))
-    clocked = _passed.get(form) if form is not None else None
-    if clocked is None:
-        clocked = tuple(_check_functions(Structure(system)))
-        if form is not None:
-            _passed[form] = clocked
+    if form in _passed:
+        return _passed[form]
+    clocked = tuple(_check_functions(Structure(system)))
+    if form is not None:
+        _passed[form] = clocked
     return clocked
+
+
+def _check_parameters(system: HybridSystem) -> None:
+    for name, leaf in arrays_of(system).items():
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact) or is_traced(leaf):
+            continue
+        values = np.asarray(leaf)
+        if not np.isfinite(values).all():
+            raise DefinitionError(
+                f"parameter `{name}` of {type(system).__name__} is {values}; every parameter must "
+                "be finite."
+            )
+    require_positive(system)
 
 
 def _check_functions(s: Structure) -> Iterator[str]:
     """Check all functions; yield the names of those that use the time."""
-    system, kind = s.system, type(s.system).__name__
+    _check_definition(s)
+    for a in range(len(s.charts)):
+        yield from _check_chart(s, a)
+    _check_all_names(s)
+    # Transitions of one kind are one program; the first and the last may index beyond the states.
+    ends = set()
+    for kind in s.kinds:
+        ends |= {kind[0], kind[-1]}
+    for g in sorted(ends):
+        yield from _check_transition(s, g)
+    for output in s.system.outputs():
+        yield from check_output(s, output)
+
+
+def _check_definition(s: Structure) -> None:
+    """Check what the methods of a system return, and names of its inputs and of its solver."""
+    system = s.system
+    kind = type(system).__name__
     charts = system.charts()
-    for name, items, type_ in (
-        ("charts", charts.values() if isinstance(charts, Mapping) else None, Chart),
-        ("transitions", system.transitions(), Transition),
-        ("outputs", system.outputs(), Output),
-    ):
-        if not isinstance(items, Iterable) or not all(
-            isinstance(x, type_) for x in items
-        ):
-            several = "a dict {name: chart}" if type_ is Chart else "a list"
-            raise DefinitionError(
-                f"{kind}.{name}() must return {several} of `{type_.__name__}`."
-            )
+    if not isinstance(charts, Mapping) or not _are_all(charts.values(), Chart):
+        raise DefinitionError(
+            f"{kind}.charts() must return a dict {{name: chart}} of `Chart`."
+        )
+    if not _are_all(system.transitions(), Transition):
+        raise DefinitionError(
+            f"{kind}.transitions() must return a list of `Transition`."
+        )
+    if not _are_all(system.outputs(), Output):
+        raise DefinitionError(f"{kind}.outputs() must return a list of `Output`.")
     if not s.charts:
         raise DefinitionError(f"{kind} has no charts.")
     _check_names(kind, "inputs", system.inputs, system.input_units)
-    for name in system.solver.names if isinstance(system.solver, ByChart) else ():
-        s.chart_index(name)
-    for a, (name, chart) in enumerate(zip(s.names, s.charts, strict=True)):
-        _check_names(f"chart '{name}'", "inputs", chart.inputs or ())
-        require_among("input", chart.inputs or (), s.inputs, f"chart '{name}': ")
-        _check_names(f"chart '{name}'", "states", (*chart.states, *chart.absent))
-        _check_names(f"chart '{name}'", "states", chart.states, chart.units)
-        s.method(a)
-        states = (
-            f"the chart has the states {quoted(chart.states)}: return one rate for each"
-        )
-        field = lambda s, *x, a=a: s.field(a, *x)  # noqa: E731
-        yield from _check_shape(
-            s, a, f"field of chart '{name}'", field, (s.dims[a],), states
-        )
-    if len(set(map(str, s.state_names()))) < len(s.state_names()):
-        raise DefinitionError(
-            f"{kind} gives a state two units: {quoted(s.state_names())}."
-        )
+    if isinstance(system.solver, ByChart):
+        for name in system.solver.names:
+            s.chart_index(name)
+
+
+def _are_all(items: Any, type_: type) -> bool:
+    return isinstance(items, Iterable) and all(isinstance(x, type_) for x in items)
+
+
+def _check_chart(s: Structure, a: int) -> Iterator[str]:
+    name = s.names[a]
+    chart = s.charts[a]
+    of = f"chart '{name}'"
+    inputs = chart.inputs or ()
+    _check_names(of, "inputs", inputs)
+    require_among("input", inputs, s.inputs, f"{of}: ")
+    _check_names(of, "states", (*chart.states, *chart.absent))
+    _check_names(of, "states", chart.states, chart.units)
+    s.method(a)
+
+    def field(s, *point):
+        return s.field(a, *point)
+
+    states = (
+        f"the chart has the states {quoted(chart.states)}: return one rate for each"
+    )
+    yield from _check_shape(s, a, f"field of {of}", field, (s.dims[a],), states)
+
+
+def _check_all_names(s: Structure) -> None:
+    """Check that no two states, inputs, outputs or transitions have the same name."""
+    kind = type(s.system).__name__
+    states = s.state_names()
+    if len(set(map(str, states))) < len(states):
+        raise DefinitionError(f"{kind} gives a state two units: {quoted(states)}.")
     _check_names(kind, "transitions", [tr.name for tr in s.transitions])
-    # Transitions of one kind are one program; the first and the last may index beyond the states.
-    for g in sorted({g for kind in s.kinds for g in (kind[0], kind[-1])}):
-        yield from _check_transition(s, g)
-    names = [output.name for output in system.outputs()]
-    _check_names(kind, "states and outputs", (*map(str, s.state_names()), *names))
-    absent = [name for chart in s.charts for name in chart.absent]
-    require_inputs_apart(kind, s.inputs, [*s.state_names(), *absent, *names])
-    for output in system.outputs():
-        yield from check_output(s, output)
+    outputs = [output.name for output in s.system.outputs()]
+    _check_names(kind, "states and outputs", (*map(str, states), *outputs))
+    absent = itertools.chain(*(chart.absent for chart in s.charts))
+    require_inputs_apart(kind, s.inputs, [*states, *absent, *outputs])
 
 
 def check_schedules(s: Structure) -> None:
@@ -127,14 +158,15 @@ def check_schedules(s: Structure) -> None:
     """
     clocks = [g for g, number in enumerate(s.clocks) if number >= 0]
     for g, h in itertools.combinations(clocks, 2):
-        first, second = s.transitions[g], s.transitions[h]
+        first = s.transitions[g]
+        second = s.transitions[h]
         one_clock = s.clocks[g] == s.clocks[h]
         chain = first.target == second.source or second.target == first.source
         if first.source != second.source and (one_clock or not chain):
             continue
-        if not is_traced((first.guard, second.guard)) and _meet(
-            first.guard, second.guard
-        ):
+        if is_traced((first.guard, second.guard)):
+            continue
+        if _meet(first.guard, second.guard):
             raise DefinitionError(
                 f"'{first.name}' and '{second.name}' are scheduled for the same time in chart "
                 f"'{second.source}', so that their order is not defined: write them as one event, "
@@ -145,42 +177,56 @@ def check_schedules(s: Structure) -> None:
 def _meet(first: Any, second: Any) -> bool:
     """Test whether the events of two schedules, or if their periods are the same, those of one
     period, have the same time."""
-    (a, p), (b, other) = ((float(x.offset), float(x.period)) for x in (first, second))
-    same = SAME_TIME * min(p, other)
-    if abs(p - other) <= SAME_TIME * p:
-        return abs(a - b) <= same
-    ratio = p / other if p > other else other / p
+    apart = float(first.offset) - float(second.offset)
+    shorter, longer = sorted([float(first.period), float(second.period)])
+    same = SAME_TIME * shorter
+    ratio = longer / shorter
+    if ratio - 1 <= SAME_TIME * ratio:
+        return abs(apart) <= same
     if abs(ratio - round(ratio)) > SAME_TIME * ratio:
         return False  # (they meet by chance)
-    return abs(math.remainder(a - b, min(p, other))) <= same
+    return abs(math.remainder(apart, shorter)) <= same
 
 
 def check_output(s: Structure, output: Output, kind: str = "output") -> Iterator[str]:
     """Check an output in each chart; yield its name in those where it uses the time."""
-    for name in () if callable(output.function) else output.function:
-        s.chart_index(name)
+    if not callable(output.function):
+        for name in output.function:
+            s.chart_index(name)
     for a, name in enumerate(s.names):
         if s.resolve_outputs(output).defined(a):
             what = f"{kind} '{output.name}' in chart '{name}'"
-            values = lambda s, *x, a=a: s.resolve_outputs(output)(a, *x)  # noqa: E731
-            yield from _check_shape(s, a, what, values, (1,), "", in_flow=False)
+            yield from _check_shape(
+                s, a, what, ft.partial(_value_of, output, a), (1,), "", in_flow=False
+            )
+
+
+def _value_of(output: Output, a: int, s: Structure, *point: Any) -> Any:
+    return s.resolve_outputs(output)(a, *point)
 
 
 def _check_transition(s: Structure, g: int) -> Iterator[str]:
     tr = s.transitions[g]
-    a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+    a = s.chart_index(tr.source)
+    b = s.chart_index(tr.target)
     of = f"of transition '{tr.name}' ({tr.source} -> {tr.target})"
+
+    def guard(s, *point):
+        return s.guard(g, *point)
+
+    def holds(s, *point):
+        return s.enabled(g, *point)
+
+    def reset(s, *point):
+        return s.reset(g, *point)
+
     if not isinstance(tr.guard, Scheduled):
-        guard = lambda s, *x: s.guard(g, *x)  # noqa: E731
         yield from _check_shape(s, a, f"guard {of}", guard, (), "it must be one number")
-    holds = lambda s, *x: s.enabled(g, *x)  # noqa: E731
     yield from _check_shape(
         s, a, f"`enabled` {of}", holds, (), "it must be one truth value"
     )
     states = f"chart '{tr.target}' has the states {quoted(s.charts[b].states)}: return one for each"
-    yield from _check_shape(
-        s, a, f"reset {of}", lambda s, *x: s.reset(g, *x), (s.dims[b],), states
-    )
+    yield from _check_shape(s, a, f"reset {of}", reset, (s.dims[b],), states)
 
 
 def _check_shape(
@@ -201,87 +247,84 @@ def _check_shape(
         points = [jax.ShapeDtypeStruct(x, real) for x in shapes]
         program, *_ = eqx.filter_make_jaxpr(function)(s, *points)
         _check_indices(ft.partial(function, s), *(np.full(x, 0.5) for x in shapes))
-    (actual,) = (x.shape for x in program.out_avals)
-    if actual != shape:
-        raise DefinitionError(f"the {what} returns shape {actual}, but {reason}.")
-    needed, uses = dce_jaxpr(program.jaxpr, [True])
-    point = [False] * (len(uses) - 3) + [True] * 3
-    kept = [x for x, used in zip(point, uses, strict=True) if used]
-    if in_flow and real == np.float64 and (low := _rounded_to(needed, kept)):
-        raise DefinitionError(
-            f"the {what} is computed in {low}, whose rounding errors are jumps for the accuracy of "
-            f"the flow: write `float` in place of `jnp.{low}`."
-        )
-    if uses[-3] and _depends_on(
-        needed, [x == len(uses) - 3 for x in np.flatnonzero(uses)]
-    ):
+    (result,) = program.out_avals
+    if result.shape != shape:
+        raise DefinitionError(f"the {what} returns shape {result.shape}, but {reason}.")
+    needed, uses = jax_compat.needed_part(program.jaxpr)
+    # (The last three arguments are t, q and u; numbers of the system come before.)
+    time = len(uses) - 3
+    kept = np.flatnonzero(uses)
+    if in_flow and real == np.float64:
+        low = _rounded_to(needed, list(kept >= time))
+        if low:
+            raise DefinitionError(
+                f"the {what} is computed in {low}, whose rounding errors are jumps for the "
+                f"accuracy of the flow: write `float` in place of `jnp.{low}`."
+            )
+    if uses[time] and _depends_on(needed, list(kept == time)):
         yield what
 
 
-def _rounded_to(program: jex.Jaxpr, moving: Sequence[bool]) -> str:
+def _rounded_to(program: Program, moving: Sequence[bool]) -> str:
     """A type of few digits in which a program computes with arguments that are `moving`; "" for
     none. (Constants of such a type are exact.)"""
-    depends = dict(zip(program.invars, moving, strict=True))
+    depends: dict[Any, bool] = dict(zip(program.invars, moving, strict=True))
     for equation in program.eqns:
-        inputs = [_is_in(depends, x) for x in equation.invars]
-        for inner in jaxprs(equation.params):
-            same = len(inner.invars) == len(inputs)
-            found = _rounded_to(
-                inner, inputs if same else [any(inputs)] * len(inner.invars)
-            )
-            if found:
-                return found
-        for x in equation.outvars:
-            depends[x] = any(inputs)
-            kind = (
-                np.dtype(x.aval.dtype) if hasattr(x.aval, "dtype") else np.dtype(float)
-            )
-            low = jnp.issubdtype(kind, jnp.floating) and jnp.finfo(kind).bits < 64
-            if low and any(inputs):
-                return kind.name
+        inputs = [is_variable(x) and depends.get(x, False) for x in equation.invars]
+        depends |= dict.fromkeys(equation.outvars, any(inputs))
+        if not any(inputs):
+            continue
+        for inner in jax_compat.inner_programs(equation):
+            if len(inner.invars) != len(inputs):
+                inputs = [True] * len(inner.invars)
+            low = _rounded_to(inner, inputs)
+            if low:
+                return low
+        results: list[Any] = equation.outvars
+        for x in results:
+            bits = jax_compat.bits_of(x)
+            if bits is not None and bits < 64:
+                return x.aval.dtype.name
     return ""
 
 
-def _depends_on(program: jex.Jaxpr, moving: Sequence[bool]) -> bool:
+def _depends_on(program: Program, moving: Sequence[bool]) -> bool:
     """Test whether a result of a program depends on arguments that are `moving`, but for products
     with the number zero."""
     return any(_dependence(program, [(x, False) for x in moving]))
 
 
-def _dependence(
-    program: jex.Jaxpr, arguments: Sequence[tuple[bool, bool]]
-) -> list[bool]:
+def _dependence(program: Program, arguments: Sequence[tuple[bool, bool]]) -> list[bool]:
     """Whether each result of a program depends on arguments, of which each is given by whether it
     moves, and whether it is the number zero."""
     states = dict(zip(program.invars, arguments, strict=True))
 
     def state(x) -> tuple[bool, bool]:
-        if isinstance(x, jex.Literal):
+        if jax_compat.is_constant(x):
             return False, bool(np.all(np.asarray(x.val) == 0))
         return states.get(x, (False, False))
 
     for equation in program.eqns:
-        name, inputs = equation.primitive.name, [state(x) for x in equation.invars]
-        moves, zeros = any(x for x, _ in inputs), [zero for _, zero in inputs]
-        inner = list(jaxprs(equation.params))
-        results = [(moves, False)] * len(equation.outvars)
-        if name == "mul" and any(zeros):
+        inputs = [state(x) for x in equation.invars]
+        called = _called(equation)
+        if jax_compat.gives_zero(equation, [zero for _, zero in inputs]):
             results = [(False, True)]
-        elif name in _SAME_ZERO and zeros[0]:
-            results = [(False, True)]
-        elif len(inner) == 1 and len(inner[0].invars) == len(inputs) and name in _CALLS:
-            results = [(x, False) for x in _dependence(inner[0], inputs)]
+        elif called is not None:
+            results = [(moves, False) for moves in _dependence(called, inputs)]
+        else:
+            moves = any(moves for moves, _ in inputs)
+            results = [(moves, False)] * len(equation.outvars)
         states.update(zip(equation.outvars, results, strict=True))
     return [state(x)[0] for x in program.outvars]
 
 
-# Operations that leave zero as it is, and those that call another program.
-_SAME_ZERO = ("broadcast_in_dim", "convert_element_type", "reshape", "neg", "squeeze")
-_CALLS = ("pjit", "jit", "closed_call", "custom_jvp_call", "custom_vjp_call")
-
-
-def _is_in(depends: Mapping, x) -> bool:
-    return not isinstance(x, jex.Literal) and depends.get(x, False)
+def _called(equation: Equation) -> Program | None:
+    """The program that an equation calls with its own arguments, if it does nothing more."""
+    calls = (jax_compat.is_call, jax_compat.has_rule, jax_compat.is_hosted)
+    inner = jax_compat.inner_programs(equation)
+    if len(inner) != 1 or len(inner[0].invars) != len(equation.invars):
+        return None
+    return inner[0] if any(test(equation) for test in calls) else None
 
 
 def _check_indices(function: Callable, *point: np.ndarray) -> None:
@@ -292,7 +335,7 @@ def _check_indices(function: Callable, *point: np.ndarray) -> None:
             jax.eval_shape(lambda: function(*point))
         except IndexError:
             raise
-        except Exception:  # functions for arrays of JAX only
+        except Exception:  # a function for arrays of JAX only
             return
 
 
@@ -307,7 +350,8 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
     except DefinitionError:
         raise
     except Exception as error:
-        takes = _ARGUMENTS if takes and "positional argument" in str(error) else takes
+        if takes and "positional argument" in str(error):
+            takes = _ARGUMENTS
         problem = f"{str(error).rstrip('.')}{takes}."
         if isinstance(error, jax.errors.JAXTypeError):
             problem = (
@@ -319,7 +363,10 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
 
 
 def _check_names(
-    what: str, kind: str, names: Sequence[str], units: Sequence[str] = ()
+    what: str,
+    kind: str,
+    names: Sequence[str],
+    units: Sequence[str] = (),
 ) -> None:
     """Check that names are distinct, and units as many, or none."""
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
@@ -329,5 +376,7 @@ def _check_names(
     if len(set(names)) < len(names):
         raise DefinitionError(f"{what} has {kind} of the same name: {quoted(names)}.")
     if len(units) not in (0, len(names)):
-        text = f"{what} has the {kind} {quoted(names)}, but {len(units)} units"
-        raise DefinitionError(f"{text}: give one for each, or none.")
+        raise DefinitionError(
+            f"{what} has the {kind} {quoted(names)}, but {len(units)} units: give one for each, "
+            "or none."
+        )

@@ -89,7 +89,8 @@ class Drawing(eqx.Module):
         """The position of the body; the origin without one."""
         if self.body is None:
             return 0 * self.velocity
-        return {**self.points, **self.circles}[self.body][:2]
+        places = {**self.points, **self.circles}
+        return places[self.body][:2]
 
     @staticmethod
     def spring(
@@ -101,13 +102,15 @@ class Drawing(eqx.Module):
 
         **Raises:** `DefinitionError` for ends that are no points of the plane.
         """
-        a, b = _array("start", start, (2,)), _array("end", end, (2,))
+        a = _array("start", start, (2,))
+        b = _array("end", end, (2,))
         width = _array("width", width, ())
         along = b - a
-        length = jnp.sqrt(
-            jnp.maximum(along @ along, 1e-18)
-        )  # (hypot takes longer to compile)
+        # (`hypot` takes longer to compile.)
+        length = jnp.sqrt(jnp.maximum(along @ along, 1e-18))
         across = width * jnp.stack([-along[1], along[0]]) / length
         part = np.array([0.0, *np.linspace(0.15, 0.85, 13), 1.0])
-        side = np.array([0.0, 0.0, *[1.0, -1.0] * 5, 1.0, 0.0, 0.0])
+        side = np.zeros(15)
+        side[2:13:2] = 1.0
+        side[3:13:2] = -1.0
         return a + part[:, None] * along + side[:, None] * across

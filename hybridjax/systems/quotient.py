@@ -81,14 +81,19 @@ class Quotient(Derived):
         translation: SignalNames = (),
         half_period: str | Callable | bool = False,
     ):
-        swap, relabel = dict(swap or {}), dict(relabel or {})
+        swap = dict(swap or {})
+        relabel = dict(relabel or {})
         if half_period:  # every chart is kept, and has an image
             swap |= {b: a for a, b in swap.items()}
             swap = {name: swap.get(name, name) for name in (*system.charts(), *swap)}
         partners = {b: a for a, b in relabel.items()} | relabel
-        self.system, self.solver, self.half_period = system, system.solver, half_period
-        self.pairs, self.names = tuple(swap.items()), tuple(partners.items())
-        self.flipped, self.translation = tuple(flipped), tuple(translation)
+        self.system = system
+        self.solver = system.solver
+        self.half_period = half_period
+        self.pairs = tuple(swap.items())
+        self.names = tuple(partners.items())
+        self.flipped = tuple(flipped)
+        self.translation = tuple(translation)
 
     @property
     def swap(self) -> dict[str, str]:
@@ -103,48 +108,45 @@ class Quotient(Derived):
     def __check_init__(self):
         charts = self.system.charts()
         require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
-        states = sorted({state for chart in charts.values() for state in chart.states})
+        states = sorted(set().union(*(chart.states for chart in charts.values())))
         named = (*dict(self.names), *self.flipped, *self.translation)
         require_among("state", named, states, "Quotient: ")
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
-                text = (
-                    f"{sorted(mirrored)}, but '{image}' {sorted(charts[image].states)}"
-                )
                 raise DefinitionError(
-                    f"Quotient: '{kept}' mirrored has {text}: use `relabel`."
+                    f"Quotient: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
+                    f"{sorted(charts[image].states)}: use `relabel`."
                 )
         if self.half_period:
             self._check_half_period()
 
     def _check_half_period(self):
         if (self.system.period() is not None) != (self.half_period is True):
-            sentence = "True if a clock drives the system, else a state or a function of (t, q)"
-            raise DefinitionError(f"Quotient: `half_period` must be {sentence}.")
-        for x in self.system.transitions():
-            if isinstance(x.guard, Scheduled) and not is_traced(x.guard):
-                if abs(math.remainder(x.guard.offset / x.guard.period, 1.0)) < TOGETHER:
-                    text = (
-                        f"'{x.name}' must not be scheduled at t = 0, where halves begin"
-                    )
-                    raise DefinitionError(
-                        f"Quotient: {text}: let the clock begin earlier."
-                    )
-        for name, x in (
-            self.system.charts().items() if isinstance(self.half_period, str) else ()
-        ):
-            require_among(
-                "state", [str(self.half_period)], x.states, f"Quotient: in '{name}' "
+            raise DefinitionError(
+                "Quotient: `half_period` must be True if a clock drives the system, else a state "
+                "or a function of (t, q)."
             )
+        for x in self.system.transitions():
+            if not isinstance(x.guard, Scheduled) or is_traced(x.guard):
+                continue
+            phase = math.remainder(x.guard.offset / x.guard.period, 1.0)
+            if abs(phase) < TOGETHER:
+                raise DefinitionError(
+                    f"Quotient: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
+                    "the clock begin earlier."
+                )
+        if isinstance(self.half_period, str):
+            for name, chart in self.system.charts().items():
+                here = f"Quotient: in '{name}' "
+                require_among("state", [self.half_period], chart.states, here)
 
     def period(self):
         return None if self.half_period else self.system.period()
 
     def charts(self):
-        return {
-            x: self._reduced(x) for x in self.system.charts() if x not in self._kept_of
-        }
+        kept = [x for x in self.system.charts() if x not in self._kept_of]
+        return {name: self._reduced(name) for name in kept}
 
     def transitions(self):
         events = [x for x in self.system.transitions() if x.source not in self._kept_of]
@@ -152,73 +154,84 @@ class Quotient(Derived):
         return made + [self._transition(x, self.swap, 0.0) for x in self._halves()]
 
     def _transition(
-        self, x: Transition, images: Mapping[str, str], clock: float
+        self,
+        x: Transition,
+        images: Mapping[str, str],
+        clock: float,
     ) -> Transition:
         """A transition, with the state in the image of its target; the clock is multiplied."""
-        chart, guard, direction = self._reduced(x.source), x.guard, x.direction
+        chart = self._reduced(x.source)
+        guard = x.guard
+        direction = x.direction
         target, landed = self._landing(x, images)
-        if isinstance(guard, Scheduled) and chart.clocked:
-            guard, direction = _phase_of(guard), "rising"
-        guard = guard if isinstance(guard, Scheduled) else chart.lifted(guard)
+        if not isinstance(guard, Scheduled):
+            guard = chart.lifted(guard)
+        elif chart.clocked:
+            guard = chart.lifted(_phase_of(guard))
+            direction = "rising"
         enabled = None if x.enabled is None else chart.lifted(x.enabled)
-        at, n = chart.lifted(landed), len(chart.kept)
-        reset = lambda *point: jnp.append(at(*point), clock * point[1][n:])  # noqa: E731
+        at = chart.lifted(landed)
+        n = len(chart.kept)
+
+        def reset(*point):
+            return jnp.append(at(*point), clock * point[1][n:])
+
         return Transition(x.name, x.source, target, guard, direction, reset, enabled)
 
     def _halves(self):
         """The ends of half a period, as transitions of the original system."""
-        rises, period, charts = (
-            self.half_period,
-            self.system.period(),
-            self.system.charts(),
-        )
-        for name in self.swap if rises else ():
-            if period is not None:
-                guard = lambda t, q, u: t - period / 2  # noqa: E731
-            elif callable(rises):
-                guard = lambda t, q, u: rises(t, q)  # noqa: E731
-            else:
-                place = charts[name].states.index(rises)
-                guard = lambda t, q, u, k=place: q[k]  # noqa: E731
-            title = "half period" + f" ({name})" * (len(self.pairs) > 1)
-            yield Transition(title, name, name, guard, "rising")
+        if not self.half_period:
+            return
+        for name in self.swap:
+            title = "half period" if len(self.pairs) == 1 else f"half period ({name})"
+            yield Transition(title, name, name, self._end_of_half(name), "rising")
+
+    def _end_of_half(self, name: str) -> Callable:
+        """A function (t, q, u) of a chart that rises through zero after half a period."""
+        rises = self.half_period
+        period = self.system.period()
+        if period is not None:
+            return lambda t, q, u: t - period / 2
+        if callable(rises):
+            return lambda t, q, u: rises(t, q)
+        place = self.system.charts()[name].states.index(rises)
+        return lambda t, q, u: q[place]
 
     def guess(self):
         guess = self.system.guess()
         if guess is None or guess.chart not in self.charts():
             return None
-        chart, period = self.charts()[guess.chart], self.system.period()
-        state, time = chart.less(guess.state), guess.time
+        chart = self.charts()[guess.chart]
+        period = self.system.period()
+        state = chart.less(guess.state)
+        time = guess.time
         if chart.clocked and period is not None:
-            state, time = jnp.append(state, jnp.asarray(time) % (period / 2)), 0.0
+            state = jnp.append(state, jnp.asarray(time) % (period / 2))
+            time = 0.0
         return Guess(guess.chart, state, time, after=guess.after)
 
     def outputs(self):
-        charts, outputs = self.charts(), []
+        charts = self.charts()
+        outputs = []
         for x in self.system.outputs():
-            functions = (
-                dict.fromkeys(charts, x.function)
-                if callable(x.function)
-                else x.function
-            )
-            kept = {
-                name: charts[name].lifted(f)
-                for name, f in functions.items()
-                if name in charts
-            }
-            outputs.append(Output(x.name, kept, x.unit))
+            lifted = {}
+            for name, chart in charts.items():
+                function = x.in_chart(name)
+                if function is not None:
+                    lifted[name] = chart.lifted(function)
+            outputs.append(Output(x.name, lifted, x.unit))
         return outputs
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """The picture of the original system, which stands at the translation 0 and moves."""
-        whole, still = self.system.charts()[chart], dict.fromkeys(self.translation, 0.0)
-        state = jnp.stack(
-            [jnp.asarray((still | dict(q))[x], float) for x in whole.states]
-        )
+        whole = self.system.charts()[chart]
+        still = dict.fromkeys(self.translation, 0.0)
         time = q["clock"] if self.charts()[chart].clocked else t
         drawing = self.system.draw(chart, time, {**q, **still})
         if drawing is None or len(self.translation) != 1:
             return drawing
+        values = {**still, **q}
+        state = jnp.stack([jnp.asarray(values[x], float) for x in whole.states])
         rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
         along = rates[whole.states.index(self.translation[0])]
         return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
@@ -229,88 +242,91 @@ class Quotient(Derived):
             return None
         if self.charts()[at.chart].clocked:
             at = Guess(at.chart, at.state[:-1], at.state[-1])
-        still = self.translation
-        return Quotient(self.system, translation=still) if still else self.system, at
+        if not self.translation:
+            return self.system, at
+        return Quotient(self.system, translation=self.translation), at
 
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
         (t, q, u) that are equal. The first numbers of q are the state without translations, in
         its `sizes`."""
-        for name in self.system.charts() if self.translation else ():
-            parts = (
-                self._parts(name, self._kept_of, sizes, shift=x) for x in (0.0, 0.7)
-            )
-            for (what, before), (_, after) in zip(*parts, strict=True):
-                yield f"the {what} changes under the translation", before, after
+        if self.translation:
+            yield from self._claims_of_translation(sizes)
         clock: Any = self.system.period()
         images = self.swap if self.half_period else self._kept_of
         later = 0.5 * clock if self.half_period is True else 0.0
         for kept, other in self.swap.items():
             ours = list(self._parts(kept, self._kept_of, sizes))
             # In a chart that is its own mirror image, the last transition is that of the first.
-            theirs = list(
-                self._parts(other, images, sizes, later=later, back=kept == other)
-            )
+            back = kept == other
+            theirs = list(self._parts(other, images, sizes, later=later, back=back))
             if len(ours) != len(theirs):
                 sentence = (
                     f"'{kept}' and '{other}' have different numbers of transitions"
                 )
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
             for (what, function), (name, image) in zip(ours, theirs, strict=False):
-                yield (
-                    f"the {name} is not the mirror image of the {what}",
-                    function,
-                    image,
-                )
+                sentence = f"the {name} is not the mirror image of the {what}"
+                yield sentence, function, image
+
+    def _claims_of_translation(self, sizes: Mapping[str, Any]):
+        for name in self.system.charts():
+            here = self._parts(name, self._kept_of, sizes, shift=0.0)
+            there = self._parts(name, self._kept_of, sizes, shift=0.7)
+            for (what, before), (_, after) in zip(here, there, strict=True):
+                yield f"the {what} changes under the translation", before, after
 
     def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
         """All functions of a chart, of points of the reduced one, with rates and states mirrored if
         the chart is among the `images`; transitions in the order of their list, or `back`; under a
         translation by `shift`, outputs, too."""
         kept = images.get(name, name)
-        chart, mirrored = (
-            self._reduced(kept),
-            self._mirrored if name in images else _same,
-        )
-        n, moves = len(chart.kept), np.isin(chart.chart.states, self.translation)
+        chart = self._reduced(kept)
+        original = self.system.charts()[name]
+        mirrored = self._mirrored if name in images else _same
+        n = len(chart.kept)
+        moves = np.isin(chart.chart.states, self.translation)
         size = sizes[kept][:n]
-        state = lambda q: mirrored(kept, chart.full(size * q[:n], shift or 0.0))  # noqa: E731
-        field, used = (
-            getattr(self.system.charts()[name], x) for x in ("field", "inputs")
-        )
-        used = slice(None if used is None else len(used))
-        at = lambda f: lambda t, q, u: f(t + later, state(q), u[used])  # noqa: E731
-        rates = lambda *point: mirrored(kept, as_vector(field(*point)), back=True)  # noqa: E731
-        yield (
-            f"field of chart '{name}'",
-            at(lambda *point: chart.less(rates(*point)) / size),
-        )
-        yield f"field of chart '{name}'", at(lambda *point: rates(*point)[moves])
-        for x in list(self.system.transitions())[:: -1 if back else 1]:
-            if x.source == name:
-                (target, reset), guard = self._landing(x, images), x.guard
-                if isinstance(guard, Scheduled):
-                    guard = _phase_of(guard)
-                into = sizes[target][: len(self._reduced(target).kept)]
-                yield (
-                    f"transition '{x.name}'",
-                    at(lambda *y, r=reset, c=into: r(*y) / c),
-                )
-                yield (
-                    f"transition '{x.name}'",
-                    at(lambda *y, g=guard, x=x: x.sign * g(*y)),
-                )
-        for x in self.system.outputs() if shift is not None else ():
-            function = x.function if callable(x.function) else x.function.get(name)
+        used = slice(None if original.inputs is None else len(original.inputs))
+
+        def at(function, *scale):
+            """A function of the original chart, divided by a scale, of a reduced point."""
+
+            def of_reduced(t, q, u):
+                state = mirrored(kept, chart.full(size * q[:n], shift or 0.0))
+                value = function(t + later, state, u[used])
+                return value / scale[0] if scale else value
+
+            return of_reduced
+
+        def rates(*point):
+            return mirrored(kept, as_vector(original.field(*point)), back=True)
+
+        field = f"field of chart '{name}'"
+        yield field, at(lambda *point: chart.less(rates(*point)), size)
+        yield field, at(lambda *point: rates(*point)[moves])
+        transitions = [x for x in self.system.transitions() if x.source == name]
+        if back:
+            transitions.reverse()
+        for x in transitions:
+            target, reset = self._landing(x, images)
+            into = sizes[target][: len(self._reduced(target).kept)]
+            guard = _phase_of(x.guard) if isinstance(x.guard, Scheduled) else x.guard
+            yield f"transition '{x.name}'", at(reset, into)
+            yield f"transition '{x.name}'", at(guard, x.sign)
+        if shift is not None:
+            yield from self._output_parts(name, at)
+        if self.system.period() is None:
+            sign = -1.0 if name in images else 1.0
+            for x in self._halves():
+                if x.source == name and callable(x.guard):
+                    yield f"sign of '{x.name}'", at(x.guard, sign)
+
+    def _output_parts(self, name, at):
+        for x in self.system.outputs():
+            function = x.in_chart(name)
             if function is not None:
                 yield f"output '{x.name}'", at(function)
-        sign = -1.0 if name in images else 1.0
-        for x in self._halves() if self.system.period() is None else ():
-            if x.source == name and callable(x.guard):
-                yield (
-                    f"sign of '{x.name}'",
-                    at(lambda *point, g=x.guard: sign * g(*point)),
-                )
 
     def _reduced(self, name: str) -> "_Reduced":
         clocked = bool(self.half_period) and self.system.period() is not None
@@ -336,14 +352,14 @@ class Quotient(Derived):
         """The mirror image of a state of a chart that is kept, or with `back`, of a state of its
         image."""
         charts = self.system.charts()
-        source, target = charts[kept].states, charts[self.swap[kept]].states
+        source = charts[kept].states
+        target = charts[self.swap[kept]].states
         if back:
             source, target = target, source
         order = [source.index(self._partner(name)) for name in target]
-        names = target if back else map(self._partner, target)
-        return q[np.array(order)] * np.array(
-            [-1.0 if x in self.flipped else 1.0 for x in names]
-        )
+        names = target if back else [self._partner(x) for x in target]
+        signs = np.where([x in self.flipped for x in names], -1.0, 1.0)
+        return q[np.array(order)] * signs
 
 
 @jax.ensure_compile_time_eval()
@@ -359,10 +375,11 @@ def check_symmetry(
     if not isinstance(system, Quotient):
         return
     check_symmetry(system.system, None, along and along.removeprefix("system."))
-    sizes = sizes or {
-        name: np.ones(len(x.states)) for name, x in system.charts().items()
-    }
-    clock, rng = system.system.period(), np.random.default_rng(0)
+    if not sizes:
+        charts = system.charts()
+        sizes = {name: np.ones(len(chart.states)) for name, chart in charts.items()}
+    clock = system.system.period()
+    rng = np.random.default_rng(0)
     q = rng.normal(size=(3, max(map(len, sizes.values()))))
     t = rng.normal(size=3) * (1.0 if clock is None else clock)
     values = _sides(system, sizes, q, t, along)
@@ -370,9 +387,10 @@ def check_symmetry(
         size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
         x, y = (values / size for values in pair)
         if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
-            text = f"{type(system.system).__name__} does not have the symmetry of its Quotient"
+            once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
-                f"{text}{f' once {along!r} changes' * bool(along)}: {sentence}."
+                f"{type(system.system).__name__} does not have the symmetry of its "
+                f"Quotient{once}: {sentence}."
             )
 
 
@@ -380,15 +398,20 @@ def check_symmetry(
 def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list[tuple]:
     """Both sides of all claims of a symmetry, or with `along` their derivatives by a parameter."""
     if along:
-        at = lambda x: _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)  # noqa: E731
+
+        def at(x):
+            return _sides(with_parameters(quotient, {along: x}), sizes, q, t, None)
+
         return jax.jvp(at, (parameter_of(quotient, along),), (1.0,))[1]
-    u, claims = (
-        jnp.zeros(len(quotient.inputs)),
-        [x for _, *x in quotient._claims(sizes)],
-    )
-    return jax.vmap(
-        lambda q, t: [tuple(as_vector(f(t, q, u)) for f in x) for x in claims]
-    )(q, t)
+    u = jnp.zeros(len(quotient.inputs))
+
+    def at_a_point(q, t):
+        values = []
+        for _, first, second in quotient._claims(sizes):
+            values.append((as_vector(first(t, q, u)), as_vector(second(t, q, u))))
+        return values
+
+    return jax.vmap(at_a_point)(q, t)
 
 
 def _same(kept: str, q: Any, back: bool = False):
@@ -408,18 +431,20 @@ class _Reduced(DerivedChart):
 
     @property
     def kept(self) -> np.ndarray:
-        return np.array(
-            [k for k, x in enumerate(self.chart.states) if x not in self.translation]
-        )
+        return np.flatnonzero(~np.isin(self.chart.states, self.translation))
 
     @property
     def states(self) -> tuple[str, ...]:  # type: ignore[override]
-        return *(self.chart.states[k] for k in self.kept), *("clock",) * self.clocked
+        kept = tuple(self.chart.states[k] for k in self.kept)
+        return (*kept, "clock") if self.clocked else kept
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
         units = self.chart.units
-        return (*(units[k] for k in self.kept), *("",) * self.clocked) if units else ()
+        if not units:
+            return ()
+        kept = tuple(units[k] for k in self.kept)
+        return (*kept, "") if self.clocked else kept
 
     def full(self, q, shift=0.0):
         """The state of the whole chart, translated by a shift."""
@@ -431,7 +456,12 @@ class _Reduced(DerivedChart):
 
     def lifted(self, function: Callable) -> Callable:
         """A function of the whole chart's state, of the reduced one."""
-        return lambda t, q, u: function(q[-1] if self.clocked else t, self.full(q), u)
+
+        def of_reduced(t, q, u):
+            time = q[-1] if self.clocked else t
+            return function(time, self.full(q), u)
+
+        return of_reduced
 
     def field(self, t, q, u):
         rates = self.less(as_vector(self.lifted(self.chart.field)(t, q, u)))

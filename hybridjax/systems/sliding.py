@@ -71,11 +71,24 @@ def sliding(
             f"charts '{above}' and '{below}' need the same states and inputs."
         )
     middle = SlidingChart(f, g, surface)
-    height = lambda t, q, u: surface(t, q)  # noqa: E731
-    up, down = (lambda t, q, u, k=k: middle.rates(t, q, u)[k] for k in (0, 1))
-    held = lambda t, q, u: down(t, q, u) >= 0  # noqa: E731
-    borne = lambda t, q, u: up(t, q, u) <= 0  # noqa: E731
-    no = lambda predicate: lambda t, q, u: ~predicate(t, q, u)  # noqa: E731
+
+    def height(t, q, u):
+        return surface(t, q)
+
+    def up(t, q, u):
+        return middle.rates(t, q, u)[0]
+
+    def down(t, q, u):
+        return middle.rates(t, q, u)[1]
+
+    def held(t, q, u):
+        return down(t, q, u) >= 0
+
+    def borne(t, q, u):
+        return up(t, q, u) <= 0
+
+    def no(predicate):
+        return lambda t, q, u: ~predicate(t, q, u)
 
     def event(source, target, guard, sense: Direction = "falling", enabled=None):
         return Transition(
@@ -104,17 +117,23 @@ class SlidingChart(DerivedChart):
 
     def rates(self, t, q, u):
         """Those of the surface's function in both fields."""
-        t, q = jnp.asarray(t, float), jnp.asarray(q, float)
-        along = lambda f: jax.jvp(self.surface, (t, q), (jnp.ones_like(t), f))[1]  # noqa: E731
+        t = jnp.asarray(t, float)
+        q = jnp.asarray(q, float)
+
+        def along(f):
+            return jax.jvp(self.surface, (t, q), (jnp.ones_like(t), f))[1]
+
         return [along(f) for f in self.fields(t, q, u)]
 
     def field(self, t, q, u):
-        (f, g), (a, b) = self.fields(t, q, u), self.rates(t, q, u)
+        (f, g) = self.fields(t, q, u)
+        (a, b) = self.rates(t, q, u)
         return (b * f - a * g) / (b - a)
 
     def returned(self, t, q, u):
         """The effect (n, n) of a small push once the state is back on the surface, which either
         side reaches by the same direction f_a - f_b."""
-        (f, g), (a, b) = self.fields(t, q, u), self.rates(t, q, u)
+        (f, g) = self.fields(t, q, u)
+        (a, b) = self.rates(t, q, u)
         normal = jax.grad(self.surface, 1)(jnp.asarray(t, float), jnp.asarray(q, float))
         return jnp.eye(len(f)) - jnp.outer(f - g, normal) / (a - b)

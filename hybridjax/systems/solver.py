@@ -86,14 +86,13 @@ def solvers(
 
     **Raises:** `DefinitionError` for what is no solver.
     """
-    for solver in given.values() if isinstance(given, Mapping) else (given,):
+    each = list(given.values()) if isinstance(given, Mapping) else [given]
+    for solver in each:
         if not isinstance(solver, Method | eqx.Module | ByChart | None):
             raise _no_solver(solver)
-    return (
-        ByChart(tuple(given), tuple(given.values()))
-        if isinstance(given, Mapping)
-        else given
-    )
+    if isinstance(given, Mapping):
+        return ByChart(tuple(given), tuple(given.values()))
+    return given
 
 
 def as_method(solver: Any) -> Method:
@@ -164,9 +163,11 @@ def _radau(s: int) -> Method:
     c = np.append((1 + special.roots_jacobi(s - 1, 1, 0)[0]) / 2, 1.0)
     # Integrals of the Lagrange polynomials from 0 to each point.
     x, weights = np.polynomial.legendre.leggauss(s)
-    a = np.array(
-        [y / 2 * weights @ [_lagrange(c, y * (1 + z) / 2) for z in x] for y in c]
-    )
+    rows = []
+    for end in c:
+        values = [_lagrange(c, end * (1 + z) / 2) for z in x]
+        rows.append(end / 2 * weights @ values)
+    a = np.array(rows)
     eigenvalues = np.linalg.eigvals(a)
     gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
     # The quadrature formula of order s that has the weight gamma at the start of the step.

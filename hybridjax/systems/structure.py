@@ -18,13 +18,12 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
+from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.call import once_in_call
 from .._core.compilation import kernel
@@ -32,7 +31,6 @@ from .._core.executor import Array, is_hidden
 from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
-from .._core.vector_math.rewrite import jaxprs
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart, Method, as_method
@@ -76,18 +74,17 @@ def member_of(alike: Sequence[Any], place: Any) -> Any:
     )
 
 
-def counts_alike(program: jex.Jaxpr) -> bool:
+def counts_alike(program: jax_compat.Program) -> bool:
     """Test whether a program computes with integers as Python does. (JAX evaluates integer powers
     by the bits of the exponent: a negative or too large one would give another number.)"""
-    return not any(
-        (eqn.primitive.name.startswith("shift") or eqn.primitive.name == "pow")
-        and all(
-            jnp.issubdtype(getattr(v.aval, "dtype", object), jnp.integer)
-            for v in eqn.invars
-        )
-        or not all(map(counts_alike, jaxprs(eqn.params)))
-        for eqn in program.eqns
-    )
+    for equation in program.eqns:
+        types = [getattr(v.aval, "dtype", object) for v in equation.invars]
+        whole = all(jnp.issubdtype(x, jnp.integer) for x in types)
+        if whole and jax_compat.works_on_bits(equation):
+            return False
+        if not all(map(counts_alike, jax_compat.inner_programs(equation))):
+            return False
+    return True
 
 
 def _form(x: Transition) -> Hashable:
@@ -121,9 +118,9 @@ def _form_of_leaf(leaf: Any) -> Hashable:
 def as_vector(value: Any) -> jax.Array:
     """Numbers returned by a user's function, as one floating-point vector."""
     if isinstance(value, tuple | list):
-        return (
-            jnp.stack([jnp.asarray(v, float) for v in value]) if value else jnp.zeros(0)
-        )
+        if value:
+            return jnp.stack([jnp.asarray(v, float) for v in value])
+        return jnp.zeros(0)
     return jnp.asarray(value, float)
 
 
@@ -216,7 +213,9 @@ class Structure:
 
     @ft.cached_property
     def inputs(self) -> tuple[Signal, ...]:
-        named = lambda: signals(self.system.inputs, self.system.input_units)  # noqa: E731
+        def named():
+            return signals(self.system.inputs, self.system.input_units)
+
         return self._once_in_call("inputs", named)
 
     def inputs_among(
@@ -248,14 +247,22 @@ class Structure:
 
         def make():
             if isinstance(self.source, PerLane):
-                of_source = lambda source, *x: function(Structure(source), *x)  # noqa: E731
+
+                def of_source(source, *x):
+                    return function(Structure(source), *x)
+
                 return by_lane(of_source, self.source, *trees, by_row=by_row)
             return by_lane(lambda *x: function(self, *x), *trees, by_row=by_row)
 
         return make() if name is None else self.once(name, trees, make)
 
     def kernel(
-        self, function: Callable, form, *static: Hashable, trees=(), lanes=1
+        self,
+        function: Callable,
+        form,
+        *static: Hashable,
+        trees=(),
+        lanes=1,
     ) -> Callable:
         """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
         compiled (see `_core/compilation.py`)."""
@@ -281,9 +288,12 @@ class Structure:
 
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
         """Return what was made under this name for these trees, made anew only for other trees."""
-        if name in self._made and all(map(operator.is_, self._made[name][1], trees)):
-            return self._made[name][0]
-        self._made[name] = made, _ = make(), trees
+        if name in self._made:
+            made, before = self._made[name]
+            if all(map(operator.is_, before, trees)):
+                return made
+        made = make()
+        self._made[name] = made, trees
         return made
 
     def under(self, u: Array) -> "Structure":
@@ -307,15 +317,18 @@ class Structure:
     def _method(self, a: int) -> Method:
         system = self.system.system if isinstance(self.system, Driven) else self.system
         solver = type(system).solver if system.solver is None else system.solver
-        solver = solver.get(self.names[a]) if isinstance(solver, ByChart) else solver
-        solver = self.charts[a].solver if solver is None else solver
+        if isinstance(solver, ByChart):
+            solver = solver.get(self.names[a])
+        if solver is None:
+            solver = self.charts[a].solver
         return VERNER76 if solver is None else as_method(solver)
 
     def chart_input(self, a: int, t: ArrayLike, u: Array) -> Array:
         """g_a(û): the inputs that chart a uses."""
         if isinstance(self.system, Driven):
             u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
-        if (names := self.charts[a].inputs) is None:
+        names = self.charts[a].inputs
+        if names is None:
             return u
         return u[np.array([self.inputs.index(n) for n in names], int)]
 
@@ -329,11 +342,10 @@ class Structure:
         def make():
             groups = []
             for kind in kinds(self.transitions):
-                groups += (
-                    [kind]
-                    if len(kind) == 1 or self._is_one(kind)
-                    else [(g,) for g in kind]
-                )
+                if len(kind) == 1 or self._is_one(kind):
+                    groups.append(kind)
+                else:
+                    groups += [(g,) for g in kind]
             return groups
 
         return _kinds.recall(self.source, None, make)
@@ -347,12 +359,11 @@ class Structure:
             x = Member(kind, place)
             return s.guard(x, *point), s.reset(x, *point), s.enabled(x, *point)
 
-        real, array = jnp.result_type(float), jax.ShapeDtypeStruct
-        place, single = (
-            array((), jnp.result_type(int)),
-            Structure(one_lane(self.source)),
-        )
-        point = array((), real), array((n,), real), array((single.nu,), real)
+        real = jnp.result_type(float)
+        place = jax.ShapeDtypeStruct((), jnp.result_type(int))
+        single = Structure(one_lane(self.source))
+        shapes = (), (n,), (single.nu,)
+        point = [jax.ShapeDtypeStruct(shape, real) for shape in shapes]
         try:
             program, *_ = eqx.filter_make_jaxpr(at_a_point)(single, place, *point)
         except Exception:  # any error of a user's function, or of JAX in it
@@ -366,12 +377,15 @@ class Structure:
 
     def guard_kinds(self, a: int) -> tuple[Kind, ...]:
         """Kinds of the state-dependent transitions out of chart a."""
-        leaves = lambda kind: self._leaves(kind[0], a, by_clock=False)  # noqa: E731
+
+        def leaves(kind):
+            return self._leaves(kind[0], a, by_clock=False)
+
         return self.once(("guards", a), (), lambda: tuple(filter(leaves, self.kinds)))
 
     def guards(self, a: int) -> list[int]:
         """Indices of the state-dependent transitions out of chart a, by kind."""
-        return [g for kind in self.guard_kinds(a) for g in kind]
+        return list(itertools.chain(*self.guard_kinds(a)))
 
     def schedules(self, a: int) -> list[int]:
         """Indices of the scheduled transitions out of chart a."""
@@ -391,7 +405,8 @@ class Structure:
         return _all_clocks.recall(self.source, None, self._clocks)
 
     def _clocks(self) -> Int[np.ndarray, " G"]:
-        numbers, formulas = np.full(len(self.transitions), -1), []
+        numbers = np.full(len(self.transitions), -1)
+        formulas = []
         for g, transition in enumerate(self.transitions):
             if isinstance(transition.guard, Scheduled):
                 formula = self._formula(g)
@@ -409,7 +424,7 @@ class Structure:
             return guard.period, guard.offset
 
         program, *_ = eqx.filter_make_jaxpr(schedule)(one_lane(self.source))
-        needed, _ = dce_jaxpr(program.jaxpr, [True, True], instantiate=True)
+        needed, _ = jax_compat.needed_part(program.jaxpr, every_argument=True)
         constants = tuple(np.asarray(x).tobytes() for x in program.consts)
         return str(needed), constants
 
@@ -426,31 +441,36 @@ class Structure:
         alike = [self.transitions[x] for x in g.kind]
         if len(alike) == 1:
             return alike[0]
-        guard, reset, enabled = member_of(
-            [(x.guard, x.reset, x.enabled) for x in alike], g.place
-        )
+        functions = [(x.guard, x.reset, x.enabled) for x in alike]
+        guard, reset, enabled = member_of(functions, g.place)
         return dataclasses.replace(alike[0], guard=guard, reset=reset, enabled=enabled)
 
     def guard(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
         """Transition g's guard, signed so that it falls through zero at the event."""
         tr = self.transition(g)
         assert not isinstance(tr.guard, Scheduled)
-        if (
-            value := jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
-        ).dtype == bool:
+        value = jnp.asarray(tr.guard(t, q, self._input_of(tr, t, u)))
+        if value.dtype == bool:
             raise DefinitionError(
                 f"the guard of '{tr.name}' must be `a - b`, not `a > b`."
             )
         return tr.sign * jnp.asarray(value, float)
 
     def guard_values(
-        self, kinds: Sequence[Kind], t: Array, q: Array, u: Array
+        self,
+        kinds: Sequence[Kind],
+        t: Array,
+        q: Array,
+        u: Array,
     ) -> list[jax.Array]:
         """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is
         the only one of its kind."""
         if all(len(kind) == 1 for kind in kinds):
             return [self.guard(g, t, q, u) for (g,) in kinds]
-        every = lambda kind: jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))  # noqa: E731
+
+        def every(kind):
+            return jax.vmap(lambda k: self.guard(Member(kind, k), t, q, u))
+
         return [every(kind)(np.arange(len(kind))) for kind in kinds]
 
     def reset(self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array) -> jax.Array:
@@ -458,7 +478,11 @@ class Structure:
         return as_vector(tr.reset(t, q, self._input_of(tr, t, u)))
 
     def enabled(
-        self, g: int | Member, t: ArrayLike, q: ArrayLike, u: Array
+        self,
+        g: int | Member,
+        t: ArrayLike,
+        q: ArrayLike,
+        u: Array,
     ) -> jax.Array:
         tr = self.transition(g)
         if tr.enabled is None:
@@ -483,9 +507,10 @@ class Structure:
     def state_names(self) -> tuple[str, ...]:
         """All state names, in order of first appearance."""
         names: dict[str, Signal] = {}
-        for name in (name for a in range(len(self.charts)) for name in self.states(a)):
-            if not unit_of(names.get(name, "")):
-                names[name] = name
+        for a in range(len(self.charts)):
+            for name in self.states(a):
+                if not unit_of(names.get(name, "")):
+                    names[name] = name
         return tuple(names.values())
 
     def output_names(self) -> tuple[str, ...]:
@@ -494,12 +519,8 @@ class Structure:
 
     def states_everywhere(self) -> list[str]:
         """The states that every chart defines."""
-        charts = range(len(self.charts))
-        return [
-            x
-            for x in self.state_names()
-            if all(self.state_function(x, a) for a in charts)
-        ]
+        defined = [{*chart.states, *chart.absent} for chart in self.charts]
+        return [x for x in self.state_names() if all(x in names for names in defined)]
 
     def states(self, a: int) -> tuple[Signal, ...]:
         """The names of chart a's states, with their units."""
@@ -507,9 +528,8 @@ class Structure:
 
     def sizes(self, scale: Any) -> dict[str, np.ndarray]:
         """Sizes of the states of each chart, by its name, from `Settings.scale`."""
-        return {
-            x: np.asarray(scale)[a, : self.dims[a]] for a, x in enumerate(self.names)
-        }
+        rows = zip(self.names, np.asarray(scale), self.dims, strict=True)
+        return {name: row[:d] for name, row, d in rows}
 
     def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
         """A state of chart a by names."""
@@ -517,10 +537,11 @@ class Structure:
 
     def drawing(self, a: int, t: Any, q: Any) -> Any:
         """The drawing of a state of chart a, or `None`."""
-        values = {name: self.state_function(name, a) for name in self.state_names()}
-        named = {
-            str(name): f(t, q, None) for name, f in values.items() if f is not None
-        }
+        named = {}
+        for name in self.state_names():
+            function = self.state_function(name, a)
+            if function is not None:
+                named[str(name)] = function(t, q, None)
         return self.system.draw(self.names[a], t, ByName(named))
 
     def resolve_outputs(
@@ -602,9 +623,7 @@ class Outputs:
     def _function(self, item: str | Output, a: int):
         if isinstance(item, str):
             return self.structure.state_function(item, a)
-        function = item.function
-        if not callable(function):
-            function = function.get(self.structure.names[a])
+        function = item.in_chart(self.structure.names[a])
         if function is None:
             return None
         return lambda t, q, u: function(t, q, self.structure.chart_input(a, t, u))

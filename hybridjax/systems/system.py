@@ -47,6 +47,12 @@ class Output(Definition):
 
     __repr__ = fields
 
+    def in_chart(self, name: str) -> Callable[..., Any] | None:
+        """The function of a chart, `None` where the output is not defined."""
+        if callable(self.function):
+            return self.function
+        return self.function.get(name)
+
 
 OutputNames = Annotated[Sequence[str | Output] | str | Output, Names(Output)]
 """States and outputs: one, or several distinct ones; names, or `Output`s in their place."""
@@ -90,15 +96,19 @@ def unit_of_parameter(system: Any, path: str) -> str:
 def arrays_of(system: "HybridSystem") -> dict[str, Array]:
     """The arrays of a system by name, those of its parts by a path with dots."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
-    return {
-        ".".join(str(getattr(x, "name", x)) for x in path): leaf
-        for path, leaf in leaves
-    }
+    arrays = {}
+    for path, leaf in leaves:
+        names = [str(getattr(x, "name", x)) for x in path]
+        arrays[".".join(names)] = leaf
+    return arrays
 
 
 def copies_of(system: "HybridSystem") -> dict[str, Array]:
     """Copies of `arrays_of`. (A buffer that a tree holds twice cannot be donated.)"""
-    copied = lambda x: x if is_tracer(x) else jax.device_put(np.array(x))  # noqa: E731
+
+    def copied(x):
+        return x if is_tracer(x) else jax.device_put(np.array(x))
+
     return {name: copied(x) for name, x in arrays_of(system).items()}
 
 
@@ -150,7 +160,8 @@ def require_positive(system: "HybridSystem") -> None:
             continue
         wrong = np.asarray(value)[~(np.asarray(value) > 0)]
         if wrong.size:
-            name, unit = type(system).__name__, field.metadata.get("unit", "")
+            name = type(system).__name__
+            unit = field.metadata.get("unit", "")
             raise DefinitionError(
                 f"parameter `{field.name}` of {name} is {wrong.flat[0]:g} {unit}".rstrip()
                 + ": it must be positive."
@@ -171,14 +182,17 @@ class Guess(eqx.Module):
     after: str | None = eqx.field(static=True, default=None)
 
     def __init__(
-        self, chart: str, state: Vector, time: Scalar = 0.0, *, after: str | None = None
+        self,
+        chart: str,
+        state: Vector,
+        time: Scalar = 0.0,
+        *,
+        after: str | None = None,
     ):
-        self.chart, self.state, self.time, self.after = (
-            chart,
-            real(state),
-            real(time),
-            after,
-        )
+        self.chart = chart
+        self.state = real(state)
+        self.time = real(time)
+        self.after = after
 
     __repr__ = fields
 
@@ -242,15 +256,20 @@ class HybridSystem(Definition):
     time_unit: ClassVar[str] = ""
 
     solver: Solver | Method | ByChart | None = eqx.field(
-        static=True, default=None, kw_only=True, converter=solvers
+        static=True,
+        default=None,
+        kw_only=True,
+        converter=solvers,
     )
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
         for name in ("charts", "transitions", "period", "outputs", "guess", "draw"):
             if not callable(vars(cls).get(name, callable)):
-                text = f"must be a method: write `def {name}(self): return ...`"
-                raise DefinitionError(f"{cls.__name__}: `{name}` {text}.")
+                raise DefinitionError(
+                    f"{cls.__name__}: `{name}` must be a method: write `def {name}(self): return "
+                    "...`."
+                )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)
@@ -281,7 +300,10 @@ class HybridSystem(Definition):
         return None
 
     def draw(
-        self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]
+        self,
+        chart: str,
+        t: Float[Array, ""],
+        q: Mapping[str, Any],
     ) -> Drawing | None:
         """What the system looks like in a chart, for `hj.plot.animate`: a `Drawing`, written for
         one state as a vector field is. `q` holds the states of the chart and the values of those
@@ -312,10 +334,8 @@ class Derived(HybridSystem):
 
     system: HybridSystem
 
-    inputs, time_unit = (
-        attribute_of("system", "inputs"),
-        attribute_of("system", "time_unit"),
-    )
+    inputs = attribute_of("system", "inputs")
+    time_unit = attribute_of("system", "time_unit")
     input_units = attribute_of("system", "input_units")
 
     def charts(self):
@@ -363,7 +383,7 @@ def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
         yield from _parts_of_transition(x, inputs[x.source])
     for x in system.outputs():
         for name in charts:
-            function = x.function if callable(x.function) else x.function.get(name)
+            function = x.in_chart(name)
             if function is not None:
                 at = ft.partial(function, *inputs[name])
                 about = f"the output '{x.name}' in chart '{name}'"

@@ -49,7 +49,8 @@ class Scheduled(eqx.Module):
                 raise DefinitionError(
                     f"Scheduled: `{name}` must be one number, not of shape {given.shape}."
                 )
-        self.period, self.offset = real(period), real(offset)
+        self.period = real(period)
+        self.offset = real(offset)
 
     __repr__ = fields
 
@@ -108,5 +109,7 @@ class Transition(eqx.Module):
         return 1.0 if self.direction == "falling" else -1.0
 
     def __repr__(self):
-        how = "scheduled" if isinstance(self.guard, Scheduled) else self.direction
-        return f"Transition({self.name!r}: {self.source} -> {self.target}, {how})"
+        about = f"{self.name!r}: {self.source} -> {self.target}"
+        if isinstance(self.guard, Scheduled):
+            return f"Transition({about}, scheduled)"
+        return f"Transition({about}, {self.direction})"

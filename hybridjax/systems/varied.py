@@ -26,7 +26,10 @@ def parameter_of(system: HybridSystem, parameter: str) -> Array:
 
 def with_parameters(system: HybridSystem, values: Mapping[str, Any]) -> HybridSystem:
     """The system with other values of some parameters."""
-    where = lambda x: [operator.attrgetter(name)(x) for name in values]  # noqa: E731
+
+    def where(x):
+        return [operator.attrgetter(name)(x) for name in values]
+
     return eqx.tree_at(where, system, [jnp.asarray(x, float) for x in values.values()])
 
 

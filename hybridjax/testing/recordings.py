@@ -60,15 +60,15 @@ def random_force(
         raise DefinitionError(
             f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
         )
-    transient = (
-        4 * rate / bandwidth
-    )  # samples cut off at either end, where the filter starts
+    # Samples that are cut off at either end, where the filter starts.
+    transient = 4 * rate / bandwidth
     samples = duration * rate + 2 * transient
     if not samples <= PERIODS:
         raise DefinitionError(
             f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples, more than {PERIODS}."
         )
-    n, pad = round(duration * rate), round(transient)
+    n = round(duration * rate)
+    pad = round(transient)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")
     white = np.random.default_rng(seed).normal(size=(n + 2 * pad, 1))
     force = signal.sosfiltfilt(sos, white, axis=0)[pad : pad + n]
@@ -101,7 +101,8 @@ def simulate_recording(
     **Raises:** `DefinitionError` as `response_function`.
     """
     recorded = check_outputs(cycle, outputs)
-    force, inputs = np.asarray(force, float), cycle.structure.inputs
+    force = np.asarray(force, float)
+    inputs = cycle.structure.inputs
     if force.shape[1] < 2 or force.shape[2] != len(inputs):
         raise DefinitionError(
             f"`force` has shape {force.shape}, but needs two samples or more of {len(inputs)} "
@@ -119,7 +120,8 @@ def simulate_recording(
     cycles = 1 << (-(-(n - 1) // K) - 1).bit_length()
     x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
-    u = x[:, :-1, None] + (x[:, 1:] - x[:, :-1])[:, :, None] * middle[:, None]
+    change = np.diff(x, axis=1)[:, :, None]
+    u = x[:, :-1, None] + change * middle[:, None]
     response = response_function(cycle, ClockPhase(K * steps), outputs)
     y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
     names = inputs + recorded.names
@@ -166,9 +168,11 @@ def spoil(
     if gap is not None and gap[0] >= gap[1]:
         raise DefinitionError(f"`gap` must end after it starts, but is {gap}.")
     rng = np.random.default_rng(seed)
-    columns, trials = [recording.column(x) for x in signals], []
+    columns = [recording.column(x) for x in signals]
+    trials = []
     for trial in recording.trials:
-        values, time = np.array(trial.values), trial.time
+        values = np.array(trial.values)
+        time = trial.time
         y = values[:, columns] + noise * rng.normal(size=(len(time), len(columns)))
         y = np.round(y / quantum) * quantum if quantum else y
         if spikes:
@@ -210,19 +214,19 @@ def simulate_beats(
     **Raises:** `DefinitionError` for a curve or a force without values, not as many rhythms as
     trials, or a rhythm above the `rate` of the force.
     """
-    force, table = np.asarray(force, float), np.asarray(curve, float)
-    (S, m), n = force.shape, len(table)
+    force = np.asarray(force, float)
+    table = np.asarray(curve, float)
+    (S, m) = force.shape
+    n = len(table)
     if not n or not S:
         raise DefinitionError("`curve` and `force` need at least one value.")
     if np.size(rhythm) not in (1, S) or np.max(rhythm) > rate:
         raise DefinitionError(f"`rhythm` must be one number or {S}, none above `rate`.")
     w = np.broadcast_to(np.asarray(rhythm, float), S)
     steps = int(np.ceil(w.max() / (rate * _STEP)))
-    h, nodes, table = (
-        1 / (rate * steps),
-        np.arange(n + 1) / n,
-        np.append(table, table[0]),
-    )
+    h = 1 / (rate * steps)
+    nodes = np.arange(n + 1) / n
+    table = np.append(table, table[0])
     rng = np.random.default_rng(seed)
 
     def at(phase):
@@ -231,7 +235,8 @@ def simulate_beats(
     phase: Any = rng.uniform(size=S)
     events: list[list[float]] = [[] for _ in range(S)]
     for i in range((m - 1) * steps):
-        k, part = i // steps, (i % steps + 0.5) / steps
+        k = i // steps
+        part = (i % steps + 0.5) / steps
         u = (1 - part) * force[:, k] + part * force[:, k + 1]
         z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
         move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)

@@ -242,8 +242,8 @@ def raise_no_home():
 
 LATE = """
 import jax, os, hybridjax as hj
-from hybridjax._core.compilation import _loops_are_kernels
-always = _loops_are_kernels()
+from hybridjax._core.jax_compat import loops_are_kernels
+always = loops_are_kernels()
 try:
     hj.enable_loop_kernels()
     print("done", always)

@@ -53,13 +53,11 @@ def checked(thing: Thing) -> Thing:
     """
     if not isinstance(thing, type):
         return cast(Thing, _wrapped(thing, thing.__qualname__))
-    for maker in (
-        ("__new__",) if issubclass(thing, tuple) else ("__init__", "__check_init__")
-    ):
+    makers = ["__new__"] if issubclass(thing, tuple) else ["__init__", "__check_init__"]
+    for maker in makers:
         if maker in vars(thing):
-            setattr(
-                thing, maker, _wrapped(getattr(thing, maker), thing.__name__, thing)
-            )
+            wrapped = _wrapped(getattr(thing, maker), thing.__name__, thing)
+            setattr(thing, maker, wrapped)
     return cast(Thing, checked_methods(thing))
 
 
@@ -69,17 +67,14 @@ def checked_methods(cls: Class) -> Class:
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
-        function = (
-            member.__func__
-            if isinstance(member, classmethod | staticmethod)
-            else member
-        )
-        if not inspect.isfunction(function) or getattr(
-            function, "__isabstractmethod__", False
-        ):
+        is_bound_otherwise = isinstance(member, classmethod | staticmethod)
+        function = member.__func__ if is_bound_otherwise else member
+        if not inspect.isfunction(function):
+            continue
+        if getattr(function, "__isabstractmethod__", False):
             continue
         wrapped = _wrapped(function, f"{cls.__name__}.{name}")
-        setattr(cls, name, type(member)(wrapped) if function is not member else wrapped)
+        setattr(cls, name, type(member)(wrapped) if is_bound_otherwise else wrapped)
     return cls
 
 
@@ -133,7 +128,8 @@ class _Kinds:
     annotations use exist."""
 
     def __init__(self, function: Callable, cls: type | None):
-        self.function, self.cls = function, cls
+        self.function = function
+        self.cls = cls
 
     def hints(self) -> dict[str, Any]:
         where = vars(sys.modules[self.cls.__module__]) if self.cls else None
@@ -142,10 +138,8 @@ class _Kinds:
     @functools.cached_property
     def by_name(self) -> dict[str, Kind | None]:
         """Kinds of all parameters that can be given by name."""
-        hints, parameters = (
-            self.hints(),
-            inspect.signature(self.function).parameters.values(),
-        )
+        hints = self.hints()
+        parameters = inspect.signature(self.function).parameters.values()
         named = (p.name for p in parameters if p.kind is not p.VAR_KEYWORD)
         return {name: kind_of(hints.get(name, Any)) for name in named}
 
@@ -155,11 +149,9 @@ class _Kinds:
         (`*args`)."""
         parameters = inspect.signature(self.function).parameters.values()
         positional = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
-        name = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
-        return [(x, self.by_name[x]) for x in positional], (
-            name,
-            self.by_name.get(name),
-        )
+        rest = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
+        named = [(x, self.by_name[x]) for x in positional]
+        return named, (rest, self.by_name.get(rest))
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.
@@ -167,7 +159,8 @@ class _Kinds:
         **Raises:** `Misfit` for the first that does not fit.
         """
         positional, further = self.in_order
-        taken, name = [], ""
+        taken = []
+        name = ""
         try:
             for k, value in enumerate(args):
                 name, kind = positional[k] if k < len(positional) else further

@@ -21,13 +21,14 @@ class Either(Kind):
         self.allowed = listed(list(dict.fromkeys(kind.allowed for kind in kinds)))
 
     def take(self, value):
-        near = None
+        nearest = None
         for kind in self.kinds:
             try:
                 return kind.take(value)
             except Misfit as misfit:
-                near = near or (misfit if misfit.near else None)
-        raise self.refused(value) if near is None else near
+                if misfit.near and nearest is None:
+                    nearest = misfit
+        raise nearest or self.refused(value)
 
 
 class Instance(Kind):
@@ -53,9 +54,9 @@ class Having(Kind):
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def fits(self, value):
-        return all(
-            inspect.getattr_static(value, name, self) is not self for name in self.names
-        )
+        missing = object()
+        found = [inspect.getattr_static(value, x, missing) for x in self.names]
+        return all(x is not missing for x in found)
 
 
 class Items(Kind):
@@ -63,12 +64,19 @@ class Items(Kind):
     `form`, it is brought to that form; with `iterable`, whatever can be iterated over is taken."""
 
     def __init__(
-        self, item: Kind | None, *, form: type | None = None, iterable: bool = False
+        self,
+        item: Kind | None,
+        *,
+        form: type | None = None,
+        iterable: bool = False,
     ):
-        self.item, self.form, self.iterable = item, form, iterable
-        self.allowed = (
-            "a sequence" if item is None else f"a sequence (each item {item.allowed})"
-        )
+        self.item = item
+        self.form = form
+        self.iterable = iterable
+        if item is None:
+            self.allowed = "a sequence"
+        else:
+            self.allowed = f"a sequence (each item {item.allowed})"
 
     def take(self, value):
         if isinstance(value, str | bytes | Mapping):
@@ -85,11 +93,9 @@ class Items(Kind):
         if self.item is not None:
             form = list if isinstance(value, list) else tuple
             value = form(_taken(self.item, i, x) for i, x in enumerate(value))
-        return (
-            value
-            if self.form is None or isinstance(value, self.form)
-            else self.form(value)
-        )
+        if self.form is None or isinstance(value, self.form):
+            return value
+        return self.form(value)
 
 
 class Tuple(Kind):
@@ -117,7 +123,8 @@ class Table(Kind):
     """A mapping all of whose keys and values are of one kind each."""
 
     def __init__(self, key: Kind | None, value: Kind | None):
-        self.key, self.value = key, value
+        self.key = key
+        self.value = value
         self.allowed = "a mapping such as {name: value}"
 
     def take(self, value):
@@ -135,9 +142,14 @@ class Names(Kind):
     them. Without `empty` there must be one. With `units`, they may be the units by name."""
 
     def __init__(
-        self, other: type | None = None, *, empty: bool = False, units: bool = False
+        self,
+        other: type | None = None,
+        *,
+        empty: bool = False,
+        units: bool = False,
     ):
-        self.empty, self.units = empty, units
+        self.empty = empty
+        self.units = units
         self.types = (str,) if other is None else (str, other)
         self.allowed = "a name, or a sequence of distinct names"
         if other is not None:
@@ -146,23 +158,28 @@ class Names(Kind):
             self.allowed += ", or their units by name"
 
     def take(self, value):
-        if self.units and isinstance(value, Mapping):
-            if not all(isinstance(x, str) for x in (*value, *value.values())):
-                raise self.refused(value)
-            value = tuple(map(Signal, value, value.values()))
-        if not isinstance(value, list | tuple | np.ndarray):
-            value = (value,)
-        elif isinstance(value, np.ndarray) and value.ndim != 1:
+        items = self._items(value)
+        if not items and not self.empty:
             raise self.refused(value)
-        if not all(isinstance(x, self.types) for x in value) or not (
-            len(value) or self.empty
-        ):
+        if not all(isinstance(x, self.types) for x in items):
             raise self.refused(value)
-        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in value)
+        given = tuple(str(x) if isinstance(x, np.str_) else current(x) for x in items)
         names = [x for x in given if isinstance(x, str)]
         if len(set(names)) < len(names):
             raise Misfit(f"must name each only once, not {show(given)}", near=True)
         return given
+
+    def _items(self, value: Any) -> list[Any]:
+        """The names in a sequence or a table of units, or the single one that it is."""
+        if self.units and isinstance(value, Mapping):
+            if not all(isinstance(x, str) for x in (*value, *value.values())):
+                raise self.refused(value)
+            return list(map(Signal, value, value.values()))
+        if isinstance(value, np.ndarray) and value.ndim != 1:
+            raise self.refused(value)
+        if isinstance(value, list | tuple | np.ndarray):
+            return list(value)
+        return [value]
 
 
 def _taken(kind: Kind, key: Any, value: Any) -> Any:
@@ -177,7 +194,8 @@ class Stream(Kind):
     is checked when it comes, and named as `argument`."""
 
     def __init__(self, cls: type, argument: str):
-        self.item, self.argument = Instance(cls), argument
+        self.item = Instance(cls)
+        self.argument = argument
         self.allowed = f"an iterable of items, each {self.item.allowed}"
 
     def take(self, value):
@@ -194,7 +212,8 @@ class _Checked:
     """An iterable whose items are checked each time that it is iterated over."""
 
     def __init__(self, stream: Stream, value: Iterable):
-        self._stream, self._value = stream, value
+        self._stream = stream
+        self._value = value
 
     def __iter__(self) -> Iterator[Any]:
         item = self._stream.item

@@ -18,6 +18,7 @@ import numpy as np
 
 from .. import limits
 from ..arguments import Numbers
+from ..jax_compat import is_numpy_annotation
 from . import values
 from .containers import Either, Having, Instance, Items, Names, Table, Tuple
 from .values import Complexes, Integers, Kind, Number, OneOf, Reals, Switch, Whole
@@ -75,6 +76,7 @@ _PLAIN = {
 }
 _SEQUENCES: dict[Any, dict[str, Any]] = {
     list: {"form": list},
+    tuple: {"form": tuple},
     collections.abc.Sequence: {},
     collections.abc.Iterable: {"iterable": True},
     collections.abc.Collection: {"iterable": True},
@@ -92,7 +94,8 @@ def kind_of(hint: Any) -> Kind | None:
         return None
     if hint in _PLAIN:
         return _PLAIN[hint]
-    origin, arguments = get_origin(hint), get_args(hint)
+    arguments = get_args(hint)
+    origin = get_origin(hint) or hint
     if origin is Annotated:
         declared = [x for x in hint.__metadata__ if isinstance(x, Kind)]
         return declared[-1] if declared else kind_of(arguments[0])
@@ -100,30 +103,29 @@ def kind_of(hint: Any) -> Kind | None:
         return OneOf(*arguments)
     if origin in (Union, types.UnionType):
         return _either(arguments)
-    if hint is collections.abc.Callable or origin is collections.abc.Callable:
+    if origin is collections.abc.Callable:
         return values.FUNCTION
-    if origin is tuple:
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return Items(kind_of(arguments[0]), form=tuple)
-        return Tuple(*map(kind_of, arguments))
-    container = hint if origin is None else origin
-    if container in _SEQUENCES:
-        return Items(
-            kind_of(arguments[0]) if arguments else None, **_SEQUENCES[container]
-        )
-    if container in _MAPPINGS:
-        return Table(*map(kind_of, arguments)) if arguments else Table(None, None)
-    if isinstance(container, type):
-        return _of_class(container)
+    if origin in _SEQUENCES:
+        return _sequence(origin, arguments)
+    if origin in _MAPPINGS:
+        return Table(*map(kind_of, arguments or (Any, Any)))
+    if isinstance(origin, type):
+        return _of_class(origin)
     raise TypeError(f"there is no kind for the annotation {hint}.")
+
+
+def _sequence(origin: Any, arguments: tuple[Any, ...]) -> Kind:
+    if origin is tuple and arguments and arguments[-1] is not Ellipsis:
+        return Tuple(*map(kind_of, arguments))
+    item = kind_of(arguments[0]) if arguments else None
+    return Items(item, **_SEQUENCES[origin])
 
 
 def _either(arguments: tuple[Any, ...]) -> Kind | None:
     kinds = [kind_of(x) for x in arguments]
     arrays = [kind for kind in kinds if isinstance(kind, Reals)]
-    if (
-        len(arrays) > 1 and arrays[0].form is not None
-    ):  # of NumPy or of JAX: stay what they are
+    if len(arrays) > 1 and arrays[0].form is not None:
+        # (Arrays of NumPy or of JAX stay what they are.)
         arrays[0].form = None
         kinds = [kind for kind in kinds if kind not in arrays[1:]]
     if len(kinds) == 1:
@@ -137,7 +139,7 @@ def _either(arguments: tuple[Any, ...]) -> Kind | None:
 def _of_class(cls: type) -> Kind:
     if issubclass(cls, jaxtyping.AbstractArray):
         return _array(cls)
-    if cls.__module__.startswith("numpy._typing"):
+    if is_numpy_annotation(cls):
         raise TypeError("an array is annotated as `Annotated[Numbers, Reals(shape)]`.")
     return Having(cls) if getattr(cls, "_is_protocol", False) else Instance(cls)
 

@@ -29,9 +29,15 @@ class Misfit(Exception):
     """
 
     def __init__(
-        self, problem: str | Callable[[], str], *, near: bool = False, path: str = ""
+        self,
+        problem: str | Callable[[], str],
+        *,
+        near: bool = False,
+        path: str = "",
     ):
-        self._problem, self.near, self.path = problem, near, path
+        self._problem = problem
+        self.near = near
+        self.path = path
 
     @property
     def problem(self) -> str:
@@ -58,26 +64,29 @@ def show(value: Any) -> str:
         return f"an array of {value.dtype} with shape {value.shape}"
     if isinstance(value, np.generic):
         return show(value.item())
-    if (
-        value is None
-        or value is ...
-        or isinstance(value, int | float | complex | str | bytes)
-    ):
-        try:
-            text = repr(value)
-        except ValueError:  # an integer with more digits than Python writes
-            return "a number with thousands of digits"
-        return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+    if isinstance(value, _WRITTEN):
+        return _written(value)
     if isinstance(value, type):
         return f"the class {value.__name__} itself"
     if isinstance(value, list | tuple | set | frozenset | dict) and len(value) < 100:
         text = repr(value)
-        return (
-            text if len(text) <= _SHOWN else f"a {type(value).__name__} of {len(value)}"
-        )
+        if len(text) <= _SHOWN:
+            return text
+        return f"a {type(value).__name__} of {len(value)}"
     if callable(value) and hasattr(value, "__name__"):
         return f"the function {value.__name__}"
     return with_article(type(value).__name__)
+
+
+_WRITTEN = int, float, complex, str, bytes, type(None), type(...)
+
+
+def _written(value: Any) -> str:
+    try:
+        text = repr(value)
+    except ValueError:  # an integer with more digits than Python writes
+        return "a number with thousands of digits"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 def with_article(name: str) -> str:
@@ -88,7 +97,8 @@ def with_article(name: str) -> str:
 
 def listed(words: list[str]) -> str:
     """ "a", "a or b", "a, b or c"."""
-    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    *first, last = words
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 class Kind:
@@ -211,7 +221,8 @@ class Plain(Kind):
     """What passes a test."""
 
     def __init__(self, allowed: str, fits: Callable[[Any], bool]):
-        self.allowed, self.fits = allowed, fits
+        self.allowed = allowed
+        self.fits = fits
 
 
 TEXT = Plain("a string", lambda value: isinstance(value, str))
@@ -228,11 +239,9 @@ def _is_path(value: Any) -> bool:
 def _plain(value: Any, allowed: str) -> Any:
     """A number of Python for an array without axes."""
     refuse_traced(value, allowed)
-    return (
-        value.item()
-        if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0
-        else value
-    )
+    if isinstance(value, np.ndarray | jax.Array) and value.ndim == 0:
+        return value.item()
+    return value
 
 
 def unmasked(values: Any) -> np.ndarray:
@@ -281,10 +290,14 @@ class Reals(Kind):
         infinite: bool = False,
         form: Callable[[Any], Any] | None = None,
     ):
-        self.shape, self.sign = tuple(shape.split()), sign
-        self.missing, self.infinite, self.form = missing, infinite, form
+        self.shape = tuple(shape.split())
+        self.sign = sign
+        self.missing = missing
+        self.infinite = infinite
+        self.form = form
         if sign != "any":
-            self.single, self.items = f"a {sign} number", f"{sign} numbers"
+            self.single = f"a {sign} number"
+            self.items = f"{sign} numbers"
         self.allowed = self.single if self.shape == () else f"an array of {self.items}"
         if self.shape not in ((), ("...",)):
             self.allowed += f" with shape {self._written()}"
@@ -294,8 +307,9 @@ class Reals(Kind):
         if array.dtype.kind not in self.types:
             raise self._wrong_type(value, array)
         if not self._fits(array.shape):
-            what = "one number" if self.shape == () else f"of shape {self._written()}"
-            raise Misfit(f"must be {what}, not of shape {array.shape}", near=True)
+            wanted = f"of shape {self._written()}" if self.shape else "one number"
+            problem = f"must be {wanted}, not of shape {array.shape}"
+            raise Misfit(problem, near=True)
         if not is_tracer(array):
             self._check_values(array)
         # (Arrays of JAX in single precision have lost digits, and are refused by `require_x64`.)
@@ -355,7 +369,10 @@ class Reals(Kind):
             self._refuse_any(values < 0, values, "zero or positive")
 
     def _refuse_any(
-        self, bad: np.ndarray | np.bool_, values: np.ndarray, allowed: str
+        self,
+        bad: np.ndarray | np.bool_,
+        values: np.ndarray,
+        allowed: str,
     ) -> None:
         if not bad.any():
             return
@@ -368,7 +385,8 @@ class Reals(Kind):
         )
 
     def _written(self) -> str:
-        return f"({', '.join(self.shape)}{',' * (len(self.shape) == 1)})"
+        comma = "," if len(self.shape) == 1 else ""
+        return f"({', '.join(self.shape)}{comma})"
 
 
 class Complexes(Reals):

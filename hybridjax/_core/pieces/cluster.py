@@ -12,12 +12,12 @@ from typing import Any
 
 import cloudpickle
 import equinox as eqx
-import jax
 import numpy as np
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
 
 from ...errors import ComputationError, DefinitionError, HybridJaxError
+from .. import jax_compat
 from ..cache import enable_compilation_cache
 from ..meaning import meaning
 from ..progress import counted, say
@@ -34,7 +34,10 @@ _lock = threading.Lock()
 
 
 def run_on(
-    client: Any, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+    client: Any,
+    job: Any,
+    store: ArrayStore | ZarrStore,
+    missing: Sequence[int],
 ) -> None:
     """Compute pieces on the workers of a client.
 
@@ -56,11 +59,14 @@ def run_on(
 
 
 def _run(
-    client: Client, job: Any, store: ArrayStore | ZarrStore, missing: Sequence[int]
+    client: Client,
+    job: Any,
+    store: ArrayStore | ZarrStore,
+    missing: Sequence[int],
 ) -> None:
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
-    x64 = bool(jax.config.read("jax_enable_x64"))
+    x64 = jax_compat.has_double_precision()
     # Dask gives out the tasks again that a lost worker had, and what they need.
     needed = client.submit(bytes, packed, pure=False)
     tasks = client.map(_piece, missing, packed=needed, x64=x64, pure=False)
@@ -72,8 +78,10 @@ def _run(
             try:
                 values = task.result()
             except KilledWorker as error:
-                text = f"piece {k} has ended each worker that it was given to"
-                raise ComputationError(f"{text}: give workers more memory.") from error
+                raise ComputationError(
+                    f"piece {k} has ended each worker that it was given to: give workers more "
+                    "memory."
+                ) from error
             if values is not None:
                 store.write(k, values)
     finally:
@@ -88,27 +96,23 @@ class _Packer(cloudpickle.Pickler):
 
     def reducer_override(self, obj: Any) -> Any:
         way = super().reducer_override(obj)
-        if (
-            way is not NotImplemented
-            and isinstance(obj, type)
-            and issubclass(obj, eqx.Module)
-        ):
-            raise DefinitionError(
-                f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
-            )
-        if way is NotImplemented and isinstance(
-            obj, types.FunctionType | types.ModuleType | type
-        ):
+        if way is not NotImplemented:
+            if isinstance(obj, type) and issubclass(obj, eqx.Module):
+                raise DefinitionError(
+                    f"`{obj.__name__}` is defined in the script or notebook: put it into a module."
+                )
+            return way
+        if isinstance(obj, types.FunctionType | types.ModuleType | type):
             if not is_packaged(getattr(obj, "__module__", obj.__name__)):
-                with contextlib.suppress(
-                    DefinitionError
-                ):  # of a module's other functions
+                # (Errors may be of a module's other functions.)
+                with contextlib.suppress(DefinitionError):
                     self.imported.append((obj, meaning(obj)))
         return way
 
 
 def _packed(job: Any) -> bytes:
-    packer = _Packer(file := io.BytesIO())
+    file = io.BytesIO()
+    packer = _Packer(file)
     packer.imported = []
     packer.dump(job)
     return cloudpickle.dumps((packer.imported, file.getvalue()))
@@ -122,9 +126,10 @@ def _check_packages(client: Client) -> None:
         for name in _PACKAGES:
             theirs = about["packages"].get(name)
             if theirs != mine[name]:
-                has = f"has {name} {theirs}" if theirs else f"lacks {name}"
-                text = f"{has}, and this process has {mine[name]}: use one environment"
-                raise DefinitionError(f"the Dask worker {worker} {text}.")
+                raise DefinitionError(
+                    f"the Dask worker {worker} has {name} {theirs}, and this process has "
+                    f"{mine[name]}: use one environment."
+                )
 
 
 def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
@@ -140,7 +145,7 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece
 def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     if x64:
-        jax.config.update("jax_enable_x64", True)
+        jax_compat.use_double_precision()
     enable_compilation_cache()
     # Dask's nanny starts workers with MALLOC_TRIM_THRESHOLD_ = 65536.
     with contextlib.suppress(AttributeError, OSError):  # (glibc only)
@@ -150,7 +155,9 @@ def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
     imported, packed = cloudpickle.loads(packed)
     for x, digest in imported:
         if meaning(x) != digest:
-            text = "is not what it is in this process: after changes of it, call `client.restart()`"
-            raise DefinitionError(f"`{x.__name__}` on a Dask worker {text}.")
+            raise DefinitionError(
+                f"`{x.__name__}` on a Dask worker is not what it is in this process: after changes "
+                "of it, call `client.restart()`."
+            )
     job, address = cloudpickle.loads(packed)
     return job, None if address is None else ZarrStore(address)

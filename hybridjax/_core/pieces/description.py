@@ -22,11 +22,14 @@ def versions() -> dict[str, str]:
 def difference(mine: Any, theirs: Any, name: str = "") -> str | None:
     """Return the first difference between two descriptions in words, None if they are the same."""
     if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
-        for key in [*theirs, *(x for x in mine if x not in theirs)]:
-            inside = f"{name}.{key}" if name else key
-            if key not in mine or key not in theirs:
-                return f"`{inside}` is {'only there' if key in theirs else 'not there'}"
-            if (change := difference(mine[key], theirs[key], inside)) is not None:
+        for key in dict.fromkeys([*theirs, *mine]):
+            inside = ".".join(filter(None, [name, key]))
+            if key not in mine:
+                return f"`{inside}` is only there"
+            if key not in theirs:
+                return f"`{inside}` is not there"
+            change = difference(mine[key], theirs[key], inside)
+            if change is not None:
                 return change
         return None
     if mine == theirs:

@@ -42,9 +42,10 @@ def fill(
         job = job.resume(store.layout, store.start)
     else:
         job, layout = job.begin()
-        store = (
-            make_store(address, layout, job.arrays()) if address else ArrayStore(layout)
-        )
+        if address:
+            store = make_store(address, layout, job.arrays())
+        else:
+            store = ArrayStore(layout)
     missing = store.missing()
     if missing and client is not None:
         package("distributed")

@@ -120,10 +120,13 @@ class ArrayStore:
     address = None
 
     def __init__(self, layout: Layout):
-        self.layout, arrays = layout, layout.variables.items()
-        self._arrays = {
-            k: np.full(layout.array(k)[1], x.fill, x.dtype) for k, x in arrays
-        }
+        self.layout = layout
+        arrays: dict[str, Any] = dict(layout.constants)
+        for name, x in layout.variables.items():
+            dims, shape = layout.array(name)
+            arrays[name] = dims, np.full(shape, x.fill, x.dtype), x.attributes
+        data = package("xarray").Dataset(arrays).set_coords(layout.coordinates)
+        self._data = data.assign_attrs({_ABOUT: json.dumps(layout.description)})
 
     def missing(self) -> list[int]:
         """Return all pieces."""
@@ -131,17 +134,12 @@ class ArrayStore:
 
     def write(self, k: int, values: Mapping[str, np.ndarray]) -> None:
         """Keep piece k."""
-        for name, array in self._arrays.items():
-            array[self.layout.blocks.slices(k)] = values[name]
+        for name in self.layout.variables:
+            self._data[name].values[self.layout.blocks.slices(k)] = values[name]
 
     def dataset(self) -> Any:
         """Return all results as `xarray.Dataset`."""
-        of, arrays = self.layout, self._arrays.items()
-        data = {k: (of.array(k)[0], x, of.variables[k].attributes) for k, x in arrays}
-        data = package("xarray").Dataset({**of.constants, **data})
-        return data.set_coords(of.coordinates).assign_attrs(
-            {_ABOUT: json.dumps(of.description)}
-        )
+        return self._data
 
 
 class ZarrStore:
@@ -164,13 +162,12 @@ class ZarrStore:
                 name: self._group[name].with_config({"write_empty_chunks": True})
                 for name in about["variables"]
             }
-            first, p = next(iter(self._arrays.values())), len(about["dims"])
-            arrays = {
-                name: Variable(
-                    x.dtype.str, tuple(x.metadata.dimension_names[p:]), x.shape[p:]
-                )
-                for name, x in self._arrays.items()
-            }
+            first = next(iter(self._arrays.values()))
+            p = len(about["dims"])
+            arrays = {}
+            for name, x in self._arrays.items():
+                dims = tuple(x.metadata.dimension_names[p:])
+                arrays[name] = Variable(x.dtype.str, dims, x.shape[p:])
             blocks = Blocks(first.shape[:p], first.chunks[:p])
             self.layout = Layout(
                 tuple(about["dims"]), blocks, arrays, {}, (), about["description"]
@@ -179,16 +176,16 @@ class ZarrStore:
             kept = self._group[_START]
             start = [kept[f"{i}"] for i in range(about["start"])]
             whole = [*start, *(self._group[name] for name in about["constants"])]
-            if lost := {_key(x) for x in whole if x.size} - self._present():
+            lost = {_key(x) for x in whole if x.size} - self._present()
+            if lost:
                 raise FileNotFoundError(f"{min(lost)} is missing")
             self.start = [np.asarray(x[...]) for x in start]
         except Exception as error:  # (of many kinds)
             raise DefinitionError(
                 f"cannot open '{address}' as a store: {error}"
             ) from error
-        chunk = max(
-            math.prod(x.chunks) * x.dtype.itemsize for x in self._arrays.values()
-        )
+        arrays = self._arrays.values()
+        chunk = max(math.prod(x.chunks) * x.dtype.itemsize for x in arrays)
         for path, size in sizes.items():
             if size > max(limits.TEXT, chunk + _CHECKSUM):
                 raise DefinitionError(
@@ -198,7 +195,8 @@ class ZarrStore:
     def missing(self) -> list[int]:
         """Return the pieces of which a chunk is missing."""
 
-        present, pieces = self._present(), range(len(self.layout.blocks))
+        present = self._present()
+        pieces = range(len(self.layout.blocks))
         return [k for k in pieces if not present.issuperset(self._chunks(k))]
 
     def _present(self) -> set[str]:
@@ -223,9 +221,9 @@ class ZarrStore:
             try:
                 values[name] = array[(*self.layout.blocks.slices(k), ...)]
             except Exception as error:  # (of many kinds: checksums, sizes, headers)
-                text = f"piece {k} of '{self.address}' is damaged in `{name}`"
                 raise FileFormatError(
-                    f"{text}: make the call that wrote it again."
+                    f"piece {k} of '{self.address}' is damaged in `{name}`: make the call that "
+                    "wrote it again."
                 ) from error
         return values
 
@@ -257,9 +255,8 @@ class ZarrStore:
         options = {"consolidated": False, "chunks": None, "zarr_format": 3}
         try:
             data = package("xarray").open_zarr(self.address, **options)
-        except (
-            Exception
-        ) as error:  # (of many kinds, for an array that another program has added)
+        except Exception as error:
+            # (Of many kinds, for an array that another program has added.)
             raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
         # (Zarr lists arrays in any order.)
         dims = [name for name in self.layout.dims if name in data.coords]
@@ -290,11 +287,12 @@ def open_store(address: str, job: Any) -> ZarrStore | None:
     except Exception as error:  # (of many kinds)
         if isinstance(error, FileNotFoundError) and not sizes:
             return None
-        text = f"'{address}' is no store of results, or only begun ({error!r})"
-        raise DefinitionError(f"{text}: choose another name, or delete it.") from error
-    if (
-        change := difference(json.loads(json.dumps(job.description)), theirs)
-    ) is not None:
+        raise DefinitionError(
+            f"'{address}' is no store of results, or only begun ({error!r}): choose another name, "
+            "or delete it."
+        ) from error
+    change = difference(json.loads(json.dumps(job.description)), theirs)
+    if change is not None:
         raise DefinitionError(
             f"'{address}' holds other results: {change}. Choose another store."
         )
@@ -318,7 +316,11 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
     common = {"compressors": [Crc32cCodec()], "config": {"write_empty_chunks": True}}
 
     def constant(
-        group: Any, name: str, dims: Sequence[str], values: Any, attributes: Any = None
+        group: Any,
+        name: str,
+        dims: Sequence[str],
+        values: Any,
+        attributes: Any = None,
     ):
         values = np.asarray(values)
         group.create_array(
@@ -331,9 +333,8 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         )
 
     with _writing(address), warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # (Zarr announces that its format of texts may change.)
+        # (Zarr announces that its format of texts may change.)
+        warnings.simplefilter("ignore")
         group = _group(address, "a")
         for name, x in layout.variables.items():
             dims, shape = layout.array(name)
@@ -352,9 +353,9 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
         kept = group.require_group(_START)
         for i, x in enumerate(start):
             constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
-        if beside := [
-            x for x in layout.coordinates if (x,) != tuple(layout.constants[x][0])
-        ]:
+        dims = {name: tuple(x[0]) for name, x in layout.constants.items()}
+        beside = [name for name in layout.coordinates if dims[name] != (name,)]
+        if beside:
             group.attrs["coordinates"] = " ".join(beside)
         about = {
             "description": layout.description,
@@ -386,15 +387,13 @@ def _sizes(address: str) -> dict[str, int]:
     """
     if "://" in address:
         return {}
-    tree = (
-        (at, name)
-        for at, *names in os.walk(address)
-        for name in itertools.chain(*names)
-    )
+    paths = [address] if os.path.lexists(address) else []
+    for folder, *names in os.walk(address):
+        paths += [os.path.join(folder, name) for name in itertools.chain(*names)]
     sizes = {}
-    for path in [address, *itertools.starmap(os.path.join, tree)]:
-        about = os.lstat(path) if os.path.lexists(path) else None
-        if about is None or stat.S_ISDIR(about.st_mode):
+    for path in paths:
+        about = os.lstat(path)
+        if stat.S_ISDIR(about.st_mode):
             continue
         if not stat.S_ISREG(about.st_mode):
             raise DefinitionError(

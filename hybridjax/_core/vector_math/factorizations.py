@@ -37,32 +37,30 @@ def solve_positive(
     NaN where a pivot is not positive, up to rounding: the matrix is singular, or not definite.
     """
     n = right.shape[-1]
-    lower, below = dict[tuple[int, int], Array](), dict[tuple[int, int], Array]()
-    pivots: list[Array] = []
+    lower: dict[tuple[int, int], Array] = {}  # L below its diagonal of ones
+    scaled: dict[tuple[int, int], Array] = {}  # L D
+    inverse: list[Array] = []  # of D
     singular = jnp.asarray(False)
+    least = n * jnp.finfo(right.dtype).eps
     for j in range(n):
         for i in range(j, n):
-            below[i, j] = _less(
-                matrix[..., i, j], [(below[i, k], lower[j, k]) for k in range(j)]
-            )
-        pivot = below[j, j]
-        singular = singular | ~(
-            pivot > n * jnp.finfo(right.dtype).eps * matrix[..., j, j]
-        )
-        pivots.append(1 / pivot)
+            products = [(scaled[i, k], lower[j, k]) for k in range(j)]
+            scaled[i, j] = _less(matrix[..., i, j], products)
+        pivot = scaled[j, j]
+        singular = singular | ~(pivot > least * matrix[..., j, j])
+        inverse.append(1 / pivot)
         for i in range(j + 1, n):
-            lower[i, j] = below[i, j] * pivots[j]
+            lower[i, j] = scaled[i, j] * inverse[j]
 
     def by_factors(_, right):
-        x: list[Array] = []
+        rows = [right[..., i] for i in range(n)]
+        rows[0] = jnp.where(singular, jnp.nan, rows[0])
         for i in range(n):
-            b = right[..., i] if i else jnp.where(singular, jnp.nan, right[..., i])
-            x.append(_less(b, [(lower[i, k], x[k]) for k in range(i)]))
+            rows[i] = _less(rows[i], [(lower[i, k], rows[k]) for k in range(i)])
         for i in reversed(range(n)):
-            x[i] = _less(
-                x[i] * pivots[i], [(lower[k, i], x[k]) for k in range(i + 1, n)]
-            )
-        return jnp.stack(x, axis=-1)
+            above = [(lower[k, i], rows[k]) for k in range(i + 1, n)]
+            rows[i] = _less(rows[i] * inverse[i], above)
+        return jnp.stack(rows, axis=-1)
 
     # (Derivatives use the factors, too.)
     return jax.lax.custom_linear_solve(
@@ -90,19 +88,20 @@ def solve(
 
 def _eliminated(matrix, right):
     n = matrix.shape[-1]
-    rows = [[*(matrix[i, j] for j in range(n)), right[..., i]] for i in range(n)]
+    rows = [[*jnp.moveaxis(matrix[i], -1, 0), right[..., i]] for i in range(n)]
     for k in range(n):
         for i in range(k + 1, n):
             larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            both = list(zip(rows[k][k:], rows[i][k:], strict=True))
-            upper = [jnp.where(larger, y, x) for x, y in both]
-            lower = [jnp.where(larger, x, y) for x, y in both]
+            pairs = list(zip(rows[k][k:], rows[i][k:], strict=True))
+            upper = [jnp.where(larger, y, x) for x, y in pairs]
+            lower = [jnp.where(larger, x, y) for x, y in pairs]
             share = lower[0] / jnp.where(upper[0] == 0, 1.0, upper[0])
             rows[k][k:] = upper
             rows[i][k:] = [y - share * x for x, y in zip(upper, lower, strict=True)]
     x: dict[int, Array] = {}
     for i in reversed(range(n)):
-        x[i] = _less(rows[i][n], [(rows[i][k], x[k]) for k in x]) / rows[i][i]
+        known = [(rows[i][k], x[k]) for k in x]
+        x[i] = _less(rows[i][n], known) / rows[i][i]
     return jnp.stack([x[i] for i in range(n)], axis=-1)
 
 
@@ -114,10 +113,12 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     lower = [[jnp.zeros_like(matrix[..., 0, 0])] * n for _ in range(n)]
     for j in range(n):
         for i in range(j, n):
-            x = _less(matrix[..., i, j], [(lower[i][k], lower[j][k]) for k in range(j)])
-            if i == j:
-                root = jnp.sqrt(jnp.where(x > 0, x, jnp.nan))
-            lower[i][j] = root if i == j else x / root
+            products = [(lower[i][k], lower[j][k]) for k in range(j)]
+            lower[i][j] = _less(matrix[..., i, j], products)
+        pivot = lower[j][j]
+        lower[j][j] = jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))
+        for i in range(j + 1, n):
+            lower[i][j] = lower[i][j] / lower[j][j]
     return jnp.stack([jnp.stack(row, axis=-1) for row in lower], axis=-2)
 
 
@@ -136,13 +137,20 @@ def triangular_solve(
     """Return X in `op(matrix) @ X = right`, or in `X @ op(matrix) = right`:
     `jax.lax.linalg.triangular_solve` for real numbers."""
     if not left_side:  # the transpose of the first form
-        right, transpose_a = jnp.swapaxes(right, -1, -2), not transpose_a
+        right = jnp.swapaxes(right, -1, -2)
+        transpose_a = not transpose_a
     op = jnp.swapaxes(matrix, -1, -2) if transpose_a else matrix
-    downwards, n = lower != transpose_a, op.shape[-1]
+    downwards = lower != transpose_a
+    n = op.shape[-1]
     X: dict[int, Array] = {}
-    for i in range(n) if downwards else reversed(range(n)):
-        x = _less(right[..., i, :], [(op[..., i, k][..., None], X[k]) for k in X])
-        X[i] = x if unit_diagonal else x / op[..., i, i][..., None]
+    order = list(range(n))
+    if not downwards:
+        order.reverse()
+    for i in order:
+        known = [(op[..., i, k, None], X[k]) for k in X]
+        X[i] = _less(right[..., i, :], known)
+        if not unit_diagonal:
+            X[i] = X[i] / op[..., i, i, None]
     solution = jnp.stack([X[i] for i in range(n)], axis=-2)
     return solution if left_side else jnp.swapaxes(solution, -1, -2)
 
@@ -157,32 +165,31 @@ def lu(
     n = matrix.shape[-1]
     index = jnp.arange(n)
 
-    def traded(x, k, chosen):
-        """x with rows k and `chosen` in each other's place."""
-        mask = jnp.reshape(chosen, (*chosen.shape, *(1,) * (x.ndim - chosen.ndim)))
-        other = jnp.sum(
-            jnp.where(mask, x, 0), axis=chosen.ndim - 1, dtype=x.dtype, keepdims=True
-        )
-        row = jax.lax.dynamic_slice_in_dim(x, k, 1, chosen.ndim - 1)
-        at_k = jnp.reshape(index == k, mask.shape[chosen.ndim - 1 :])
-        return jnp.where(at_k, other, jnp.where(mask, row, x))
+    def traded(rows, k, chosen):
+        """(*b, n, m) with rows k and `chosen` (a mask) in each other's place."""
+        mask = chosen[..., None]
+        masked = jnp.where(mask, rows, 0)
+        other = jnp.sum(masked, axis=-2, dtype=rows.dtype, keepdims=True)
+        row = jax.lax.dynamic_slice_in_dim(rows, k, 1, rows.ndim - 2)
+        here = (index == k)[:, None]
+        return jnp.where(here, other, jnp.where(mask, row, rows))
 
     def eliminate(k, carry):
         X, pivots, order = carry
+        candidates = jnp.where(index >= k, jnp.abs(_column(X, k)), -1.0)
+        largest = jnp.argmax(candidates, axis=-1)[..., None]
+        chosen = index == largest
+        X = traded(X, k, chosen)
+        order = traded(order[..., None], k, chosen)[..., 0]
+        pivots = jnp.where(index == k, largest.astype(np.int32), pivots)
         column = _column(X, k)
-        p = jnp.argmax(jnp.where(index >= k, jnp.abs(column), -1.0), axis=-1)
-        chosen = index == p[..., None]
-        X, order = traded(X, k, chosen), traded(order, k, chosen)
-        pivots = jnp.where(index == k, p[..., None].astype(np.int32), pivots)
-        row, column = _row(X, k), _column(X, k)
         pivot = _row(column[..., None], k)
-        share = jnp.where(index > k, column / jnp.where(pivot == 0, 1.0, pivot), 0.0)
-        X = X - share[..., :, None] * jnp.where(index > k, row, 0.0)[..., None, :]
-        return (
-            jnp.where((index == k) & (index[:, None] > k), share[..., :, None], X),
-            pivots,
-            order,
-        )
+        share = column / jnp.where(pivot == 0, 1.0, pivot)
+        share = jnp.where(index > k, share, 0.0)[..., :, None]
+        row = jnp.where(index > k, _row(X, k), 0.0)[..., None, :]
+        below = (index == k) & (index[:, None] > k)
+        X = jnp.where(below, share, X - share * row)
+        return X, pivots, order
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
     return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))

@@ -93,7 +93,8 @@ def _polynomial(coefficients, z):
 def _sincos(x):
     n = _N
     k = jax.lax.round(x * (2 / jnp.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
-    a, b = x - k * n.pi_2[0], k * n.pi_2[1]
+    a = x - k * n.pi_2[0]
+    b = k * n.pi_2[1]
     r = a - b
     lost = (a - r) - b  # by rounding
     r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]
@@ -104,7 +105,8 @@ def _sincos(x):
     c = 1 - (0.5 * z - z * z * _polynomial(n.cos, z))
     quadrant = k - 4 * jax.lax.floor(0.25 * k)
     odd = abs(quadrant - 2) == 1
-    sin, cos = jax.lax.select(odd, c, s), jax.lax.select(odd, s, c)
+    sin = jax.lax.select(odd, c, s)
+    cos = jax.lax.select(odd, s, c)
     sin = jax.lax.select(quadrant >= 2, -sin, sin)
     cos = jax.lax.select(abs(quadrant - 1.5) < 1, -cos, cos)
     return jax.lax.select(x == 0, x, sin), cos  # the sign of zero is kept
@@ -112,15 +114,19 @@ def _sincos(x):
 
 @_sincos.defjvp
 def _(xs, dxs):
-    (x,), (dx,) = xs, dxs
+    (x,) = xs
+    (dx,) = dxs
     s, c = _sincos(x)
     return (s, c), (dx * c, -dx * s)
 
 
 def _arctan2(y, x):
     y, x = jnp.broadcast_arrays(y, x)
-    n, ax, ay = _N, abs(x), abs(y)
-    low, high = jax.lax.min(ax, ay), jax.lax.max(ax, ay)
+    n = _N
+    ax = abs(x)
+    ay = abs(y)
+    low = jax.lax.min(ax, ay)
+    high = jax.lax.max(ax, ay)
     ratio = jnp.where(low == high, jnp.where(high == 0, 0.0, 1.0), low / high)
     steep = ratio > _TAN_PI_8
     r = jax.lax.select(steep, (ratio - 1) / (ratio + 1), ratio)
