@@ -49,7 +49,6 @@ from hybridjax._core.execution import libraries
 # Files whose fast tests cover each capability once, for `-m core`.
 CORE = (
     "test_layers",
-    "test_words",
     "test_release",
     "linear/test_ldtp",
     "linear/test_htf",
