@@ -166,7 +166,8 @@ def figures_are_closed():
 def compiled():
     """The names of all that is compiled in this context, where functions of few lanes stay on the
     host: by default the seconds that earlier tests have spent there decide."""
-    names, patience = set(), compilation.WORTH_COMPILING
+    names = set()
+    patience = compilation.WORTH_COMPILING
 
     def listen(event, *_, fun_name="", **__):
         if "backend_compile" in event:

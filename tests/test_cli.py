@@ -116,7 +116,8 @@ def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message)
     with pytest.raises(SystemExit) as error:
         main([*command.split(), *options.split()])
     said = capsys.readouterr().err
-    assert error.value.code == 2 and said.startswith("usage: hybridjax")
+    assert error.value.code == 2
+    assert said.startswith("usage: hybridjax")
     assert message in said.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
@@ -151,10 +152,8 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new")])
-    assert (
-        error.value.code == 130
-        and capsys.readouterr().err == "hybridjax: interrupted.\n"
-    )
+    assert error.value.code == 130
+    assert capsys.readouterr().err == "hybridjax: interrupted.\n"
     assert not list(tmp_path.iterdir())
 
 

@@ -23,16 +23,22 @@ def model():
 def test_the_lifted_system_is_the_periodic_one(model):
     """In time, sample by sample, and in frequency, harmonic by harmonic."""
     lti = convert.to_lti(model)
-    assert lti.n_sections == 1 and lti.A.shape == (1, 2, 2)
-    assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]") and lti.inputs[2].unit == "N"
+    assert lti.n_sections == 1
+    assert lti.A.shape == (1, 2, 2)
+    assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]")
+    assert lti.inputs[2].unit == "N"
     np.testing.assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
     u = np.random.default_rng(1).normal(size=(4 * N, 2))
     y = lti.simulate(u.reshape(4, -1))
     np.testing.assert_allclose(y.reshape(-1, 1), model.simulate(u), rtol=0, atol=1e-13)
-    f, n = np.linspace(0.01, 0.49, 7), np.arange(N)
+    f = np.linspace(0.01, 0.49, 7)
+    n = np.arange(N)
     H = model.htf(f)
     G = np.asarray(lti.htf(f).H[0]).reshape(len(f), N, 1, N, 2)
-    wave = lambda f: np.exp(2j * np.pi * np.outer(f, n) / N)  # noqa: E731
+
+    def wave(f):
+        return np.exp(2j * np.pi * np.outer(f, n) / N)
+
     for m in H.harmonics:
         found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
         np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
@@ -42,7 +48,8 @@ def test_python_control(model):
     control = pytest.importorskip("control")
     f = np.linspace(0.01, 0.49, 7)
     system = convert.to_control(model, period=2.0)
-    assert system.dt == 2.0 and system.input_labels[2] == "u[1]"
+    assert system.dt == 2.0
+    assert system.input_labels[2] == "u[1]"
     expected = convert.to_lti(model).htf(f).H[0]
     response = system(np.exp(2j * np.pi * f))
     np.testing.assert_allclose(
@@ -51,15 +58,18 @@ def test_python_control(model):
     H = model.htf(f)
     data = convert.to_control(H, period=2.0)
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
-    np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
+    measured = data(1j * data.omega)[1]
+    np.testing.assert_array_equal(measured, np.asarray(H[-1])[:, 0].T)
     np.testing.assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
     lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
-    np.testing.assert_allclose(lines[0, 0][0].get_ydata(), np.abs(H[0][:, 0, 0]))
+    measured = lines[0, 0][0].get_ydata()
+    np.testing.assert_allclose(measured, np.abs(H[0][:, 0, 0]))
 
 
 def test_scipy(model):
-    system, lti = convert.to_scipy(model, period=2.0), convert.to_lti(model)
+    system = convert.to_scipy(model, period=2.0)
+    lti = convert.to_lti(model)
     assert system.dt == 2.0
     for name in "ABCD":
         np.testing.assert_array_equal(getattr(system, name), getattr(lti, name)[0])
@@ -87,9 +97,12 @@ def test_datasets_know_names_and_units(model):
     fewer = convert.from_xarray(
         dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
     )
-    assert fewer.harmonics == (-1, 0) and fewer.inputs == ("u",) and len(fewer.f) == 2
+    assert fewer.harmonics == (-1, 0)
+    assert fewer.inputs == ("u",)
+    assert len(fewer.f) == 2
     made = convert.to_xarray(recording())
-    assert made.a.attrs["units"] == "N" and "units" not in made.b.attrs
+    assert made.a.attrs["units"] == "N"
+    assert "units" not in made.b.attrs
     second = made.isel(sample=made.trial.values == 1)
     np.testing.assert_array_equal(second.b, recording().trials[1].values[:, 1])
     assert made.event_time[made.event == "e"].values.tolist() == [0.1, 0.3, 0.1, 0.3]
@@ -98,10 +111,12 @@ def test_datasets_know_names_and_units(model):
     assert dims["B"] == ("section", "next_state", "input")
     u = np.zeros((2, 4 * N, 2))
     data = hj.ExperimentData(u, u + np.arange(4 * N)[:, None], n_sections=N, periods=2)
-    dataset, whole = convert.to_xarray(data), convert.to_xarray(model)
+    dataset = convert.to_xarray(data)
+    whole = convert.to_xarray(model)
     later = convert.from_xarray(dataset.isel(sample=slice(N, None)))
     np.testing.assert_array_equal(later.y, data.y[:, N:])
-    backwards, late = slice(None, None, -1), slice(1, None)
+    backwards = slice(None, None, -1)
+    late = slice(1, None)
     for part in (dataset.isel(sample=x) for x in (backwards, late)):
         with pytest.raises(
             hj.DefinitionError, match="`sample` must be in order, from section 0"
@@ -115,14 +130,15 @@ def test_datasets_know_names_and_units(model):
 def test_section_data(wave):
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
-    crossing, about = hj.Crossing("v", "falling"), {"inputs": "f", "outputs": "x"}
+    crossing = hj.Crossing("v", "falling")
+    about = {"inputs": "f", "outputs": "x"}
     data = hj.recordings.section_data(wave, crossing, **about, n_sections=8)
-    dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
+    dataset = convert.to_xarray(data)
+    frame = convert.to_pandas(data)
     np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
     np.testing.assert_array_equal(frame["time"], data.times[0])
-    np.testing.assert_array_equal(
-        frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8
-    )
+    expected = (frame["section"][0] + np.arange(8)) % 8
+    np.testing.assert_array_equal(frame["section"][:8], expected)
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
     average = dataset.average_cycle.sel(signal="x").values

@@ -32,7 +32,8 @@ def toy(charts, transitions=(), period=None, outputs=(), **names):
 
 def resting(t, q, u):
     """A driven oscillator, and beside it a state that only rounding errors move from zero."""
-    (x, v, w), c = q, jnp.cos(3 * t)
+    (x, v, w) = q
+    c = jnp.cos(3 * t)
     return v, c - 4 * x - v + u[0], (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
 
 
@@ -41,7 +42,8 @@ RESTING = toy({"all": Field(("x", "v", "w"), resting)}, period=2 * np.pi / 3)
 
 def hopper_in(length, time):
     """Return the hopper with lengths and times multiplied."""
-    h, force = hj.models.VerticalHopper(), length / time**2
+    h = hj.models.VerticalHopper()
+    force = length / time**2
     return hj.models.VerticalHopper(
         l0=h.l0 * length,
         a=h.a * force,
@@ -101,7 +103,8 @@ def many(cycle, n):
     """Return so many times the same cycle, without a program that finds them."""
     arrays, rest = eqx.partition(cycle, eqx.is_array)
     arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
-    c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
+    c = eqx.combine(arrays, rest)
+    codes = np.tile(cycle.event_sequence, (n, 1))
     return LimitCycles(
         c.system,
         cycle.base,

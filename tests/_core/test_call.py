@@ -35,7 +35,10 @@ class Slowed(hj.HybridSystem):
 
     def charts(self):
         k = DRAG[0] if self.water is None else self.water.drag
-        force = lambda t, u: jnp.cos(2 * jnp.pi * t) + self.wind + u[0]  # noqa: E731
+
+        def force(t, u):
+            return jnp.cos(2 * jnp.pi * t) + self.wind + u[0]
+
         return {"air": Field(("x",), lambda t, q, u: (force(t, u) - k * q[0],))}
 
     def guess(self):
@@ -105,7 +108,8 @@ def test_systems_given_together_that_are_equal_may_compute_something_else():
 )
 def test_code_is_read_once_in_a_public_call(use, most, monkeypatch):
     cycle = hj.find_limit_cycle(Slowed())
-    count, digest_of = [], meaning._digest_of
+    count = []
+    digest_of = meaning._digest_of
 
     def counted(x):
         count.append(type(x).__name__)

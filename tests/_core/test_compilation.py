@@ -63,7 +63,8 @@ class Pair(NamedTuple):
 @pytest.fixture
 def tiers(monkeypatch):
     """The options of all programs that are compiled, which begin with none."""
-    compiled, compile = [], jax.stages.Lowered.compile
+    compiled = []
+    compile = jax.stages.Lowered.compile
 
     def count(self, compiler_options=None):
         compiled.append("quick" if compiler_options else "full")
@@ -93,7 +94,8 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
     ]  # one program for one job
     later = TwoTiers(total, large=False)
     np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
-    assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
+    assert [x[1] for x in later._chosen.values()] == [program._full]
+    assert len(tiers) == 2
 
 
 def test_functions_that_are_written_anew_share_a_program(tiers):
@@ -120,7 +122,8 @@ def plain(function, *trees):
 
 @pytest.mark.parametrize("lanes", [1, 3, 4, 8])
 def test_a_kernel_of_any_number_of_lanes(lanes):
-    x, y = np.linspace(0.0, 1.0, 4)[None], np.ones((1, 1))
+    x = np.linspace(0.0, 1.0, 4)[None]
+    y = np.ones((1, 1))
     before = len(compilation._kernels)
     for k in (1.0, 2.0):
         values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
@@ -139,8 +142,11 @@ def test_programs_that_call_lapack_take_turns():
     TwoTiers(jnp.linalg.eigvals, False)(A)
     TwoTiers(jnp.linalg.matmul, False)(A, A)
     alone = {key[0]: program._alone for key, program in compilation._by_kind.items()}
-    assert alone[jnp.linalg.eigvals] and not alone[jnp.linalg.matmul]
-    inside, counts, met = [], [], threading.Barrier(2)
+    assert alone[jnp.linalg.eigvals]
+    assert not alone[jnp.linalg.matmul]
+    inside = []
+    counts = []
+    met = threading.Barrier(2)
 
     def work():
         met.wait(10.0)
@@ -293,13 +299,12 @@ def test_loop_kernels_that_come_too_late_are_refused():
     printed = run(LATE)
     if printed.strip() == "done True":
         pytest.skip("this XLA makes single kernels of loops by default")
-    assert (
-        printed.startswith(" XLA has read")
-        and "before JAX computes anything" in printed
-    )
+    assert printed.startswith(" XLA has read")
+    assert "before JAX computes anything" in printed
 
 
 @pytest.mark.slow
 def test_two_workers_with_lapack_do_not_wait_for_each_other():
     printed = run(LAPACK)
-    assert "500/500 found" in printed and "500/500 ok" in printed
+    assert "500/500 found" in printed
+    assert "500/500 ok" in printed

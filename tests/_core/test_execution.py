@@ -19,9 +19,11 @@ def test_the_default_device_counts_more_than_the_backend(monkeypatch):
     """A CPU that is asked for on a machine with a GPU is a CPU."""
     assert on_cpu()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert not on_cpu() and Execution().threads == 1
+    assert not on_cpu()
+    assert Execution().threads == 1
     with jax.default_device("cpu"):
-        assert on_cpu() and jnp.ones(1).devices() == {jax.devices("cpu")[0]}
+        assert on_cpu()
+        assert jnp.ones(1).devices() == {jax.devices("cpu")[0]}
     assert not on_cpu()
 
 
@@ -29,9 +31,8 @@ def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
     executors = []
     function = host_first(lambda x: (executors.append(on_host(x)), 2 * x)[1])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [
-        True
-    ]
+    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]}
+    assert executors == [True]
 
 
 def test_programs_factorize_one_matrix_at_a_time():
@@ -40,7 +41,8 @@ def test_programs_factorize_one_matrix_at_a_time():
     A, B, C, u = (
         rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2))
     )
-    matrices, right = rng.normal(size=(3, 2, 4, 4)), rng.normal(size=(4, 1))
+    matrices = rng.normal(size=(3, 2, 4, 4))
+    right = rng.normal(size=(4, 1))
     exact = np.linalg.solve(matrices, right)
     np.testing.assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
     for program, arguments in (
@@ -54,7 +56,8 @@ def test_programs_factorize_one_matrix_at_a_time():
             .as_text()
             .split("getrf_ffi")
         )
-        assert len(calls) == 2 and 'num_batch_dims = "0"' in calls[1]
+        assert len(calls) == 2
+        assert 'num_batch_dims = "0"' in calls[1]
 
 
 @pytest.fixture
@@ -81,7 +84,8 @@ def test_threads_come_back(library):
     with pytest.raises(ZeroDivisionError), one_blas_thread():
         1 / 0  # noqa: B018
     assert library.get() == 4
-    entered, leave = threading.Event(), threading.Event()
+    entered = threading.Event()
+    leave = threading.Event()
 
     @one_blas_thread()
     def other():

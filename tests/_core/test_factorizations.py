@@ -33,7 +33,8 @@ FUNCTIONS = {
 def samples(n, lanes=9):
     """The first number of the first matrix is zero: without pivoting nothing would be right."""
     rng = np.random.default_rng(n)
-    A, b = rng.normal(size=(n, n, lanes)), rng.normal(size=(n, lanes))
+    A = rng.normal(size=(n, n, lanes))
+    b = rng.normal(size=(n, lanes))
     A[0, 0, 0] = 0.0
     return A, b
 
@@ -65,7 +66,8 @@ def test_other_factorizations_are_left_to_lapack(function):
 
 def test_matrices_that_are_not_positive_are_seen():
     singular = jnp.array([[1.0, 2.0], [2.0, 4.0]])
-    tiny, matrices = 1e-30 * jnp.eye(2), [singular, -jnp.eye(2), jnp.zeros((2, 2))]
+    tiny = 1e-30 * jnp.eye(2)
+    matrices = [singular, -jnp.eye(2), jnp.zeros((2, 2))]
     x = jax.jit(jax.vmap(solve_positive))(
         jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
     )

@@ -509,7 +509,8 @@ def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_
     monkeypatch.chdir(tmp_path)
     before, change = CHANGES[kind][0]
     space = made(f"{before}\n{CLOCKED}")
-    sections, guess = hj.ClockPhase(2), hj.Guess("line", (0.0,))
+    sections = hj.ClockPhase(2)
+    guess = hj.Guess("line", (0.0,))
     cycles = []
     for statement in ("", change):
         exec(statement, space)
@@ -546,7 +547,9 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
     """Classes that `type` makes have the module of a package; a number may be anywhere."""
 
     def system(k):
-        field = lambda t, q, u: (k, 1.0)  # noqa: E731
+        def field(t, q, u):
+            return (k, 1.0)
+
         charts = {"line": Field(("x", "y"), field)}
         return type("Made", (hj.HybridSystem,), {"charts": lambda self, x=charts: x})()
 
@@ -554,7 +557,8 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
         way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
         np.testing.assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
     digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
-    assert digests[0] == digests[1] and len(set(digests)) == 3
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
 
 
 MIRRORED = """

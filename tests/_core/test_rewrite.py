@@ -36,7 +36,8 @@ def looped(x, y):
 
 
 def test_vectorized_replaces_everything():
-    assert left(looped, 0.3, 0.7) and not left(vectorized(looped), 0.3, 0.7)
+    assert left(looped, 0.3, 0.7)
+    assert not left(vectorized(looped), 0.3, 0.7)
     np.testing.assert_allclose(
         vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13
     )
@@ -91,7 +92,8 @@ def test_closures_over_tracers():
 
 
 def test_every_call_sees_the_present_parameters_and_traces_once():
-    parameters, traces = {"a": 1.0}, []
+    parameters = {"a": 1.0}
+    traces = []
 
     @vectorized
     def function(x):
@@ -100,7 +102,8 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
 
     first = function(0.5)
     parameters["a"] = 2.0
-    assert function(0.5) == 2 * first and len(traces) == 2
+    assert function(0.5) == 2 * first
+    assert len(traces) == 2
 
 
 def test_off_away_from_cpu(monkeypatch):
@@ -110,12 +113,14 @@ def test_off_away_from_cpu(monkeypatch):
 
 def test_vectors_of_several_functions_are_put_together_row_by_row():
     def field(t, q):
-        a, b = jnp.sin(t) + q[0], jnp.cos(2 * t) * q[1]
+        a = jnp.sin(t) + q[0]
+        b = jnp.cos(2 * t) * q[1]
         return jnp.stack([a, q[0], a * b, jnp.tan(b)]), jnp.concatenate(
             [q, jnp.sin(t)[None]]
         )
 
-    t, q = jnp.asarray(0.7), jnp.array([0.3, -1.2])
+    t = jnp.asarray(0.7)
+    q = jnp.array([0.3, -1.2])
     program = str(jax.make_jaxpr(vectorized(field))(t, q))
     assert "stack[" not in program.replace("_stack[", "")
     assert program.count("concatenate[") == 1  # with one function behind it
@@ -157,7 +162,8 @@ ZOO = {
 
 
 def rotation(angle):
-    s, c = jnp.sin(angle), jnp.cos(angle)
+    s = jnp.sin(angle)
+    c = jnp.cos(angle)
     return jnp.array([[c, -s], [s, c]])
 
 
@@ -182,6 +188,7 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True
     )
     for (path, a), b in pairs:
-        assert a.dtype == b.dtype and a.shape == b.shape
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
         atol = tolerance * max(1.0, np.abs(b).max())
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))

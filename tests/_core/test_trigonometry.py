@@ -93,7 +93,8 @@ def test_special_values(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives(name):
-    ours, plain = getattr(trigonometry, name), getattr(jnp, name)
+    ours = getattr(trigonometry, name)
+    plain = getattr(jnp, name)
     x = jnp.linspace(-0.9, 0.9, 8)
     for derivative in (
         lambda f: jax.vmap(jax.grad(f)),

@@ -60,5 +60,8 @@ def random_designs(number, rms, *arguments, **options):
     """Yield multisines with random amplitudes."""
     rng = np.random.default_rng(0)
     for _ in range(number):
-        amplitude = lambda f: rng.exponential(size=f.shape)  # noqa: E731
+
+        def amplitude(f):
+            return rng.exponential(size=f.shape)
+
         yield hj.multisine(*arguments, amplitude=amplitude, **options).scaled(rms)

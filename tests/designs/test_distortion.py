@@ -14,7 +14,8 @@ from ..conftest import APEX, OUTPUTS
 from ..toys import Field, toy
 
 
-Limits, Distortion = hj.designs.Limits, hj.designs.Distortion
+Limits = hj.designs.Limits
+Distortion = hj.designs.Distortion
 # (Eight sections: shapes are the same in all tests of the hopper, so that each is compiled once.)
 KINEMATIC = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
@@ -126,7 +127,8 @@ def test_without_a_clock(vanderpol_cycle):
     quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
     u = hj.multisine(4, periods=4, band=(0.0, 2.0)).scaled(rms=1e-3).inputs()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
-    assert np.abs(even - quadratic.second_order(u)).max() < 1e-4 * np.abs(even).max()
+    error = np.abs(even - quadratic.second_order(u)).max()
+    assert error < 1e-4 * np.abs(even).max()
 
 
 @pytest.mark.slow
@@ -139,16 +141,19 @@ def test_two_inputs(two, inputs):
     full = np.zeros((*u.shape[:2], 2))
     full[:, :, [("push", "pull").index(n) for n in inputs]] = u
     even = even_part(cycle, sections, full, ("x", "z"))
-    assert np.abs(even - quadratic.second_order(u)).max() < 1e-5 * np.abs(even).max()
+    error = np.abs(even - quadratic.second_order(u)).max()
+    assert error < 1e-5 * np.abs(even).max()
 
 
 @pytest.mark.parametrize("gaussian", [False, True])
 def test_the_expected_size_with_two_inputs(two, gaussian):
     """Over draws of the phases; and of amplitudes, too, which makes the inputs Gaussian."""
-    count, cosines = 400, Candidates.of(SHORT)
+    count = 400
+    cosines = Candidates.of(SHORT)
     limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
     form = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    drawn, expected = SHORT.realizations(count), form.rms(SHORT) ** 2
+    drawn = SHORT.realizations(count)
+    expected = form.rms(SHORT) ** 2
     if gaussian:
         size = np.sqrt(np.random.default_rng(0).exponential(size=len(drawn.line)))
         drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
@@ -165,7 +170,8 @@ def test_the_expected_size_with_two_inputs(two, gaussian):
 def test_one_cosine_in_closed_form(quadratic, f):
     """x2[p+1] = 0.6 x2[p] + 0.7 x1[p]^2, of which the mean and twice the frequency are seen; z has
     the square of the input, too."""
-    a, z = 0.01, np.exp(2j * np.pi * f)
+    a = 0.01
+    z = np.exp(2j * np.pi * f)
     design = hj.Design(
         experiment=[0],
         line=[round(8 * f)],
@@ -181,10 +187,10 @@ def test_one_cosine_in_closed_form(quadratic, f):
     limit = Distortion(quadratic[0], quadratic[1], {"x": 1.0, "z": 1.0})
     found = products(limit, cosines, ("u",), cosines.power_of(design))
     x1 = a / np.abs(z - 0.6)
-    mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
-    assert found.rms(design)[0] == pytest.approx(
-        np.sqrt(mean**2 + twice**2 / 2), rel=1e-9
-    )
+    mean = 0.7 * x1**2 / 2 / 0.4
+    twice = 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
+    expected = pytest.approx(np.sqrt(mean**2 + twice**2 / 2), rel=1e-9)
+    assert found.rms(design)[0] == expected
     np.testing.assert_allclose(
         found.rms(design, phases=True), found.rms(design), rtol=1e-9
     )
@@ -197,10 +203,8 @@ def test_one_cosine_in_closed_form(quadratic, f):
 def test_designs_within_a_distortion(hopper_cycle):
     """The limit holds for the experiments that are made, and those of equal amplitudes."""
     sections = hj.ClockPhase(8, anchor=APEX)
-    model, usual = (
-        hj.linearize(hopper_cycle, sections, OUTPUTS),
-        hj.multisine(8, periods=32),
-    )
+    model = hj.linearize(hopper_cycle, sections, OUTPUTS)
+    usual = hj.multisine(8, periods=32)
     distortion = Distortion(hopper_cycle, sections, LEVEL)
     plan = hj.optimal_design(
         model, usual, limit=Limits(distortion=distortion), noise=NOISE
@@ -210,10 +214,10 @@ def test_designs_within_a_distortion(hopper_cycle):
     }
     assert plan.limited == tuple(n for n, share in ends.items() if share > 0.99) != ()
     for rms in (plan.rms, plan.usual_rms):
-        assert max(
-            rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL
-        ) == pytest.approx(1)
-    assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
+        measured = max(rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL)
+        assert measured == pytest.approx(1)
+    assert plan.saved > 1.2
+    assert 1 <= plan.certificate < 1.1
     assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
     # Twice what is allowed: twice the power, half of the strides.
@@ -247,8 +251,10 @@ def test_beside_other_limits(quadratic):
         robust="worst",
         **options,
     )
-    assert both.limited == ("u",) and both.rms["distortion of x"] < 1e-3
-    assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
+    assert both.limited == ("u",)
+    assert both.rms["distortion of x"] < 1e-3
+    assert both.rms["u"] <= 0.01 * (1 + 1e-9)
+    assert both.certificate >= 1
 
 
 def test_without_distortion(quadratic):

@@ -64,14 +64,17 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
 
 def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
     plan = hj.optimal_design(isochron_ldtp, usual, limit="output")
-    assert 1 < plan.saved < 1.05 and plan.certificate < 1.03
+    assert 1 < plan.saved < 1.05
+    assert plan.certificate < 1.03
     assert plan.advice.endswith("limited, equal amplitudes are nearly optimal.")
     assert all(plan.rms[n] <= plan.usual_rms[n] * (1 + 1e-9) for n in ("yM", "vM"))
     both = hj.optimal_design(
         isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE
     )
-    assert both.rms["u"] <= 0.02 * (1 + 1e-9) and both.rms["yM"] <= 0.001 * (1 + 1e-9)
-    assert both.limited == ("u", "yM") and both.certificate < 1.04
+    assert both.rms["u"] <= 0.02 * (1 + 1e-9)
+    assert both.rms["yM"] <= 0.001 * (1 + 1e-9)
+    assert both.limited == ("u", "yM")
+    assert both.certificate < 1.04
 
 
 def test_experiments_are_as_promised(plan, isochron_ldtp):
@@ -119,4 +122,5 @@ def test_units_and_estimates(isochron_ldtp, usual):
     fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
     for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
-        assert estimated.saved > 5 and estimated.certificate < 1.1
+        assert estimated.saved > 5
+        assert estimated.certificate < 1.1

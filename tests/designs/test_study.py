@@ -56,7 +56,8 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
 
 def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     assert [one.blocks for one in studies] == list(range(len(studies)))
-    assert studies[0].design is first and studies[0].fit is None
+    assert studies[0].design is first
+    assert studies[0].fit is None
     cycles = [one.design.cycles(0) for one in studies[:-1]]
     np.testing.assert_array_equal(studies[-1].strides, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
@@ -72,13 +73,17 @@ def test_too_much_noise_to_begin_with(model, first):
     """The first design is repeated with other phases."""
     study = hj.designs.Study(first, order=2, standard_error=1e-3)
     lost = study.add(measured(model, first, factor=1e4))
-    assert not lost.done and np.isnan(lost.standard_errors).all() and lost.plan is None
+    assert not lost.done
+    assert np.isnan(lost.standard_errors).all()
+    assert lost.plan is None
     assert "the first design again, since the data " in repr(lost)
-    assert "lower `order` in a new study" in repr(lost) and "check=" not in repr(lost)
+    assert "lower `order` in a new study" in repr(lost)
+    assert "check=" not in repr(lost)
     np.testing.assert_array_equal(lost.design.line, first.line)
     assert (lost.design.phase != first.phase).all()
     found = lost.add(measured(model, lost.design))
-    assert np.isnan(found.standard_errors[0]).all() and found.plan is not None
+    assert np.isnan(found.standard_errors[0]).all()
+    assert found.plan is not None
     unstable = dataclasses.replace(model, A=1.05 * model.A)
     assert "again, since the estimate is unstable" in repr(
         study.add(measured(unstable, first))
@@ -103,7 +108,8 @@ def test_repeated_windows_count(model, first):
     )
     noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
     study = hj.designs.Study(first, 2, 1e-5)
-    once, twice = study.add(noisy), study.add(noisy, repeats=2)
+    once = study.add(noisy)
+    twice = study.add(noisy, repeats=2)
     assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
     assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
@@ -121,7 +127,8 @@ def test_bad_data(model, first):
         hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
     ):
         hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
-    study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
+    study = hj.designs.Study(first, 2, 1e-4)
+    data = measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),
         (dict(result=[3] * len(data.u)), "no experiment ran to its end \\(0/8 ok"),
@@ -188,7 +195,8 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     ],
 )
 def test_a_transient_in_the_window_is_refused(before, repeats, left):
-    data, left = records(1e-3, before=before, repeats=repeats), 1e-3 * left
+    data = records(1e-3, before=before, repeats=repeats)
+    left = 1e-3 * left
     arguments = data, repeats, MULTIPLIERS, np.zeros(2)
     refuse_transient(*arguments, 1.05 * left)
     with pytest.raises(hj.DefinitionError, match=f"after {before} discarded cycles"):
@@ -199,7 +207,8 @@ def test_a_transient_in_the_window_is_refused(before, repeats, left):
 def test_noise_is_no_transient():
     """Unless its mean square is beyond six standard deviations of that of noise, which the
     difference of two cycles contains twice."""
-    noise, level = np.array([0.01, 0.01]), 2 * 0.01**2
+    noise = np.array([0.01, 0.01])
+    level = 2 * 0.01**2
     size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)

@@ -32,9 +32,15 @@ class Converter(hj.HybridSystem):
 
     def transitions(self):
         tick = hj.Scheduled(1.0)
-        anew = lambda t, q, u: (q[0], 0.0)  # noqa: E731
+
+        def anew(t, q, u):
+            return (q[0], 0.0)
+
         if self.by_ramp:
-            trip = lambda t, q, u: self.duty - q[1]  # noqa: E731
+
+            def trip(t, q, u):
+                return self.duty - q[1]
+
         else:
             trip = hj.Scheduled(1.0, 1.0 * self.duty)
         return (
@@ -64,7 +70,8 @@ def test_a_converter_at_any_duty(duty, by_ramp):
 @pytest.mark.parametrize("duty, by_ramp", CASES)
 def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
     """A comparator that trips within rounding of the tick is refused by name."""
-    system, chart = Converter(duty, by_ramp), "off" if duty <= 0.5 else "on"
+    system = Converter(duty, by_ramp)
+    chart = "off" if duty <= 0.5 else "on"
     guess = hj.Guess(chart, (0.3, 0.9), time=0.6 if duty == 0.5 else 0.9)
     if by_ramp and duty > 1 - 1e-8:
         with pytest.raises(hj.ComputationError, match="'trip' and 'tick' coincide"):
@@ -99,7 +106,9 @@ class PeakCurrent(hj.HybridSystem):
     allows: bool = False
 
     def charts(self):
-        circuit = lambda v: Field(("i",), lambda t, q, u: (v - 0.1 * q[0],))  # noqa: E731
+        def circuit(v):
+            return Field(("i",), lambda t, q, u: (v - 0.1 * q[0],))
+
         return {"off": circuit(0.0), "on": circuit(1.0)}
 
     def transitions(self):
@@ -125,8 +134,13 @@ def test_a_current_above_its_limit_at_the_tick(allows, events):
 
 def neurons(push):
     """Two neurons, of which each spike pushes the other one. In `x`, both are set back."""
-    pulse = lambda t, q, u: (0.0, q[1] + push)  # noqa: E731
-    other = lambda t, q, u: (q[0] + push, 0.0)  # noqa: E731
+
+    def pulse(t, q, u):
+        return (0.0, q[1] + push)
+
+    def other(t, q, u):
+        return (q[0] + push, 0.0)
+
     charts = {"rest": Field(("x", "y"), lambda t, q, u: (1.5 - q[0], 1.4 - q[1]))}
     return toy(
         charts,
@@ -163,8 +177,12 @@ class Kicked(hj.HybridSystem):
         return {"calm": decay, "kicked": ready}
 
     def transitions(self):
-        kick = lambda t, q, u: (q[0] + 1.0,)  # noqa: E731
-        halve = lambda t, q, u: (0.4 * q[0] ** 2,)  # noqa: E731
+        def kick(t, q, u):
+            return (q[0] + 1.0,)
+
+        def halve(t, q, u):
+            return (0.4 * q[0] ** 2,)
+
         return (
             hj.Transition("kick", "calm", "kicked", hj.Scheduled(1.0), reset=kick),
             hj.Transition(
@@ -181,19 +199,20 @@ def test_derivatives_across_an_event_at_once():
     system = Kicked()
     cycle = hj.find_limit_cycle(system, hj.Guess("calm", (0.5,), time=0.5))
     low = np.exp(-0.5 * 0.7) * float(cycle.anchor.q[0, 0])
-    np.testing.assert_allclose(
-        cycle.state["x"], np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2, rtol=1e-11
-    )
+    expected = np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2
+    np.testing.assert_allclose(cycle.state["x"], expected, rtol=1e-11)
     multiplier = 0.8 * (1 + low) * np.exp(-0.7)
     np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
     ldtp = hj.linearize(cycle, hj.ClockPhase(3, 0.3))
     np.testing.assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
-    at = lambda rate: hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]  # noqa: E731
+
+    def at(rate):
+        return hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]
+
     by_steps = (float(at(0.7 + 1e-5)) - float(at(0.7 - 1e-5))) / 2e-5
     np.testing.assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
-    np.testing.assert_allclose(
-        jax.jit(jax.grad(at))(jnp.asarray(0.7)), by_steps, rtol=1e-7
-    )
+    measured = jax.jit(jax.grad(at))(jnp.asarray(0.7))
+    np.testing.assert_allclose(measured, by_steps, rtol=1e-7)
 
 
 def test_events_that_take_each_others_place_at_once():
@@ -216,7 +235,10 @@ def test_events_that_take_each_others_place_at_once():
 def test_a_guard_that_both_charts_have_happens_once():
     """x rises through zero once; a clock changes the chart, in which it has the same guard."""
     fields = {name: Field(("x",), lambda t, q, u: (1.0,)) for name in ("day", "night")}
-    cross = lambda t, q, u: q[0]  # noqa: E731
+
+    def cross(t, q, u):
+        return q[0]
+
     system = toy(
         fields,
         [
@@ -246,9 +268,9 @@ def test_programs_refuse_events_that_coincide():
     result = jax.jit(
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
+    measured = result(jnp.array([0.95, 0.99, 1 - 1e-10]))
     np.testing.assert_array_equal(
-        result(jnp.array([0.95, 0.99, 1 - 1e-10])),
-        [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE],
+        measured, [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE]
     )
 
 

@@ -24,7 +24,8 @@ STEP = 1e-6
 def flow(s, t, q, u, end):
     """(t, q) at the end, the lanes at the start, the target and the tape."""
     lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
-    target, sizes = until(np.array([end])), np.ones((len(s.charts), s.d))
+    target = until(np.array([end]))
+    sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
     done = move(
         s, lanes, u[:, None], target, settings, options=Options(True, tangents=True)

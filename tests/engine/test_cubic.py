@@ -58,17 +58,20 @@ def test_a_dip_within_the_step_is_found():
 def test_touching_and_nearly_touching():
     assert crossing(0.16, 0.36, -0.8, 1.2).touch[0]
     near = crossing(0.16 + 1e-4, 0.36 + 1e-4, -0.8, 1.2)
-    assert near.near[0] and not near.touch[0] and np.isinf(near.position[0])
+    assert near.near[0]
+    assert not near.touch[0]
+    assert np.isinf(near.position[0])
     clear = crossing(0.16 + 0.1, 0.36 + 0.1, -0.8, 1.2)
-    assert not clear.near[0] and not clear.touch[0] and np.isinf(clear.position[0])
+    assert not clear.near[0]
+    assert not clear.touch[0]
+    assert np.isinf(clear.position[0])
 
 
 def test_a_guard_that_starts_at_zero_must_leave_it_first():
     assert np.isinf(crossing(0.0, -1.0, -1.0, -1.0, armed=False).position[0])
     assert np.isinf(crossing(0.0, 1.0, 1.0, 1.0, armed=False).position[0])
     # s (0.5 - s): up, and down through zero at 0.5.
-    np.testing.assert_allclose(
-        crossing(0.0, -0.5, 0.5, -1.5, armed=False).position[0], 0.5, atol=1e-12
-    )
+    measured = crossing(0.0, -0.5, 0.5, -1.5, armed=False).position[0]
+    np.testing.assert_allclose(measured, 0.5, atol=1e-12)
     # s^3 - s^2 + 0.1 s (zero to first order only) falls and rises without being positive first.
     assert np.isinf(crossing(-1e-18, -0.5, 0.0, -1.0, armed=False).position[0])

@@ -133,7 +133,9 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     with unchecked_host():
         cycle = hj.find_limit_cycle(system)
         map = to_host(cycle.return_map)
-        q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
+        q = map.anchor.q[:, 0]
+        sizes = map.sizes
+        s = map.structure
         turn = map.turn_with_jacobian(q)
         x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), q / sizes)
         if name == "VerticalHopper":  # (moves arm later ones)
@@ -141,7 +143,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
         assert (travelled := travel(map, x * sizes, expected)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
         # Refused: a gap before a move, another first time, an event (not the last) overlooked.
-        third, event = np.arange(len(expected.t)) == 2, expected.code >= 0
+        third = np.arange(len(expected.t)) == 2
+        event = expected.code >= 0
         gap = 1e-6 * third * map.scale[expected.chart].T
         early = expected.t - 1e-6 * map.expected * (expected.order + expected.lane == 0)
         blind = np.where(event & (np.cumsum(event) == 1), MOVE, expected.code)
@@ -170,9 +173,11 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
     assert np.abs(apart).max() < 1e-8
-    assert abs(again.period / turn.period - 1) < 3e-10
+    error = abs(again.period / turn.period - 1)
+    assert error < 3e-10
     size = np.abs(turn.factors).max(axis=0)
-    assert (np.abs(again.factors - turn.factors) / size).max() < 1e-6
+    error = (np.abs(again.factors - turn.factors) / size).max()
+    assert error < 1e-6
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("PaddleJuggler",)))
@@ -231,4 +236,5 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
         )
         for gap, steps in ((8e-13, 1), (1e-9, 2)):
             end, _, taken = newton._newton(map, x + gap, moves, 0, 9)
-            assert taken == steps and abs(end / map.sizes - x) < 1e-12
+            assert taken == steps
+            assert abs(end / map.sizes - x) < 1e-12

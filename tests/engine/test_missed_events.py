@@ -33,7 +33,10 @@ def chain(guard=lambda t, q, u: q[0], enabled=None):
     """Polynomials of time, as the first of states of which each is the rate of the one before. A
     step of a method of order 6 or more may be as long as one likes."""
     names = tuple(f"x{k}" for k in range(DEGREE + 1))
-    rates = lambda t, q, u: (*(q[k + 1] for k in range(DEGREE)), 0.0)  # noqa: E731
+
+    def rates(t, q, u):
+        return (*(q[k + 1] for k in range(DEGREE)), 0.0)
+
     fall = hj.Transition("fall", "a", "a", guard, enabled=enabled)
     return toy({"a": Field(names, rates)}, (fall,))
 
@@ -65,7 +68,8 @@ def falls(p, ends):
 
 
 def test_no_event_of_200_polynomials_is_missed_or_invented():
-    rng, L = np.random.default_rng(1), 200
+    rng = np.random.default_rng(1)
+    L = 200
     tolerance = np.tile([1e-3, 1e-6, 1e-9, 1e-12], L // 4)
     flows = [draw(rng, x) for x in tolerance]
     s = Structure(chain())
@@ -116,7 +120,10 @@ def test_two_dips_within_a_step(depth):
 
 def test_a_guard_that_is_faster_than_the_state():
     """Steps are long where the state is linear in time, but the guard turns 80 times."""
-    guard = lambda t, q, u: jnp.sin(500 * t) + 0.3 + 0 * q[0]  # noqa: E731
+
+    def guard(t, q, u):
+        return jnp.sin(500 * t) + 0.3 + 0 * q[0]
+
     fall = hj.Transition("fall", "a", "a", guard)
     system = toy({"a": Field(("x",), lambda t, q, u: (1.0,))}, (fall,))
     found = hj.simulate(system, "a", (0.0,), 1.0, settings=hj.Settings(1e-6, 1e-6))
@@ -140,9 +147,14 @@ METHODS = [
 def test_the_state_halfway_has_its_order(method, order):
     """x' = x^2 cos t, whose solution is x / (1 - x sin t)."""
     assert halfway(method) is not None
-    field = lambda t, q: q**2 * jnp.cos(t)  # noqa: E731
-    begin, lengths = 0.8, np.array([0.4, 0.2])
-    time, state = np.zeros(2), np.full((1, 2), begin)
+
+    def field(t, q):
+        return q**2 * jnp.cos(t)
+
+    begin = 0.8
+    lengths = np.array([0.4, 0.2])
+    time = np.zeros(2)
+    state = np.full((1, 2), begin)
     step = jax.jit(lambda t, q, h: take_step(method, field, t, q, h))
     end = step(time, state, lengths)
     true = begin / (1 - begin * np.sin(lengths / 2))
@@ -166,7 +178,8 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
     ends = [np.array([x]) for x in (1.0, 1.0, 0.0, 0.0)]
     margin = np.array([1.2])
     low, high = bounds(*ends, margin)
-    assert low[0] < -0.2 and high[0] > 2.2
+    assert low[0] < -0.2
+    assert high[0] > 2.2
     armed = np.array([True])
     assert first_crossing(*ends, armed, margin).near[0]
     assert not first_crossing(*ends, armed, np.array([0.9])).near[0]
@@ -176,8 +189,13 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
 def test_an_event_just_before_a_blow_up_is_found(begin):
     """x' = x^2 from 1 is 1 / (1 - t): it reaches 1e11 in 1 - 1e-11, and infinity in 1."""
     square = Field(("x",), lambda t, q, u: (q[0] ** 2,))
-    spike = lambda t, q, u: q[0] - 1e11  # noqa: E731
-    again = lambda t, q, u: (1.0,)  # noqa: E731
+
+    def spike(t, q, u):
+        return q[0] - 1e11
+
+    def again(t, q, u):
+        return (1.0,)
+
     reset = hj.Transition("spike", "a", "a", spike, "rising", again)
     path = hj.simulate(toy({"a": square}, [reset]), "a", (1.0,), 9.5, time=begin)
     spikes = np.array([event.time for event in path.events]) - begin

@@ -69,7 +69,8 @@ def test_lanes_fail_one_by_one():
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
     moved = move(s, lanes, u, until(end), tight(s)).moved
-    bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
+    bad = hj.Result.BAD_INPUT
+    zeno = hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
     np.testing.assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
@@ -89,7 +90,10 @@ def roots(a):
     """Chart "rise" is not defined for negative states, which chart "fall" has."""
     rise = Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))
     charts = {"fall": Field(("x",), lambda t, q, u: (-a,)), "rise": rise}
-    turn = lambda t, q, u: q[0] + 1.0  # noqa: E731
+
+    def turn(t, q, u):
+        return q[0] + 1.0
+
     return charts, (
         hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),
     )
@@ -100,12 +104,19 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     z = (1 + (2 - t1) / 2)^2 with the event at t1 = (x + 1) / a."""
 
     def end(x, a):
-        system, zero = Toys(roots, [a]), jnp.zeros(())
+        system = Toys(roots, [a])
+        zero = jnp.zeros(())
         return flow(system, "fall", x[None], zero[None], zero, jnp.asarray(2.0))[0][0]
 
-    exact = lambda x, a: (1 + (2 - (x + 1) / a) / 2) ** 2  # noqa: E731
-    x, a = jnp.array([-0.5, 0.2]), 1.3
-    loss = lambda f: lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)  # noqa: E731
+    def exact(x, a):
+        return (1 + (2 - (x + 1) / a) / 2) ** 2
+
+    x = jnp.array([-0.5, 0.2])
+    a = 1.3
+
+    def loss(f):
+        return lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)
+
     gradient = jax.jit(jax.grad(loss(end), argnums=(0, 1)))(x, a)
     for value, true in zip(
         gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True

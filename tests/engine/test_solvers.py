@@ -62,8 +62,12 @@ def test_radau_is_a_collocation_method(stages):
 @pytest.mark.parametrize("rate", [1.0, 1e3, 1e5])
 def test_no_error_of_a_stiff_step_is_hidden(rate):
     """Of a mode that follows, or is excited, by however little, and dies out within the step."""
-    field = lambda t, q: -rate * (q - jnp.cos(t)) - jnp.sin(t)  # noqa: E731
-    excited, h = np.array([[0.0, 1.0, 1e-4, 1e-8]]), 0.4
+
+    def field(t, q):
+        return -rate * (q - jnp.cos(t)) - jnp.sin(t)
+
+    excited = np.array([[0.0, 1.0, 1e-4, 1e-8]])
+    h = 0.4
     step = take_step(
         as_method(hj.Radau()), field, jnp.zeros(4), 1.0 + excited, jnp.array([h])
     )
@@ -78,7 +82,8 @@ def test_a_landing_is_as_stiff_as_its_chart():
     """The last part of the way, five decay times long, is no explicit step."""
     s = Structure(integrated(RAMP, hj.Radau()))
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
-    one, none = np.ones(1), np.zeros(1, np.int32)
+    one = np.ones(1)
+    none = np.zeros(1, np.int32)
     lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
     target = Target(
         np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.Result.OK
@@ -92,7 +97,8 @@ def test_a_landing_is_as_stiff_as_its_chart():
 @pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
 def test_estimates_are_of_the_size_of_errors(solver):
     """Of a step whose end is known, one of its modes stiff."""
-    method, h = as_method(solver), 0.4
+    method = as_method(solver)
+    h = 0.4
 
     def field(t, q):
         return jnp.stack([-(q[0] ** 2), -30 * (q[1] - jnp.cos(t)) - jnp.sin(t)])
@@ -106,9 +112,8 @@ def test_inverses_of_many_matrices():
     matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
     matrix[0, 0] = 0.0  # pivots are needed
     found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
-    np.testing.assert_allclose(
-        found, np.linalg.inv(np.moveaxis(matrix, -1, 0)), atol=1e-12
-    )
+    expected = np.linalg.inv(np.moveaxis(matrix, -1, 0))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +121,8 @@ def test_inverses_of_many_matrices():
 )
 def test_derivatives_of_implicit_steps(solver):
     """First and second, by the implicit function theorem, against differences of long steps."""
-    method, h = as_method(solver), jnp.array([0.1])
+    method = as_method(solver)
+    h = jnp.array([0.1])
 
     def end(x):
         def field(t, q, x=x):
@@ -158,10 +164,10 @@ def test_linearization_of_a_stiff_system(damped):
     exactly = expm(
         np.block([[STIFF, np.array([[0.0], [1.0]])], [np.zeros((1, 3))]]) / 4
     )
-    A, B = model.A[0], model.B[0]
+    A = model.A[0]
+    B = model.B[0]
     size = np.array([damped.scale["y"], damped.scale["v"]])
     ratio = size / size[:, None]
     np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
-    np.testing.assert_allclose(
-        B[:, 0] / size, exactly[:2, 2] / size, rtol=1e-8, atol=1e-8
-    )
+    expected = exactly[:2, 2] / size
+    np.testing.assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)

@@ -54,7 +54,8 @@ def exact(fast=1e4, slow=5.0):
 
 def by_differences(order):
     """Derivatives of the period by `slow`."""
-    d, at = 0.02, np.arange(-2, 3)
+    d = 0.02
+    at = np.arange(-2, 3)
     values = [exact(slow=5.0 + d * k)[0] for k in at]
     weights = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}[order]
     return np.dot(weights, values) / 12 / d**order

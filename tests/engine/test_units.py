@@ -39,7 +39,8 @@ def begin(system, length, time):
 def flow(length, time, scale, tangents):
     """Steps, codes and states (in the units of 1, 1) of a second and a half."""
     system = hopper_in(length, time)
-    lanes, u = begin(system, length, time), jnp.zeros((1, 2))
+    lanes = begin(system, length, time)
+    u = jnp.zeros((1, 2))
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
     moved, tape = move(
@@ -69,8 +70,12 @@ def test_the_same_steps_in_all_units(tangents):
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------
 
 
-SPRING = lambda t, q, u: (q[1], 9.81 - 100.3 * (q[0] - 0.1))  # noqa: E731
-CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
+def SPRING(t, q, u):
+    return (q[1], 9.81 - 100.3 * (q[0] - 0.1))
+
+
+def CHAIN(t, q, u):
+    return (*q[1:], jnp.cos(t))
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,8 @@ def run(placed):
     "start, least, most", [("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)]
 )
 def test_experiments_start_in_their_periodic_response(run, start, least, most):
-    data, n = run(DESIGN, start=start), DESIGN.inputs().shape[1]
+    data = run(DESIGN, start=start)
+    n = DESIGN.inputs().shape[1]
     assert least <= np.abs(data.y[:, :n] - data.y[:, n:]).max() < most
     with no_compilation(after=lambda: run(DESIGN, start=start)):
         run(hj.multisine(4, 3, (0, 1.2), 0.05, seed=2), start=start)
@@ -52,8 +53,10 @@ def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
     """Also those that a controller adds."""
-    model, r = hj.linearize(placed.cycle, placed, ("x", "v")), 1e-3 * DESIGN.inputs(6)
-    sizes, rng = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2)), np.random.default_rng(0)
+    model = hj.linearize(placed.cycle, placed, ("x", "v"))
+    r = 1e-3 * DESIGN.inputs(6)
+    sizes = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2))
+    rng = np.random.default_rng(0)
     matrices = [0.3 * rng.normal(size=size) for size in sizes]
     F = hj.LDTP(*matrices, inputs=model.outputs, outputs=model.inputs)
     for system, controller in ((model, None), (model.feedback(F), F)):
@@ -86,7 +89,8 @@ def test_process_noise_acts_but_is_not_recorded(run):
             DESIGN, start="periodic", process_noise=hj.experiments.ProcessNoise(std)
         )
 
-    still, once = run(DESIGN, start="periodic"), noisy(1e-3)
+    still = run(DESIGN, start="periodic")
+    once = noisy(1e-3)
     np.testing.assert_array_equal(once.u, DESIGN.inputs(6))
     np.testing.assert_array_equal(once.y, noisy(1e-3).y)
     change = np.std(once.y - still.y)

@@ -70,7 +70,8 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
     parts = list(stream(*arguments, Options(**BATCH), chunk=5))
     assert [len(part.u) for part in parts] == [5, 5, 2]
     np.testing.assert_array_equal(records(parts), whole.y)
-    estimate, expected = hj.estimate_htf(part for part in parts), hj.estimate_htf(whole)
+    estimate = hj.estimate_htf(part for part in parts)
+    expected = hj.estimate_htf(whole)
     np.testing.assert_array_equal(estimate.f, expected.f)
     np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-9)
     noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
@@ -96,18 +97,23 @@ def test_batches_are_alike_and_keep_all_workers_busy():
     for S in (1, 20, 80, 1000, 1001, 99_999):
         for workers in (1, 2, 7, 64):
             divided = divide(S, hj.Execution(workers=workers))
-            size, used = divided.batch, divided.workers
-            assert 1 <= used <= workers and 1 <= size <= min(S, 320)
+            size = divided.batch
+            used = divided.workers
+            assert 1 <= used <= workers
+            assert 1 <= size <= min(S, 320)
             number = -(-S // size)
             assert used == min(workers, number)
             if S >= 64 * workers:  # every worker has about the same to do
-                assert used == workers and number * size < 1.2 * S
+                assert used == workers
+                assert number * size < 1.2 * S
     assert divide(1000, hj.Execution(256, 8)) == hj.Execution(256, 4)
     assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(made, whole):
-    assert len(made) == 3 and made.experiments == COUNT and made.missing() == []
+    assert len(made) == 3
+    assert made.experiments == COUNT
+    assert made.missing() == []
     np.testing.assert_array_equal(records(made), whole.y)
     np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
     np.testing.assert_array_equal(
@@ -152,7 +158,10 @@ def test_a_store_without_what_it_began_with_is_refused(lost, stored, tmp_path):
 
 def test_other_experiments_are_refused(made, arguments):
     cycle, placed, _, _ = arguments
-    where = lambda p: (p.cycle.system.damping, p.cycle.numbers["damping"])  # noqa: E731
+
+    def where(p):
+        return (p.cycle.system.damping, p.cycle.numbers["damping"])
+
     other = eqx.tree_at(where, placed, (jnp.asarray(0.11),) * 2)
     velocity = hj.Output("speed", lambda t, q, u: -q[1], "m/s")
     cases = (
@@ -190,7 +199,8 @@ def test_another_process_can_run_a_piece(arguments, start):
     )
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
-    mine, theirs = job.run(0, None), sent.run(0, 1)
+    mine = job.run(0, None)
+    theirs = sent.run(0, 1)
     assert mine.keys() == theirs.keys()
     for name, values in mine.items():
         np.testing.assert_array_equal(theirs[name], values)
@@ -201,7 +211,8 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
 ):
     other = hj.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
-    good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
+    good = np.cos(2 * np.pi * n / 64 * 3)
+    high = np.cos(2 * np.pi * n / 64 * 19)
     good, bad = (
         hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high)
     )

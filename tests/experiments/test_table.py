@@ -67,7 +67,8 @@ def test_experiments_that_leave_the_table_are_run_again(campaign, responses):
     y = data.y + np.resize(data.cycle_outputs, data.y.shape[1:])
     np.testing.assert_array_equal(data.result, searched.result)
     sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
-    assert np.nanmax(np.abs(y - searched.y) / sizes) < 2e-9
+    error = np.nanmax(np.abs(y - searched.y) / sizes)
+    assert error < 2e-9
 
 
 def test_other_inputs_and_parameters_compile_nothing(campaign):

@@ -48,7 +48,9 @@ class Run:
 def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Run:
     """Follow a system until it has had some number of events, or to its time limit."""
     t, q, u, limit = sample.start
-    found, chart, excluded = [], 0, None
+    found = []
+    chart = 0
+    excluded = None
     while len(found) < events and t < limit:
         stay = _Stay(plan, sample, chart, t, np.asarray(q, float), u)
         t, q, code, reason = stay.follow(limit, rtol, atol)
@@ -56,7 +58,8 @@ def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Ru
         if code is None:
             break
         x = sample.arrows[code]
-        q, chart = x["R"] @ q + x["r"] + x["V"] @ u, plan.arrows[code].target
+        q = x["R"] @ q + x["r"] + x["V"] @ u
+        chart = plan.arrows[code].target
         if found and t - found[-1].t < CLOSE:
             excluded = excluded or "events too close"
         found.append(Event(t, code, chart, q))
@@ -106,7 +109,8 @@ class _Stay:
         """The next scheduled event: time, transition."""
         times = []
         for g in self.clocks:
-            period, offset = self.arrows[g]["period"], self.arrows[g]["offset"]
+            period = self.arrows[g]["period"]
+            offset = self.arrows[g]["offset"]
             k = np.floor((self.t - offset) / period + 1e-9) + 1
             times.append((offset + k * period, g))
         return min(times, default=(np.inf, None))
@@ -159,7 +163,8 @@ class _Stay:
             )
             if low.fun < 0 and low.x != t[k]:
                 place = k if low.x < t[k] else k + 1
-                t, v = np.insert(t, place, low.x), np.insert(v, place, low.fun)
+                t = np.insert(t, place, low.x)
+                v = np.insert(v, place, low.fun)
         rates = np.abs(np.diff(v) / np.diff(t))
         self.fastest[g] = max(self.fastest[g], rates.max())
         found = []
@@ -177,7 +182,8 @@ class _Stay:
     def look(self, t, q, fired, known):
         """Whether an event is a border case."""
         for g in self.guards:
-            value, rate = self.guard(g, t, q), self.rate(g, t, q)
+            value = self.guard(g, t, q)
+            rate = self.rate(g, t, q)
             if g != fired and self.armed[g] and abs(value) < CLOSE * abs(rate):
                 self.excluded = "events too close"
             if g == fired and -rate < SLOW * self.fastest[g]:

@@ -30,14 +30,18 @@ THRESHOLD = toy(
 def rounded(level):
     """An event that changes nothing: its guard is zero afterwards, but for rounding errors, which
     grow with the state and with time."""
-    guard = lambda t, q, u: q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level  # noqa: E731
+
+    def guard(t, q, u):
+        return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level
+
     charts = {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
     return charts, (hj.Transition("fall", "line", "line", guard),)
 
 
 def test_a_guard_that_the_input_makes_negative_is_not_armed():
     run = hj.simulate(THRESHOLD, "line", (0.5,), 1.0, input=-1.0, throw=False)
-    assert run.result == hj.Result.OK and not run.events
+    assert run.result == hj.Result.OK
+    assert not run.events
 
 
 def two_pieces(x, first, second):
@@ -49,7 +53,8 @@ def two_pieces(x, first, second):
         moved = move(
             s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h
         ).moved
-        lanes, h = moved.lanes, moved.h
+        lanes = moved.lanes
+        h = moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 
 

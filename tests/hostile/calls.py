@@ -104,7 +104,8 @@ def linear(t):
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
-    f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
+    f = np.asarray(t.estimate.f)
+    H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
     scatter = hj.Scatter(f, size)
     errors = dict(
@@ -238,10 +239,8 @@ def recordings(t):
     yield t.recording.with_trials, dict(trials=t.recording.trials)
     yield hj.Recording.join, dict(recordings=[t.recording])
     yield hj.Recording.beside, dict(recordings=[t.recording])
-    rises, angle = (
-        hj.Crossing("x", "rising"),
-        hj.KinematicPhase(4, position="x", velocity="v"),
-    )
+    rises = hj.Crossing("x", "rising")
+    angle = hj.KinematicPhase(4, position="x", velocity="v")
     yield t.recording.mark, dict(event="e", crossing=rises)
     for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
@@ -276,7 +275,8 @@ def recordings(t):
 
 
 def subjects(t):
-    population, maps = t.population, t.maps
+    population = t.population
+    maps = t.maps
     yield population.from_fits, dict(fits=[t.fit, t.fit], table={"subject": ["a", "b"]})
     for call in (population.mean, population.predictions, population.allocation):
         yield call, dict(quantity="m")
@@ -375,7 +375,8 @@ def rhythms(t):
 
 def without_arguments(t):
     natural = hj.recordings.natural_multipliers(t.variability)
-    data, design = t.data, t.design
+    data = t.data
+    design = t.design
     for call in (
         hj.Execution,
         hj.designs.Multipliers,

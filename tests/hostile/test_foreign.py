@@ -20,8 +20,12 @@ class Neuron(hj.HybridSystem):
         return {"below": Leaky()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0,)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0,)
+
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 

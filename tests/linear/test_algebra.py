@@ -13,7 +13,8 @@ from .conftest import blocks_at_random
 
 
 N = 4
-IN, OUT = {"u": "N", "w": ""}, {"y": "m", "v": ""}
+IN = {"u": "N", "w": ""}
+OUT = {"y": "m", "v": ""}
 # All lines f + integers of four classes, among them those that are their own mirror images.
 F = np.array([0, 0.5, 1, 1.5, 2, 0.3, 1.3, 0.7, 1.7, -0.2, 0.8, 1.8, -1.2])
 
@@ -26,7 +27,8 @@ def system(seed, dims, inputs=IN, outputs=OUT, through=1.0):
 def lifted(ldtp, z):
     """The transfer matrices from all inputs of a period to all outputs of it."""
     A, B, C, D = map(np.asarray, (ldtp.A, ldtp.B, ldtp.C, ldtp.D))
-    n, nu = A.shape[1], D.shape[2]
+    n = A.shape[1]
+    nu = D.shape[2]
     x = np.eye(
         n, n + N * nu
     )  # as a function of the state at section 0, and of all inputs
@@ -48,7 +50,9 @@ def pair():
 def test_systems_against_lifted_ones(pair):
     P, F = pair
     z = np.exp(2j * np.pi * np.array([0.0, 0.17, 0.5]))
-    a, b, one = lifted(P, z), lifted(F, z), np.eye(2 * N)
+    a = lifted(P, z)
+    b = lifted(F, z)
+    one = np.eye(2 * N)
     for ours, exact in (
         (P @ F, a @ b),
         (P + P, a + a),
@@ -57,16 +61,16 @@ def test_systems_against_lifted_ones(pair):
         (P.feedback(0.1 * np.eye(2)), np.linalg.solve(one + 0.1 * a, a)),
     ):
         np.testing.assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
-    assert P.feedback(F).inputs == tuple(IN) and (P @ F).inputs == (
-        P @ F
-    ).outputs == tuple(OUT)
+    assert P.feedback(F).inputs == tuple(IN)
+    assert (P @ F).inputs == (P @ F).outputs == tuple(OUT)
     inside = eqx.filter_jit(lambda P, F: P.feedback(F).htf(0.3).H)(P, F)
     np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
 
 
 def test_transfer_functions_against_systems(pair):
     P, K = pair
-    H, G = P.htf(F), K.htf(F)
+    H = P.htf(F)
+    G = K.htf(F)
     for ours, exact in (
         (H @ G, P @ K),
         (H @ K, P @ K),
@@ -75,13 +79,16 @@ def test_transfer_functions_against_systems(pair):
         (H.feedback(G), P.feedback(K)),
     ):
         np.testing.assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
-        assert ours.source == "exact" and ours.variance is None
-        assert (ours.inputs, ours.outputs) == (exact.inputs, exact.outputs)
+        assert ours.source == "exact"
+        assert ours.variance is None
+        assert ours.inputs == exact.inputs
+        assert ours.outputs == exact.outputs
 
 
 def test_variances_are_those_of_draws(pair):
     H, G = (x.htf(F[5:]) for x in pair)
-    rng, size = np.random.default_rng(0), 1e-5
+    rng = np.random.default_rng(0)
+    size = 1e-5
 
     def drawn(x):
         noise = rng.normal(size=(200, *x.H.shape, 2)) @ [1, 1j] * size / np.sqrt(2)
@@ -104,12 +111,16 @@ def test_variances_are_those_of_draws(pair):
         variance = operation(known(H), known(G)).variance
         ratio = np.mean(np.abs(error) ** 2, axis=0) / np.asarray(variance)
         # (Errors of neighboring entries are those of the same draws.)
-        assert abs(ratio.mean() - 1) < 0.08 and ratio.std() < 0.1
+        assert abs(ratio.mean() - 1) < 0.08
+        assert ratio.std() < 0.1
 
 
 def test_what_does_not_fit_is_refused(pair):
     P, K = pair
-    refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
+
+    def refused(text):
+        return pytest.raises(hj.DefinitionError, match=text)
+
     with refused(r"'y' \(m\).*'y' \(mm\)"):
         P.feedback(system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN))
     with refused("are not the inputs"):

@@ -27,11 +27,13 @@ def test_three_ways_agree(seed, shape, f):
     blocks = blocks_at_random(seed, dims, ny, nu)
     ldtp = hj.LDTP.from_blocks(*blocks)
     htf = ldtp.htf([f])
-    assert htf.harmonics == all_harmonics(N) and len(htf.harmonics) == N
+    assert htf.harmonics == all_harmonics(N)
+    assert len(htf.harmonics) == N
     assert htf.harmonics[0] == -(N // 2)
 
     # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
-    w, m = 2 * np.pi * f / N, np.array(htf.harmonics)
+    w = 2 * np.pi * f / N
+    m = np.array(htf.harmonics)
     h = np.asarray(ldtp.impulse_response(120))
     G = np.einsum("nrij,r->nij", h, np.exp(-1j * w * np.arange(120)))
     H = (
@@ -41,24 +43,26 @@ def test_three_ways_agree(seed, shape, f):
     np.testing.assert_allclose(np.asarray(htf.H)[:, 0], H, rtol=0, atol=1e-12)
 
     # The DFT of the response to a cosine, once the transient has died.
-    periods, settle = 8, 160 // N
+    periods = 8
+    settle = 160 // N
     u = np.zeros(((settle + periods) * N, nu))
     j = seed % nu
     u[:, j] = np.cos(w * np.arange(len(u)) + 0.3)
     _, y = simulate_blocks(blocks, u, np.zeros(dims[0]))
-    Y, U = np.fft.fft(y[settle * N :], axis=0), np.fft.fft(u[settle * N :, j])
+    Y = np.fft.fft(y[settle * N :], axis=0)
+    U = np.fft.fft(u[settle * N :, j])
     k = round(f * periods)
     lines = (k + m * periods) % (periods * N)
-    np.testing.assert_allclose(
-        np.asarray(htf.H)[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12
-    )
+    measured = np.asarray(htf.H)[:, 0, :, j]
+    np.testing.assert_allclose(measured, Y[lines] / U[k], rtol=0, atol=1e-12)
 
 
 @settings(max_examples=4)
 @given(seeds, st.sampled_from(SHAPES[:2]))
 def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
-    N, P = len(dims), 4
+    N = len(dims)
+    P = 4
     ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
     u = np.random.default_rng(seed).normal(size=(P * N, nu))
     y = ldtp.simulate(u, ldtp.periodic_state(u, P))

@@ -25,7 +25,8 @@ def test_simulation_follows_the_definition(seed, shape, start):
     blocks = blocks_at_random(seed, dims, ny, nu, gain=1.0)
     ldtp = hj.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(seed)
-    u, x0 = rng.normal(size=(11, nu)), rng.normal(size=dims[start % len(dims)])
+    u = rng.normal(size=(11, nu))
+    x0 = rng.normal(size=dims[start % len(dims)])
     xs, ys = simulate_blocks(blocks, u, x0, start)
     states = np.asarray(ldtp.states(u, x0, start))
     for row, x in zip(states, xs, strict=True):

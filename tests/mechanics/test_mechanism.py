@@ -34,8 +34,12 @@ def free_ball():
 
 
 def test_a_double_pendulum_moves_as_textbooks_say():
-    q, v, f = jnp.array([0.4, -0.7]), jnp.array([1.1, 0.6]), jnp.array([0.2, -0.1])
-    pendulum, s, c = double_pendulum(), jnp.sin(q[0] - q[1]), jnp.cos(q[0] - q[1])
+    q = jnp.array([0.4, -0.7])
+    v = jnp.array([1.1, 0.6])
+    f = jnp.array([0.2, -0.1])
+    pendulum = double_pendulum()
+    s = jnp.sin(q[0] - q[1])
+    c = jnp.cos(q[0] - q[1])
     mass = m * L**2 * jnp.array([[2, c], [c, 1]])
     bias = m * L**2 * s * jnp.array([v[1] ** 2, -(v[0] ** 2)])
     bias = bias + m * G * L * jnp.array([2, 1]) * jnp.sin(q)
@@ -53,16 +57,20 @@ def test_a_double_pendulum_moves_as_textbooks_say():
 
 def test_a_contact_that_holds_is_a_rod():
     """A ball on a rod: the same motion in two coordinates with a contact, and in one."""
-    rod = lambda q: jnp.sum(q**2, keepdims=True) / 2  # noqa: E731
+
+    def rod(q):
+        return jnp.sum(q**2, keepdims=True) / 2
+
     angle, rate = 0.5, 1.2
-    place = lambda p: L * jnp.stack([jnp.sin(p[0]), -jnp.cos(p[0])])  # noqa: E731
+
+    def place(p):
+        return L * jnp.stack([jnp.sin(p[0]), -jnp.cos(p[0])])
+
     pendulum = free_ball().along(place)
     a = jax.jit(pendulum.acceleration)(jnp.array([angle]), jnp.array([rate]))
     np.testing.assert_allclose(a, [-G / L * np.sin(angle)], rtol=1e-13)
-    q, v = (
-        place([angle]),
-        jax.jvp(place, (jnp.array([angle]),), (jnp.array([rate]),))[1],
-    )
+    q = place([angle])
+    v = jax.jvp(place, (jnp.array([angle]),), (jnp.array([rate]),))[1]
     found = jax.jit(
         lambda q, v: free_ball().constrained(q, v, 0.0, lambda q: rod(q)[0])
     )(q, v)
@@ -74,9 +82,13 @@ def test_a_contact_that_holds_is_a_rod():
 
 @pytest.mark.parametrize("e", [0.6, 1.0])
 def test_impacts(e):
-    q, v = jnp.array([0.4, -0.7]), jnp.array([1.1, 0.6])
+    q = jnp.array([0.4, -0.7])
+    v = jnp.array([1.1, 0.6])
     pendulum = double_pendulum()
-    tip = lambda q: L * jnp.array([1.0, 1.0]) @ jnp.sin(q)[:, None]  # noqa: E731
+
+    def tip(q):
+        return L * jnp.array([1.0, 1.0]) @ jnp.sin(q)[:, None]
+
     found = jax.jit(lambda e: pendulum.impact(q, v, tip, e))(e)
     J = jax.jacfwd(tip)(q)
     np.testing.assert_allclose(J @ found.velocity, -e * (J @ v), atol=1e-14)
@@ -88,7 +100,10 @@ def test_impacts(e):
 
 def worn(t, q, u):
     """The second body wears away as the first moves, until x = 1."""
-    lost = lambda q, v: 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2  # noqa: E731
+
+    def lost(q, v):
+        return 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2
+
     return jnp.concatenate([q[2:], hj.Mechanism(lost).acceleration(q[:2], q[2:])])
 
 

@@ -221,5 +221,6 @@ def test_where_no_section_is_met_again_one_is_asked_for():
     # A guess that says so is enough, and is where Newton's method starts.
     said = hj.Guess("swing", after_impact.state, after="impact")
     again = hj.find_limit_cycle(wheel, said)
-    assert again.base.name == "impact" and float(again.anchor.t[0]) == 0
+    assert again.base.name == "impact"
+    assert float(again.anchor.t[0]) == 0
     np.testing.assert_allclose(again.multipliers, cycle.multipliers, rtol=1e-9)

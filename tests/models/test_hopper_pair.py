@@ -21,7 +21,8 @@ def test_small_multipliers_are_not_dropped(placed):
     cycle = placed.cycle
     np.testing.assert_allclose(cycle.multipliers[4:].real, SMALL, rtol=1e-6)
     model = hj.linearize(cycle, placed, OUTPUTS)
-    assert model.inputs == ("u1", "u2") and len(model.multipliers) == 6
+    assert model.inputs == ("u1", "u2")
+    assert len(model.multipliers) == 6
     np.testing.assert_allclose(model.multipliers[4:].real, SMALL, rtol=1e-5)
 
 

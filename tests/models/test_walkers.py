@@ -20,7 +20,10 @@ WALKERS = {
 
 def placed(name):
     leg, levels = WALKERS[name]
-    angle = lambda t, q: np.array(leg) @ q[: len(leg)]  # noqa: E731
+
+    def angle(t, q):
+        return np.array(leg) @ q[: len(leg)]
+
     levels = [hj.Crossing(angle, "rising", level) for level in levels]
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
     return hj.place_sections(cycle, [hj.AtEvent("touchdown"), *levels])
@@ -29,7 +32,8 @@ def placed(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WALKERS)
 def test_A_and_B(name):
-    truth, sections = np.load(DATA / "walkers.npz"), placed(name)
+    truth = np.load(DATA / "walkers.npz")
+    sections = placed(name)
     model = hj.linearize(
         sections.cycle, sections, sections.cycle.system.charts()["step"].states[0]
     )
@@ -37,20 +41,20 @@ def test_A_and_B(name):
         truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input")
     )
     np.testing.assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
-    leg, d = (
-        np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0]))),
-        len(state),
-    )
+    leg = np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0])))
+    d = len(state)
     for n in range(4):
         # A move in one coordinate takes the one that is left out along the section.
-        out, dropped = int(sections.drop[n]) - 1, int(sections.drop[(n + 1) % 4]) - 1
+        out = int(sections.drop[n]) - 1
+        dropped = int(sections.drop[(n + 1) % 4]) - 1
         moves = (
             np.eye(d)
             if out < 0
             else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
         )
         rows, columns = (np.flatnonzero(np.arange(d) != k) for k in (dropped, out))
-        A, B = (by_state[n] @ moves)[np.ix_(rows, columns)], by_input[n][rows]
+        A = (by_state[n] @ moves)[np.ix_(rows, columns)]
+        B = by_input[n][rows]
         ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
         np.testing.assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
         np.testing.assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))

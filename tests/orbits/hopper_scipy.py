@@ -48,13 +48,15 @@ def _polish(function, t, q, u):
         f = _field(t, q, u)
         rate = (function(t + e, q + e * f) - function(t - e, q - e * f)) / (2 * e)
         dt = -function(t, q) / rate
-        t, q = t + dt, q + dt * f
+        t = t + dt
+        q = q + dt * f
     return t, q
 
 
 def flow(point, section, u=0.0, retention=1.0):
     """The point at which the flow from `point` reaches `section`."""
-    t, q = point[0], np.asarray(point[1:])
+    t = point[0]
+    q = np.asarray(point[1:])
     while True:
         watched = [lambda t, q: _guard(t, q), lambda t, q: _level(section, t, q)]
         for function in watched:
@@ -71,7 +73,8 @@ def flow(point, section, u=0.0, retention=1.0):
         assert run.status == 1, f"nothing happens after {point}"
         which = int(len(run.t_events[1]) > 0)
         # Once more over the last step, so that its end is a true step and no interpolant.
-        last, start = run.t[-2], run.y[:, -2]
+        last = run.t[-2]
+        start = run.y[:, -2]
         if run.t[-1] > last:
             again = solve_ivp(
                 lambda t, q: _field(t, q, u),

@@ -19,7 +19,10 @@ class WrongPaddle(hj.models.PaddleJuggler):
         return 1.1
 
 
-PULSE = lambda t: jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))  # noqa: E731
+def PULSE(t):
+    return jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))
+
+
 KICKED = toy({"fall": Field(("x",), lambda t, q, u: (PULSE(t) - q[0],))}, period=1.0)
 
 
@@ -46,7 +49,10 @@ def test_a_period_that_does_not_follow_a_parameter():
         hj.DefinitionError, match="does not have the period 12.5664 that Fixed"
     ):
         hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
-    every = lambda self: hj.Scheduled(20 * np.pi * self.damping, 1.0)  # noqa: E731
+
+    def every(self):
+        return hj.Scheduled(20 * np.pi * self.damping, 1.0)
+
     tick = {
         "transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]
     }
@@ -62,7 +68,9 @@ def test_a_period_that_does_not_follow_a_parameter():
 def test_a_force_that_jumps_with_the_clock():
     """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
 
-    force = lambda t: jnp.where(t % 1.0 < 0.5, 1.0, 0.0)  # noqa: E731
+    def force(t):
+        return jnp.where(t % 1.0 < 0.5, 1.0, 0.0)
+
     charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
     square = toy(
         charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0

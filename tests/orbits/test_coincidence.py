@@ -37,7 +37,10 @@ PAIR = toy(
 
 def ticked(height=1.0, other=0.0):
     """A saw-tooth that is set back when it comes to `height`, and by a clock at whole times."""
-    back = lambda t, q, u: (0.2,)  # noqa: E731
+
+    def back(t, q, u):
+        return (0.2,)
+
     transitions = [
         hj.Transition("full", "a", "a", lambda t, q, u: q[0] - height, "rising", back),
         hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
@@ -66,7 +69,10 @@ def race():
         for name, speed in speeds.items()
     }
     x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
-    again = lambda t, q, u: (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))  # noqa: E731
+
+    def again(t, q, u):
+        return (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))
+
     transitions = (
         hj.Transition("x", "a", "x first", x, "rising"),
         hj.Transition("y", "a", "y first", y, "rising"),
@@ -82,7 +88,8 @@ def test_derivatives_of_both_orders():
     cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
     (found,) = hj.coincidences(cycle)
-    assert found.time % 1.0 == pytest.approx(0.5) and not found.commute
+    assert found.time % 1.0 == pytest.approx(0.5)
+    assert not found.commute
     exact = {
         ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),
         ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
@@ -105,10 +112,12 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(jnp.array([0.0, 0.2, 0.4]))
     begin = hj.find_limit_cycle(Balls(), BALLS)
     found = hj.find_limit_cycles(systems, begin)
-    ok, not_ok = hj.Result.OK, hj.Result.COINCIDENCE
+    ok = hj.Result.OK
+    not_ok = hj.Result.COINCIDENCE
     np.testing.assert_array_equal(found.result, [ok, not_ok, not_ok])
     branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
-    assert branch.cycles.result[0] == ok and (branch.cycles.result[1:] == not_ok).all()
+    assert branch.cycles.result[0] == ok
+    assert (branch.cycles.result[1:] == not_ok).all()
 
 
 @pytest.mark.slow

@@ -30,7 +30,8 @@ def juggling():
 def test_fold_and_flip_of_the_juggler(juggling):
     """Small amplitudes of the paddle end in a fold, large ones in a flip."""
     p = juggling.system
-    a, v = float(p.restitution), float(p.g * p.T / 2)
+    a = float(p.restitution)
+    v = float(p.g * p.T / 2)
     speed = (1 - a) * v / (1 + a)
     fold = speed / (2 * np.pi)  # the paddle just reaches the speed: s = 0
     s = 2 * (1 + a**2) / (1 + a) ** 2 * float(p.g)
@@ -47,7 +48,8 @@ def test_fold_and_flip_of_the_juggler(juggling):
     assert 0.2 in branch.values
     assert [x.message for x in branch.ends] == ["end of the parameter range"] * 2
     at = np.flatnonzero(branch.values == 0.2)
-    assert len(at) == 2 and list(branch.stable[at]) == [False, True]
+    assert len(at) == 2
+    assert list(branch.stable[at]) == [False, True]
     for k in at:
         cycle = branch[k]
         y = cycle.trajectory().events[0].before["y"]
@@ -57,7 +59,8 @@ def test_fold_and_flip_of_the_juggler(juggling):
         np.testing.assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
     ax = hj.plot.branch(branch, output="v").ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("A (m)", "largest v (m/s)")
+    assert ax.get_xlabel() == "A (m)"
+    assert ax.get_ylabel() == "largest v (m/s)"
     lines = [x for x in ax.get_lines() if len(x.get_xdata()) > 1]
     assert [x.get_linestyle() for x in lines] == ["--", "-", "--"]
     rows = (0, *(x.index for x in branch.points), len(branch) - 1)
@@ -66,7 +69,8 @@ def test_fold_and_flip_of_the_juggler(juggling):
 
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
-    dataset, frame = hj.convert.to_xarray(branch), hj.convert.to_pandas(branch)
+    dataset = hj.convert.to_xarray(branch)
+    frame = hj.convert.to_pandas(branch)
     np.testing.assert_array_equal(dataset["A"], branch.values)
     np.testing.assert_array_equal(dataset["multipliers"], branch.multipliers)
     assert list(frame[frame["kind"] != ""].index) == [x.index for x in branch.points]
@@ -79,10 +83,8 @@ def test_neimark_sacker_of_the_juggler(juggling):
     np.testing.assert_allclose(point.value, 1.0, rtol=1e-11)
     np.testing.assert_allclose(np.abs(point.multipliers), 1, rtol=1e-9)
     assert point.kind == "Neimark-Sacker"
-    assert (
-        branch.stable[: point.index].all()
-        and not branch.stable[point.index + 1 :].any()
-    )
+    assert branch.stable[: point.index].all()
+    assert not branch.stable[point.index + 1 :].any()
     assert str(branch[point.index]).startswith(
         "LimitCycle(PaddleJuggler: ok)"
     )  # neutral
@@ -103,8 +105,11 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
     )
     for k in (0, len(branch) - 1):
         p = branch[k].system
-        a, g, T = float(p.restitution), float(p.g), float(p.T)
-        bounce, multipliers = branch[k].trajectory().events[0], branch[k].multipliers
+        a = float(p.restitution)
+        g = float(p.g)
+        T = float(p.T)
+        bounce = branch[k].trajectory().events[0]
+        multipliers = branch[k].multipliers
         np.testing.assert_allclose(bounce.after["v"], g * T / 2, rtol=1e-9)
         trace = 1 + a**2 - (1 + a) ** 2 * (2 * np.pi / T) ** 2 * bounce.before["y"] / g
         np.testing.assert_allclose(np.sum(multipliers), trace, atol=1e-7)
@@ -146,10 +151,9 @@ def test_period_2_of_the_buck_converter():
         buck, hj.Guess("open", (12.04, 0.627, 3.8)), multiplicity=2
     )
     np.testing.assert_allclose(cycle.period, 800e-6)
+    measured = [cycle.state["v"], cycle.state["i"]]
     np.testing.assert_allclose(
-        [cycle.state["v"], cycle.state["i"]],
-        [12.0384992252652, 0.626948841497016],
-        rtol=1e-11,
+        measured, [12.0384992252652, 0.626948841497016], rtol=1e-11
     )
     pair = 0.613891423607179 + 0.290590765487630j
     np.testing.assert_allclose(cycle.multipliers, [pair, np.conj(pair)], rtol=1e-9)
@@ -173,8 +177,10 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     r = 2 * (2 * np.pi) ** 2
     np.testing.assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
-    assert branch.ends[1].message == "end of the parameter range" and not branch.points
-    assert branch.values[-1] == 30.0 and float(branch[-1].anchor.t[0]) != 0.5
+    assert branch.ends[1].message == "end of the parameter range"
+    assert not branch.points
+    assert branch.values[-1] == 30.0
+    assert float(branch[-1].anchor.t[0]) != 0.5
     again = hj.find_limit_cycle(branch[-1].system, branch[-1])
     np.testing.assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
 
@@ -213,7 +219,8 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
     with pytest.raises(hj.DefinitionError, match="'growth.c'; parameters are growth.r"):
         hj.continuation(cycle, "growth.c", (1.0, 2.0))
     points = hj.continuation(cycle, "growth.r", (1.9, 3.1), step=1.0).points
-    assert [(x.kind[0], len(x.critical)) for x in points] == [
+    measured = [(x.kind[0], len(x.critical)) for x in points]
+    assert measured == [
         ("N", 2),
         ("N", 2),
         ("f", 2),

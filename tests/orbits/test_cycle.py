@@ -31,23 +31,26 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
     np.testing.assert_allclose(
         hopper_cycle.anchor.q[:2, 0], data["state_clock_half"], atol=1e-10
     )
-    assert hopper_cycle.result == hj.Result.OK and hopper_cycle.stable
-    assert hopper_cycle.period == 1.0 and hopper_cycle.residual < 1e-12
+    assert hopper_cycle.result == hj.Result.OK
+    assert hopper_cycle.stable
+    assert hopper_cycle.period == 1.0
+    assert hopper_cycle.residual < 1e-12
     liftoff, touchdown = hopper_cycle.trajectory().events
-    assert (liftoff.name, touchdown.name) == ("liftoff", "touchdown")
+    assert liftoff.name == "liftoff"
+    assert touchdown.name == "touchdown"
     np.testing.assert_allclose(liftoff.time % 1, data["liftoff_clock"], atol=1e-10)
     np.testing.assert_allclose(touchdown.time % 1, data["touchdown_clock"], atol=1e-10)
     for event in (liftoff, touchdown):
         for x, when in ((event.before, "pre"), (event.after, "post")):
-            np.testing.assert_allclose(
-                list(x.values()), data[f"{event.name}_{when}"], atol=1e-10
-            )
+            expected = data[f"{event.name}_{when}"]
+            np.testing.assert_allclose(list(x.values()), expected, atol=1e-10)
     (before, _), (after, _) = map(
         last_turn, (hopper_cycle, begin_later(hopper_cycle, 2))
     )
     np.testing.assert_array_equal(after.t, np.append(before.t[2:], before.t[:2] + 1.0))
     text = repr(hopper_cycle)
-    assert "liftoff, touchdown" in text and "-0.248983335+0.699333252j" in text
+    assert "liftoff, touchdown" in text
+    assert "-0.248983335+0.699333252j" in text
 
 
 def test_a_cycle_can_be_donated(hopper_cycle):
@@ -110,16 +113,24 @@ def test_van_der_pol(mu):
     np.testing.assert_allclose(
         cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0
     )
-    assert not cycle.clocked and cycle.event_sequence == () and cycle.stable == (mu > 0)
+    assert not cycle.clocked
+    assert cycle.event_sequence == ()
+    assert cycle.stable == (mu > 0)
 
 
 def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
     """v' = 1 + v^2 from -1 to 1e5, in the time atan(1e5) + pi/4; at the guess a millionth of it."""
     square = Field(("v",), lambda t, q, u: (1 + q[0] ** 2,))
-    spike = lambda t, q, u: q[0] - 1e5  # noqa: E731
-    again = lambda t, q, u: (-1.0,)  # noqa: E731
+
+    def spike(t, q, u):
+        return q[0] - 1e5
+
+    def again(t, q, u):
+        return (-1.0,)
+
     event = hj.Transition("spike", "a", "a", spike, "rising", again)
-    guess, section = hj.Guess("a", (9e4,)), hj.AtEvent("spike")
+    guess = hj.Guess("a", (9e4,))
+    section = hj.AtEvent("spike")
     cycle = hj.find_limit_cycle(toy({"a": square}, [event]), guess, section=section)
     np.testing.assert_allclose(cycle.period, np.arctan(1e5) + np.pi / 4, rtol=1e-9)
 
@@ -208,7 +219,10 @@ def test_an_equilibrium_is_no_cycle():
     ):
         vanderpol(1.0, section=far, max_period=20.0)
     still = vanderpol(-0.5, (0.1, 0.0), throw=False)
-    linearize = lambda: hj.linearize(still, far)  # noqa: E731
+
+    def linearize():
+        return hj.linearize(still, far)
+
     for use in (
         still.responses,
         linearize,
@@ -257,9 +271,12 @@ def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
     """The juggler's unstable cycle; its trace and that of the stable one have the mean 1 + e^2."""
     juggler = hj.models.PaddleJuggler()
     cycle = hj.find_limit_cycle(juggler, hj.Guess("fall", (1.3, -1.0), 0.56))
-    e, stable = juggler.restitution, hj.find_limit_cycle(juggler)
+    e = juggler.restitution
+    stable = hj.find_limit_cycle(juggler)
     np.testing.assert_allclose(np.prod(cycle.multipliers), e**2, rtol=1e-9)
     traces = sum(np.sum(x.multipliers) for x in (cycle, stable))
     np.testing.assert_allclose(traces, 2 * (1 + e**2), rtol=1e-9)
-    assert stable.stable and not cycle.stable
-    assert ": ok, unstable)" in str(cycle) and ": ok)" in str(stable)
+    assert stable.stable
+    assert not cycle.stable
+    assert ": ok, unstable)" in str(cycle)
+    assert ": ok)" in str(stable)

@@ -31,7 +31,8 @@ def test_one_cycle_of_a_family(running):
     np.testing.assert_allclose(state, [0.940267144379607, 5.11585365577165], rtol=1e-12)
     np.testing.assert_allclose(running.period, 0.252532613817573, rtol=1e-11)
     np.testing.assert_allclose(running.multipliers, [1, -0.161307631037475], rtol=1e-10)
-    assert running.multipliers[0] == 1 and running.stable
+    assert running.multipliers[0] == 1
+    assert running.stable
     assert "(1: conserved energy)" in repr(running)
 
 
@@ -55,9 +56,8 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
     )
     for exact, step in ((by_k, (4.0, 0.0)), (by_energy, (0.0, 0.05))):
         ends = [height(at[0] + s * step[0], at[1] + s * step[1]) for s in (-1, 1)]
-        np.testing.assert_allclose(
-            exact, (ends[1] - ends[0]) / 2 / max(step), rtol=1e-5
-        )
+        expected = (ends[1] - ends[0]) / 2 / max(step)
+        np.testing.assert_allclose(exact, expected, rtol=1e-5)
 
 
 ENERGY = hj.Output("energy", lambda t, q, u: (q[0] ** 2 + q[1] ** 2) / 2)

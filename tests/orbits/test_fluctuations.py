@@ -11,11 +11,18 @@ from .test_responses import Juggler, Neuron, StuartLandau
 
 G, TABLE, SPEED = 9.81, 2e-3, 3e-3
 NOISE = dict(guards={"impact": TABLE}, resets={"impact": {"v": SPEED}})
-paddle, slope, bend = (
-    lambda t: 0.15 * np.sin(2 * np.pi * t),
-    lambda t: 0.3 * np.pi * np.cos(2 * np.pi * t),
-    lambda t: -0.6 * np.pi**2 * np.sin(2 * np.pi * t),
-)
+
+
+def paddle(t):
+    return 0.15 * np.sin(2 * np.pi * t)
+
+
+def slope(t):
+    return 0.3 * np.pi * np.cos(2 * np.pi * t)
+
+
+def bend(t):
+    return -0.6 * np.pi**2 * np.sin(2 * np.pi * t)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +51,14 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
 
 @pytest.mark.core
 def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
     noisy = hj.find_limit_cycle(StuartLandau(), guess, section=section).fluctuations(
         {"x": 1e-3}
     )
     # Of the amplitude r: r' = -0.2 r + cos(t w) dW; of the phase: see the closed form of Z.
-    angle, w = 2 * np.pi * np.array([0.0, 0.2, 0.7]), 1.0 + 0.4 * 0.1
+    angle = 2 * np.pi * np.array([0.0, 0.2, 0.7])
+    w = 1.0 + 0.4 * 0.1
     wave = 0.4 * np.cos(2 * angle) + 2 * w * np.sin(2 * angle)
     radial = 1e-6 / 2 * (1 / 0.4 + wave / (0.4**2 + 4 * w**2))
     # At equal phases d angle = alpha dr / r.
@@ -57,12 +66,10 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     C, later = (noisy.covariance([0.0, 0.2, 0.7], lag) for lag in (0, 1))
     np.testing.assert_allclose(C[:, 0, 1], radial * along[0] * along[1], rtol=1e-11)
     decay = np.exp(-0.2 * 2 * np.pi / w)
-    np.testing.assert_allclose(
-        later[:, 1, 1], decay * radial * along[1] ** 2, rtol=1e-11
-    )
-    np.testing.assert_allclose(
-        noisy.diffusion, 1e-6 * (1 + 0.4**2) / 0.2 / w**2, rtol=1e-11
-    )
+    expected = decay * radial * along[1] ** 2
+    np.testing.assert_allclose(later[:, 1, 1], expected, rtol=1e-11)
+    expected = 1e-6 * (1 + 0.4**2) / 0.2 / w**2
+    np.testing.assert_allclose(noisy.diffusion, expected, rtol=1e-11)
     # Periods are correlated, and over many of them their variance is that of the diffusion.
     both = noisy.durations()[0, 0] + 2 * sum(
         noisy.durations(k)[0, 0] for k in range(1, 40)
@@ -79,7 +86,8 @@ def test_states_may_have_no_correlation():
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     """The chain of times, heights and speeds (t, y, v) after bounces."""
-    noisy, (t, v) = juggler.fluctuations(**NOISE), _at_impact(juggler)
+    noisy = juggler.fluctuations(**NOISE)
+    (t, v) = _at_impact(juggler)
     fall = v - G  # the speed with which it lands, after a period of 1
     late = np.array([fall, -1.0, -1.0]) / (fall - slope(t))
     early = late - [1, 0, 0]
@@ -96,30 +104,33 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     ago = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
     now = np.array([[-(v - G * ago), 1.0, ago], [G, 0.0, 1.0]])
     np.testing.assert_allclose(noisy.covariance([0.0])[0], now @ C @ now.T, rtol=1e-11)
-    np.testing.assert_allclose(
-        noisy.covariance([0.0], 2)[0], now @ step @ step @ C @ now.T, rtol=1e-11
-    )
+    measured = noisy.covariance([0.0], 2)[0]
+    expected = now @ step @ step @ C @ now.T
+    np.testing.assert_allclose(measured, expected, rtol=1e-11)
     lags = [C[0, 0], *((np.linalg.matrix_power(step, k) @ C)[0, 0] for k in (1, 2))]
-    np.testing.assert_allclose(
-        noisy.durations()[0, 0], 2 * (lags[0] - lags[1]), rtol=1e-12
-    )
-    np.testing.assert_allclose(
-        noisy.durations(1)[0, 0], 2 * lags[1] - lags[0] - lags[2], rtol=1e-11
-    )
+    expected = 2 * (lags[0] - lags[1])
+    np.testing.assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
+    measured = noisy.durations(1)[0, 0]
+    expected = 2 * lags[1] - lags[0] - lags[2]
+    np.testing.assert_allclose(measured, expected, rtol=1e-11)
 
 
 def test_a_million_simulated_bounces_scatter_as_computed(juggler):
-    noisy, (t, v) = juggler.fluctuations(**NOISE), _at_impact(juggler)
-    rng, draws = np.random.default_rng(0), 2000
+    noisy = juggler.fluctuations(**NOISE)
+    (t, v) = _at_impact(juggler)
+    rng = np.random.default_rng(0)
+    draws = 2000
     t, y, v = np.full(draws, t), np.full(draws, paddle(t)), np.full(draws, v)
     durations = []
     for k in range(560):
-        table, tau = TABLE * rng.normal(size=draws), np.ones(draws)
+        table = TABLE * rng.normal(size=draws)
+        tau = np.ones(draws)
         for _ in range(8):
             off = y + v * tau - G / 2 * tau**2 - paddle(t + tau) - table
             tau = tau - off / (v - G * tau - slope(t + tau))
         t = t + tau
-        y, v = paddle(t) + table, 1.7 * slope(t) - 0.7 * (v - G * tau)
+        y = paddle(t) + table
+        v = 1.7 * slope(t) - 0.7 * (v - G * tau)
         v = v + SPEED * rng.normal(size=draws)
         if k >= 60:
             durations.append(tau - 1)
@@ -166,8 +177,12 @@ class _Follower(hj.HybridSystem):
         return {"sub": _Adaptive()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0, q[1] + 1)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0, q[1] + 1)
+
         return [hj.Transition("spike", "sub", "sub", guard=threshold, reset=after)]
 
 

@@ -101,7 +101,8 @@ def test_a_repeated_cycle_is_that_of_the_closed_form(free, compiled):
     assert abs(largest - amplitude(0.5)) < 1e-3 * x
     # A turn damps by exp(-damping T) in two directions.
     product = np.prod(cycle.multipliers).real
-    assert abs(product - np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-11
+    error = abs(product - np.exp(-0.4 * 2 * np.pi / 1.3))
+    assert error < 1e-11
 
 
 def test_an_event_that_is_new_goes_to_the_search(free, compiled):
@@ -112,7 +113,8 @@ def test_an_event_that_is_new_goes_to_the_search(free, compiled):
     ]
     # The rebound keeps the product of the multipliers, less the squared restitution.
     product = np.prod(cycle.multipliers).real
-    assert abs(product - 0.6**2 * np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-9
+    error = abs(product - 0.6**2 * np.exp(-0.4 * 2 * np.pi / 1.3))
+    assert error < 1e-9
 
 
 def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
@@ -169,13 +171,15 @@ def test_programs_of_many_systems_factorize_nothing(free):
     times = np.zeros(4), np.full(4, float(free.period))
     q = np.repeat(route.map.anchor.q.T, 4, axis=0)
     ends = np.repeat(route.first.ends[None], 4, axis=0)
-    map, plan = on_device(route.map), Plan.of(route.first)
+    map = on_device(route.map)
+    plan = Plan.of(route.first)
 
     def program(leaves, t, expected, q, ends):
         return correct(Maps(map, leaves, t, expected), route.first.form, plan, q, ends)
 
     text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
-    assert "while" in text and "@lapack_" not in text
+    assert "while" in text
+    assert "@lapack_" not in text
 
 
 def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
@@ -195,4 +199,5 @@ def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     after = np.flatnonzero(path.event == 0)[0]
     # In closed form, the charge with which a pulse of 0.35 begins.
     begin = np.exp(-0.65) * (1 - np.exp(-0.35)) / (1 - np.exp(-1.0))
-    assert abs(path.after[after, 0] - begin) < 1e-10
+    error = abs(path.after[after, 0] - begin)
+    assert error < 1e-10

@@ -12,7 +12,10 @@ from ..toys import Field, Toys, toy
 
 def kicked(beat=1.0, schedule=0.0):
     """x' = -x, and x grows by 1 each time the cosine falls, or at scheduled times."""
-    guard = lambda t, q, u: jnp.cos(2 * jnp.pi * t)  # noqa: E731
+
+    def guard(t, q, u):
+        return jnp.cos(2 * jnp.pi * t)
+
     guard = hj.Scheduled(schedule, 0.1) if schedule else guard
     kick = hj.Transition("kick", "a", "a", guard, reset=lambda t, q, u: (q[0] + 1.0,))
     charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + 0.0 * jnp.sin(t) + u[0],))}
@@ -25,9 +28,8 @@ BEAT = kicked(schedule=1.0)
 @pytest.mark.parametrize("size", [1e300, 1e100])
 def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
     cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (size,)))
-    np.testing.assert_allclose(
-        cycle.state["x"], np.exp(-0.9) / (1 - np.exp(-1)), rtol=1e-12
-    )
+    expected = np.exp(-0.9) / (1 - np.exp(-1))
+    np.testing.assert_allclose(cycle.state["x"], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,9 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     """Of the logistic map, of which each period of a clock makes a step."""
 
     def make(r):
-        grow = lambda t, q, u: (r * q[0] * (1 - q[0]),)  # noqa: E731
+        def grow(t, q, u):
+            return (r * q[0] * (1 - q[0]),)
+
         still = {"a": Field(("x",), lambda t, q, u: (0.0 * jnp.sin(2 * jnp.pi * t),))}
         return (
             still,
@@ -66,7 +70,8 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
         Toys(make, [3.2]), hj.Guess("a", (0.8,)), multiplicity=2
     )
     result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
-    assert [result(np.array([r])) for r in (3.3, 2.8)] == [
+    measured = [result(np.array([r])) for r in (3.3, 2.8)]
+    assert measured == [
         hj.Result.OK,
         hj.Result.EXTRA_TURNS,
     ]
@@ -87,7 +92,8 @@ def test_outputs_of_a_call_have_the_period_of_the_clock():
 def test_a_ball_does_not_fall_through_the_floor():
     ball = hj.models.BouncingBall(restitution=0.0)
     path = hj.simulate(ball, "fall", (1.0, 0.0), 2.0, throw=False)
-    assert path.result == hj.Result.GUARD_PASSED and len(path.events) == 1
+    assert path.result == hj.Result.GUARD_PASSED
+    assert len(path.events) == 1
 
 
 def test_a_cycle_of_another_kind_is_no_guess(hopper_cycle):
@@ -109,10 +115,8 @@ def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)
     cycle = hj.find_limit_cycle(slower, hopper_cycle)
     np.testing.assert_allclose(cycle.anchor.t, 1.05 * hopper_cycle.anchor.t, rtol=1e-14)
-    assert (
-        cycle.result == hj.Result.OK
-        and cycle.event_sequence == hopper_cycle.event_sequence
-    )
+    assert cycle.result == hj.Result.OK
+    assert cycle.event_sequence == hopper_cycle.event_sequence
 
 
 def test_a_guess_that_is_far_too_large_in_one_state_leads_to_the_same_accuracy(

@@ -50,8 +50,12 @@ class Neuron(hj.HybridSystem):
         return (self.current - self.leak * q[0] + self.square * q[0] ** 2 + u[0],)
 
     def transitions(self):
-        guard = lambda t, q, u: 1 - self.grip * u[0] - q[0]  # noqa: E731
-        reset = lambda t, q, u: (self.low + self.grip * u[0],)  # noqa: E731
+        def guard(t, q, u):
+            return 1 - self.grip * u[0] - q[0]
+
+        def reset(t, q, u):
+            return (self.low + self.grip * u[0],)
+
         return [hj.Transition("spike", "membrane", "membrane", guard, reset=reset)]
 
     def guess(self):
@@ -87,17 +91,24 @@ class Square(hj.HybridSystem):
     def charts(self):
         charts = {"inside": FieldChart(lambda t, q, u: self.rates(q), ("x", "y"))}
         for name, axis, _ in self.WALLS:
-            along = lambda t, q, u, k=axis: [
-                r * (i != k) for i, r in enumerate(self.rates(q))
-            ]
+
+            def along(t, q, u, k=axis):
+                return [r * (i != k) for i, r in enumerate(self.rates(q))]
+
             charts[name] = FieldChart(along, ("x", "y"))
         return charts
 
     def transitions(self):
         for name, k, side in self.WALLS:
-            inner = lambda t, q, u, k=k, side=side: 1 - side * q[k]
+
+            def inner(t, q, u, k=k, side=side):
+                return 1 - side * q[k]
+
             yield hj.Transition(f"to {name}", "inside", name, inner)
-            pressed = lambda t, q, u, k=k, side=side: side * self.rates(q)[k]
+
+            def pressed(t, q, u, k=k, side=side):
+                return side * self.rates(q)[k]
+
             yield hj.Transition(f"off {name}", name, "inside", pressed)
 
     def guess(self):
@@ -114,7 +125,8 @@ class Juggler(hj.models.PaddleJuggler):
 @pytest.mark.core
 def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     system = StuartLandau()
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
     responses = hj.find_limit_cycle(system, guess, section=section).responses()
     angle = 2 * np.pi * PHASES
     phase = responses.phase(PHASES, "radians")
@@ -147,7 +159,8 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
             x, y = super().field(t, (q[0], q[1] / size), u)
             return x, y * size
 
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
     cycle = hj.find_limit_cycle(Scaled(), guess, section=section)
     exact = -(np.sin(2 * np.pi * PHASES) - 0.4 * np.cos(2 * np.pi * PHASES)) / np.sqrt(
         0.1
@@ -164,7 +177,10 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
 
 def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
     """x' = cos(2 pi t) - 0.3 x, and x changes its sign at each tick."""
-    field = lambda t, q, u: (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
+
+    def field(t, q, u):
+        return (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
+
     tick = hj.Scheduled(1.0, 0.5)
     turned = hj.Transition("tick", "line", "line", tick, reset=lambda t, q, u: (-q[0],))
     system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
@@ -176,7 +192,8 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
 
 
 def test_the_closed_form_of_a_response_has_its_derivative():
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
     near = hj.find_limit_cycle(StuartLandau(), guess, section=section)
 
     def response(mu):
@@ -190,20 +207,19 @@ def test_the_closed_form_of_a_response_has_its_derivative():
 
 
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
     responses = hj.find_limit_cycle(StuartLandau(), guess, section=section).responses()
     pushed = responses.coupling(lambda phase: np.cos(2 * np.pi * phase))
-    size, angle = 1 / (4 * np.pi * np.sqrt(0.1)), 2 * np.pi * PHASES
-    np.testing.assert_allclose(
-        pushed(PHASES), size * (np.sin(angle) + 0.4 * np.cos(angle)), rtol=1e-11
-    )
-    np.testing.assert_allclose(
-        pushed.locking, np.array([-1, 1]) * size * np.sqrt(1.16), rtol=1e-12
-    )
+    size = 1 / (4 * np.pi * np.sqrt(0.1))
+    angle = 2 * np.pi * PHASES
+    expected = size * (np.sin(angle) + 0.4 * np.cos(angle))
+    np.testing.assert_allclose(pushed(PHASES), expected, rtol=1e-11)
+    expected = np.array([-1, 1]) * size * np.sqrt(1.16)
+    np.testing.assert_allclose(pushed.locking, expected, rtol=1e-12)
     rates = [x.rate for x in pushed.locked()]
-    np.testing.assert_allclose(
-        np.abs(rates), 2 * np.pi * size * np.sqrt(1.16), rtol=1e-11
-    )
+    expected = 2 * np.pi * size * np.sqrt(1.16)
+    np.testing.assert_allclose(np.abs(rates), expected, rtol=1e-11)
     together, apart = responses.coupling("x").locked(mutual=True)
     np.testing.assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
     leads = [
@@ -232,7 +248,8 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
     system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
     cycle = hj.find_limit_cycle(system)
-    begin, quadratic = np.arctan(-2.0), cycle.responses()
+    begin = np.arctan(-2.0)
+    quadratic = cycle.responses()
     period = np.arctan(1.0) - begin
     exact = np.cos(begin + PHASES * period) ** 2
     np.testing.assert_allclose(quadratic.phase(PHASES)["u"], exact, rtol=1e-12)
@@ -240,7 +257,8 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     exact = np.cos(begin + curve.phase * period) ** 2 / period
     kept = np.isfinite(curve.values)
     np.testing.assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
-    assert 0 < np.sum(~kept) <= 2 and curve.input == "u"
+    assert 0 < np.sum(~kept) <= 2
+    assert curve.input == "u"
     change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
     np.testing.assert_allclose(change.period, -1 / 5, rtol=1e-11)
     np.testing.assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
@@ -251,13 +269,13 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
 def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_derivative():
     cycle = hj.find_limit_cycle(Square())
     np.testing.assert_allclose(cycle.period, 6.766182958186238, rtol=1e-11)
-    a, omega = cycle.sensitivity("a"), cycle.sensitivity("omega")
+    a = cycle.sensitivity("a")
+    omega = cycle.sensitivity("omega")
     np.testing.assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
     np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
-    np.testing.assert_allclose(
-        np.reshape(a.durations, (4, 2)).sum(1), a.period / 4, rtol=1e-9
-    )
+    measured = np.reshape(a.durations, (4, 2)).sum(1)
+    np.testing.assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
     periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
     np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
@@ -275,13 +293,18 @@ AUTONOMOUS = """
 def test_phase_responses_are_differences_of_asymptotic_phases(name):
     """Of flows from states that are pushed in a random direction, to both sides."""
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
-    s, period, flow = cycle.structure, float(cycle.period), linear_flow(cycle)
+    s = cycle.structure
+    period = float(cycle.period)
+    flow = linear_flow(cycle)
     phases = np.array([0.15, 0.4, 0.77])
     response = cycle.responses(modes=0).phase(phases, "cycles")
     charts, states = flow.at(phases, period, flow.q)
-    rng, exact, difference = np.random.default_rng(0), [], []
+    rng = np.random.default_rng(0)
+    exact = []
+    difference = []
     for k, a in enumerate(charts):
-        names, q = s.charts[a].states, states[k, : s.dims[a]]
+        names = s.charts[a].states
+        q = states[k, : s.dims[a]]
         push = 1e-4 * rng.normal(size=len(q)) * [cycle.scale[x] for x in names]
         push *= [response[x][k] != 0 for x in names]  # sliding undoes the others
 
@@ -301,7 +324,8 @@ def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
     inside = (flow.chart == cycle.structure.chart_index("sticks")) & (flow.event < 0)
     sticks = flow.t[inside] - flow.t[0]
     phase = cycle.responses().phase(sticks[:-1] / float(cycle.period))
-    assert np.all(phase["v"] == 0) and np.all(np.abs(phase["x"]) > 1)
+    assert np.all(phase["v"] == 0)
+    assert np.all(np.abs(phase["x"]) > 1)
     assert "2 faster modes left out" not in str(cycle.responses())
 
 
@@ -314,7 +338,8 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         0.333649918824 + 0.129840711721j,
     ]
     np.testing.assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
-    assert "continuous time" in str(htf) and htf[1].shape == (1, 1, 1)
+    assert "continuous time" in str(htf)
+    assert htf[1].shape == (1, 1, 1)
     held = hj.linearize(cycle, hj.ClockPhase(64), "x").htf(0.25, (-1, 0, 1)).H
     x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
     np.testing.assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
@@ -323,12 +348,11 @@ def test_mathieus_equation_has_the_published_continuous_htf():
 
 
 def test_htfs_at_many_frequencies_come_from_fewer():
-    cycle, f = (
-        hj.find_limit_cycle(hj.models.BuckConverter()),
-        np.linspace(0.013, 9.987, 620),
-    )
+    cycle = hj.find_limit_cycle(hj.models.BuckConverter())
+    f = np.linspace(0.013, 9.987, 620)
     some = [0, 7, 311, 619]
-    many, few = cycle.htf(f, (-1, 0, 1)).H, cycle.htf(f[some], (-1, 0, 1)).H
+    many = cycle.htf(f, (-1, 0, 1)).H
+    few = cycle.htf(f[some], (-1, 0, 1)).H
     np.testing.assert_allclose(
         many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max()
     )
@@ -342,7 +366,8 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
     ]
     exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
     np.testing.assert_allclose(H, exact, rtol=1e-11)
-    assert space.error < 1e-12 and space.order == 8
+    assert space.error < 1e-12
+    assert space.order == 8
     assert hj.convert.to_harmonic_state_space(cycle, 1).error > 1e-3
     with pytest.raises(hj.DefinitionError, match="has events at which deviations jump"):
         hj.convert.to_harmonic_state_space(hj.find_limit_cycle(Neuron()))
@@ -351,25 +376,23 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
 def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_the_height():
     """With the impulses of the speed at impacts whose time moves."""
     cycle = hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
-    f, m = np.array([0.3, 1.7]), np.arange(-3, 4)
+    f = np.array([0.3, 1.7])
+    m = np.arange(-3, 4)
     y, v = np.moveaxis(cycle.htf(f, m, ("y", "v")).H[..., 0], -1, 0)
     np.testing.assert_allclose(v, 2j * np.pi * (f + m[:, None]) * y, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_path):
-    rng, system = (
-        np.random.default_rng(0),
-        Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0),
-    )
+    rng = np.random.default_rng(0)
+    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
     f, angle = rng.uniform(0.1, 0.9, (2, 12))
-    current = lambda t: (
-        0.05 * jnp.sum(jnp.cos(2 * jnp.pi * (f * t + angle)), keepdims=True)
-    )
-    way, t = (
-        hj.simulate(system, "membrane", (-2.0,), 600.0, input=current),
-        np.arange(0, 600, 0.02),
-    )
+
+    def current(t):
+        return 0.05 * jnp.sum(jnp.cos(2 * jnp.pi * (f * t + angle)), keepdims=True)
+
+    way = hj.simulate(system, "membrane", (-2.0,), 600.0, input=current)
+    t = np.arange(0, 600, 0.02)
     spikes = np.array([x.time for x in way.events]) + 0.01 * rng.normal(
         size=len(way.events)
     )
@@ -378,7 +401,8 @@ def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_pa
     )
     measured = hj.recordings.phase_response(recording, hj.AtEvent("spike"), input="u")
     curve = hj.find_limit_cycle(system).responses().curve()
-    (low, high), values = measured.interval(curve.phase), curve.values
+    (low, high) = measured.interval(curve.phase)
+    values = curve.values
     assert np.mean(((low <= values) & (values <= high))[np.isfinite(values)]) > 0.9
     hj.plot.save(tmp_path / "both", hj.plot.phase_response(measured, model=curve))
 
@@ -399,7 +423,8 @@ def _shifted(cycle, name, step):
 )
 def test_sensitivities_are_differences_of_cycles(system, name):
     cycle = hj.find_limit_cycle(system)
-    change, step = cycle.sensitivity(name), 1e-3 * float(getattr(system, name))
+    change = cycle.sensitivity(name)
+    step = 1e-3 * float(getattr(system, name))
 
     def numbers(step):
         other = _shifted(cycle, name, step)
@@ -415,7 +440,9 @@ def test_sensitivities_are_differences_of_cycles(system, name):
             ]
         )
 
-    central = lambda h: (numbers(h) - numbers(-h)) / (2 * h)
+    def central(h):
+        return (numbers(h) - numbers(-h)) / (2 * h)
+
     difference = (4 * central(step / 2) - central(step)) / 3
     name = cycle.structure.charts[0].states[0]
     begin = float(cycle.anchor.t[0]) / float(cycle.period) * change.period
@@ -439,16 +466,15 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     ids=["a phase", "two charts", "a schedule", "four charts"],
 )
 def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, output):
-    guess, begin = (
-        hj.find_limit_cycle(system),
-        jnp.asarray(getattr(system, name), float),
-    )
+    guess = hj.find_limit_cycle(system)
+    begin = jnp.asarray(getattr(system, name), float)
 
     def result(value):
         cycle = hj.find_limit_cycle(
             eqx.tree_at(lambda x: getattr(x, name), system, value), guess
         )
-        responses, at = cycle.responses(modes=2 * guess.clocked), jnp.array([0.3])
+        responses = cycle.responses(modes=2 * guess.clocked)
+        at = jnp.array([0.3])
         push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
         htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
         noise = cycle.fluctuations({output: 0.1})
@@ -460,7 +486,10 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         return jnp.abs(jnp.stack([push[output][0], htf, noisy, shape, impulse, later]))
 
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
-    central = lambda h: (result(begin + h) - result(begin - h)) / (2 * h)
+
+    def central(h):
+        return (result(begin + h) - result(begin - h)) / (2 * h)
+
     h = 1e-3 * begin
     difference = (4 * central(h / 2) - central(h)) / 3
     np.testing.assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)

@@ -15,7 +15,10 @@ def decaying(rates):
     modes = np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.6, 1.0]])
     A = jnp.asarray(modes @ np.diag(-np.array(rates)) @ np.linalg.inv(modes))
     force = jnp.array([1.0, 2.0, 3.0])
-    field = lambda t, q, u: A @ q + force * jnp.cos(2 * jnp.pi * t)  # noqa: E731
+
+    def field(t, q, u):
+        return A @ q + force * jnp.cos(2 * jnp.pi * t)
+
     return toy({"a": Field(("x", "y", "z"), field)}, period=1.0)
 
 
@@ -41,7 +44,10 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
         small * jnp.cos(2 * jnp.pi * t) - q[0] / 2,
         q[0] / small * large - q[1],
     )
-    reset = lambda t, q, u: (q[0], 0.0)  # noqa: E731
+
+    def reset(t, q, u):
+        return (q[0], 0.0)
+
     tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0, 0.5), reset=reset)
     cycle = hj.find_limit_cycle(
         toy({"a": Field(("x", "y"), field)}, [tick], period=1.0),

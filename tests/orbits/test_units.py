@@ -59,11 +59,10 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     length, time = UNITS[unit]
     sizes = dimensions(length, time)
     cycle = hopper_cycle_in(length, time)
-    assert (cycle.result, cycle.event_sequence) == (
-        hj.Result.OK,
-        hopper_cycle.event_sequence,
-    )
-    assert cycle.iterations == hopper_cycle.iterations and cycle.residual < 1e-12
+    assert cycle.result == hj.Result.OK
+    assert cycle.event_sequence == hopper_cycle.event_sequence
+    assert cycle.iterations == hopper_cycle.iterations
+    assert cycle.residual < 1e-12
     np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
     for name, size in hopper_cycle.scale.items():
         np.testing.assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
@@ -73,7 +72,8 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     np.testing.assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
     H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
     for k, name in enumerate(model.outputs):
-        mine, back = H[:, :, k], sizes["force"] / sizes[name[0]]
+        mine = H[:, :, k]
+        back = sizes["force"] / sizes[name[0]]
         np.testing.assert_allclose(
             theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max()
         )
@@ -98,7 +98,8 @@ def test_states_that_rest_stop_nothing(relaxation):
     truth = [8.59695063603805e-4, np.exp(-6.66328685932313), np.exp(-6.66328685932313)]
     found = np.sort_complex(relaxation.multipliers)
     np.testing.assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
-    assert relaxation.scale["nothing"] == 1.0 and relaxation.scale["rounding"] > 1e-7
+    assert relaxation.scale["nothing"] == 1.0
+    assert relaxation.scale["rounding"] > 1e-7
 
 
 def test_a_state_that_rounding_moves_by_time_stops_nothing():

@@ -66,8 +66,12 @@ class Hopper:
             if not self.guard(self.t, self.q) > 0 > self.guard(end, q):
                 self.t, self.q = end, q
                 break
-            ahead = lambda h: self.guard(self.t + h, self.flow(h, u[0]))  # noqa: E731
+
+            def ahead(h):
+                return self.guard(self.t + h, self.flow(h, u[0]))
+
             when = brentq(ahead, 1e-15, left, xtol=1e-15)
-            q, self.t = self.flow(when, u[0]), self.t + when
+            q = self.flow(when, u[0])
+            self.t = self.t + when
             self.q = q[:2] if len(q) == 4 else [*q, 0.0, 0.0]
         return self.observe()

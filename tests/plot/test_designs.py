@@ -23,9 +23,8 @@ def test_the_spectrum_of_a_design(plan):
     H = np.abs(np.asarray(MODEL.htf(f, 0).H)[0, :, 0, 0])
     np.testing.assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
     usual, optimal = below.get_lines()
-    np.testing.assert_allclose(
-        np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum()
-    )
+    measured = np.sum(np.square(optimal.get_ydata()) / 2)
+    np.testing.assert_allclose(measured, plan.power.sum())
     np.testing.assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
     legend = [x.get_text() for x in below.get_legend().get_texts()]

@@ -50,15 +50,18 @@ def test_feet_do_not_slide_and_the_loop_closes(walk):
 
 def test_files_and_refusals(walk, tmp_path):
     motion = hj.plot.animate(walk)
-    assert abs(motion.interval * len(motion.times) - float(walk.period)) < 1e-9
+    error = abs(motion.interval * len(motion.times) - float(walk.period))
+    assert error < 1e-9
     assert motion.save(tmp_path / "walk.gif").read_bytes().startswith(b"GIF89a")
     page = motion.save(tmp_path / "walk.html").read_text()
-    assert "<script>" in page and 'src="http' not in page
+    assert "<script>" in page
+    assert 'src="http' not in page
     pictures = [
         base64.b64decode(x) for x in re.findall(r"base64,([\w+/=]+)['\"]", page)
     ]
     still, first, *shown = (Image.open(io.BytesIO(x)).convert("RGBA") for x in pictures)
-    assert len(shown) == len(motion.times) and first == shown[0]
+    assert len(shown) == len(motion.times)
+    assert first == shown[0]
     for frame, over in zip(motion._frames(107), shown, strict=True):
         assert Image.alpha_composite(still, over) == frame.convert("RGBA")
     with pytest.raises(hj.DefinitionError, match="name it .gif, .html or .mp4"):
@@ -89,7 +92,8 @@ def test_no_input_gives_the_cycle():
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
     )
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
-    assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
+    error = abs(motion.interval * len(motion.times) - 2 * float(cycle.period))
+    assert error < 1e-9
     motion.figure.draw_without_rendering()
     assert all(
         motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes

@@ -32,8 +32,10 @@ def test_magnitude_draws_the_values(estimate, exact):
         == lines["$H_{-1}$"].get_color()
         != lines["$H_{0}$"].get_color()
     )
-    assert drawn.get_linestyle() == "-" and lines["$H_{-1}$"].get_linestyle() == "--"
-    assert ax.get_yscale() == "log" and "cycles/period" in ax.get_xlabel()
+    assert drawn.get_linestyle() == "-"
+    assert lines["$H_{-1}$"].get_linestyle() == "--"
+    assert ax.get_yscale() == "log"
+    assert "cycles/period" in ax.get_xlabel()
     assert ax.get_ylabel() == "$|H_m|$, vM"
 
 
@@ -75,7 +77,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
         "structured fit",
         "exact",
     ]
-    assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
+    assert upper.get_ylabel() == "$|H_{0}|$"
+    assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
     fitted = rational.htf(estimate.f).H[0, :, 0, 0]
@@ -138,7 +141,8 @@ def test_every_input_is_drawn_and_named():
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
-    assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
+    measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
+    assert measured == [4, 4]
     with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bodes(families, fits={"c": rational})
 
@@ -156,16 +160,17 @@ def test_multipliers(hopper, rational, structured):
         "structured",
     ]
     z = hopper.multipliers
-    np.testing.assert_array_equal(
-        lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1)
-    )
+    expected = np.stack([z.real, z.imag], 1)
+    np.testing.assert_array_equal(lines["exact"].get_xydata(), expected)
     assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
     assert f"{structured.compare(z).max_error:.1e}".split("e")[0] in list(lines)[-1]
     (inset,) = ax.child_axes
-    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    (left, right) = inset.get_xlim()
+    (low, high) = inset.get_ylim()
     for points in (z, *rational.multipliers, structured.multipliers):
         first = points[points.imag > 0][0]
-        assert left < first.real < right and low < first.imag < high
+        assert left < first.real < right
+        assert low < first.imag < high
     crowd = (np.arange(-4, 5)[:, None] + 1j * np.arange(-4, 5)).ravel() / 6
     assert not hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax.child_axes
 
@@ -207,11 +212,11 @@ def test_saved_in_several_formats(tmp_path):
     png, pdf, svg = hj.plot.save(
         tmp_path / "multipliers.png", plot, ("png", "pdf", "svg")
     )
-    assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
+    assert png.read_bytes()[:4] == b"\x89PNG"
+    assert pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
-    assert [p.name for p in (png, pdf, svg)] == [
-        f"multipliers.{x}" for x in ("png", "pdf", "svg")
-    ]
+    expected = [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
+    assert [p.name for p in (png, pdf, svg)] == expected
     assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
@@ -248,7 +253,8 @@ def test_validation_draws_signals_and_correlations(found):
     np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
     np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
     assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
-    assert grid[0, 0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
+    expected = f"fit {found.fit[0]:.3g} %\n"
+    assert grid[0, 0].get_title("right") == expected
     for k, values in (
         (1, found.autocorrelation[:, :, 0]),
         (2, found.cross_correlation[:, :, 0]),
@@ -256,9 +262,8 @@ def test_validation_draws_signals_and_correlations(found):
         heights = [
             path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()
         ]
-        np.testing.assert_allclose(
-            heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12
-        )
+        expected = values.sum(axis=0).ravel() / np.sqrt(32)
+        np.testing.assert_allclose(heights, expected, atol=1e-12)
 
 
 def test_no_texts_overlap_at_the_width_of_a_column(found):
@@ -300,7 +305,8 @@ def test_regions_are_drawn_around_estimates(hopper):
         line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100
     ]
     np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
-    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    (left, right) = inset.get_xlim()
+    (low, high) = inset.get_ylim()
     border = estimate.ellipse(0)
     assert left < border.real.min() < border.real.max() < right
     assert low < border.imag.min() < border.imag.max() < high

@@ -87,7 +87,8 @@ def test_an_interruption_leaves_whole_pieces(tmp_path):
         np.random.default_rng(np.random.SeedSequence(0, spawn_key=(i,)))
         for i in range(10)
     ]
-    expected, again = [rng.normal() for rng in expected], tmp_path / "again"
+    expected = [rng.normal() for rng in expected]
+    again = tmp_path / "again"
     seventh = expected[6]
 
     def drawn(rng):
@@ -128,11 +129,9 @@ def test_a_store_knows_its_function(tmp_path):
 )
 def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     """A store that was made to look like that of the call."""
-    first, victim, store = (
-        partial(np.random.Generator.normal),
-        tmp_path / "x",
-        tmp_path / "s.zarr",
-    )
+    first = partial(np.random.Generator.normal)
+    victim = tmp_path / "x"
+    store = tmp_path / "s.zarr"
     hj.monte_carlo(first, 4, chunk=2, store=store)
     values = store / "value"
     victim.mkdir()
@@ -229,7 +228,8 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     stream = hj.experiments.stream_experiments
     stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
     alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
-    assert len(stored) == 3 and stored.missing() == []
+    assert len(stored) == 3
+    assert stored.missing() == []
     for mine, theirs in zip(alone, stored, strict=True):
         np.testing.assert_array_equal(mine.y, theirs.y)
     data = list(stored)

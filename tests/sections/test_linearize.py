@@ -52,9 +52,8 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
         found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
-        np.testing.assert_allclose(
-            sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9
-        )
+        measured = sorted(found[-2:], key=np.imag)
+        np.testing.assert_allclose(measured, truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
 
 
@@ -90,10 +89,13 @@ def cycle_points(sections, start, retention=1.0):
 
 def check_against_differences(ldtp, sections, points, retention, subset):
     N = len(sections)
-    scale_A, scale_B = np.max(np.abs(ldtp.A)), np.max(np.abs(ldtp.B))
+    scale_A = np.max(np.abs(ldtp.A))
+    scale_B = np.max(np.abs(ldtp.B))
     for i in subset:
-        here, there = sections[i], sections[(i + 1) % N]
-        names, after = ldtp.coordinates[i], ldtp.coordinates[(i + 1) % N]
+        here = sections[i]
+        there = sections[(i + 1) % N]
+        names = ldtp.coordinates[i]
+        after = ldtp.coordinates[(i + 1) % N]
         if ldtp.coordinates[0][0] != "t" and i == N - 1:
             there = ("clock", there[1] + 1.0)
         J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
@@ -115,7 +117,8 @@ def test_kinematic_sections_agree_with_scipy(
         sections, (0.5, *reference("limit_cycle")["state_clock_half"])
     )
     for i, point in enumerate(points):
-        assert abs(float(placed_kinematic.lanes.t[i]) - point[0]) < 1e-10
+        error = abs(float(placed_kinematic.lanes.t[i]) - point[0])
+        assert error < 1e-10
         found = placed_kinematic.lanes.q[: len(point) - 1, i]
         np.testing.assert_allclose(found, point[1:], rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
@@ -200,8 +203,12 @@ class _Neuron(hj.HybridSystem):
         return {"below": _Leaky()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0,)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0,)
+
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 
@@ -224,9 +231,9 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
         np.testing.assert_allclose(H[0][:, 0, 0], 2)
         assert all(np.all(H[m] == 0) for m in H.harmonics if m)
         for system in (model, model.feedback(np.zeros((1, 1)))):
-            np.testing.assert_allclose(
-                system.simulate(np.ones((4, 1))), 2 * np.ones((4, 1))
-            )
+            measured = system.simulate(np.ones((4, 1)))
+            expected = 2 * np.ones((4, 1))
+            np.testing.assert_allclose(measured, expected)
         design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
         data = hj.run_experiments(cycle, sections, design, current, start="periodic")
         np.testing.assert_allclose(data.y, 2 * data.u, rtol=1e-9)
@@ -239,7 +246,8 @@ def test_a_section_map_waits_for_late_arrivals():
     state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
     begin = float(hj.place_sections(cycle, [hj.AtEvent("impact")]).lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
-    alone, inside = paddle(state), eqx.filter_jit(paddle)(state)
+    alone = paddle(state)
+    inside = eqx.filter_jit(paddle)(state)
     both = jax.vmap(paddle)(np.stack([state, state]))
     assert float(alone.t) - begin > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):

@@ -41,7 +41,10 @@ def agrees(system, measure, rtol):
     numbers, others = eqx.partition(system, eqx.is_inexact_array)
     flat, unravel = ravel_pytree(numbers)
     along = flat * np.random.default_rng(0).uniform(-1, 1, flat.shape)
-    at = lambda h: measure(eqx.combine(unravel(flat + h * along), others))  # noqa: E731
+
+    def at(h):
+        return measure(eqx.combine(unravel(flat + h * along), others))
+
     values, reverse = jax.vjp(at, 0.0)
     # (Under transformations, matrices are padded with zeros.)
     sizes = [np.shape(x) for x in at(0.0)]
@@ -54,10 +57,8 @@ def agrees(system, measure, rtol):
     by_host = jax.jvp(at, (0.0,), (1.0,))[1]
     e = 2e-4
     minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
-    differences, size = (
-        (8 * (plus - minus) - (plus2 - minus2)) / (12 * e),
-        kept(by_host),
-    )
+    differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
+    size = kept(by_host)
     np.testing.assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(
         size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size))
@@ -153,7 +154,8 @@ def test_later_calls_repeat_the_first_to_the_last_bit():
     class Hopper(hj.models.VerticalHopper):
         """Its programs are its own."""
 
-    cycle, matrices = hj.find_limit_cycle(Hopper()), []
+    cycle = hj.find_limit_cycle(Hopper())
+    matrices = []
     for _ in range(10):
         matrices.append(
             hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices

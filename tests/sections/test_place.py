@@ -15,7 +15,8 @@ from ..conftest import APEX
 from ..engine.test_executors import slow_but
 
 
-AtEvent, Crossing = hj.AtEvent, hj.Crossing
+AtEvent = hj.AtEvent
+Crossing = hj.Crossing
 LAMBDA = -0.248983334735609 + 0.699333251798004j
 VDP = 8.59695063603805e-4
 
@@ -45,9 +46,8 @@ def test_a_number_as_the_anchor(hopper_cycle):
         hopper_cycle.anchor.t[0], 0.0
     )  # by rounding before the cycle begins
     clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
-    np.testing.assert_allclose(
-        clock.lanes.t % 1, (first + np.arange(3) / 3) % 1, atol=1e-12
-    )
+    expected = (first + np.arange(3) / 3) % 1
+    np.testing.assert_allclose(clock.lanes.t % 1, expected, atol=1e-12)
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
@@ -67,7 +67,8 @@ def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     ldtp = hj.linearize(
         vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling"))
     )
-    assert ldtp.outputs == ("x", "v") and ldtp.coordinates[0] == ("x", "v")
+    assert ldtp.outputs == ("x", "v")
+    assert ldtp.coordinates[0] == ("x", "v")
     np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
     family = hj.KinematicPhase(
         8, position="x", velocity="v", anchor=Crossing("v", "falling")
@@ -127,7 +128,10 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
     with pytest.raises(
         hj.ComputationError, match=rf"section 0 \(function falling\) {text}"
     ):
-        twice = lambda t, q: jnp.sin(4 * jnp.pi * t)  # noqa: E731
+
+        def twice(t, q):
+            return jnp.sin(4 * jnp.pi * t)
+
         hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
     with pytest.raises(
         hj.DefinitionError, match=r"'function falling' .*`Crossing`.* \(t, q\)"
@@ -137,9 +141,13 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
 
 def test_sections_out_of_order_have_no_matrices_in_programs(vanderpol_cycle):
     """Their round takes two periods, and would give squares of multipliers."""
-    levels = lambda x: [Crossing("x", "rising", y) for y in (0.2, 0.4, x)]  # noqa: E731
+
+    def levels(x):
+        return [Crossing("x", "rising", y) for y in (0.2, 0.4, x)]
+
     A = jax.jit(lambda x: hj.linearize(vanderpol_cycle, levels(x)).A)
-    assert np.isfinite(A(0.6)).all() and np.isnan(A(0.3)).all()
+    assert np.isfinite(A(0.6)).all()
+    assert np.isnan(A(0.3)).all()
 
 
 @pytest.mark.slow
@@ -149,7 +157,9 @@ def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
 
 
 def test_equal_sections_are_located_once(hopper_cycle):
-    at = lambda phase: hj.place_sections(hopper_cycle, hj.ClockPhase(2, phase))  # noqa: E731
+    def at(phase):
+        return hj.place_sections(hopper_cycle, hj.ClockPhase(2, phase))
+
     assert at(0.3) is at(0.3)
     assert at(0.4) is not at(0.3)
 
@@ -172,17 +182,14 @@ def test_outputs_of_any_kind_and_feedthrough(
     ldtp = hj.linearize(
         hopper_cycle, placed_isochrons, ["vM", hj.Output("aM", acceleration)]
     )
-    np.testing.assert_allclose(
-        ldtp.D[:, :, 0], np.tile([0.0, 0.5], (32, 1)), atol=1e-15
-    )
+    expected = np.tile([0.0, 0.5], (32, 1))
+    np.testing.assert_allclose(ldtp.D[:, :, 0], expected, atol=1e-15)
     np.testing.assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
     flight = np.asarray(ldtp.dims) == 4
-    np.testing.assert_allclose(
-        ldtp.C[flight, 1], [[-5.0, 0.0, 5.0, 0.0]] * flight.sum()
-    )
-    np.testing.assert_allclose(
-        ldtp.C[~flight, 1], [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum()
-    )
+    expected = [[-5.0, 0.0, 5.0, 0.0]] * flight.sum()
+    np.testing.assert_allclose(ldtp.C[flight, 1], expected)
+    expected = [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum()
+    np.testing.assert_allclose(ldtp.C[~flight, 1], expected)
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
@@ -205,8 +212,10 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
             "has no guess, a family of cycles, or events that rounding puts in order"
         )
     cycle = hj.find_limit_cycle(system)
-    s, (_, _, q) = cycle.structure, cycle.trajectory().dense()
-    names, kept = s.states_everywhere()[:2], []
+    s = cycle.structure
+    (_, _, q) = cycle.trajectory().dense()
+    names = s.states_everywhere()[:2]
+    kept = []
     families = [hj.ClockPhase(7)]
     families += [
         [AtEvent(s.transitions[g].name)] for g in sorted(set(cycle.event_sequence))

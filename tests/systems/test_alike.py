@@ -90,7 +90,8 @@ def test_kinds_are_found():
 
 @pytest.mark.parametrize("other", [Circle(apart=True)])
 def test_events_are_those_of_transitions_of_their_own(other):
-    one, two = run(Circle()), run(other)
+    one = run(Circle())
+    two = run(other)
     assert len(one.events) == 8
     assert [e.name for e in one.events] == [e.name for e in two.events]
     np.testing.assert_allclose(
@@ -101,7 +102,8 @@ def test_events_are_those_of_transitions_of_their_own(other):
 
 def test_numbers_are_those_of_python():
     """In JAX, an integer to the power of one that is negative is another number."""
-    one, two = run(Circle(mark=Halving)), run(Circle(mark=Halving, apart=True))
+    one = run(Circle(mark=Halving))
+    two = run(Circle(mark=Halving, apart=True))
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
     assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
 

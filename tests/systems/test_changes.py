@@ -13,7 +13,8 @@ from ..toys import Field
 
 hj.enable_x64()
 DRAG = 0.7
-SECTIONS, DESIGN = hj.ClockPhase(2), hj.multisine(2, periods=4).scaled(rms=0.01)
+SECTIONS = hj.ClockPhase(2)
+DESIGN = hj.multisine(2, periods=4).scaled(rms=0.01)
 TURN = hj.Crossing("v", "falling")
 drag = jax.jit(lambda speed: -DRAG * speed)  # whose trace JAX keeps
 
@@ -25,7 +26,9 @@ class Slowed(hj.HybridSystem):
         return 1.0
 
     def charts(self):
-        slows = lambda t, q, u: (drag(q[0]) + jnp.cos(2 * jnp.pi * t) + u[0],)  # noqa: E731
+        def slows(t, q, u):
+            return (drag(q[0]) + jnp.cos(2 * jnp.pi * t) + u[0],)
+
         return {"air": Field(("x",), slows)}
 
     def guess(self):
@@ -50,12 +53,16 @@ def test_functions_that_are_made_anew_have_traces_of_their_own(monkeypatch):
         drag(jnp.ones(1)[0])  # a call by the user
 
         class Anew(hj.HybridSystem):
-            period = lambda self: 1.0  # noqa: E731
-            charts = lambda self: {"air": Field(("x",), lambda t, q, u: (drag(q[0]),))}  # noqa: E731
+            def period(self):
+                return 1.0
+
+            def charts(self):
+                return {"air": Field(("x",), lambda t, q, u: (drag(q[0]),))}
 
         return Anew()
 
-    first, second = made(), made()
+    first = made()
+    second = made()
     for system, value in ((first, 0.7), (second, 1.3), (second, 0.7)):
         monkeypatch.setitem(globals(), "DRAG", value)
         cycle = hj.find_limit_cycle(system, hj.Guess("air", (0.0,)))
@@ -120,7 +127,10 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
     assert len(cycle.trajectory().t) > 2  # another solver is no other code
     response = hj.response_function(cycle, SECTIONS, "x")
     chunks = hj.experiments.stream_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
-    force = lambda t: DRAG * jnp.cos(t)  # noqa: E731
+
+    def force(t):
+        return DRAG * jnp.cos(t)
+
     ends = []
     for drag in (0.7, 1.3):
         monkeypatch.setitem(globals(), "DRAG", drag)

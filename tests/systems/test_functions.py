@@ -18,7 +18,9 @@ def test_a_network_and_a_scan():
     coefficients = jnp.array([-0.1, 0.2, 0.3])
 
     def learned(t, q, u):
-        horner = lambda value, c: (value * q[0] + c, None)  # noqa: E731
+        def horner(value, c):
+            return (value * q[0] + c, None)
+
         value, _ = jax.lax.scan(horner, 0.0 * q[0], coefficients)
         return (-q[0] + network(jnp.stack([q[0], jnp.cos(t)]))[0] + value + u[0],)
 

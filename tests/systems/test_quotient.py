@@ -78,7 +78,8 @@ FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
 PLACED = type("Placed", (Full,), {"outputs": lambda self: [FAR]})()
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
 MIRROR = {"swap": {"left stands": "right stands"}, "relabel": PARTNERS}
-ODD, SIZES = {"flipped": ("x", "v"), "half_period": True}, np.r_[1, 1, 1, 1, 1e-9]
+ODD = {"flipped": ("x", "v"), "half_period": True}
+SIZES = np.r_[1, 1, 1, 1, 1e-9]
 STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.slow)
 
 
@@ -120,11 +121,9 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
 
 
 def test_an_odd_oscillator_closes_after_half_a_period():
-    pol, duffing, at = (
-        hj.models.VanDerPol(),
-        hj.models.Duffing(),
-        hj.AtEvent("half period"),
-    )
+    pol = hj.models.VanDerPol()
+    duffing = hj.models.Duffing()
+    at = hj.AtEvent("half period")
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
     folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
@@ -144,7 +143,9 @@ class Biased(hj.models.Duffing):
 
 
 def test_the_symmetry_is_that_of_all_systems_in_all_units():
-    half = lambda x: hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)  # noqa: E731
+    def half(x):
+        return hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)
+
     cycle = hj.find_limit_cycle(half(0.0), section=hj.AtEvent("half period"))
     seen = hj.ObservedCycle(cycle.base, period=6.0)
     for use in (

@@ -28,7 +28,8 @@ HOPPER = hj.models.VerticalHopper()
 
 def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
     hopper = hj.models.VerticalHopper(M=3)
-    assert hopper.M == 3.0 and hopper.M.dtype == np.float64
+    assert hopper.M == 3.0
+    assert hopper.M.dtype == np.float64
     period = eqx.filter_grad(lambda h: h.period())(hopper)
     np.testing.assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
     many = eqx.filter_vmap(lambda M: hj.models.VerticalHopper(M=M))(
@@ -118,7 +119,8 @@ def test_outputs_by_name_by_function_and_by_chart():
     assert z.names == ("x", "energy", "sum")
     values = z(0, 1.0, jnp.array([2.0, 3.0]), jnp.array([10.0]))
     np.testing.assert_array_equal(values, [2.0, 24.0, 5.0])
-    assert z.defined(0) and not z.defined(1)
+    assert z.defined(0)
+    assert not z.defined(1)
     with pytest.raises(
         hj.DefinitionError, match="output 'x' is not defined in chart 'b'"
     ):
