@@ -236,6 +236,6 @@ def kinematic_ldtp(hopper_cycle, placed_kinematic):
 
 @pytest.fixture(scope="session")
 def vanderpol_cycle():
-    return hj.find_limit_cycle(
-        hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling")
-    )
+    system = hj.models.VanDerPol(mu=1.0)
+    section = hj.Crossing("v", "falling")
+    return hj.find_limit_cycle(system, section=section)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -27,10 +28,10 @@ def test_the_lifted_system_is_the_periodic_one(model):
     assert lti.A.shape == (1, 2, 2)
     assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]")
     assert lti.inputs[2].unit == "N"
-    np.testing.assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
+    assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
     u = np.random.default_rng(1).normal(size=(4 * N, 2))
     y = lti.simulate(u.reshape(4, -1))
-    np.testing.assert_allclose(y.reshape(-1, 1), model.simulate(u), rtol=0, atol=1e-13)
+    assert_allclose(y.reshape(-1, 1), model.simulate(u), rtol=0, atol=1e-13)
     f = np.linspace(0.01, 0.49, 7)
     n = np.arange(N)
     H = model.htf(f)
@@ -41,7 +42,7 @@ def test_the_lifted_system_is_the_periodic_one(model):
 
     for m in H.harmonics:
         found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
-        np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
+        assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
 def test_python_control(model):
@@ -52,19 +53,17 @@ def test_python_control(model):
     assert system.input_labels[2] == "u[1]"
     expected = convert.to_lti(model).htf(f).H[0]
     response = system(np.exp(2j * np.pi * f))
-    np.testing.assert_allclose(
-        np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12
-    )
+    assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
     H = model.htf(f)
     data = convert.to_control(H, period=2.0)
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
     measured = data(1j * data.omega)[1]
-    np.testing.assert_array_equal(measured, np.asarray(H[-1])[:, 0].T)
-    np.testing.assert_allclose(data.omega, np.pi * f)
+    assert_array_equal(measured, np.asarray(H[-1])[:, 0].T)
+    assert_allclose(data.omega, np.pi * f)
     assert isinstance(data, control.FrequencyResponseData)
     lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
     measured = lines[0, 0][0].get_ydata()
-    np.testing.assert_allclose(measured, np.abs(H[0][:, 0, 0]))
+    assert_allclose(measured, np.abs(H[0][:, 0, 0]))
 
 
 def test_scipy(model):
@@ -72,7 +71,7 @@ def test_scipy(model):
     lti = convert.to_lti(model)
     assert system.dt == 2.0
     for name in "ABCD":
-        np.testing.assert_array_equal(getattr(system, name), getattr(lti, name)[0])
+        assert_array_equal(getattr(system, name), getattr(lti, name)[0])
 
 
 def recording():
@@ -104,7 +103,7 @@ def test_datasets_know_names_and_units(model):
     assert made.a.attrs["units"] == "N"
     assert "units" not in made.b.attrs
     second = made.isel(sample=made.trial.values == 1)
-    np.testing.assert_array_equal(second.b, recording().trials[1].values[:, 1])
+    assert_array_equal(second.b, recording().trials[1].values[:, 1])
     assert made.event_time[made.event == "e"].values.tolist() == [0.1, 0.3, 0.1, 0.3]
     dims = {name: x.dims for name, x in convert.to_xarray(model).data_vars.items()}
     assert dims["A"] == ("section", "next_state", "state")
@@ -114,7 +113,7 @@ def test_datasets_know_names_and_units(model):
     dataset = convert.to_xarray(data)
     whole = convert.to_xarray(model)
     later = convert.from_xarray(dataset.isel(sample=slice(N, None)))
-    np.testing.assert_array_equal(later.y, data.y[:, N:])
+    assert_array_equal(later.y, data.y[:, N:])
     backwards = slice(None, None, -1)
     late = slice(1, None)
     for part in (dataset.isel(sample=x) for x in (backwards, late)):
@@ -135,14 +134,14 @@ def test_section_data(wave):
     data = hj.recordings.section_data(wave, crossing, **about, n_sections=8)
     dataset = convert.to_xarray(data)
     frame = convert.to_pandas(data)
-    np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
-    np.testing.assert_array_equal(frame["time"], data.times[0])
+    assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
+    assert_array_equal(frame["time"], data.times[0])
     expected = (frame["section"][0] + np.arange(8)) % 8
-    np.testing.assert_array_equal(frame["section"][:8], expected)
+    assert_array_equal(frame["section"][:8], expected)
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
     average = dataset.average_cycle.sel(signal="x").values
-    np.testing.assert_array_equal(average, data.cycle_outputs[:, 0])
+    assert_array_equal(average, data.cycle_outputs[:, 0])
 
 
 def test_pandas(model):
@@ -151,7 +150,7 @@ def test_pandas(model):
     frame = convert.to_pandas(recording())
     first = frame[frame["trial"] == 0].drop(columns="trial")
     again = hj.Recording.from_frame(first, units={"a": "N"})
-    np.testing.assert_array_equal(again.trials[0].values, recording().trials[0].values)
+    assert_array_equal(again.trials[0].values, recording().trials[0].values)
     H = model.htf(np.linspace(0.01, 0.4, 5))
     row = convert.to_pandas(H).loc[-1, H.f[1].item(), "y", "w"]
     z = complex(H[-1][1, 0, 1])
@@ -160,16 +159,14 @@ def test_pandas(model):
     u = np.random.default_rng(3).normal(size=(60 * N, 2))
     fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
     table = convert.to_pandas(fit)
-    np.testing.assert_array_equal(
-        table["real"] + 1j * table["imaginary"], fit.multipliers
-    )
+    assert_array_equal(table["real"] + 1j * table["imaginary"], fit.multipliers)
     errors = np.hypot(table["real_error"], table["imaginary_error"])
-    np.testing.assert_array_equal(errors, fit.standard_errors)
-    np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
+    assert_array_equal(errors, fit.standard_errors)
+    assert_array_equal(table["standard_error"], fit.standard_errors)
     rational = hj.fit_rational(model.htf(np.linspace(0.01, 0.4, 20)), input="u")
     table = convert.to_pandas(rational)
     poles = table["pole_real"] + 1j * table["pole_imaginary"]
-    np.testing.assert_array_equal(poles, rational.poles[0])
+    assert_array_equal(poles, rational.poles[0])
 
 
 def test_what_is_refused(model, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 import scipy
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
@@ -206,7 +207,7 @@ def test_a_matlab_file(folder, ldtp, htf):
         read = scipy.io.loadmat(folder / "thing.mat")
         for name in names.split():
             value = operator.attrgetter(name.replace("_", "."))(thing)
-            np.testing.assert_array_equal(read[name].squeeze(), np.squeeze(value))
+            assert_array_equal(read[name].squeeze(), np.squeeze(value))
         assert json.loads(read["header"].item())["kind"] == type(thing).__name__
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
@@ -201,9 +202,7 @@ def test_fits_show_standard_errors():
     fit = hj.fit_series(record, order=2)
     page = shown(fit)
     errors = [x for x in page.texts if re.fullmatch(r"\d\.\de-\d\d", x)]
-    np.testing.assert_allclose(
-        [float(x) for x in errors], fit.standard_errors, rtol=0.05
-    )
+    assert_allclose([float(x) for x in errors], fit.standard_errors, rtol=0.05)
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1

@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -98,7 +99,7 @@ def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
 
     for name in ("compass-gait", "slip", "van-der-pol"):
         file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
-        np.testing.assert_allclose(
+        assert_allclose(
             values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01
         )
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
@@ -134,7 +135,7 @@ def called(annotation, value):
 def test_what_fits_arrives_in_one_form(annotation, given, expected):
     found = called(annotation, given)
     assert type(found) is type(expected)
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
     assert getattr(found, "dtype", None) == getattr(expected, "dtype", None)
 
 
@@ -281,7 +282,7 @@ def test_arrays_may_be_traced():
     assert jax.jit(summed)(x) == 6
     assert jax.grad(lambda s: summed(x, s))(2.0) == 6
     assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
-    np.testing.assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
+    assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
     with pytest.raises(
         hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
     ):

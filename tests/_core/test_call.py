@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core import meaning
@@ -58,7 +59,7 @@ def test_a_function_that_a_public_call_calls_may_change_what_a_system_computes()
 
     draws = hj.monte_carlo(multiplier, 3)
     assert len(np.unique(draws.drag)) == 3
-    np.testing.assert_allclose(draws.value, np.exp(-draws.drag), rtol=1e-9)
+    assert_allclose(draws.value, np.exp(-draws.drag), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +94,7 @@ def test_systems_given_together_that_are_equal_may_compute_something_else():
         hj.find_limit_cycles(systems, first)
     for system, k in zip(systems, (0.7, 1.3), strict=True):
         cycle = hj.find_limit_cycle(system)
-        np.testing.assert_allclose(cycle.multipliers, [np.exp(-k)], rtol=1e-9)
+        assert_allclose(cycle.multipliers, [np.exp(-k)], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -45,7 +46,7 @@ WAYS = {
 @pytest.mark.parametrize("function", [double, TwoTiers(lambda x: 2 * x, False)])
 @pytest.mark.parametrize("way", WAYS)
 def test_programs_work_wherever_they_are_called(way, function):
-    np.testing.assert_array_equal(WAYS[way](function), 2 * X)
+    assert_array_equal(WAYS[way](function), 2 * X)
 
 
 def test_errors_of_the_function_come_through():
@@ -93,7 +94,7 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
         program._quick
     ]  # one program for one job
     later = TwoTiers(total, large=False)
-    np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
+    assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
     assert [x[1] for x in later._chosen.values()] == [program._full]
     assert len(tiers) == 2
 
@@ -108,7 +109,7 @@ def test_functions_that_are_written_anew_share_a_program(tiers):
         job(X[:2], lambda x: 2 * x, 1),
         job(X, jnp.cos, 4),
     ]
-    np.testing.assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
+    assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
     assert len(tiers) == 4
 
 
@@ -127,14 +128,14 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
     before = len(compilation._kernels)
     for k in (1.0, 2.0):
         values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
-        np.testing.assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
+        assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
     assert len(compilation._kernels) == before + 1
     some = np.array([False, True, False, True])
     values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(
         x, y, some=some
     )
     expected = (3 * np.sin(x) ** 2 + y)[:, some]
-    np.testing.assert_allclose(values[:, some], expected, rtol=1e-15)
+    assert_allclose(values[:, some], expected, rtol=1e-15)
 
 
 def test_programs_that_call_lapack_take_turns():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from hybridjax._core import execution
 from hybridjax._core.compilation import host_first
@@ -44,7 +45,7 @@ def test_programs_factorize_one_matrix_at_a_time():
     matrices = rng.normal(size=(3, 2, 4, 4))
     right = rng.normal(size=(4, 1))
     exact = np.linalg.solve(matrices, right)
-    np.testing.assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
+    assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
     for program, arguments in (
         (solve, (matrices, right)),
         (harmonic_transfer, (A, B, C, np.zeros((8, 1, 2)), np.arange(9.0) / 9)),

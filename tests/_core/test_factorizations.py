@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from hybridjax._core.lanes import by_lane
 from hybridjax._core.vector_math.factorizations import solve_positive
@@ -51,7 +52,7 @@ def test_values_and_derivatives_are_those_of_lapack(name):
     assert "lapack" not in program.lower(A, b).as_text()
     theirs = jax.jit(value_and_gradient(jax.vmap(function, -1, -1)))(A, b)
     for x, y in zip(program(A, b), theirs, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.abs(y).max())
+        assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.abs(y).max())
 
 
 @pytest.mark.parametrize(
@@ -71,4 +72,4 @@ def test_matrices_that_are_not_positive_are_seen():
     x = jax.jit(jax.vmap(solve_positive))(
         jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
     )
-    np.testing.assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)
+    assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)

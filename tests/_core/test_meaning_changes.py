@@ -6,6 +6,7 @@ import types
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.meaning import code_digest
@@ -520,7 +521,7 @@ def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_
                 hj.linearize(cycle, sections)
         cycles.append(hj.find_limit_cycle(space["Uses"](), guess))
         model = hj.linearize(cycles[-1], sections)
-        np.testing.assert_allclose(model.multipliers, [np.exp(-k)], rtol=1e-9)
+        assert_allclose(model.multipliers, [np.exp(-k)], rtol=1e-9)
 
 
 # Changes that leave the numbers as they are, for an x that JAX traces.
@@ -555,7 +556,7 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
 
     for k in (1.0, 1.0 + 1e-15, 2.0):
         way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
-        np.testing.assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
+        assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
     digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3

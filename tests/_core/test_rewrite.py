@@ -10,6 +10,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.vector_math.rewrite import vectorized
@@ -38,9 +39,7 @@ def looped(x, y):
 def test_vectorized_replaces_everything():
     assert left(looped, 0.3, 0.7)
     assert not left(vectorized(looped), 0.3, 0.7)
-    np.testing.assert_allclose(
-        vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13
-    )
+    assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
 
 
 def test_other_types_and_requested_accuracies_stay():
@@ -88,7 +87,7 @@ def test_closures_over_tracers():
             jax.jit(transform(lambda a, f=f: response(f, a, x)))(jnp.asarray(a))
             for f in (vectorized, same)
         )
-        np.testing.assert_allclose(ours, truth, rtol=1e-13)
+        assert_allclose(ours, truth, rtol=1e-13)
 
 
 def test_every_call_sees_the_present_parameters_and_traces_once():
@@ -125,9 +124,9 @@ def test_vectors_of_several_functions_are_put_together_row_by_row():
     assert "stack[" not in program.replace("_stack[", "")
     assert program.count("concatenate[") == 1  # with one function behind it
     for new, old in zip(vectorized(field)(t, q), field(t, q), strict=True):
-        np.testing.assert_allclose(new, old, rtol=1e-15)
+        assert_allclose(new, old, rtol=1e-15)
     new, old = (jax.jacfwd(f)(t, q)[0] for f in (vectorized(field), field))
-    np.testing.assert_allclose(new, old, rtol=1e-14)
+    assert_allclose(new, old, rtol=1e-14)
 
 
 ZOO = {
@@ -169,7 +168,8 @@ def rotation(angle):
 
 def test_a_zoo_of_functions_gives_what_it_gave_before():
     """Values and derivatives of both orders of nesting, over 16 lanes."""
-    x, y = np.random.default_rng(0).uniform(-2, 2, (2, 16))
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-2, 2, (2, 16))
 
     def evaluated(f):
         values = jax.vmap(f)(x, y)
@@ -191,4 +191,4 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         assert a.dtype == b.dtype
         assert a.shape == b.shape
         atol = tolerance * max(1.0, np.abs(b).max())
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))
+        assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))

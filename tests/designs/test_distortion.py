@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.designs.candidates import Candidates
@@ -74,9 +75,8 @@ SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
 
 
 def about(system):
-    cycle = hj.find_limit_cycle(
-        system, hj.Guess("rest", (0.0,), time=0.5), scale={"x": 1.0}
-    )
+    guess = hj.Guess("rest", (0.0,), time=0.5)
+    cycle = hj.find_limit_cycle(system, guess, scale={"x": 1.0})
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, "x")
 
@@ -94,14 +94,15 @@ def two():
 
 def even_part(cycle, sections, u, outputs):
     """(y(u) + y(-u)) / 2 of the nonlinear system, as it deviates from the cycle."""
-    y = hj.run_experiments(
+    data = hj.run_experiments(
         cycle,
         sections,
         np.concatenate([u, -u]),
         outputs,
         start="steady",
         accuracy=1e-11,
-    ).y
+    )
+    y = data.y
     return (y[: len(u)] + y[len(u) :]) / 2
 
 
@@ -191,12 +192,10 @@ def test_one_cosine_in_closed_form(quadratic, f):
     twice = 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
     expected = pytest.approx(np.sqrt(mean**2 + twice**2 / 2), rel=1e-9)
     assert found.rms(design)[0] == expected
-    np.testing.assert_allclose(
-        found.rms(design, phases=True), found.rms(design), rtol=1e-9
-    )
+    assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
     u2 = design.inputs()[0, :, 0] ** 2
     both = found.quadratic.second_order(design.inputs())[0]
-    np.testing.assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
+    assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
 
 
 @pytest.mark.slow
@@ -230,7 +229,7 @@ def test_designs_within_a_distortion(hopper_cycle):
         np.mean(quadratic.second_order(plan.design.inputs()) ** 2, axis=(0, 1))
     )
     said = [plan.rms[f"distortion of {n}"] for n in OUTPUTS]
-    np.testing.assert_allclose(seen, said, rtol=0.1)
+    assert_allclose(seen, said, rtol=0.1)
 
 
 def test_beside_other_limits(quadratic):

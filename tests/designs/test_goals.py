@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -44,7 +45,7 @@ def test_transfer_functions_in_a_band(model, usual):
     ):
         fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
         variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
-        np.testing.assert_allclose(said, variance, rtol=0.02)
+        assert_allclose(said, variance, rtol=0.02)
 
 
 @pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
@@ -57,9 +58,7 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
     bound = hj.identify.ldtp_bound(
         two, expected_htf(two, plan.usual, TWO_NOISE, harmonics)
     )
-    np.testing.assert_allclose(
-        plan.usual_variances.sum(), total_variance(bound), rtol=1e-5
-    )
+    assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
     for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
         bound = hj.identify.ldtp_bound(
             two, expected_htf(two, other, TWO_NOISE, harmonics)
@@ -175,9 +174,7 @@ def test_draws_have_the_covariance_of_the_fit():
     c = np.array(
         [np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)]
     )
-    np.testing.assert_allclose(
-        np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max()
-    )
+    assert_allclose(np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max())
 
 
 @pytest.mark.slow
@@ -203,4 +200,4 @@ def test_physical_parameters():
     observed = hj.ObservedHTF(x, sections)
     S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
-    np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)
+    assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

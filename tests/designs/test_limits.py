@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -15,7 +16,7 @@ RMS = {"u0": 0.1, "u1": 0.05}
 def test_peaks_hold_in_every_experiment(optimal_two):
     free = optimal_two()
     plan = optimal_two(limit=Limits(rms={"u1": 0.05}, peak={"u0": 0.1}))
-    np.testing.assert_allclose(np.abs(plan.design.inputs()).max(axis=1)[:, 0], 0.1)
+    assert_allclose(np.abs(plan.design.inputs()).max(axis=1)[:, 0], 0.1)
     assert plan.limited == ("u1", "peak of u0")
     # (The crest factor is about 2.)
     assert 1.5 < plan.criterion / free.criterion < 5
@@ -24,7 +25,7 @@ def test_peaks_hold_in_every_experiment(optimal_two):
     measured = set(np.abs(plan.usual.inputs()).max(axis=1)[:, 0].round(6))
     assert measured == {0.0, 0.1}
     measured = np.mean(plan.design.inputs()[..., 1] ** 2)
-    np.testing.assert_allclose(measured, plan.rms["u1"] ** 2)
+    assert_allclose(measured, plan.rms["u1"] ** 2)
     # A peak that nothing exceeds changes nothing.
     loose = optimal_two(limit=Limits(rms=RMS, peak={"u0": 9.0}))
     assert loose.criterion == pytest.approx(free.criterion)

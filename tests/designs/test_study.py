@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.designs.study_estimate import refuse_transient
@@ -59,14 +60,14 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     assert studies[0].design is first
     assert studies[0].fit is None
     cycles = [one.design.cycles(0) for one in studies[:-1]]
-    np.testing.assert_array_equal(studies[-1].strides, np.cumsum(cycles))
+    assert_array_equal(studies[-1].strides, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
         assert after.strides[-1] <= 3 * before.strides[-1]
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
-    np.testing.assert_array_equal(again.standard_errors, studies[1].standard_errors)
-    np.testing.assert_array_equal(again.design.phase, studies[1].design.phase)
+    assert_array_equal(again.standard_errors, studies[1].standard_errors)
+    assert_array_equal(again.design.phase, studies[1].design.phase)
 
 
 def test_too_much_noise_to_begin_with(model, first):
@@ -79,7 +80,7 @@ def test_too_much_noise_to_begin_with(model, first):
     assert "the first design again, since the data " in repr(lost)
     assert "lower `order` in a new study" in repr(lost)
     assert "check=" not in repr(lost)
-    np.testing.assert_array_equal(lost.design.line, first.line)
+    assert_array_equal(lost.design.line, first.line)
     assert (lost.design.phase != first.phase).all()
     found = lost.add(measured(model, lost.design))
     assert np.isnan(found.standard_errors[0]).all()

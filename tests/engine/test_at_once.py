@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -64,7 +65,7 @@ def test_a_converter_at_any_duty(duty, by_ramp):
     system = Converter(duty, by_ramp)
     path = hj.simulate(system, "off", (0.0, 0.5), 10.5, time=0.5)
     exact = at_tick(duty) * (1 - np.exp(-10.0))
-    np.testing.assert_allclose(path.after[-1, 0], exact, atol=1e-9)
+    assert_allclose(path.after[-1, 0], exact, atol=1e-9)
 
 
 @pytest.mark.parametrize("duty, by_ramp", CASES)
@@ -84,8 +85,8 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
         exact = at_trip * np.exp(-later)
     else:
         exact = 1 + (at_tick(duty) - 1) * np.exp(-float(cycle.anchor.t[0]))
-    np.testing.assert_allclose(cycle.state["x"], exact, atol=1e-11)
-    np.testing.assert_allclose(cycle.multipliers, [np.exp(-1)], rtol=1e-9)
+    assert_allclose(cycle.state["x"], exact, atol=1e-11)
+    assert_allclose(cycle.multipliers, [np.exp(-1)], rtol=1e-9)
 
 
 def test_schedules_whose_order_is_not_defined():
@@ -129,7 +130,7 @@ def test_a_current_above_its_limit_at_the_tick(allows, events):
     """The comparator trips at once, or the tick is not enabled: the current decays either way."""
     path = hj.simulate(PeakCurrent(allows=allows), "off", (2.0,), 5.0, time=0.5)
     assert [e.name for e in path.events] == events
-    np.testing.assert_allclose(path.after[-1], [2.0 * np.exp(-0.5)], rtol=1e-9)
+    assert_allclose(path.after[-1], [2.0 * np.exp(-0.5)], rtol=1e-9)
 
 
 def neurons(push):
@@ -155,13 +156,14 @@ def neurons(push):
 def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
     """Also to above where it would come to rest, so that it moves back from there. By hand: x
     spikes first, y at once, and leaves (push, 0)."""
-    cycle = hj.find_limit_cycle(neurons(push), hj.Guess("rest", (push + 0.05, 0.1)))
+    guess = hj.Guess("rest", (push + 0.05, 0.1))
+    cycle = hj.find_limit_cycle(neurons(push), guess)
     period = np.log((1.5 - push) / 0.5)
     assert [neurons(push).transitions()[g].name for g in cycle.event_sequence] == [
         "X",
         "Y",
     ]
-    np.testing.assert_allclose(cycle.period, period, rtol=1e-10)
+    assert_allclose(cycle.period, period, rtol=1e-10)
     assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
     assert hj.coincidences(cycle) == []
 
@@ -200,19 +202,19 @@ def test_derivatives_across_an_event_at_once():
     cycle = hj.find_limit_cycle(system, hj.Guess("calm", (0.5,), time=0.5))
     low = np.exp(-0.5 * 0.7) * float(cycle.anchor.q[0, 0])
     expected = np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2
-    np.testing.assert_allclose(cycle.state["x"], expected, rtol=1e-11)
+    assert_allclose(cycle.state["x"], expected, rtol=1e-11)
     multiplier = 0.8 * (1 + low) * np.exp(-0.7)
-    np.testing.assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
+    assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
     ldtp = hj.linearize(cycle, hj.ClockPhase(3, 0.3))
-    np.testing.assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
+    assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
 
     def at(rate):
         return hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]
 
     by_steps = (float(at(0.7 + 1e-5)) - float(at(0.7 - 1e-5))) / 2e-5
-    np.testing.assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
+    assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
     measured = jax.jit(jax.grad(at))(jnp.asarray(0.7))
-    np.testing.assert_allclose(measured, by_steps, rtol=1e-7)
+    assert_allclose(measured, by_steps, rtol=1e-7)
 
 
 def test_events_that_take_each_others_place_at_once():
@@ -259,7 +261,7 @@ def test_a_turn_cannot_begin_between_events_at_once():
     with pytest.raises(hj.ComputationError, match="event .Y. coincides with .X."):
         hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("X"))
     cycle = hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("Y"))
-    np.testing.assert_allclose(cycle.period, np.log(1.2 / 0.5), rtol=1e-10)
+    assert_allclose(cycle.period, np.log(1.2 / 0.5), rtol=1e-10)
 
 
 def test_programs_refuse_events_that_coincide():
@@ -269,9 +271,7 @@ def test_programs_refuse_events_that_coincide():
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
     measured = result(jnp.array([0.95, 0.99, 1 - 1e-10]))
-    np.testing.assert_array_equal(
-        measured, [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE]
-    )
+    assert_array_equal(measured, [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE])
 
 
 def test_experiments_near_full_and_zero_duty():
@@ -283,4 +283,4 @@ def test_experiments_near_full_and_zero_duty():
             guess = hj.Guess(chart, (0.3, 0.9), time=0.9)
             cycle = hj.find_limit_cycle(Converter(duty, by_ramp), guess)
             ldtp = hj.linearize(cycle, hj.ClockPhase(4, 0.3), "x")
-            np.testing.assert_allclose(ldtp.multipliers, [np.exp(-1)], rtol=1e-9)
+            assert_allclose(ldtp.multipliers, [np.exp(-1)], rtol=1e-9)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridjax._core.executor import from_host
 from hybridjax.engine.lanes import start_lanes
@@ -58,13 +59,9 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
             for sign in (1, -1):
                 after, *_, other = run(x + sign * STEP * (np.arange(len(x)) == k))
                 happened = other.tape.code[:, 0]
-                np.testing.assert_array_equal(
-                    happened[happened >= 0], codes[codes >= 0]
-                )
+                assert_array_equal(happened[happened >= 0], codes[codes >= 0])
                 ends.append(after)
             slope = (ends[0] - ends[1]) / (2 * STEP)
             size = 1 + np.abs(slope).max()
-            np.testing.assert_allclose(
-                exact[:, k] / size, slope / size, atol=1e-6, err_msg=str(k)
-            )
+            assert_allclose(exact[:, k] / size, slope / size, atol=1e-6, err_msg=str(k))
     assert (codes >= 0).any()

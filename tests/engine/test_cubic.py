@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 from hypothesis import assume, given, settings, strategies as st
+from numpy.testing import assert_allclose
 
 from hybridjax.engine.cubic import first_crossing
 
@@ -44,15 +45,13 @@ def test_first_crossing_is_a_root(v0, v1, d0, d1):
     # Tangencies are the business of the next tests.
     assume(all(abs(np.polyval(c, e)) > 1e-3 for e in extrema if -0.1 < e < 1.1))
     found = crossing(v0, v1, d0, d1, armed)
-    np.testing.assert_allclose(found.position[0], expected, atol=1e-9)
+    assert_allclose(found.position[0], expected, atol=1e-9)
     assert not found.touch[0]
 
 
 def test_a_dip_within_the_step_is_found():
     # (s - 0.4)^2 - 0.01: falls through zero at 0.3, rises at 0.5.
-    np.testing.assert_allclose(
-        crossing(0.15, 0.35, -0.8, 1.2).position[0], 0.3, atol=1e-12
-    )
+    assert_allclose(crossing(0.15, 0.35, -0.8, 1.2).position[0], 0.3, atol=1e-12)
 
 
 def test_touching_and_nearly_touching():
@@ -72,6 +71,6 @@ def test_a_guard_that_starts_at_zero_must_leave_it_first():
     assert np.isinf(crossing(0.0, 1.0, 1.0, 1.0, armed=False).position[0])
     # s (0.5 - s): up, and down through zero at 0.5.
     measured = crossing(0.0, -0.5, 0.5, -1.5, armed=False).position[0]
-    np.testing.assert_allclose(measured, 0.5, atol=1e-12)
+    assert_allclose(measured, 0.5, atol=1e-12)
     # s^3 - s^2 + 0.1 s (zero to first order only) falls and rises without being positive first.
     assert np.isinf(crossing(-1e-18, -0.5, 0.0, -1.0, armed=False).position[0])

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -73,20 +74,16 @@ def agree(system, chart, state, u, begin, duration):
     # Steps amplify the rounding errors of their error estimates.
     size = 1 + np.abs(xla.moved.lanes.q)
     for other in (whole, xla):
-        np.testing.assert_array_equal(host.moved.result, other.moved.result)
+        assert_array_equal(host.moved.result, other.moved.result)
         for name in ("code", "chart"):
-            np.testing.assert_array_equal(
-                getattr(host.tape, name), getattr(other.tape, name)
-            )
-        np.testing.assert_allclose(host.moved.lanes.t, other.moved.lanes.t, rtol=1e-12)
-        np.testing.assert_allclose(
+            assert_array_equal(getattr(host.tape, name), getattr(other.tape, name))
+        assert_allclose(host.moved.lanes.t, other.moved.lanes.t, rtol=1e-12)
+        assert_allclose(
             host.moved.lanes.q / size, other.moved.lanes.q / size, atol=1e-9
         )
     moved = host.tape.code[:, 0] != IDLE
-    np.testing.assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
-    np.testing.assert_allclose(
-        whole.tape.before[moved], host.tape.before[moved], atol=1e-7
-    )
+    assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
+    assert_allclose(whole.tape.before[moved], host.tape.before[moved], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
@@ -166,9 +163,7 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
             False  # (of other charts)
         )
     for field in ("armed", "chart", "events"):
-        np.testing.assert_array_equal(
-            getattr(again.legs, field), getattr(turn.legs, field)
-        )
+        assert_array_equal(getattr(again.legs, field), getattr(turn.legs, field))
     apart = (again.legs.q - turn.legs.q) / map.scale[turn.legs.chart].T
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
@@ -198,10 +193,8 @@ def test_searches_with_moves_side_by_side_end_at_the_same_cycle(name, monkeypatc
     cycles += [hj.find_limit_cycle(moved), hj.find_limit_cycle(moved, guess)]
     for cycle in cycles[:2]:
         assert cycle.event_sequence == cycles[2].event_sequence
-        np.testing.assert_allclose(cycle.period, cycles[2].period, rtol=1e-11)
-        np.testing.assert_allclose(
-            cycle.multipliers, cycles[2].multipliers, rtol=1e-9, atol=1e-10
-        )
+        assert_allclose(cycle.period, cycles[2].period, rtol=1e-11)
+        assert_allclose(cycle.multipliers, cycles[2].multipliers, rtol=1e-9, atol=1e-10)
 
 
 def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
@@ -216,7 +209,7 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
     monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
     results = [call(from_host(np.arange(3.0))) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
-    np.testing.assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
+    assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
     with jax.default_matmul_precision("highest"):
         call(from_host(np.arange(3.0)))
     assert seen == [True, False] * 2  # (as a program of its own)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 
 import hybridjax as hj
@@ -109,13 +110,13 @@ def test_two_dips_within_a_step(depth):
     truth = [x for x, _ in falls(p, ends)]
     assert len(truth) == 2
     both = hj.simulate(chain(), "a", start(p), 1.0)
-    np.testing.assert_allclose([e.time for e in both.events], truth, atol=1e-7)
+    assert_allclose([e.time for e in both.events], truth, atol=1e-7)
     later = chain(enabled=lambda t, q, u: t > 0.5)
     second = hj.simulate(later, "a", start(p), 1.0)
-    np.testing.assert_allclose([e.time for e in second.events], truth[1:], atol=1e-7)
+    assert_allclose([e.time for e in second.events], truth[1:], atol=1e-7)
     curved = chain(guard=lambda t, q, u: jnp.expm1(2 * q[0]))
     same = hj.simulate(curved, "a", start(p), 1.0)
-    np.testing.assert_allclose([e.time for e in same.events], truth, atol=1e-7)
+    assert_allclose([e.time for e in same.events], truth, atol=1e-7)
 
 
 def test_a_guard_that_is_faster_than_the_state():
@@ -129,7 +130,7 @@ def test_a_guard_that_is_faster_than_the_state():
     found = hj.simulate(system, "a", (0.0,), 1.0, settings=hj.Settings(1e-6, 1e-6))
     truth = (np.pi + np.arcsin(0.3) + 2 * np.pi * np.arange(80)) / 500
     truth = truth[truth < 1]
-    np.testing.assert_allclose([e.time for e in found.events], truth, atol=1e-9)
+    assert_allclose([e.time for e in found.events], truth, atol=1e-9)
 
 
 METHODS = [
@@ -197,6 +198,7 @@ def test_an_event_just_before_a_blow_up_is_found(begin):
         return (1.0,)
 
     reset = hj.Transition("spike", "a", "a", spike, "rising", again)
-    path = hj.simulate(toy({"a": square}, [reset]), "a", (1.0,), 9.5, time=begin)
+    system = toy({"a": square}, [reset])
+    path = hj.simulate(system, "a", (1.0,), 9.5, time=begin)
     spikes = np.array([event.time for event in path.events]) - begin
-    np.testing.assert_allclose(spikes, np.arange(1, 10) * (1 - 1e-11), rtol=1e-9)
+    assert_allclose(spikes, np.arange(1, 10) * (1 - 1e-11), rtol=1e-9)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -55,8 +56,8 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     slope, exact = jax.jit(
         lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x))
     )(X)
-    np.testing.assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
+    assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
+    assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
 
 
 def test_lanes_fail_one_by_one():
@@ -73,7 +74,7 @@ def test_lanes_fail_one_by_one():
     zeno = hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
-    np.testing.assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
+    assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
 
 
 def test_new_numbers_compile_nothing():
@@ -121,4 +122,4 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     for value, true in zip(
         gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True
     ):
-        np.testing.assert_allclose(value, true, rtol=1e-10)
+        assert_allclose(value, true, rtol=1e-10)

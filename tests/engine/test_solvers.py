@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
 import hybridjax as hj
@@ -52,7 +53,7 @@ def test_radau_is_a_collocation_method(stages):
     method = as_method(hj.Radau(stages))
     a, b, c, error = (np.array(x) for x in (method.a, method.b, method.c, method.error))
     for k in range(1, stages + 1):
-        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, atol=1e-14)
+        assert_allclose(a @ c ** (k - 1), c**k / k, atol=1e-14)
         assert abs(error @ c ** (k - 1)) < 1e-13
     for k in range(1, 2 * stages):
         assert abs(b @ c ** (k - 1) - 1 / k) < 1e-14
@@ -91,7 +92,7 @@ def test_a_landing_is_as_stiff_as_its_chart():
     settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
     stride = Stride(one, 0.9975 * one, 1e7 * one)
     moved = move(s, lanes, np.zeros((s.nu, 1)), target, settings, stride)
-    np.testing.assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
+    assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
 
 
 @pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
@@ -113,7 +114,7 @@ def test_inverses_of_many_matrices():
     matrix[0, 0] = 0.0  # pivots are needed
     found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
     expected = np.linalg.inv(np.moveaxis(matrix, -1, 0))
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -139,24 +140,21 @@ def test_derivatives_of_implicit_steps(solver):
     first = jax.jit(jax.jacfwd(end))(0.0)
     second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
     by_differences = (lowest - 8 * low + 8 * high - highest) / (12 * d)
-    np.testing.assert_allclose(first, by_differences, rtol=1e-6)
+    assert_allclose(first, by_differences, rtol=1e-6)
     twice = (16 * (low + high) - 30 * middle - lowest - highest) / (12 * d**2)
-    np.testing.assert_allclose(second, twice, rtol=1e-5)
+    assert_allclose(second, twice, rtol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def damped():
-    return hj.find_limit_cycle(
-        integrated(DAMPED, hj.Radau()), hj.Guess("a", (0.01, 0.02))
-    )
+    guess = hj.Guess("a", (0.01, 0.02))
+    return hj.find_limit_cycle(integrated(DAMPED, hj.Radau()), guess)
 
 
 def test_a_stiff_cycle_with_default_settings(damped):
-    np.testing.assert_allclose(
-        list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13
-    )
-    np.testing.assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
-    np.testing.assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
+    assert_allclose(list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13)
+    assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
+    assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
 
 
 def test_linearization_of_a_stiff_system(damped):
@@ -168,6 +166,6 @@ def test_linearization_of_a_stiff_system(damped):
     B = model.B[0]
     size = np.array([damped.scale["y"], damped.scale["v"]])
     ratio = size / size[:, None]
-    np.testing.assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
+    assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
     expected = exactly[:2, 2] / size
-    np.testing.assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)
+    assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import brentq
 
 import hybridjax as hj
@@ -71,9 +72,9 @@ def cycle():
 @pytest.mark.slow
 def test_the_cycle(cycle):
     period, x = exact()
-    np.testing.assert_allclose(cycle.period, period, rtol=1e-11)
-    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-11)
-    np.testing.assert_array_equal(cycle.multipliers, [0.0])
+    assert_allclose(cycle.period, period, rtol=1e-11)
+    assert_allclose(cycle.state["x"], x, rtol=1e-11)
+    assert_array_equal(cycle.multipliers, [0.0])
 
 
 def period(cycle):
@@ -83,11 +84,11 @@ def period(cycle):
 @pytest.mark.slow
 def test_derivatives_under_all_transformations(cycle):
     first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(jnp.array([5.0, 5.5]))
-    np.testing.assert_allclose(first[0], by_differences(1), rtol=1e-6)
+    assert_allclose(first[0], by_differences(1), rtol=1e-6)
     backwards = jax.jit(jax.grad(period(cycle)))(5.5)
-    np.testing.assert_allclose(backwards, first[1], rtol=1e-8)
+    assert_allclose(backwards, first[1], rtol=1e-8)
     twice = jax.jit(jax.jacfwd(jax.jacfwd(period(cycle))))(5.0)
-    np.testing.assert_allclose(twice, by_differences(2), rtol=1e-4)
+    assert_allclose(twice, by_differences(2), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -101,6 +102,6 @@ def test_experiments(cycle, start):
     )
     assert (data.result == 0).all()
     x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
-    np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
+    assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
     there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
-    np.testing.assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
+    assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)

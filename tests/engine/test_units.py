@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -59,12 +60,12 @@ def flow(length, time, scale, tangents):
 )
 def test_the_same_steps_in_all_units(tangents):
     h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
-    np.testing.assert_array_equal(result, hj.Result.OK)
+    assert_array_equal(result, hj.Result.OK)
     assert jnp.max(code) >= 0
     for length, time in UNITS:
         other = flow(length, time, SIZES * sizes(length, time), tangents)
         for x, y in zip((h, code, q), other, strict=False):
-            np.testing.assert_array_equal(x, y)
+            assert_array_equal(x, y)
 
 
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------
@@ -104,9 +105,9 @@ def test_states_at_rest_stop_nothing(function, start, end):
     if end is None:
         t = 10.0
         end = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
-        np.testing.assert_allclose(found.after[-1][1:], end, rtol=1e-9)
+        assert_allclose(found.after[-1][1:], end, rtol=1e-9)
     else:
-        np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
+        assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
 
 
 def test_derivatives_need_sizes():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
@@ -22,9 +23,7 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
-        np.testing.assert_allclose(
-            y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14
-        )
+        assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
     assert data.inputs == ("a", "b")
     assert data.outputs == ("y0", "y1")
     assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"

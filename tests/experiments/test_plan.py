@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -36,11 +37,11 @@ def test_host_and_program_try_the_same_ways(name, monkeypatch):
     monkeypatch.setattr(compilation, "WORTH_COMPILING", -1.0)
     xla = plan._try_ways(placed, settings, np.zeros((1, len(cycle.system.inputs))))
     after = np.roll(scale, -1, axis=0).T[:, None, None]
-    np.testing.assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)
+    assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)
     # Estimates are differences in which the digits of small ones cancel.
-    np.testing.assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
+    assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
     for one in ("first", "slack", "lead"):
-        np.testing.assert_allclose(getattr(host, one), getattr(xla, one), rtol=1e-12)
+        assert_allclose(getattr(host, one), getattr(xla, one), rtol=1e-12)
 
 
 # Derivatives of the ways from section 0 to 1 and back, and sizes at both.
@@ -52,9 +53,9 @@ def test_errors_are_followed_from_their_section_on():
     each turn a fifth is left."""
     errors = np.ones((1, 2, 1))
     worst = plan._impact(BACK_AND_FORTH, errors, np.ones((2, 1)))
-    np.testing.assert_allclose(worst, [[1 / (1 - 0.2), 2 / (1 - 0.2)]], rtol=1e-12)
+    assert_allclose(worst, [[1 / (1 - 0.2), 2 / (1 - 0.2)]], rtol=1e-12)
     worst = plan._impact(BACK_AND_FORTH, errors, np.array([[1.0], [100.0]]))
-    np.testing.assert_allclose(worst, [[0.1 / (1 - 0.2), 1 / (1 - 0.2)]], rtol=1e-12)
+    assert_allclose(worst, [[0.1 / (1 - 0.2), 1 / (1 - 0.2)]], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

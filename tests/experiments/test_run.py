@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -87,13 +88,13 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     assert "#17: section" in broken.summary()
     assert "79/80 ok" in broken.summary()
     others = np.arange(80) != 17
-    np.testing.assert_allclose(broken.y[others], data.y[others], atol=1e-9)
+    assert_allclose(broken.y[others], data.y[others], atol=1e-9)
     after = broken.failed_at[17] + 1
     assert np.all(np.isfinite(broken.y[17, :after]))
     assert np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
     lost = design.f[design.experiment == 17]
-    np.testing.assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
+    assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
 
 
 def test_large_inputs_that_change_the_order_of_events_are_reported(
@@ -213,9 +214,8 @@ def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
 
 
 def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
-    resting = hj.find_limit_cycle(
-        RESTING, hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0}
-    )
+    guess = hj.Guess("all", (0.0, 0.0, 0.0))
+    resting = hj.find_limit_cycle(RESTING, guess, scale={"w": 1.0})
     family = hj.ClockPhase(4)
     design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))
@@ -223,10 +223,10 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
     assert np.all(data.error < 1e-8)
     model = hj.linearize(resting, family, ("x", "w"))  # the system is linear
     expected = hj.experiments.simulate_experiments(model, design).y
-    np.testing.assert_allclose(data.y, expected, atol=1e-9)
+    assert_allclose(data.y, expected, atol=1e-9)
     scales = hj.response_function(resting, family, "x").stepping.scales
     sizes = [float(resting.period), *(resting.scale[name] for name in "xv"), 1.0]
-    np.testing.assert_array_equal(scales, np.tile(sizes, (4, 1)))
+    assert_array_equal(scales, np.tile(sizes, (4, 1)))
 
 
 def pick(hopper):
@@ -256,11 +256,11 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
         parameters, u
     )
     forward, _ = jax.jit(jax.jacfwd(loss, has_aux=True))(parameters, u)
-    np.testing.assert_allclose(forward, by_x, rtol=1e-9)
+    assert_allclose(forward, by_x, rtol=1e-9)
     true = central(lambda x: value(x, u)[0], parameters)
-    np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+    assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
     true = central(lambda u: value(parameters, u)[0], u)
-    np.testing.assert_allclose(by_u, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+    assert_allclose(by_u, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
 
 
 class Restarted(hj.HybridSystem):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.experiments import start as steady
@@ -15,9 +16,8 @@ ALONE = hj.Execution(workers=1)
 
 @pytest.fixture(scope="module")
 def placed(vanderpol_cycle):
-    return hj.place_sections(
-        vanderpol_cycle, hj.KinematicPhase(4, position="x", velocity="v")
-    )
+    sections = hj.KinematicPhase(4, position="x", velocity="v")
+    return hj.place_sections(vanderpol_cycle, sections)
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +46,7 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
 
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
     whole = run(DESIGN.inputs(6), start="steady", discard=0)
-    np.testing.assert_allclose(
-        whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8
-    )
+    assert_allclose(whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8)
 
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
@@ -62,13 +60,9 @@ def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
     for system, controller in ((model, None), (model.feedback(F), F)):
         data = run(r, discard=0, feedback=controller)
         exact = np.stack([system.simulate(x) for x in r])
-        np.testing.assert_allclose(
-            data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max()
-        )
+        assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
     u = r - np.stack([F.simulate(x) for x in exact])
-    np.testing.assert_allclose(
-        data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max()
-    )
+    assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max())
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
@@ -91,8 +85,8 @@ def test_process_noise_acts_but_is_not_recorded(run):
 
     still = run(DESIGN, start="periodic")
     once = noisy(1e-3)
-    np.testing.assert_array_equal(once.u, DESIGN.inputs(6))
-    np.testing.assert_array_equal(once.y, noisy(1e-3).y)
+    assert_array_equal(once.u, DESIGN.inputs(6))
+    assert_array_equal(once.y, noisy(1e-3).y)
     change = np.std(once.y - still.y)
     assert 1e-5 < change < 1e-2
-    np.testing.assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)
+    assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.pieces.store import Blocks
@@ -58,7 +59,7 @@ def records(parts):
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
     u = DESIGN.inputs(9)
     parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
-    np.testing.assert_array_equal(np.concatenate(parts), u)
+    assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
             hj.DefinitionError, match="a slice of consecutive experiments"
@@ -69,14 +70,14 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
     parts = list(stream(*arguments, Options(**BATCH), chunk=5))
     assert [len(part.u) for part in parts] == [5, 5, 2]
-    np.testing.assert_array_equal(records(parts), whole.y)
+    assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
     expected = hj.estimate_htf(whole)
-    np.testing.assert_array_equal(estimate.f, expected.f)
-    np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-9)
+    assert_array_equal(estimate.f, expected.f)
+    assert_allclose(estimate.H, expected.H, rtol=1e-9)
     noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
     parts = stream(*arguments, Options(**BATCH, **NOISE), chunk=5)
-    np.testing.assert_array_equal(records(parts), noisy.y)
+    assert_array_equal(records(parts), noisy.y)
     assert (noisy.y != whole.y).any()
 
 
@@ -89,8 +90,8 @@ def test_workers_and_batches_change_nothing(arguments, whole):
     with no_compilation(after=run):
         for workers in (1, 3):
             data = run(workers)
-            np.testing.assert_array_equal(data.y, whole.y)
-            np.testing.assert_array_equal(data.error, whole.error)
+            assert_array_equal(data.y, whole.y)
+            assert_array_equal(data.error, whole.error)
 
 
 def test_batches_are_alike_and_keep_all_workers_busy():
@@ -114,20 +115,16 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert len(made) == 3
     assert made.experiments == COUNT
     assert made.missing() == []
-    np.testing.assert_array_equal(records(made), whole.y)
-    np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
-    np.testing.assert_array_equal(
-        np.concatenate([part.error for part in made]), whole.error
-    )
-    np.testing.assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
+    assert_array_equal(records(made), whole.y)
+    assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
+    assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
     assert made[0].outputs[0].unit == "m"
     assert made.summary() == whole.summary() == "12/12 ok"
     assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
     assert made.dataset.y.dims == ("experiment", "sample", "output")
-    np.testing.assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
-    np.testing.assert_allclose(
-        hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9
-    )
+    assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
+    assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -143,7 +140,7 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
         stored[2]
     before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
     again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=5)
-    np.testing.assert_array_equal(records(again), whole.y)
+    assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
@@ -203,7 +200,7 @@ def test_another_process_can_run_a_piece(arguments, start):
     theirs = sent.run(0, 1)
     assert mine.keys() == theirs.keys()
     for name, values in mine.items():
-        np.testing.assert_array_equal(theirs[name], values)
+        assert_array_equal(theirs[name], values)
 
 
 def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(

@@ -4,8 +4,8 @@ import functools as ft
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -67,8 +67,8 @@ def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32
     result, events = across(size * jnp.linspace(0.5, 2.0, 100), time, duration)
-    np.testing.assert_array_equal(result, hj.Result.OK)
-    np.testing.assert_array_equal(events, 1)
+    assert_array_equal(result, hj.Result.OK)
+    assert_array_equal(events, 1)
 
 
 @jax.jit

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -60,11 +61,11 @@ def test_systems_against_lifted_ones(pair):
         (P.feedback(F), np.linalg.solve(one + a @ b, a)),
         (P.feedback(0.1 * np.eye(2)), np.linalg.solve(one + 0.1 * a, a)),
     ):
-        np.testing.assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
+        assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
     assert P.feedback(F).inputs == tuple(IN)
     assert (P @ F).inputs == (P @ F).outputs == tuple(OUT)
     inside = eqx.filter_jit(lambda P, F: P.feedback(F).htf(0.3).H)(P, F)
-    np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
+    assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
 
 
 def test_transfer_functions_against_systems(pair):
@@ -78,7 +79,7 @@ def test_transfer_functions_against_systems(pair):
         (H.inverse(), P.inverse()),
         (H.feedback(G), P.feedback(K)),
     ):
-        np.testing.assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
+        assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
         assert ours.source == "exact"
         assert ours.variance is None
         assert ours.inputs == exact.inputs

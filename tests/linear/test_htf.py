@@ -7,6 +7,7 @@ import jax.test_util
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.linear.frequency_response import all_harmonics
@@ -40,7 +41,7 @@ def test_three_ways_agree(seed, shape, f):
         np.einsum("mn,nij->mij", np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N), G)
         / N
     )
-    np.testing.assert_allclose(np.asarray(htf.H)[:, 0], H, rtol=0, atol=1e-12)
+    assert_allclose(np.asarray(htf.H)[:, 0], H, rtol=0, atol=1e-12)
 
     # The DFT of the response to a cosine, once the transient has died.
     periods = 8
@@ -54,7 +55,7 @@ def test_three_ways_agree(seed, shape, f):
     k = round(f * periods)
     lines = (k + m * periods) % (periods * N)
     measured = np.asarray(htf.H)[:, 0, :, j]
-    np.testing.assert_allclose(measured, Y[lines] / U[k], rtol=0, atol=1e-12)
+    assert_allclose(measured, Y[lines] / U[k], rtol=0, atol=1e-12)
 
 
 @settings(max_examples=4)
@@ -67,7 +68,7 @@ def test_prediction_is_the_periodic_response(seed, shape):
     u = np.random.default_rng(seed).normal(size=(P * N, nu))
     y = ldtp.simulate(u, ldtp.periodic_state(u, P))
     htf = ldtp.htf(np.arange(P * N // 2 + 1) / P)  # negative frequencies by symmetry
-    np.testing.assert_allclose(htf.predict(u), y, rtol=0, atol=1e-11)
+    assert_allclose(htf.predict(u), y, rtol=0, atol=1e-11)
 
 
 def test_derivatives(synthetic):
@@ -75,7 +76,8 @@ def test_derivatives(synthetic):
 
     @jax.jit
     def values(A, B, C, D, f):
-        htf = hj.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
+        ldtp = hj.LDTP(A, B, C, D)
+        htf = ldtp.htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
 
     arrays = (synthetic.A, synthetic.B, synthetic.C, synthetic.D, f)
@@ -93,7 +95,7 @@ def test_derivatives(synthetic):
     bump[2, 0, 1, 0] = 1e-6
     up, down = (loss(np.asarray(htf.H) + s * bump) for s in (1, -1))
     slope = np.asarray(gradient)[2, 0, 1, 0].real
-    np.testing.assert_allclose((up - down) / 2e-6, slope, rtol=1e-6)
+    assert_allclose((up - down) / 2e-6, slope, rtol=1e-6)
 
 
 def test_a_multiplier_on_the_unit_circle_is_named():

@@ -7,6 +7,7 @@ import jax.test_util
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -30,9 +31,9 @@ def test_simulation_follows_the_definition(seed, shape, start):
     xs, ys = simulate_blocks(blocks, u, x0, start)
     states = np.asarray(ldtp.states(u, x0, start))
     for row, x in zip(states, xs, strict=True):
-        np.testing.assert_allclose(row[: len(x)], x, rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(row[len(x) :], 0)
-    np.testing.assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
+        assert_allclose(row[: len(x)], x, rtol=0, atol=1e-12)
+        assert_array_equal(row[len(x) :], 0)
+    assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
 
 
 def test_periodic_state_of_an_unstable_system():
@@ -44,21 +45,19 @@ def test_periodic_state_of_an_unstable_system():
         np.eye(40) - np.kron(np.roll(np.eye(20), 1, axis=0), A[0]),
         np.kron(np.roll(np.eye(20), 1, axis=0), np.ones((2, 1))) @ u[:, 0],
     )
-    np.testing.assert_allclose(ldtp.periodic_state(u, 20), expected[:2], rtol=1e-12)
+    assert_allclose(ldtp.periodic_state(u, 20), expected[:2], rtol=1e-12)
 
 
 def test_jit_vmap_and_gradients(synthetic):
     u = np.random.default_rng(1).normal(size=(18, 2))
     plain = synthetic.simulate(u)
-    np.testing.assert_allclose(
-        eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14
-    )
+    assert_allclose(eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14)
     many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
-    np.testing.assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
+    assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
     batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
     many = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
-    np.testing.assert_allclose(many[0], plain, atol=1e-14)
+    assert_allclose(many[0], plain, atol=1e-14)
     assert not np.allclose(many[1], plain)
 
     @jax.jit
@@ -84,10 +83,10 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
 
     u = np.random.default_rng(2).normal(size=(12, 2))
     y, error = inside(u)
-    np.testing.assert_allclose(
+    assert_allclose(
         y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13
     )
-    np.testing.assert_allclose(error, 0, atol=1e-14)
+    assert_allclose(error, 0, atol=1e-14)
 
 
 GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1, 3))}

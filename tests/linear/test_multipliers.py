@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import linear_sum_assignment
 
 import hybridjax as hj
@@ -125,7 +126,7 @@ def test_structural_zeros_are_counted_not_guessed():
     mixed[:3, :3], mixed[:, 3] = nilpotent, [3, 2, 5, 0.5]
     change = basis_at_random(np.random.default_rng(0), 4)
     mixed = change @ mixed @ np.linalg.inv(change)
-    np.testing.assert_allclose(product_eigenvalues([mixed], RTOL), [0.5], rtol=1e-12)
+    assert_allclose(product_eigenvalues([mixed], RTOL), [0.5], rtol=1e-12)
     assert product_rank([mixed], RTOL) == 3
     # A true multiplier of 1e-20 is none of them, a zero factor is.
     assert len(product_eigenvalues([np.diag([1, 1e-2])] * 10, RTOL)) == 2
@@ -136,36 +137,32 @@ def test_products_that_leave_the_range_of_numbers():
     tiny = np.diag([1.0, 1e-200])
     huge = np.diag([1.0, 1e150])
     found = product_eigenvalues([tiny, tiny, huge, huge, tiny, huge], 0.0)
-    np.testing.assert_allclose(found, [1, 1e-150], rtol=1e-12, atol=0)
-    np.testing.assert_array_equal(product_eigenvalues([tiny, tiny], 0.0), [1, 0])
+    assert_allclose(found, [1, 1e-150], rtol=1e-12, atol=0)
+    assert_array_equal(product_eigenvalues([tiny, tiny], 0.0), [1, 0])
 
 
 def test_defective_and_cyclic_products():
     jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
-    np.testing.assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
+    assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
     roots = product_eigenvalues([np.roll(np.eye(6), 1, axis=0)], RTOL)
-    np.testing.assert_allclose(roots**6, 1, atol=1e-13)
+    assert_allclose(roots**6, 1, atol=1e-13)
     assert_conjugate_and_sorted(roots)
     measured = product_eigenvalues([np.eye(3)] * 4, RTOL)
-    np.testing.assert_array_equal(measured, np.ones(3))
+    assert_array_equal(measured, np.ones(3))
 
 
 def test_hopper(hopper, reference):
     data = reference("ldtp_isochron")
     found = hopper.multipliers
-    np.testing.assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
+    assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
     assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
-    np.testing.assert_allclose(
-        hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14
-    )
+    assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
 
 
 def test_the_synthetic_system(synthetic):
     assert list(synthetic.dims) == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
-    np.testing.assert_allclose(
-        synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13
-    )
+    assert_allclose(synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13)
 
 
 def test_characteristic_polynomial(synthetic, hopper):
@@ -173,8 +170,8 @@ def test_characteristic_polynomial(synthetic, hopper):
         r = len(ldtp.multipliers)
         coefficients = np.asarray(ldtp.characteristic_polynomial())
         expected = np.poly(ldtp.multipliers).real
-        np.testing.assert_allclose(coefficients[: r + 1], expected, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(coefficients[r + 1 :], 0, atol=1e-13)
+        assert_allclose(coefficients[: r + 1], expected, rtol=0, atol=1e-13)
+        assert_allclose(coefficients[r + 1 :], 0, atol=1e-13)
 
 
 def test_factors_that_are_not_finite():

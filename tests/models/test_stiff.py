@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -76,9 +77,9 @@ def test_the_hopper_on_a_compliant_ground():
     ]
     found = np.array(list(cycle.state.values())) / list(cycle.scale.values())
     expected = state / np.array(list(cycle.scale.values()))
-    np.testing.assert_allclose(found, expected, atol=1e-11)
+    assert_allclose(found, expected, atol=1e-11)
     z = -0.24885118328047069434 + 0.69922500780850327787j
-    np.testing.assert_allclose(cycle.multipliers[:2], [z, z.conjugate()], atol=1e-12)
+    assert_allclose(cycle.multipliers[:2], [z, z.conjugate()], atol=1e-12)
     assert cycle.multipliers[2] == pytest.approx(1.6159409134125691e-4, abs=1e-14)
     model = hj.linearize(cycle, hj.ClockPhase(16))
-    np.testing.assert_allclose(model.multipliers[:2], [z, z.conjugate()], atol=1e-10)
+    assert_allclose(model.multipliers[:2], [z, z.conjugate()], atol=1e-10)

@@ -5,6 +5,7 @@ The truth is `benchmarks/walkers_truth.py`: differences of another simulation, e
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -40,7 +41,7 @@ def test_A_and_B(name):
     state, by_state, by_input = (
         truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input")
     )
-    np.testing.assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
+    assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
     leg = np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0])))
     d = len(state)
     for n in range(4):
@@ -56,5 +57,5 @@ def test_A_and_B(name):
         A = (by_state[n] @ moves)[np.ix_(rows, columns)]
         B = by_input[n][rows]
         ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
-        np.testing.assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
-        np.testing.assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))
+        assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
+        assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))

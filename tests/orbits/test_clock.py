@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -77,5 +78,5 @@ def test_a_force_that_jumps_with_the_clock():
     )
     cycle = hj.find_limit_cycle(square, hj.Guess("a", (0.3,), 0.25))
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
-    np.testing.assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)
-    np.testing.assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)
+    assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)
+    assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -96,7 +97,7 @@ def test_derivatives_of_both_orders():
     }
     assert set(found.orders) == set(exact)
     for order, derivative in zip(found.orders, found.derivatives, strict=True):
-        np.testing.assert_allclose(derivative, exact[order], atol=1e-12)
+        assert_allclose(derivative, exact[order], atol=1e-12)
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
@@ -114,7 +115,7 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     found = hj.find_limit_cycles(systems, begin)
     ok = hj.Result.OK
     not_ok = hj.Result.COINCIDENCE
-    np.testing.assert_array_equal(found.result, [ok, not_ok, not_ok])
+    assert_array_equal(found.result, [ok, not_ok, not_ok])
     branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
     assert branch.cycles.result[0] == ok
     assert (branch.cycles.result[1:] == not_ok).all()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.linalg import solve_discrete_lyapunov
 
 import hybridjax as hj
@@ -41,11 +42,11 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
     cycle = hj.find_limit_cycle(Neuron())
     period = np.log(6)
     threshold = cycle.fluctuations(guards={"spike": 0.01})  # where v' = 0.2
-    np.testing.assert_allclose(threshold.durations(), [[0.05**2]], rtol=1e-12)
-    np.testing.assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
-    np.testing.assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
+    assert_allclose(threshold.durations(), [[0.05**2]], rtol=1e-12)
+    assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
+    assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
     white = cycle.fluctuations(white={"u": 0.01})  # its integral with exp(t) / 1.2
-    np.testing.assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
+    assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
     assert "standard deviation from spike to spike" in str(white)
 
 
@@ -53,9 +54,8 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
 def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     section = hj.Crossing("y", "rising")
     guess = hj.Guess("plane", (0.33, 0.0))
-    noisy = hj.find_limit_cycle(StuartLandau(), guess, section=section).fluctuations(
-        {"x": 1e-3}
-    )
+    cycle = hj.find_limit_cycle(StuartLandau(), guess, section=section)
+    noisy = cycle.fluctuations({"x": 1e-3})
     # Of the amplitude r: r' = -0.2 r + cos(t w) dW; of the phase: see the closed form of Z.
     angle = 2 * np.pi * np.array([0.0, 0.2, 0.7])
     w = 1.0 + 0.4 * 0.1
@@ -64,24 +64,22 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     # At equal phases d angle = alpha dr / r.
     along = np.cos(angle) + 0.4 * np.sin(angle), np.sin(angle) - 0.4 * np.cos(angle)
     C, later = (noisy.covariance([0.0, 0.2, 0.7], lag) for lag in (0, 1))
-    np.testing.assert_allclose(C[:, 0, 1], radial * along[0] * along[1], rtol=1e-11)
+    assert_allclose(C[:, 0, 1], radial * along[0] * along[1], rtol=1e-11)
     decay = np.exp(-0.2 * 2 * np.pi / w)
     expected = decay * radial * along[1] ** 2
-    np.testing.assert_allclose(later[:, 1, 1], expected, rtol=1e-11)
+    assert_allclose(later[:, 1, 1], expected, rtol=1e-11)
     expected = 1e-6 * (1 + 0.4**2) / 0.2 / w**2
-    np.testing.assert_allclose(noisy.diffusion, expected, rtol=1e-11)
+    assert_allclose(noisy.diffusion, expected, rtol=1e-11)
     # Periods are correlated, and over many of them their variance is that of the diffusion.
     both = noisy.durations()[0, 0] + 2 * sum(
         noisy.durations(k)[0, 0] for k in range(1, 40)
     )
-    np.testing.assert_allclose(both, noisy.diffusion * noisy.period, rtol=1e-11)
+    assert_allclose(both, noisy.diffusion * noisy.period, rtol=1e-11)
 
 
 def test_states_may_have_no_correlation():
     noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
-    np.testing.assert_allclose(
-        noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12
-    )
+    assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
@@ -103,16 +101,16 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     C = solve_discrete_lyapunov(step, noise)
     ago = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
     now = np.array([[-(v - G * ago), 1.0, ago], [G, 0.0, 1.0]])
-    np.testing.assert_allclose(noisy.covariance([0.0])[0], now @ C @ now.T, rtol=1e-11)
+    assert_allclose(noisy.covariance([0.0])[0], now @ C @ now.T, rtol=1e-11)
     measured = noisy.covariance([0.0], 2)[0]
     expected = now @ step @ step @ C @ now.T
-    np.testing.assert_allclose(measured, expected, rtol=1e-11)
+    assert_allclose(measured, expected, rtol=1e-11)
     lags = [C[0, 0], *((np.linalg.matrix_power(step, k) @ C)[0, 0] for k in (1, 2))]
     expected = 2 * (lags[0] - lags[1])
-    np.testing.assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
+    assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
     measured = noisy.durations(1)[0, 0]
     expected = 2 * lags[1] - lags[0] - lags[2]
-    np.testing.assert_allclose(measured, expected, rtol=1e-11)
+    assert_allclose(measured, expected, rtol=1e-11)
 
 
 def test_a_million_simulated_bounces_scatter_as_computed(juggler):
@@ -196,4 +194,4 @@ def test_noise_without_an_effect_gives_zero():
         assert np.array_equal(noisy.durations(lag=1), [[0]])
         assert "0: standard deviation from spike to spike" in str(noisy)
         for C in noisy.covariance([0.2, 0.7]):
-            np.testing.assert_allclose(C, expected, rtol=1e-10, atol=0)
+            assert_allclose(C, expected, rtol=1e-10, atol=0)

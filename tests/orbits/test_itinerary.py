@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.orbits import batches, find, limit_cycles, near
@@ -189,7 +190,7 @@ def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper(), guess)
     true = -0.24898333 + 0.69933325j
     values = cycle.multipliers
-    np.testing.assert_allclose(values[np.argmax(values.imag)], true, atol=1e-8)
+    assert_allclose(values[np.argmax(values.imag)], true, atol=1e-8)
 
 
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):

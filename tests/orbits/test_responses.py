@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.orbits.linear_flow import linear_flow
@@ -131,23 +132,23 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     angle = 2 * np.pi * PHASES
     phase = responses.phase(PHASES, "radians")
     exact = -(np.sin(angle) - 0.4 * np.cos(angle)) / np.sqrt(0.1)
-    np.testing.assert_allclose(phase["u"], exact, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
+    assert_allclose(phase["u"], exact, rtol=0, atol=1e-12)
+    assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
     amplitude = responses.amplitude(0, PHASES)
-    np.testing.assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(amplitude["y"], np.sin(angle), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
+    assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-12)
+    assert_allclose(amplitude["y"], np.sin(angle), rtol=0, atol=1e-12)
+    assert_allclose(responses.exponents, [-0.2], rtol=0, atol=1e-12)
     assert "exponent -0.2" in str(responses)
     fast = hj.find_limit_cycle(StuartLandau(mu=1.0), guess, section=section).responses()
     amplitude = fast.amplitude(
         0, PHASES
     )  # without a part along the flow, which would grow
-    np.testing.assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-10)
+    assert_allclose(amplitude["x"], np.cos(angle), rtol=0, atol=1e-10)
     # Isochrons are logarithmic spirals: phase = angle + alpha log(r / sqrt(mu)).
     cycle = hj.find_limit_cycle(system, guess, section=section)
     phase = cycle.asymptotic_phase("plane", (0.3, 0.15))
     exact = np.arctan2(0.15, 0.3) + 0.4 * np.log(np.hypot(0.3, 0.15) / np.sqrt(0.1))
-    np.testing.assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
+    assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
 def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
@@ -166,13 +167,13 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
         0.1
     )
     phase = cycle.responses().phase(PHASES, "radians")
-    np.testing.assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
+    assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
     slower = cycle.sensitivity("mu").period
-    np.testing.assert_allclose(slower, -2 * np.pi * 0.4 / 1.04**2, rtol=1e-11)
+    assert_allclose(slower, -2 * np.pi * 0.4 / 1.04**2, rtol=1e-11)
     driven = hj.find_limit_cycle(Driven(), hj.Guess("plane", (0.1, 1e11)))
     shape = driven.sensitivity("force").shape([0.0])
     state = driven.state
-    np.testing.assert_allclose([shape[x][0] / state[x] for x in "xy"], 1.0, rtol=1e-11)
+    assert_allclose([shape[x][0] / state[x] for x in "xy"], 1.0, rtol=1e-11)
 
 
 def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
@@ -185,10 +186,10 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
     turned = hj.Transition("tick", "line", "line", tick, reset=lambda t, q, u: (-q[0],))
     system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
     responses = hj.find_limit_cycle(system, hj.Guess("line", (0.1,))).responses()
-    np.testing.assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
+    assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
     before_tick = np.where(PHASES < 0.5, PHASES, PHASES - 1)
     exact = np.exp(1j * np.pi * before_tick) * responses.amplitude(0, [0.0])["x"]
-    np.testing.assert_allclose(responses.amplitude(0, PHASES)["x"], exact, rtol=1e-11)
+    assert_allclose(responses.amplitude(0, PHASES)["x"], exact, rtol=1e-11)
 
 
 def test_the_closed_form_of_a_response_has_its_derivative():
@@ -203,7 +204,7 @@ def test_the_closed_form_of_a_response_has_its_derivative():
     angle = 2 * np.pi * PHASES
     exact = (np.sin(angle) - 0.4 * np.cos(angle)) / (2 * 0.1**1.5)
     tangent = jax.jvp(response, (0.1,), (1.0,))[1]  # (in reverse mode: the slow test)
-    np.testing.assert_allclose(tangent, exact, rtol=0, atol=1e-9)
+    assert_allclose(tangent, exact, rtol=0, atol=1e-9)
 
 
 def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
@@ -214,18 +215,18 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     size = 1 / (4 * np.pi * np.sqrt(0.1))
     angle = 2 * np.pi * PHASES
     expected = size * (np.sin(angle) + 0.4 * np.cos(angle))
-    np.testing.assert_allclose(pushed(PHASES), expected, rtol=1e-11)
+    assert_allclose(pushed(PHASES), expected, rtol=1e-11)
     expected = np.array([-1, 1]) * size * np.sqrt(1.16)
-    np.testing.assert_allclose(pushed.locking, expected, rtol=1e-12)
+    assert_allclose(pushed.locking, expected, rtol=1e-12)
     rates = [x.rate for x in pushed.locked()]
     expected = 2 * np.pi * size * np.sqrt(1.16)
-    np.testing.assert_allclose(np.abs(rates), expected, rtol=1e-11)
+    assert_allclose(np.abs(rates), expected, rtol=1e-11)
     together, apart = responses.coupling("x").locked(mutual=True)
-    np.testing.assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
+    assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
     leads = [
         x.lead for x in type(pushed)(np.array([0.0, np.exp(0.5002j * np.pi)])).locked()
     ]
-    np.testing.assert_allclose(leads, [0.9999, 0.4999], rtol=1e-9)
+    assert_allclose(leads, [0.9999, 0.4999], rtol=1e-9)
     with pytest.raises(
         hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"
     ):
@@ -236,12 +237,12 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
 def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     leaky = hj.find_limit_cycle(Neuron(grip=0.3)).responses()
     period = np.log(1.2 / 0.2)
-    np.testing.assert_allclose(leaky.period, period, rtol=1e-12)
+    assert_allclose(leaky.period, period, rtol=1e-12)
     exact = np.exp(PHASES * period) / 1.2
-    np.testing.assert_allclose(leaky.phase(PHASES)["v"], exact, rtol=1e-12)
+    assert_allclose(leaky.phase(PHASES)["v"], exact, rtol=1e-12)
     # The guard comes 0.3 / v' = 1.5 earlier, and the reset starts 0.3 / 1.2 ahead.
     (impulse,) = leaky.impulses()
-    np.testing.assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
+    assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
     assert "inputs act at spike" in str(leaky)
     with pytest.raises(hj.DefinitionError, match="acts at events alone"):
         leaky.curve("u")
@@ -252,33 +253,33 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     quadratic = cycle.responses()
     period = np.arctan(1.0) - begin
     exact = np.cos(begin + PHASES * period) ** 2
-    np.testing.assert_allclose(quadratic.phase(PHASES)["u"], exact, rtol=1e-12)
+    assert_allclose(quadratic.phase(PHASES)["u"], exact, rtol=1e-12)
     curve = quadratic.curve()
     exact = np.cos(begin + curve.phase * period) ** 2 / period
     kept = np.isfinite(curve.values)
-    np.testing.assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
+    assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
     assert 0 < np.sum(~kept) <= 2
     assert curve.input == "u"
     change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
-    np.testing.assert_allclose(change.period, -1 / 5, rtol=1e-11)
-    np.testing.assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
-    np.testing.assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
+    assert_allclose(change.period, -1 / 5, rtol=1e-11)
+    assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
+    assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
 
 
 @pytest.mark.core
 def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_derivative():
     cycle = hj.find_limit_cycle(Square())
-    np.testing.assert_allclose(cycle.period, 6.766182958186238, rtol=1e-11)
+    assert_allclose(cycle.period, 6.766182958186238, rtol=1e-11)
     a = cycle.sensitivity("a")
     omega = cycle.sensitivity("omega")
-    np.testing.assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
-    np.testing.assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
+    assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
+    assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
     measured = np.reshape(a.durations, (4, 2)).sum(1)
-    np.testing.assert_allclose(measured, a.period / 4, rtol=1e-9)
+    assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
     periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
-    np.testing.assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
+    assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
 
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
@@ -315,7 +316,7 @@ def test_phase_responses_are_differences_of_asymptotic_phases(name):
         difference.append((4 * central(0.5) - central(1.0)) / 3)
         exact.append(sum(response[x][k] * p for x, p in zip(names, push, strict=True)))
     size = max(np.abs(np.concatenate([*response.values()]))) * 1e-4
-    np.testing.assert_allclose(difference, exact, rtol=1e-6, atol=1e-6 * size)
+    assert_allclose(difference, exact, rtol=1e-6, atol=1e-6 * size)
 
 
 def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
@@ -337,12 +338,13 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         1.085149865188 - 0.060008477233j,
         0.333649918824 + 0.129840711721j,
     ]
-    np.testing.assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
+    assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
     assert "continuous time" in str(htf)
     assert htf[1].shape == (1, 1, 1)
-    held = hj.linearize(cycle, hj.ClockPhase(64), "x").htf(0.25, (-1, 0, 1)).H
+    ldtp = hj.linearize(cycle, hj.ClockPhase(64), "x")
+    held = ldtp.htf(0.25, (-1, 0, 1)).H
     x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
-    np.testing.assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
+    assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
     with pytest.raises(hj.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
 
@@ -353,9 +355,7 @@ def test_htfs_at_many_frequencies_come_from_fewer():
     some = [0, 7, 311, 619]
     many = cycle.htf(f, (-1, 0, 1)).H
     few = cycle.htf(f[some], (-1, 0, 1)).H
-    np.testing.assert_allclose(
-        many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max()
-    )
+    assert_allclose(many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max())
 
 
 def test_harmonic_state_spaces_converge_to_the_exact_htf():
@@ -365,7 +365,7 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
         0, space.order - 1 : space.order + 2, 0, 0
     ]
     exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
-    np.testing.assert_allclose(H, exact, rtol=1e-11)
+    assert_allclose(H, exact, rtol=1e-11)
     assert space.error < 1e-12
     assert space.order == 8
     assert hj.convert.to_harmonic_state_space(cycle, 1).error > 1e-3
@@ -379,7 +379,7 @@ def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_t
     f = np.array([0.3, 1.7])
     m = np.arange(-3, 4)
     y, v = np.moveaxis(cycle.htf(f, m, ("y", "v")).H[..., 0], -1, 0)
-    np.testing.assert_allclose(v, 2j * np.pi * (f + m[:, None]) * y, rtol=1e-9)
+    assert_allclose(v, 2j * np.pi * (f + m[:, None]) * y, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -451,7 +451,7 @@ def test_sensitivities_are_differences_of_cycles(system, name):
         np.array(change.times) - begin,
         change.shape(PHASES[1:])[name],
     ]
-    np.testing.assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
+    assert_allclose(np.concatenate(exact), difference, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -492,8 +492,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
 
     h = 1e-3 * begin
     difference = (4 * central(h / 2) - central(h)) / 3
-    np.testing.assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
+    assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
+    assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 
 
 def test_bad_questions_are_refused_in_one_sentence():

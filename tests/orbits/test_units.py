@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -63,20 +64,18 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     assert cycle.event_sequence == hopper_cycle.event_sequence
     assert cycle.iterations == hopper_cycle.iterations
     assert cycle.residual < 1e-12
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
     for name, size in hopper_cycle.scale.items():
-        np.testing.assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
+        assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
         size = hopper_cycle.state.get(name, 0.0) * sizes[name[0]]
-        np.testing.assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
+        assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
     model, other = (hj.linearize(x, CLOCK, ("yM", "vM")) for x in (hopper_cycle, cycle))
-    np.testing.assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
+    assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
     H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
     for k, name in enumerate(model.outputs):
         mine = H[:, :, k]
         back = sizes["force"] / sizes[name[0]]
-        np.testing.assert_allclose(
-            theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max()
-        )
+        assert_allclose(theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max())
 
 
 @pytest.mark.slow
@@ -86,10 +85,8 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     length, time = UNITS[unit]
     cycle = relaxation_in(length, time)
     assert cycle.result == hj.Result.OK
-    np.testing.assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
-    np.testing.assert_allclose(
-        cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9
-    )
+    assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
+    assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
 
 
 def test_states_that_rest_stop_nothing(relaxation):
@@ -97,7 +94,7 @@ def test_states_that_rest_stop_nothing(relaxation):
     these. Both have the multiplier exp(-period) of their decay."""
     truth = [8.59695063603805e-4, np.exp(-6.66328685932313), np.exp(-6.66328685932313)]
     found = np.sort_complex(relaxation.multipliers)
-    np.testing.assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
+    assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
     assert relaxation.scale["nothing"] == 1.0
     assert relaxation.scale["rounding"] > 1e-7
 
@@ -109,10 +106,10 @@ def test_a_state_that_rounding_moves_by_time_stops_nothing():
         cycle = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0), time))
         assert cycle.scale["w"] > 1e-7
         x = (amplitude * np.exp(3j * time)).real
-        np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
+        assert_allclose(cycle.state["x"], x, rtol=1e-9)
         decay = np.sort(np.abs(cycle.multipliers))
         truth = np.exp(-np.array([1.0, 0.5, 0.5]) * 2 * np.pi / 3)
-        np.testing.assert_allclose(decay, truth, rtol=1e-9)
+        assert_allclose(decay, truth, rtol=1e-9)
 
 
 @pytest.mark.parametrize("factor", [100.0, 0.5])
@@ -126,4 +123,4 @@ def test_sizes_that_are_given(hopper_cycle, factor):
     assert dict(cycle.scale) == pytest.approx(
         hopper_cycle.scale | {"ym": 5.0}, rel=1e-9
     )
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)

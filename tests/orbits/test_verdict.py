@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.results import Result
@@ -123,20 +124,18 @@ def test_a_cycle_beyond_a_guard_is_refused_by_name():
     section = hj.AtEvent("spike 1")
     with pytest.raises(ComputationError, match="beyond the guard of 'spike 2'"):
         hj.find_limit_cycle(TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section)
-    ghost = hj.find_limit_cycle(
-        TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section, throw=False
-    )
+    guess = hj.Guess("rest", (0.0, 1.2))
+    ghost = hj.find_limit_cycle(TwoCells(), guess, section=section, throw=False)
     assert ghost.result == Result.GUARD_BEYOND
     with pytest.raises(hj.errors.DefinitionError, match="beyond a guard"):
         hj.linearize(ghost, [section, section])
 
 
 def test_the_rhythm_of_two_cells_is_that_of_the_closed_form():
-    cycle = hj.find_limit_cycle(
-        TwoCells(), hj.Guess("rest", (0.0, 0.5)), section=hj.AtEvent("spike 1")
-    )
+    guess = hj.Guess("rest", (0.0, 0.5))
+    cycle = hj.find_limit_cycle(TwoCells(), guess, section=hj.AtEvent("spike 1"))
     before, last = spikes_by_hand((0.0, 0.5))
-    np.testing.assert_allclose(cycle.period, last - before, rtol=1e-12)
+    assert_allclose(cycle.period, last - before, rtol=1e-12)
     assert "checked by" in repr(cycle)
     assert "not reached" not in repr(cycle)
 

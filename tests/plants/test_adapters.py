@@ -128,9 +128,8 @@ def ground():
         period=1.0,
         substeps=20,
     )
-    return hj.plants.settle(
-        plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=32
-    )
+    sections = hj.ClockPhase(10, anchor=0.7)
+    return hj.plants.settle(plant, sections, ("yM", "yM_rate"), cycles=32)
 
 
 def test_mujoco_continues_from_its_state(ground):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
+from numpy.testing import assert_allclose
 from PIL import Image
 
 import hybridjax as hj
@@ -19,7 +20,7 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer = hj.explore(hj.models.RimlessWheel(), "slope")
     explorer.move({"slope": 0.1})
     expected = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.1))
-    np.testing.assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
+    assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
     explorer.move({"slope": 0.001})  # too flat to roll
     assert explorer.message.startswith("The cycle is lost at slope = 0.0")
     found = float(explorer.cycle.system.slope)
@@ -29,7 +30,7 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer.move({"slope": 0.1})
     assert explorer.message == ""
     assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("white")}
-    np.testing.assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
+    assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
 
 
 def test_an_event_passes_the_phase_at_which_the_clock_begins():

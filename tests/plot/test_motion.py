@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 import hybridjax as hj
@@ -24,8 +25,8 @@ def test_states_at_times_lie_on_the_trajectory(walk):
     t, chart, q = path.dense(7)
     once = np.append(np.diff(t) > 0, False)  # at an event both sides have one time
     found = path.at(t[once])
-    np.testing.assert_array_equal(found[0], chart[once])
-    np.testing.assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
+    assert_array_equal(found[0], chart[once])
+    assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
     with pytest.raises(hj.DefinitionError, match="times must lie between"):
         path.at([path.t[-1] + 1])
 
@@ -37,15 +38,15 @@ def test_feet_do_not_slide_and_the_loop_closes(walk):
     strike = path.t[path.event >= 0][-1]
     before, after = pictures.at(np.array([strike - 1e-9, strike]))
     for new, old in (("stance foot", "swing foot"), ("swing foot", "stance foot")):
-        np.testing.assert_allclose(after.points[new], before.points[old], atol=1e-7)
+        assert_allclose(after.points[new], before.points[old], atol=1e-7)
     times = path.t[0] + np.linspace(0.01, 0.9, 20) * period
     feet = [x.points["stance foot"] for x in pictures.at(times)] + pictures.camera(
         times
     )
-    np.testing.assert_allclose(feet - feet[0], 0, atol=1e-12)
+    assert_allclose(feet - feet[0], 0, atol=1e-12)
     # A step has the length of the line between the feet.
     step = before.points["swing foot"] - before.points["stance foot"]
-    np.testing.assert_allclose(pictures.stride, step, atol=1e-7)
+    assert_allclose(pictures.stride, step, atol=1e-7)
 
 
 def test_files_and_refusals(walk, tmp_path):
@@ -77,9 +78,7 @@ def test_both_halves_of_a_cycle_are_drawn():
     )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]
-    np.testing.assert_allclose(
-        [span, 2 * half.period], float(duffing.period()), rtol=1e-9
-    )
+    assert_allclose([span, 2 * half.period], float(duffing.period()), rtol=1e-9)
 
 
 def test_no_input_gives_the_cycle():
@@ -87,7 +86,7 @@ def test_no_input_gives_the_cycle():
     placed = hj.place_sections(cycle, hj.ClockPhase(4))
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
-    np.testing.assert_allclose(end, 0, atol=1e-9)
+    assert_allclose(end, 0, atol=1e-9)
     data = hj.ExperimentData(
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
     )

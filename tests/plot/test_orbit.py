@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -33,9 +34,9 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]
     r = (bars - [1.9, 0.0]) / [0.3, 1.9]
     angle = np.unwrap(np.angle(r[..., 0] + 1j * r[..., 1]), axis=0)
-    np.testing.assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
-    np.testing.assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
-    np.testing.assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
+    assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
+    assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
+    assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
 
 
 def test_a_cycle_that_was_not_found_is_refused():
@@ -53,7 +54,7 @@ def test_resets_that_jump_are_dashed(hopper_cycle):
     (jump,) = [x for x in ax.get_lines() if x.get_linestyle() == "--"]
     touchdown = hopper_cycle.trajectory().events[1].before
     expected = [[0, touchdown["vm"]], [0, 0]]
-    np.testing.assert_allclose(jump.get_xydata(), expected, atol=1e-12)
+    assert_allclose(jump.get_xydata(), expected, atol=1e-12)
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
@@ -63,4 +64,4 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     assert ax.get_ylabel() == "x"
     bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
     measured = bars[:, :2].mean(axis=1).T
-    np.testing.assert_allclose(measured, placed.lanes.q[::-1], atol=1e-9)
+    assert_allclose(measured, placed.lanes.q[::-1], atol=1e-9)

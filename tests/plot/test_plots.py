@@ -8,6 +8,7 @@ from matplotlib import pyplot
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
@@ -25,8 +26,8 @@ def test_magnitude_draws_the_values(estimate, exact):
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
-    np.testing.assert_array_equal(drawn.get_xdata(), estimate.f)
-    np.testing.assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
+    assert_array_equal(drawn.get_xdata(), estimate.f)
+    assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
     assert (
         drawn.get_color()
         == lines["$H_{-1}$"].get_color()
@@ -50,7 +51,7 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
             for m in (hopper, exact)
         ]
         for line, expected in zip(*drawn, strict=True):
-            np.testing.assert_allclose(line, expected, rtol=1e-9)
+            assert_allclose(line, expected, rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="model alone"):
         hj.plot.bode(hopper)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
@@ -82,12 +83,10 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
     fitted = rational.htf(estimate.f).H[0, :, 0, 0]
-    np.testing.assert_allclose(curves[2].get_ydata(), np.abs(fitted))
+    assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
-    np.testing.assert_allclose(
-        phases[0], phases[3], atol=2
-    )  # no curve is a whole turn away
-    np.testing.assert_allclose(phases[1], phases[0], atol=2)
+    assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
+    assert_allclose(phases[1], phases[0], atol=2)
 
 
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
@@ -103,8 +102,8 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
-        np.testing.assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
-        np.testing.assert_array_equal(first.get_ydata(), second.get_ydata())
+        assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
+        assert_array_equal(first.get_ydata(), second.get_ydata())
     with pytest.raises(
         hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
@@ -122,7 +121,7 @@ def test_every_input_is_drawn_and_named():
         upper = np.ravel(draw(exact).figure.axes)[0]
         curves = [x for x in upper.get_lines() if len(x.get_xdata())]
         for line, values in zip(curves, expected, strict=True):
-            np.testing.assert_allclose(line.get_ydata(), values)
+            assert_allclose(line.get_ydata(), values)
         assert len({x.get_color() for x in curves}) == len(pairs)
         assert list(labeled(upper)) == [*names, "exact"]
     # A fit lies over the curves of its own input.
@@ -161,7 +160,7 @@ def test_multipliers(hopper, rational, structured):
     ]
     z = hopper.multipliers
     expected = np.stack([z.real, z.imag], 1)
-    np.testing.assert_array_equal(lines["exact"].get_xydata(), expected)
+    assert_array_equal(lines["exact"].get_xydata(), expected)
     assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
     assert f"{structured.compare(z).max_error:.1e}".split("e")[0] in list(lines)[-1]
     (inset,) = ax.child_axes
@@ -183,7 +182,7 @@ def test_poles_and_zeros(rational):
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
         poles = labeled(ax)["poles, isochron"].get_xydata()
-        np.testing.assert_array_equal(poles[:, 1], rational.poles[i].imag)
+        assert_array_equal(poles[:, 1], rational.poles[i].imag)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
     with pytest.raises(hj.DefinitionError, match="one or more fits"):
@@ -200,8 +199,8 @@ def test_experiment(hopper):
         r"$\delta$ vM",
     ]
     y = figure.axes[2].get_lines()[0]
-    np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
-    np.testing.assert_allclose(y.get_xdata()[32], 1.0)
+    assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
+    assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.DefinitionError, match="no experiment 99"):
         hj.plot.experiment(data, 99)
@@ -231,10 +230,10 @@ def test_bands_hold_the_values(estimate):
     ax = hj.plot.magnitude(sure, harmonics=(0,)).ax
     radius = float(sure.confidence_radius().max())
     top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
-    np.testing.assert_allclose(top, np.abs(sure[0][:, 0, 0]).max() + radius)
+    assert_allclose(top, np.abs(sure[0][:, 0, 0]).max() + radius)
     upper, lower = hj.plot.bode(sure, outputs="yM").axes[:, 0]
     known = np.isfinite(lower.get_lines()[0].get_ydata())
-    np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
+    assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
     assert len(upper.collections) == len(lower.collections) == 1
 
 
@@ -242,16 +241,17 @@ def test_bands_hold_the_values(estimate):
 def found(hopper):
     u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
-    y = y + 0.1 * y.std(axis=0) * np.random.default_rng(1).normal(size=y.shape)
+    rng = np.random.default_rng(1)
+    y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
     return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
 
 
 def test_validation_draws_signals_and_correlations(found):
     grid = np.reshape(hj.plot.validation(found, cycles=2).figure.axes, (2, 3))
     simulated, measured = grid[1, 0].get_lines()
-    np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
-    np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
-    np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
+    assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
+    assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
     assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
     expected = f"fit {found.fit[0]:.3g} %\n"
     assert grid[0, 0].get_title("right") == expected
@@ -263,7 +263,7 @@ def test_validation_draws_signals_and_correlations(found):
             path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()
         ]
         expected = values.sum(axis=0).ravel() / np.sqrt(32)
-        np.testing.assert_allclose(heights, expected, atol=1e-12)
+        assert_allclose(heights, expected, atol=1e-12)
 
 
 def test_no_texts_overlap_at_the_width_of_a_column(found):
@@ -304,7 +304,7 @@ def test_regions_are_drawn_around_estimates(hopper):
     drawn = [
         line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100
     ]
-    np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
+    assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
     (left, right) = inset.get_xlim()
     (low, high) = inset.get_ylim()
     border = estimate.ellipse(0)

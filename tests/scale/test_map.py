@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
@@ -43,12 +44,12 @@ def whole(wheel, options):
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
     expected = np.broadcast_to(np.cos(2 * np.pi / OVER["spokes"]) ** 2, (3, 3))
-    np.testing.assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
+    assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
     assert (whole.result == 0).all()
     assert (whole.residual < 1e-8).all()
     assert whole.slope.attrs["units"] == "rad"
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.abs(whole.multipliers).max("multiplier"), whole.spectral_radius
     )
     assert list(whole.coords) == ["slope", "spokes", "state_name", "state_unit"]
@@ -67,9 +68,7 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     assert np.flatnonzero(found.result).tolist() == [2]
     assert np.isnan(found.period[2])
     expected = np.delete(np.cos(2 * np.pi / found.spokes.values) ** 2, 2)
-    np.testing.assert_allclose(
-        np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7
-    )
+    assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
 
 def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path):
@@ -130,9 +129,9 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     assert found.period.dims == ("point",)
     assert set(found.coords) == {"slope", "spokes"}
     expected = whole.period.values[::2, ::2].T.ravel()
-    np.testing.assert_allclose(found.period, expected, rtol=1e-9)
+    assert_allclose(found.period, expected, rtol=1e-9)
     expected = float(found.period[0]) * np.array([1, 2])
-    np.testing.assert_allclose(found.twice[0], expected)
+    assert_allclose(found.twice[0], expected)
     assert np.isnan(found.twice[1]).all()
     for wrong, message in (
         (lambda x: x, "a function of parameters that returns one"),
@@ -152,9 +151,7 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert values.max() <= high
         measured = np.histogram(values, 4, (low, high))[0].tolist()
         assert measured == (pytest.approx([12] * 4, abs=2))
-        np.testing.assert_array_equal(
-            values, Points.sobol(ranges, 48, seed=3).values[name]
-        )
+        assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
@@ -190,14 +187,12 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
         cycle = found[i]
         alone = hj.find_limit_cycle(cycle.system, cycle)
         assert cycle.event_sequence == alone.event_sequence
-        np.testing.assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
-        np.testing.assert_allclose(
-            found.multipliers[i, :2], alone.multipliers, atol=1e-8
-        )
-        np.testing.assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
+        assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
+        assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
+        assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
     assert len(np.unique(found.anchor.chart[:4])) == 2  # also in other charts
-    np.testing.assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
+    assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
 
 
 def test_without_a_clock_and_in_waves(wheel):
@@ -209,7 +204,7 @@ def test_without_a_clock_and_in_waves(wheel):
     assert found.ok.all()
     assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
-    np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
+    assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
     assert {found[i].event_sequence for i in range(11)} == {(0,)}
 
 
@@ -218,7 +213,7 @@ def test_systems_that_are_alike_or_undefined(wheel):
     slopes = jnp.array([0.08] * 9 + [np.nan, 0.08])
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
     found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
-    np.testing.assert_array_equal(found.failed, [9])
+    assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all()
     assert np.isfinite(found.multipliers[:9]).all()
     assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
@@ -229,4 +224,4 @@ def test_a_guess_with_too_long_a_period(wheel):
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
     assert cycle.event_sequence == (0,)
     assert cycle.period < 0.7 * wheel.period
-    np.testing.assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)
+    assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)

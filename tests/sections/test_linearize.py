@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -24,17 +25,15 @@ def padded(x):
 def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochron_ldtp):
     data = reference("ldtp_isochron")
     clock = np.asarray(placed_isochrons.lanes.t) % 1
-    np.testing.assert_allclose(clock, data["clock"] % 1, atol=1e-10)
-    np.testing.assert_allclose(
-        placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10
-    )
-    np.testing.assert_array_equal(isochron_ldtp.dims, data["dim"])
-    np.testing.assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
-    np.testing.assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
-    np.testing.assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
-    np.testing.assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
+    assert_allclose(clock, data["clock"] % 1, atol=1e-10)
+    assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
+    assert_array_equal(isochron_ldtp.dims, data["dim"])
+    assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
+    assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
+    assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
+    assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
     markov = isochron_ldtp.impulse_response(97)[..., 0]
-    np.testing.assert_allclose(markov, data["markov"], atol=1e-8)
+    assert_allclose(markov, data["markov"], atol=1e-8)
 
 
 def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
@@ -48,12 +47,12 @@ def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
 def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, request):
     ldtp = request.getfixturevalue(family)
     truth = np.array([LAMBDA, np.conj(LAMBDA)])
-    np.testing.assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
-    np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
+    assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
+    assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
         found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
         measured = sorted(found[-2:], key=np.imag)
-        np.testing.assert_allclose(measured, truth[::-1], atol=1e-9)
+        assert_allclose(measured, truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
 
 
@@ -62,14 +61,12 @@ def test_resets_that_depend_on_time():
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     time, *state, exact = cycle.system.exact()
     (impact,) = cycle.trajectory().events
-    np.testing.assert_allclose(
+    assert_allclose(
         [impact.time % 1, *impact.after.values()], [time, *state], atol=1e-9
     )
-    np.testing.assert_allclose(*np.sort_complex([cycle.multipliers, exact]), atol=1e-9)
+    assert_allclose(*np.sort_complex([cycle.multipliers, exact]), atol=1e-9)
     found = hj.linearize(cycle, hj.ClockPhase(8)).multipliers
-    np.testing.assert_allclose(
-        np.sort_complex(found), np.sort_complex(exact), atol=1e-9
-    )
+    assert_allclose(np.sort_complex(found), np.sort_complex(exact), atol=1e-9)
 
 
 def angles(apex, count):
@@ -101,12 +98,8 @@ def check_against_differences(ldtp, sections, points, retention, subset):
         J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
         A = np.asarray(ldtp.A)[i, : len(after), : len(names)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        np.testing.assert_allclose(
-            A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]"
-        )
-        np.testing.assert_allclose(
-            B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]"
-        )
+        assert_allclose(A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]")
+        assert_allclose(B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]")
 
 
 def test_kinematic_sections_agree_with_scipy(
@@ -120,7 +113,7 @@ def test_kinematic_sections_agree_with_scipy(
         error = abs(float(placed_kinematic.lanes.t[i]) - point[0])
         assert error < 1e-10
         found = placed_kinematic.lanes.q[: len(point) - 1, i]
-        np.testing.assert_allclose(found, point[1:], rtol=0, atol=1e-10)
+        assert_allclose(found, point[1:], rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
 
 
@@ -144,7 +137,7 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
         else dataclasses.replace(KINEMATIC, n_sections=N)
     )
     ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
-    np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
+    assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
     sections, points = lossy_sections(kind, N)
     dims = [len(p) for p in points]
     changes = [i for i in range(N) if dims[i] != dims[(i + 1) % N]]
@@ -164,7 +157,7 @@ def test_a_cycle_that_is_rest():
     """Where the state stands still, only its derivatives say how short steps must be."""
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
     found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
-    np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
+    assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
 
 
 @pytest.mark.parametrize("late", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)])
@@ -173,14 +166,13 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late):
     M = 25
     fine = hj.linearize(hopper_cycle, hj.ClockPhase(4 * M, anchor=APEX), OUTPUTS)
     delay = np.array(late) * float(hopper_cycle.period) / (4 * M)
-    model = hj.linearize(
-        hopper_cycle, hj.ClockPhase(4, anchor=APEX), OUTPUTS, delay=delay
-    )
+    sections = hj.ClockPhase(4, anchor=APEX)
+    model = hj.linearize(hopper_cycle, sections, OUTPUTS, delay=delay)
     u = np.random.default_rng(0).normal(size=(24, 1))
     held = np.concatenate([np.zeros((4 * M + late[0], 1)), np.repeat(u, M, axis=0)])
     y = np.asarray(fine.simulate(held))[4 * M - late[1] :: M][: len(u)]
-    np.testing.assert_allclose(model.simulate(u), y, atol=1e-11 * np.abs(y).max())
-    np.testing.assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
+    assert_allclose(model.simulate(u), y, atol=1e-11 * np.abs(y).max())
+    assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
     assert max(model.dims) == max(fine.dims) + -(-sum(late) // M)
 
 
@@ -223,20 +215,20 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
         (half, [0]),
     ):
         model = hj.linearize(cycle, sections, outputs=current)
-        np.testing.assert_array_equal(model.dims, dims)
+        assert_array_equal(model.dims, dims)
         assert [len(x) for x in model.coordinates] == dims
         assert len(model.multipliers) == 0
         # The voltage of a section does not change, the current does.
         H = model.htf((0.1, 0.2, 0.4))
-        np.testing.assert_allclose(H[0][:, 0, 0], 2)
+        assert_allclose(H[0][:, 0, 0], 2)
         assert all(np.all(H[m] == 0) for m in H.harmonics if m)
         for system in (model, model.feedback(np.zeros((1, 1)))):
             measured = system.simulate(np.ones((4, 1)))
             expected = 2 * np.ones((4, 1))
-            np.testing.assert_allclose(measured, expected)
+            assert_allclose(measured, expected)
         design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
         data = hj.run_experiments(cycle, sections, design, current, start="periodic")
-        np.testing.assert_allclose(data.y, 2 * data.u, rtol=1e-9)
+        assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
 
 def test_a_section_map_waits_for_late_arrivals():
@@ -244,14 +236,15 @@ def test_a_section_map_waits_for_late_arrivals():
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     paddle = hj.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
     state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
-    begin = float(hj.place_sections(cycle, [hj.AtEvent("impact")]).lanes.t[0])
+    placed = hj.place_sections(cycle, [hj.AtEvent("impact")])
+    begin = float(placed.lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
     alone = paddle(state)
     inside = eqx.filter_jit(paddle)(state)
     both = jax.vmap(paddle)(np.stack([state, state]))
     assert float(alone.t) - begin > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):
-        np.testing.assert_allclose(t, path.events[0].time, rtol=1e-9)
+        assert_allclose(t, path.events[0].time, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -264,6 +257,6 @@ def test_second_derivatives_of_a_period():
     h = 1e-3
     second = (period(1 + h) - 2 * period(1.0) + period(1 - h)) / h**2
     exact = jax.jacrev(jax.jacfwd(period))(1.0)
-    np.testing.assert_allclose(exact, second, rtol=1e-5)
+    assert_allclose(exact, second, rtol=1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="jacrev.*jacfwd"):
         jax.hessian(period)(1.0)

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.host_derivatives import only_on_host
@@ -59,15 +60,13 @@ def agrees(system, measure, rtol):
     minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
     differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
     size = kept(by_host)
-    np.testing.assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(
-        size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size))
-    )
+    assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
+    assert_allclose(size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size)))
     weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
     expected = sum(
         np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True)
     )
-    np.testing.assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
+    assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
 
 
 FAMILIES = {
@@ -107,9 +106,7 @@ def test_numbers_of_sections(hopper_cycle):
 
     e = 1e-4
     differences = (determinant(e) - determinant(-e)) / (2 * e)
-    np.testing.assert_allclose(
-        jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9
-    )
+    assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.usefixtures("compiles_none")
@@ -134,9 +131,8 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
 
     def multiplier(hopper):
         cycle = hj.find_limit_cycle(hopper, hopper_cycle)
-        monodromy = hj.linearize(
-            cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM"
-        ).monodromy(5)
+        ldtp = hj.linearize(cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM")
+        monodromy = ldtp.monodromy(5)
         trace = jax.numpy.trace(monodromy)
         determinant = (trace**2 - jax.numpy.trace(monodromy @ monodromy)) / 2
         return jax.numpy.stack([trace / 2, jax.numpy.sqrt(determinant - trace**2 / 4)])
@@ -157,9 +153,6 @@ def test_later_calls_repeat_the_first_to_the_last_bit():
     cycle = hj.find_limit_cycle(Hopper())
     matrices = []
     for _ in range(10):
-        matrices.append(
-            hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices
-        )
-    np.testing.assert_array_equal(
-        ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0]
-    )
+        ldtp = hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM")
+        matrices.append(ldtp.matrices)
+    assert_array_equal(ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0])

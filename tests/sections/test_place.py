@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.engine.events import belongs
@@ -33,11 +34,11 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
         strict=True,
     )
     placed = hj.place_sections(hopper_cycle, sections)
-    np.testing.assert_allclose(placed.lanes.t, times, atol=1e-8)
+    assert_allclose(placed.lanes.t, times, atol=1e-8)
     ldtp = hj.linearize(hopper_cycle, placed, ("yM", "vM"))
     assert tuple(" ".join(x) for x in ldtp.coordinates) == names
-    np.testing.assert_array_equal(ldtp.dims, [len(names) for names in ldtp.coordinates])
-    np.testing.assert_allclose(ldtp.multipliers, [LAMBDA, np.conj(LAMBDA)], atol=1e-9)
+    assert_array_equal(ldtp.dims, [len(names) for names in ldtp.coordinates])
+    assert_allclose(ldtp.multipliers, [LAMBDA, np.conj(LAMBDA)], atol=1e-9)
     assert [ldtp.rank(i) for i in range(6)] == [2] * 6
 
 
@@ -47,35 +48,34 @@ def test_a_number_as_the_anchor(hopper_cycle):
     )  # by rounding before the cycle begins
     clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
     expected = (first + np.arange(3) / 3) % 1
-    np.testing.assert_allclose(clock.lanes.t % 1, expected, atol=1e-12)
+    assert_allclose(clock.lanes.t % 1, expected, atol=1e-12)
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     q = np.asarray(hj.place_sections(hopper_cycle, family).lanes.q)
     angle = np.unwrap(np.angle((q[0] - 1.9) / 0.3 + 1j * q[1] / 1.9))
-    np.testing.assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
+    assert_allclose(angle, 0.3 - np.pi / 2 * np.arange(4), atol=1e-10)
 
 
 def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
     """On which side of it is no matter; it was taken for a section that is touched."""
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, -0.3), (0.3, 1.9), anchor=APEX)
     placed = hj.place_sections(hopper_cycle, family)
-    np.testing.assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
+    assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
     assert abs(placed.lanes.q[1, 0]) < 1e-12
 
 
 def test_equal_steps_of_time_on_an_autonomous_cycle(vanderpol_cycle):
     """Time has no origin there: a multiplier of 1 beside the true one."""
-    ldtp = hj.linearize(
-        vanderpol_cycle, hj.ClockPhase(8, anchor=Crossing("v", "falling"))
-    )
+    sections = hj.ClockPhase(8, anchor=Crossing("v", "falling"))
+    ldtp = hj.linearize(vanderpol_cycle, sections)
     assert ldtp.outputs == ("x", "v")
     assert ldtp.coordinates[0] == ("x", "v")
-    np.testing.assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
+    assert_allclose(ldtp.multipliers, [1.0, VDP], rtol=1e-9)
     family = hj.KinematicPhase(
         8, position="x", velocity="v", anchor=Crossing("v", "falling")
     )
     ldtp = hj.linearize(vanderpol_cycle, family, "x")
-    np.testing.assert_array_equal(ldtp.dims, np.ones(8))
-    np.testing.assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
+    assert_array_equal(ldtp.dims, np.ones(8))
+    assert_allclose(ldtp.multipliers, [VDP], rtol=1e-9)
 
 
 TOP = Crossing("v", "falling")
@@ -183,13 +183,13 @@ def test_outputs_of_any_kind_and_feedthrough(
         hopper_cycle, placed_isochrons, ["vM", hj.Output("aM", acceleration)]
     )
     expected = np.tile([0.0, 0.5], (32, 1))
-    np.testing.assert_allclose(ldtp.D[:, :, 0], expected, atol=1e-15)
-    np.testing.assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
+    assert_allclose(ldtp.D[:, :, 0], expected, atol=1e-15)
+    assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
     flight = np.asarray(ldtp.dims) == 4
     expected = [[-5.0, 0.0, 5.0, 0.0]] * flight.sum()
-    np.testing.assert_allclose(ldtp.C[flight, 1], expected)
+    assert_allclose(ldtp.C[flight, 1], expected)
     expected = [[-5.0, 0.0, 0.0, 0.0]] * (~flight).sum()
-    np.testing.assert_allclose(ldtp.C[~flight, 1], expected)
+    assert_allclose(ldtp.C[~flight, 1], expected)
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
@@ -227,7 +227,8 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         families += [crossings, hj.ClockPhase(5, crossings[1])]
         families.append(hj.ArcLength(5, names[:1], crossings[0]))
     if len(names) == 2:
-        families.append(hj.KinematicPhase(9, *names, center=q[:, :2].mean(axis=0)))
+        sections = hj.KinematicPhase(9, *names, center=q[:, :2].mean(axis=0))
+        families.append(sections)
 
     def spy(*arguments, plain=place.flow_along):
         kept.append((flow := plain(*arguments)) is not None)
@@ -254,13 +255,13 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         )
         scale = np.asarray(cycle.settings.scale)[their.chart].T
         assert np.abs((own.q - their.q) / scale).max() < 1e-12
-        np.testing.assert_allclose(own.t, their.t, rtol=1e-12)
+        assert_allclose(own.t, their.t, rtol=1e-12)
         for field in ("chart", "events", "armed"):
-            np.testing.assert_array_equal(getattr(own, field), getattr(their, field))
+            assert_array_equal(getattr(own, field), getattr(their, field))
         before = (x.before.transpose(2, 0, 1)[x.code.T >= 0] for x in (*tapes, tape))
         for x, y in zip([*A, next(before)], [*B, next(before)], strict=True):
-            np.testing.assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
-        np.testing.assert_array_equal(placed.drop, other.drop)
+            assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
+        assert_array_equal(placed.drop, other.drop)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     assert implicit or (all(kept) if name == "VerticalHopper" else sum(kept) > 1)
 
@@ -268,9 +269,9 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     impact = float(wheel.trajectory().events[0].time / wheel.period)
-    apex = hj.ClockPhase(
-        4, anchor=hj.Crossing("v", "falling")
-    )  # (half a flight before the impact)
+    # (half a flight before the impact)
+    section = hj.Crossing("v", "falling")
+    apex = hj.ClockPhase(4, anchor=section)
     juggling = [
         hj.find_limit_cycle(hj.models.PaddleJuggler(A=A)) for A in (0.16, 0.160001)
     ]

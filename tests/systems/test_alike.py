@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.executor import to_host
@@ -94,9 +95,7 @@ def test_events_are_those_of_transitions_of_their_own(other):
     two = run(other)
     assert len(one.events) == 8
     assert [e.name for e in one.events] == [e.name for e in two.events]
-    np.testing.assert_allclose(
-        [e.time for e in one.events], [e.time for e in two.events]
-    )
+    assert_allclose([e.time for e in one.events], [e.time for e in two.events])
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
 
 
@@ -116,4 +115,4 @@ def test_jacobians_are_those_of_each():
         )
         jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
     assert end[3] == 6.0  # three different factors
-    np.testing.assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)
+    assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -40,5 +41,5 @@ def test_a_network_and_a_scan():
     there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[
         :, -1
     ]
-    np.testing.assert_allclose(there[0], start[0], rtol=1e-10)
-    np.testing.assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)
+    assert_allclose(there[0], start[0], rtol=1e-10)
+    assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)

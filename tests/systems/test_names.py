@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -66,14 +67,14 @@ def test_the_default_input_yields_to_a_state_of_its_name():
     assert list(responses) == ["x", "u", "input"]
     # At the angle a of the unit circle, the angle changes by -sin(a) dx + cos(a) du.
     angle = 2 * np.pi * phase - np.pi / 2
-    np.testing.assert_allclose(responses["u"], np.cos(angle) / ANGULAR, atol=1e-9)
-    np.testing.assert_allclose(responses["input"], -np.sin(angle) / ANGULAR, atol=1e-9)
-    np.testing.assert_allclose(responses["u"], expected["u"], rtol=1e-12)
+    assert_allclose(responses["u"], np.cos(angle) / ANGULAR, atol=1e-9)
+    assert_allclose(responses["input"], -np.sin(angle) / ANGULAR, atol=1e-9)
+    assert_allclose(responses["u"], expected["u"], rtol=1e-12)
     # White noise of the state and of the input are two things, with equal effects here.
     diffusion = PUSH**2 / 2 / ANGULAR**2
     for name in ("u", "input"):
         noisy = cycle.fluctuations(white={name: PUSH})
-        np.testing.assert_allclose(noisy.diffusion, diffusion, rtol=1e-9)
+        assert_allclose(noisy.diffusion, diffusion, rtol=1e-9)
     model = hj.linearize(cycle, hj.KinematicPhase(4, "x", "u"), outputs=("u",))
     assert model.inputs == ("input",)
     assert model.outputs == ("u",)
@@ -81,7 +82,7 @@ def test_the_default_input_yields_to_a_state_of_its_name():
         hj.simulate(system, "plane", (1.0, 0.0), 1.0, input=jnp.cos)
         for system in (Oscillator(), Named())
     )
-    np.testing.assert_array_equal(pushed.after, expected.after)
+    assert_array_equal(pushed.after, expected.after)
 
 
 def test_the_default_input_yields_to_an_output_of_its_name():

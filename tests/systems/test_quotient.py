@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.models.walkers import _heelstrike
@@ -89,9 +90,9 @@ STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.s
 def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section):
     walker = hj.Quotient(Full(), **symmetry, translation=("x",))
     cycle = hj.find_limit_cycle(walker, section=section)
-    np.testing.assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
+    assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
     expected = np.sort_complex(np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** steps)
-    np.testing.assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
+    assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -127,8 +128,8 @@ def test_an_odd_oscillator_closes_after_half_a_period():
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
     folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
-    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
-    np.testing.assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
+    assert_allclose(2 * half.period, whole.period, rtol=1e-11)
+    assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
     with pytest.raises(
         hj.DefinitionError, match="must be True if a clock drives the system"
     ):
@@ -195,11 +196,9 @@ def test_scheduled_switches_close_after_half_a_period():
     half = hj.Quotient(Inverter(), **symmetry)
     half = hj.find_limit_cycle(half, section=hj.AtEvent("half period (minus)"))
     whole = hj.find_limit_cycle(Inverter())
-    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-12)
-    np.testing.assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
-    np.testing.assert_allclose(
-        half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10
-    )
+    assert_allclose(2 * half.period, whole.period, rtol=1e-12)
+    assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
+    assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
     assert [half.structure.transitions[g].name for g in half.event_sequence][
         0
     ] == "down"

@@ -1,7 +1,7 @@
 """Motion along a surface at which the field jumps."""
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -33,8 +33,8 @@ def test_a_block_on_a_belt_sticks_and_slips():
 
     section = hj.AtEvent("behind to sticks")
     cycle = hj.find_limit_cycle(hj.models.BeltOscillator(), section=section)
-    np.testing.assert_allclose(cycle.period, period, rtol=1e-9)
-    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
+    assert_allclose(cycle.period, period, rtol=1e-9)
+    assert_allclose(cycle.state["x"], x, rtol=1e-9)
     assert len(cycle.multipliers) == 0
     assert cycle.stable
     names = [x.name for x in hj.models.BeltOscillator().transitions()]
@@ -66,7 +66,7 @@ def field(drift, push):
 def test_it_slides_or_crosses(push, end, chart):
     parts = hj.sliding({"up": field(0.5, -1.0), "down": field(2.0, push)}, height)
     way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
-    np.testing.assert_allclose(way.after[-1], end, atol=1e-9)
+    assert_allclose(way.after[-1], end, atol=1e-9)
     assert way.chart[-1] == chart
 
 
