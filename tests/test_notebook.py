@@ -70,10 +70,8 @@ def own_system(found):
 def fit(found):
     assert found.fit.identifiability.rank == 5
     assert found.fit.contains(found.truth, 0.999)
-    error, before = (
-        np.abs(c.multipliers - found.real.multipliers).max()
-        for c in (found.found, found.guess)
-    )
+    error = np.abs(found.found.multipliers - found.real.multipliers).max()
+    before = np.abs(found.guess.multipliers - found.real.multipliers).max()
     assert error < 2e-3 < before
 
 

@@ -76,9 +76,15 @@ class Switched(hj.HybridSystem):
     duty: Float[Array, ""] = hj.parameter(0.3)
 
     def charts(self):
+        def rates(t, q, u):
+            return (1.0 + u[0] - q[0],)
+
+        def off_rates(t, q, u):
+            return (-q[0],)
+
         return {
-            "on": Field(("x",), lambda t, q, u: (1.0 + u[0] - q[0],)),
-            "off": Field(("x",), lambda t, q, u: (-q[0],)),
+            "on": Field(("x",), rates),
+            "off": Field(("x",), off_rates),
         }
 
     def transitions(self):

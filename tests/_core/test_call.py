@@ -40,7 +40,10 @@ class Slowed(hj.HybridSystem):
         def force(t, u):
             return jnp.cos(2 * jnp.pi * t) + self.wind + u[0]
 
-        return {"air": Field(("x",), lambda t, q, u: (force(t, u) - k * q[0],))}
+        def air_rates(t, q, u):
+            return (force(t, u) - k * q[0],)
+
+        return {"air": Field(("x",), air_rates)}
 
     def guess(self):
         return hj.Guess("air", (0.1,))

@@ -39,9 +39,10 @@ def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
 def test_programs_factorize_one_matrix_at_a_time():
     """Two stacks in one program wait for each other's threads for ever on two cores (JAX 0.10)."""
     rng = np.random.default_rng(0)
-    A, B, C, u = (
-        rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2))
-    )
+    A = rng.normal(size=(8, 3, 3))
+    B = rng.normal(size=(8, 3, 2))
+    C = rng.normal(size=(8, 1, 3))
+    u = rng.normal(size=(1, 5, 8, 2))
     matrices = rng.normal(size=(3, 2, 4, 4))
     right = rng.normal(size=(4, 1))
     exact = np.linalg.solve(matrices, right)

@@ -165,7 +165,8 @@ WAYS = {
 def test_a_change_is_noticed(way, named, monkeypatch):
     monkeypatch.setenv("K", "1")
     before, change = WAYS[way]
-    other, inner = (types.ModuleType(x) for x in ("users_other", "users_inner"))
+    other = types.ModuleType("users_other")
+    inner = types.ModuleType("users_inner")
     other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
     space = {**named, "other": other}
     exec(before, space)

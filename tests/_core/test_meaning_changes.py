@@ -532,7 +532,8 @@ SAME = "True for 1", "a function by types"
 def test_a_change_of_what_code_reads_is_seen_by_systems(way, monkeypatch):
     monkeypatch.setenv("K", "1")
     before, change = WAYS[way]
-    other, inner = (types.ModuleType(x) for x in ("users_other", "users_inner"))
+    other = types.ModuleType("users_other")
+    inner = types.ModuleType("users_inner")
     other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
     space = made("")
     space["other"] = other
@@ -681,7 +682,11 @@ def test_parts_of_one_name_are_all_compared():
             )
             for k in (first, second)
         ]
-        charts = {"line": Field(("x",), lambda t, q, u: (1.0,))}
+
+        def line_rates(t, q, u):
+            return (1.0,)
+
+        charts = {"line": Field(("x",), line_rates)}
         names = {"charts": lambda self: charts, "transitions": lambda self: levels}
         return type("Made", (hj.HybridSystem,), names)()
 

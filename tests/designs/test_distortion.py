@@ -31,7 +31,10 @@ class Quadratic(hj.HybridSystem):
     b: hj.Parameter = hj.parameter(0.7)
 
     def charts(self):
-        return {"rest": Field(("x",), lambda t, q, u: (0.0 * q[0],))}
+        def rest_rates(t, q, u):
+            return (0.0 * q[0],)
+
+        return {"rest": Field(("x",), rest_rates)}
 
     def transitions(self):
         def reset(t, q, u):
@@ -58,9 +61,15 @@ def two_charts():
     def shown(t, q, u):
         return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
 
+    def one_rates(t, q, u):
+        return (0.0 * q[0],)
+
+    def two_rates(t, q, u):
+        return (0.0 * q[0], 0.0 * q[1])
+
     charts = {
-        "one": Field(("x",), lambda t, q, u: (0.0 * q[0],)),
-        "two": Field(("x", "v"), lambda t, q, u: (0.0 * q[0], 0.0 * q[1])),
+        "one": Field(("x",), one_rates),
+        "two": Field(("x", "v"), two_rates),
     }
     transitions = (
         hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),

@@ -174,7 +174,8 @@ def test_draws_have_the_covariance_of_the_fit():
     c = np.array(
         [np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)]
     )
-    assert_allclose(np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max())
+    tolerance = 0.3 * fit.covariance.max()
+    assert_allclose(np.cov(c.T), fit.covariance, atol=tolerance)
 
 
 @pytest.mark.slow

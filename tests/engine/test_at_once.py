@@ -115,8 +115,12 @@ class PeakCurrent(hj.HybridSystem):
     def transitions(self):
         below = (lambda t, q, u: q[0] < self.limit) if self.allows else None
         tick = hj.Scheduled(1.0)
+
+        def trip_guard(t, q, u):
+            return self.limit - q[0]
+
         return (
-            hj.Transition("trip", "on", "off", lambda t, q, u: self.limit - q[0]),
+            hj.Transition("trip", "on", "off", trip_guard),
             hj.Transition("tick", "off", "on", tick, enabled=below),
             hj.Transition("tick on", "on", "on", tick),
         )
@@ -142,12 +146,22 @@ def neurons(push):
     def other(t, q, u):
         return (q[0] + push, 0.0)
 
-    charts = {"rest": Field(("x", "y"), lambda t, q, u: (1.5 - q[0], 1.4 - q[1]))}
+    def rest_rates(t, q, u):
+        return (1.5 - q[0], 1.4 - q[1])
+
+    charts = {"rest": Field(("x", "y"), rest_rates)}
+
+    def x_guard(t, q, u):
+        return 1 - q[0]
+
+    def y_guard(t, q, u):
+        return 1 - q[1]
+
     return toy(
         charts,
         [
-            hj.Transition("X", "rest", "rest", lambda t, q, u: 1 - q[0], reset=pulse),
-            hj.Transition("Y", "rest", "rest", lambda t, q, u: 1 - q[1], reset=other),
+            hj.Transition("X", "rest", "rest", x_guard, reset=pulse),
+            hj.Transition("Y", "rest", "rest", y_guard, reset=other),
         ],
     )
 
@@ -174,8 +188,15 @@ class Kicked(hj.HybridSystem):
     rate: float = hj.parameter(0.7)
 
     def charts(self):
-        decay = Field(("x",), lambda t, q, u: (u[0] - self.rate * q[0],))
-        ready = Field(("x",), lambda t, q, u: (u[0] + 1.0 - self.rate * q[0],))
+        def decay_rates(t, q, u):
+            return (u[0] - self.rate * q[0],)
+
+        decay = Field(("x",), decay_rates)
+
+        def ready_rates(t, q, u):
+            return (u[0] + 1.0 - self.rate * q[0],)
+
+        ready = Field(("x",), ready_rates)
         return {"calm": decay, "kicked": ready}
 
     def transitions(self):
@@ -185,11 +206,12 @@ class Kicked(hj.HybridSystem):
         def halve(t, q, u):
             return (0.4 * q[0] ** 2,)
 
+        def halve_guard(t, q, u):
+            return 1.2 - q[0]
+
         return (
             hj.Transition("kick", "calm", "kicked", hj.Scheduled(1.0), reset=kick),
-            hj.Transition(
-                "halve", "kicked", "calm", lambda t, q, u: 1.2 - q[0], reset=halve
-            ),
+            hj.Transition("halve", "kicked", "calm", halve_guard, reset=halve),
         )
 
     def period(self):
@@ -219,15 +241,29 @@ def test_derivatives_across_an_event_at_once():
 
 def test_events_that_take_each_others_place_at_once():
     """A relay whose thresholds are in the wrong order."""
+
+    def rates(t, q, u):
+        return (1.0,)
+
+    def off_rates(t, q, u):
+        return (-1.0,)
+
     fields = {
-        "on": Field(("x",), lambda t, q, u: (1.0,)),
-        "off": Field(("x",), lambda t, q, u: (-1.0,)),
+        "on": Field(("x",), rates),
+        "off": Field(("x",), off_rates),
     }
+
+    def up_guard(t, q, u):
+        return 0.5 - q[0]
+
+    def down_guard(t, q, u):
+        return q[0] - 0.9
+
     relay = toy(
         fields,
         [
-            hj.Transition("up", "on", "off", lambda t, q, u: 0.5 - q[0]),
-            hj.Transition("down", "off", "on", lambda t, q, u: q[0] - 0.9),
+            hj.Transition("up", "on", "off", up_guard),
+            hj.Transition("down", "off", "on", down_guard),
         ],
     )
     with pytest.raises(hj.ComputationError, match="events accumulate"):

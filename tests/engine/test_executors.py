@@ -218,8 +218,12 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
 def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
     """Its multiplier of 2.9e5 makes Newton steps small where gaps are not."""
     with unchecked_host():
+
+        def rates(t, q, u):
+            return (2 * q[0] - jnp.cos(t),)
+
         grow = toy(
-            {"x": Field(("x",), lambda t, q, u: (2 * q[0] - jnp.cos(t),))},
+            {"x": Field(("x",), rates)},
             period=2 * np.pi,
         )
         map = to_host(hj.find_limit_cycle(grow, hj.Guess("x", (0.4,))).return_map)

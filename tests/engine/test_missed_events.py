@@ -126,7 +126,11 @@ def test_a_guard_that_is_faster_than_the_state():
         return jnp.sin(500 * t) + 0.3 + 0 * q[0]
 
     fall = hj.Transition("fall", "a", "a", guard)
-    system = toy({"a": Field(("x",), lambda t, q, u: (1.0,))}, (fall,))
+
+    def rates(t, q, u):
+        return (1.0,)
+
+    system = toy({"a": Field(("x",), rates)}, (fall,))
     found = hj.simulate(system, "a", (0.0,), 1.0, settings=hj.Settings(1e-6, 1e-6))
     truth = (np.pi + np.arcsin(0.3) + 2 * np.pi * np.arange(80)) / 500
     truth = truth[truth < 1]
@@ -189,7 +193,11 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
 @pytest.mark.parametrize("begin", [0.0, 10.0])
 def test_an_event_just_before_a_blow_up_is_found(begin):
     """x' = x^2 from 1 is 1 / (1 - t): it reaches 1e11 in 1 - 1e-11, and infinity in 1."""
-    square = Field(("x",), lambda t, q, u: (q[0] ** 2,))
+
+    def square_rates(t, q, u):
+        return (q[0] ** 2,)
+
+    square = Field(("x",), square_rates)
 
     def spike(t, q, u):
         return q[0] - 1e11

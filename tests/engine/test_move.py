@@ -57,7 +57,8 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
         lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x))
     )(X)
     assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
-    assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
+    tolerance = 1e-9 * np.max(np.abs(exact))
+    assert_allclose(found, exact, atol=tolerance)
 
 
 def test_lanes_fail_one_by_one():
@@ -89,15 +90,24 @@ def test_new_numbers_compile_nothing():
 
 def roots(a):
     """Chart "rise" is not defined for negative states, which chart "fall" has."""
-    rise = Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))
-    charts = {"fall": Field(("x",), lambda t, q, u: (-a,)), "rise": rise}
+
+    def rise_rates(t, q, u):
+        return (jnp.sqrt(q[0]),)
+
+    rise = Field(("z",), rise_rates)
+
+    def fall_rates(t, q, u):
+        return (-a,)
+
+    charts = {"fall": Field(("x",), fall_rates), "rise": rise}
 
     def turn(t, q, u):
         return q[0] + 1.0
 
-    return charts, (
-        hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),
-    )
+    def turn_reset(t, q, u):
+        return -q
+
+    return charts, (hj.Transition("turn", "fall", "rise", turn, reset=turn_reset),)
 
 
 def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywhere():

@@ -34,7 +34,10 @@ def ceiling(height):
     def back(t, q, u):
         return (q[0], -q[1])
 
-    charts = {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))}
+    def air_rates(t, q, u):
+        return (q[1], -1.0)
+
+    charts = {"air": Field(("y", "v"), air_rates)}
     return charts, (hj.Transition("hit", "air", "air", hit, "rising", back),)
 
 
@@ -50,7 +53,11 @@ def turning(low, high):
         "high": (lambda t, q, u: q[0] - high, None),
         "gated": (lambda t, q, u: q[1], lambda t, q, u: q[2] < 1.0),
     }
-    return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}, [
+
+    def turn_rates(t, q, u):
+        return (-q[1], q[0], 0.0)
+
+    return {"turn": Field(("x", "y", "n"), turn_rates)}, [
         hj.Transition(name, "turn", "turn", guard, reset=count, enabled=enabled)
         for name, (guard, enabled) in guards.items()
     ]
@@ -70,7 +77,11 @@ def close(gap, k):
         hj.Transition("plain", "turn", "turn", plain),
         hj.Transition("curved", "turn", "turn", curved),
     )
-    return {"turn": Field(("x", "y"), lambda t, q, u: (-q[1], q[0]))}, transitions
+
+    def turn_rates(t, q, u):
+        return (-q[1], q[0])
+
+    return {"turn": Field(("x", "y"), turn_rates)}, transitions
 
 
 def dip(depth):
@@ -79,13 +90,23 @@ def dip(depth):
     def mark(t, q, u):
         return (q[0], q[1] + 1.0)
 
-    charts = {"dip": Field(("y", "n"), lambda t, q, u: (2 * (t - 1.0), 0.0))}
-    return charts, [
-        hj.Transition("dip", "dip", "dip", lambda t, q, u: q[0] - 0.0, reset=mark)
-    ]
+    def dip_rates(t, q, u):
+        return (2 * (t - 1.0), 0.0)
+
+    charts = {"dip": Field(("y", "n"), dip_rates)}
+
+    def dip_guard(t, q, u):
+        return q[0] - 0.0
+
+    return charts, [hj.Transition("dip", "dip", "dip", dip_guard, reset=mark)]
 
 
-BLOWUP = toy({"x": Field(("x",), lambda t, q, u: q**2)})  # infinite at t = 1 / x(0)
+# infinite at t = 1 / x(0)
+def x_rates(t, q, u):
+    return q**2
+
+
+BLOWUP = toy({"x": Field(("x",), x_rates)})
 
 
 def test_a_hundred_bounces():
@@ -185,8 +206,18 @@ def test_close_crossings_of_different_shape(gap, sign, k):
         assert_allclose(times(found, name), [np.pi / 2 + angle], atol=1e-11)
 
 
-COUNT = hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=lambda t, q, u: q + 1)
-TICK = toy({"a": Field(("n",), lambda t, q, u: (0.0,))}, [COUNT])
+def tick_reset(t, q, u):
+    return q + 1
+
+
+COUNT = hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=tick_reset)
+
+
+def a_rates(t, q, u):
+    return (0.0,)
+
+
+TICK = toy({"a": Field(("n",), a_rates)}, [COUNT])
 
 
 @settings(max_examples=5)
@@ -252,7 +283,11 @@ def test_samples_between_steps(reference, hopper_cycle):
     assert_array_equal(ym[chart == 1], 0.0)
 
 
-LINE = {"line": Field(("x",), lambda t, q, u: (1.0,))}
+def line_rates(t, q, u):
+    return (1.0,)
+
+
+LINE = {"line": Field(("x",), line_rates)}
 
 
 def test_every_turn_of_a_fast_guard_is_seen():
@@ -272,13 +307,24 @@ def test_an_event_at_a_tick():
     """Where x falls to zero, and starts again from 1: both happen once; n and m count them."""
     again = jnp.array([1.0, 0.0, 1.0])
     count = jnp.array([0.0, 1.0, 0.0])
-    fall = hj.Transition(
-        "fall", "a", "a", lambda t, q, u: q[0], reset=lambda t, q, u: q + again
-    )
-    tick = hj.Transition(
-        "tick", "a", "a", hj.Scheduled(1.0), reset=lambda t, q, u: q + count
-    )
-    charts = {"a": Field(("x", "n", "m"), lambda t, q, u: (-1.0, 0.0, 0.0))}
+
+    def fall_guard(t, q, u):
+        return q[0]
+
+    def fall_reset(t, q, u):
+        return q + again
+
+    fall = hj.Transition("fall", "a", "a", fall_guard, reset=fall_reset)
+
+    def tick_reset(t, q, u):
+        return q + count
+
+    tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=tick_reset)
+
+    def rates(t, q, u):
+        return (-1.0, 0.0, 0.0)
+
+    charts = {"a": Field(("x", "n", "m"), rates)}
     system = toy(charts, (fall, tick))
     run = hj.simulate(system, "a", (1.0, 0.0, 0.0), 3.5)
     assert_allclose(run.after[-1], [0.5, 3.0, 3.0], atol=1e-12)

@@ -27,9 +27,15 @@ class Thermostat(hj.HybridSystem):
         return {"on": heated, "off": FieldChart(sensed(0.0, self.slow), ("x", "z"))}
 
     def transitions(self):
+        def off_guard(t, q, u):
+            return q[1] - 0.7
+
+        def on_guard(t, q, u):
+            return q[1] - 0.3
+
         return [
-            hj.Transition("off", "on", "off", lambda t, q, u: q[1] - 0.7, "rising"),
-            hj.Transition("on", "off", "on", lambda t, q, u: q[1] - 0.3, "falling"),
+            hj.Transition("off", "on", "off", off_guard, "rising"),
+            hj.Transition("on", "off", "on", on_guard, "falling"),
         ]
 
 

@@ -60,9 +60,11 @@ def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
     for system, controller in ((model, None), (model.feedback(F), F)):
         data = run(r, discard=0, feedback=controller)
         exact = np.stack([system.simulate(x) for x in r])
-        assert_allclose(data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max())
+        tolerance = 1e-3 * np.abs(exact).max()
+        assert_allclose(data.y, exact, rtol=0, atol=tolerance)
     u = r - np.stack([F.simulate(x) for x in exact])
-    assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max())
+    tolerance = 1e-3 * np.abs(u).max()
+    assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=tolerance)
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):

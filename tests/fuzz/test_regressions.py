@@ -21,9 +21,17 @@ SETTINGS = Settings(1e-10, 1e-10)
 
 
 # x' = -1, with an event where x + u falls through zero: the input moves the guard.
+def line_rates(t, q, u):
+    return (-1.0,)
+
+
+def fall_guard(t, q, u):
+    return q[0] + u[0]
+
+
 THRESHOLD = toy(
-    {"line": Field(("x",), lambda t, q, u: (-1.0,))},
-    [hj.Transition("fall", "line", "line", lambda t, q, u: q[0] + u[0])],
+    {"line": Field(("x",), line_rates)},
+    [hj.Transition("fall", "line", "line", fall_guard)],
 )
 
 
@@ -34,7 +42,10 @@ def rounded(level):
     def guard(t, q, u):
         return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level
 
-    charts = {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
+    def line_rates(t, q, u):
+        return (-1.0, -1.0)
+
+    charts = {"line": Field(("x", "y"), line_rates)}
     return charts, (hj.Transition("fall", "line", "line", guard),)
 
 

@@ -89,7 +89,10 @@ def cycles(t):
 
 
 def linear(t):
-    A, B, C, D = (np.asarray(x) for x in (t.model.A, t.model.B, t.model.C, t.model.D))
+    A = np.asarray(t.model.A)
+    B = np.asarray(t.model.B)
+    C = np.asarray(t.model.C)
+    D = np.asarray(t.model.D)
     yield hj.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
     square = [np.eye(2)] * 3
     yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)

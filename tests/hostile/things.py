@@ -21,7 +21,8 @@ GOAL = hj.designs.Multipliers(harmonics=0)
 
 
 def repeated(t):
-    u, y = (np.concatenate([x, x], axis=1) for x in (t.data.u, t.data.y))
+    u = np.concatenate([t.data.u, t.data.u], axis=1)
+    y = np.concatenate([t.data.y, t.data.y], axis=1)
     return hj.ExperimentData(u, y, n_sections=6, periods=16, result=t.data.result)
 
 

@@ -53,9 +53,12 @@ def test_A_and_B(name):
             if out < 0
             else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
         )
-        rows, columns = (np.flatnonzero(np.arange(d) != k) for k in (dropped, out))
+        rows = np.flatnonzero(np.arange(d) != dropped)
+        columns = np.flatnonzero(np.arange(d) != out)
         A = (by_state[n] @ moves)[np.ix_(rows, columns)]
         B = by_input[n][rows]
         ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
-        assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
-        assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))
+        tolerance = 1e-8 * np.max(np.abs(A))
+        assert_allclose(ours[0], A, rtol=0, atol=tolerance)
+        tolerance = 1e-8 * np.max(np.abs(B))
+        assert_allclose(ours[1], B, rtol=0, atol=tolerance)

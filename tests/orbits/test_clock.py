@@ -24,7 +24,11 @@ def PULSE(t):
     return jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))
 
 
-KICKED = toy({"fall": Field(("x",), lambda t, q, u: (PULSE(t) - q[0],))}, period=1.0)
+def fall_rates(t, q, u):
+    return (PULSE(t) - q[0],)
+
+
+KICKED = toy({"fall": Field(("x",), fall_rates)}, period=1.0)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +76,10 @@ def test_a_force_that_jumps_with_the_clock():
     def force(t):
         return jnp.where(t % 1.0 < 0.5, 1.0, 0.0)
 
-    charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
+    def rates(t, q, u):
+        return (-q[0] + force(t),)
+
+    charts = {"a": Field(("x",), rates)}
     square = toy(
         charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0
     )

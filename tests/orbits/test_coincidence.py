@@ -13,14 +13,26 @@ from .test_explain import BALLS, Balls
 
 
 # x and y relax to 1, and are set back to 0 together at the level 1/2.
+def rates(t, q, u):
+    return (1.0 - q[0], 1.0 - q[1])
+
+
+def x_guard(t, q, u):
+    return q[0] - 0.5
+
+
+def y_guard(t, q, u):
+    return q[1] - 0.5
+
+
 PAIR = toy(
-    {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))},
+    {"a": Field(("x", "y"), rates)},
     [
         hj.Transition(
             "x",
             "a",
             "a",
-            lambda t, q, u: q[0] - 0.5,
+            x_guard,
             "rising",
             lambda t, q, u: (0.5 * (q[1] - 0.5), q[1]),
         ),
@@ -28,7 +40,7 @@ PAIR = toy(
             "y",
             "a",
             "a",
-            lambda t, q, u: q[1] - 0.5,
+            y_guard,
             "rising",
             lambda t, q, u: (q[0], 0.0),
         ),
@@ -42,17 +54,22 @@ def ticked(height=1.0, other=0.0):
     def back(t, q, u):
         return (0.2,)
 
+    def full_guard(t, q, u):
+        return q[0] - height
+
     transitions = [
-        hj.Transition("full", "a", "a", lambda t, q, u: q[0] - height, "rising", back),
+        hj.Transition("full", "a", "a", full_guard, "rising", back),
         hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
     ]
     if other:
         transitions.append(
             hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back)
         )
-    charts = {
-        "a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))
-    }
+
+    def rates(t, q, u):
+        return (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),)
+
+    charts = {"a": Field(("x",), rates)}
     return toy(charts, transitions, period=1.0)
 
 

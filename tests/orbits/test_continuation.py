@@ -191,11 +191,10 @@ class Maps(hj.HybridSystem):
     growth: Growth = eqx.field(default_factory=Growth)
 
     def charts(self):
-        return {
-            "a": Field(
-                tuple("abcdef"), lambda t, q, u: 0.0 * jnp.sin(2 * jnp.pi * t) * q
-            )
-        }
+        def rates(t, q, u):
+            return 0.0 * jnp.sin(2 * jnp.pi * t) * q
+
+        return {"a": Field(tuple("abcdef"), rates)}
 
     def transitions(self):
         def step(t, q, u):

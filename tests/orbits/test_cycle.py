@@ -114,7 +114,11 @@ def test_van_der_pol(mu):
 
 def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
     """v' = 1 + v^2 from -1 to 1e5, in the time atan(1e5) + pi/4; at the guess a millionth of it."""
-    square = Field(("v",), lambda t, q, u: (1 + q[0] ** 2,))
+
+    def square_rates(t, q, u):
+        return (1 + q[0] ** 2,)
+
+    square = Field(("v",), square_rates)
 
     def spike(t, q, u):
         return q[0] - 1e5
@@ -142,8 +146,16 @@ def test_a_default_section_is_not_replaced_by_one_at_an_event():
         name: Field(("v",), lambda t, q, u, supply=supply: (supply - q[0],))
         for name, supply in (("up", 2.0), ("down", -2.0))
     }
-    top = hj.Transition("top", "up", "down", lambda t, q, u: q[0] - 1, "rising")
-    bottom = hj.Transition("bottom", "down", "up", lambda t, q, u: q[0] + 1)
+
+    def top_guard(t, q, u):
+        return q[0] - 1
+
+    top = hj.Transition("top", "up", "down", top_guard, "rising")
+
+    def bottom_guard(t, q, u):
+        return q[0] + 1
+
+    bottom = hj.Transition("bottom", "down", "up", bottom_guard)
     system = toy(charts, [top, bottom])
     guess = hj.Guess("down", (40.0,))
     cycle = hj.find_limit_cycle(system, guess)
@@ -154,13 +166,24 @@ def test_a_default_section_is_not_replaced_by_one_at_an_event():
 def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
     """Two cells with the drive 1.3 that spike at 1 and then push the other one back by 0.1: in half
     a period e = exp(-T/2) solves 1.3 e^2 + 0.1 e = 0.3."""
-    cells = Field(("x", "y"), lambda t, q, u: (1.3 - q[0], 1.3 - q[1]))
+
+    def cells_rates(t, q, u):
+        return (1.3 - q[0], 1.3 - q[1])
+
+    cells = Field(("x", "y"), cells_rates)
+
+    def spike_x_guard(t, q, u):
+        return q[0] - 1
+
+    def spike_y_guard(t, q, u):
+        return q[1] - 1
+
     spikes = [
         hj.Transition(
             "spike x",
             "cells",
             "cells",
-            lambda t, q, u: q[0] - 1,
+            spike_x_guard,
             "rising",
             lambda t, q, u: (0.0, q[1] - 0.1),
         ),
@@ -168,7 +191,7 @@ def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
             "spike y",
             "cells",
             "cells",
-            lambda t, q, u: q[1] - 1,
+            spike_y_guard,
             "rising",
             lambda t, q, u: (q[0] - 0.1, 0.0),
         ),
@@ -181,14 +204,25 @@ def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
 
 
 def test_a_flow_that_comes_to_rest_is_no_cycle():
-    charging = Field(("v",), lambda t, q, u: (2.0 - q[0],))
-    top = hj.Transition("top", "a", "a", lambda t, q, u: q[0] - 1, "rising")
+    def charging_rates(t, q, u):
+        return (2.0 - q[0],)
+
+    charging = Field(("v",), charging_rates)
+
+    def top_guard(t, q, u):
+        return q[0] - 1
+
+    top = hj.Transition("top", "a", "a", top_guard, "rising")
     with pytest.raises(hj.ComputationError, match="beyond the guard of 'top'"):
         hj.find_limit_cycle(toy({"a": charging}, [top]), hj.Guess("a", (1.5,)))
     with pytest.raises(hj.ComputationError, match="leads to an equilibrium of chart"):
         vanderpol(-2.5, (0.1, 0.1))
+
     # (Neither is a state that drifts away, nor slow motion.)
-    drift = Field(("v",), lambda t, q, u: (1.0 + 0 * q[0],))
+    def drift_rates(t, q, u):
+        return (1.0 + 0 * q[0],)
+
+    drift = Field(("v",), drift_rates)
     with pytest.raises(hj.ComputationError, match="was not crossed within"):
         hj.find_limit_cycle(toy({"a": drift}, [top]), hj.Guess("a", (1.5,)))
     far = hj.Crossing("x", "falling", value=10.0)

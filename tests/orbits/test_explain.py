@@ -49,9 +49,17 @@ def FLOOR(t, q, u):
     return q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)
 
 
+def air_rates(t, q, u):
+    return (q[1], -1.0)
+
+
+def impact_guard(t, q, u):
+    return q
+
+
 WRONG_WAY = toy(
-    {"air": Field(("y", "v"), lambda t, q, u: (q[1], -1.0))},
-    [hj.Transition("impact", "air", "air", FLOOR, "rising", lambda t, q, u: q)],
+    {"air": Field(("y", "v"), air_rates)},
+    [hj.Transition("impact", "air", "air", FLOOR, "rising", impact_guard)],
     period=1.0,
 )
 
@@ -61,7 +69,11 @@ def FORCE(t, q):
     return -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)
 
 
-DAMPED = toy({"a": Field(("y", "v"), lambda t, q, u: (q[1], FORCE(t, q)))}, period=1.0)
+def rates(t, q, u):
+    return (q[1], FORCE(t, q))
+
+
+DAMPED = toy({"a": Field(("y", "v"), rates)}, period=1.0)
 BALLS = hj.Guess("air", (0.1, 4.7, 0.1, 4.7), 0.1)
 
 

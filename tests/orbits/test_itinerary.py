@@ -66,7 +66,8 @@ class Pulses(hj.HybridSystem):
         return {"off": Circuit(0.0), "on": Circuit(1.0)}
 
     def transitions(self):
-        up, down = (hj.Scheduled(1.0, x) for x in (self.rise, self.fall))
+        up = hj.Scheduled(1.0, self.rise)
+        down = hj.Scheduled(1.0, self.fall)
         return [
             hj.Transition("up", "off", "on", up),
             hj.Transition("down", "on", "off", down),

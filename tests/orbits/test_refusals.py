@@ -18,8 +18,16 @@ def kicked(beat=1.0, schedule=0.0):
         return jnp.cos(2 * jnp.pi * t)
 
     guard = hj.Scheduled(schedule, 0.1) if schedule else guard
-    kick = hj.Transition("kick", "a", "a", guard, reset=lambda t, q, u: (q[0] + 1.0,))
-    charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + 0.0 * jnp.sin(t) + u[0],))}
+
+    def kick_reset(t, q, u):
+        return (q[0] + 1.0,)
+
+    kick = hj.Transition("kick", "a", "a", guard, reset=kick_reset)
+
+    def rates(t, q, u):
+        return (-q[0] + 0.0 * jnp.sin(t) + u[0],)
+
+    charts = {"a": Field(("x",), rates)}
     return toy(charts, [kick], beat)
 
 
@@ -60,7 +68,10 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
         def grow(t, q, u):
             return (r * q[0] * (1 - q[0]),)
 
-        still = {"a": Field(("x",), lambda t, q, u: (0.0 * jnp.sin(2 * jnp.pi * t),))}
+        def rates(t, q, u):
+            return (0.0 * jnp.sin(2 * jnp.pi * t),)
+
+        still = {"a": Field(("x",), rates)}
         return (
             still,
             [hj.Transition("grow", "a", "a", hj.Scheduled(1, 0.5), reset=grow)],
@@ -192,9 +203,16 @@ def test_zeno_is_named_although_newton_went_elsewhere():
         name: Field(("x", "y"), lambda t, q, u, rates=rates: rates)
         for name, rates in fields.items()
     }
+
+    def y_low_guard(t, q, u):
+        return q[1] - 1
+
+    def x_low_guard(t, q, u):
+        return q[0] - 1
+
     events = [
-        hj.Transition("y low", "first", "second", lambda t, q, u: q[1] - 1),
-        hj.Transition("x low", "second", "first", lambda t, q, u: q[0] - 1),
+        hj.Transition("y low", "first", "second", y_low_guard),
+        hj.Transition("x low", "second", "first", x_low_guard),
     ]
     with pytest.raises(hj.ComputationError, match="accumulate in finite time"):
         hj.find_limit_cycle(toy(charts, events), hj.Guess("first", (1.5, 1.5)))

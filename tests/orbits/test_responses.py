@@ -90,7 +90,10 @@ class Square(hj.HybridSystem):
         return self.a * q[0] - self.omega * q[1], self.omega * q[0] + self.a * q[1]
 
     def charts(self):
-        charts = {"inside": FieldChart(lambda t, q, u: self.rates(q), ("x", "y"))}
+        def inside_rates(t, q, u):
+            return self.rates(q)
+
+        charts = {"inside": FieldChart(inside_rates, ("x", "y"))}
         for name, axis, _ in self.WALLS:
 
             def along(t, q, u, k=axis):
@@ -120,7 +123,10 @@ class Juggler(hj.models.PaddleJuggler):
     """A force acts on the ball."""
 
     def charts(self):
-        return {"fall": FieldChart(lambda t, q, u: (q[1], u[0] - self.g), ("y", "v"))}
+        def fall_rates(t, q, u):
+            return (q[1], u[0] - self.g)
+
+        return {"fall": FieldChart(fall_rates, ("y", "v"))}
 
 
 @pytest.mark.core
@@ -183,7 +189,11 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
         return (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
 
     tick = hj.Scheduled(1.0, 0.5)
-    turned = hj.Transition("tick", "line", "line", tick, reset=lambda t, q, u: (-q[0],))
+
+    def tick_reset(t, q, u):
+        return (-q[0],)
+
+    turned = hj.Transition("tick", "line", "line", tick, reset=tick_reset)
     system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
     responses = hj.find_limit_cycle(system, hj.Guess("line", (0.1,))).responses()
     assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
@@ -355,7 +365,8 @@ def test_htfs_at_many_frequencies_come_from_fewer():
     some = [0, 7, 311, 619]
     many = cycle.htf(f, (-1, 0, 1)).H
     few = cycle.htf(f[some], (-1, 0, 1)).H
-    assert_allclose(many[:, some], few, rtol=0, atol=1e-12 * np.abs(few).max())
+    tolerance = 1e-12 * np.abs(few).max()
+    assert_allclose(many[:, some], few, rtol=0, atol=tolerance)
 
 
 def test_harmonic_state_spaces_converge_to_the_exact_htf():
@@ -497,9 +508,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
 
 
 def test_bad_questions_are_refused_in_one_sentence():
-    hopper, wheel = (
-        hj.find_limit_cycle(x()) for x in (hj.models.VerticalHopper, Neuron)
-    )
+    hopper = hj.find_limit_cycle(hj.models.VerticalHopper())
+    wheel = hj.find_limit_cycle(Neuron())
     with pytest.raises(
         hj.DefinitionError, match="has no phase response: its phase is that"
     ):

@@ -235,7 +235,8 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     for mine, theirs in zip(alone, stored, strict=True):
         assert_array_equal(mine.y, theirs.y)
     data = list(stored)
-    parts, whole = (hj.fit_series(x, 2, check=False) for x in (stored, data))
+    parts = hj.fit_series(stored, 2, check=False)
+    whole = hj.fit_series(data, 2, check=False)
     assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
     assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
     assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))

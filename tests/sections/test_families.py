@@ -66,10 +66,12 @@ def test_a_family_of_clock_phases(hopper_cycle):
 def test_a_family_of_levels(vanderpol_cycle):
     family = FallingPast([1.0, 0.0, -1.0])
     one_by_one = [hj.Crossing("x", "falling", value=float(x)) for x in family.values]
-    own, listed = (hj.place_sections(vanderpol_cycle, x) for x in (family, one_by_one))
+    own = hj.place_sections(vanderpol_cycle, family)
+    listed = hj.place_sections(vanderpol_cycle, one_by_one)
     assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
     assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
-    a, b = (hj.linearize(vanderpol_cycle, x, "v") for x in (own, listed))
+    a = hj.linearize(vanderpol_cycle, own, "v")
+    b = hj.linearize(vanderpol_cycle, listed, "v")
     assert_allclose(a.A, b.A, atol=1e-12)
 
 

@@ -61,7 +61,8 @@ def agrees(system, measure, rtol):
     differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
     size = kept(by_host)
     assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
-    assert_allclose(size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size)))
+    tolerance = rtol * np.max(np.abs(size))
+    assert_allclose(size, differences, rtol=rtol, atol=tolerance)
     weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
     expected = sum(
         np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True)

@@ -260,7 +260,8 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
             assert_array_equal(getattr(own, field), getattr(their, field))
         before = (x.before.transpose(2, 0, 1)[x.code.T >= 0] for x in (*tapes, tape))
         for x, y in zip([*A, next(before)], [*B, next(before)], strict=True):
-            assert_allclose(x, y, atol=1e-10 * np.abs(y).max(initial=1e-300))
+            tolerance = 1e-10 * np.abs(y).max(initial=1e-300)
+            assert_allclose(x, y, atol=tolerance)
         assert_array_equal(placed.drop, other.drop)
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
     assert implicit or (all(kept) if name == "VerticalHopper" else sum(kept) > 1)

@@ -57,7 +57,10 @@ class Circle(hj.HybridSystem):
     levels: jax.Array = eqx.field(default_factory=lambda: jnp.array([0.6, -0.2, 0.1]))
 
     def charts(self):
-        return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}
+        def turn_rates(t, q, u):
+            return (-q[1], q[0], 0.0)
+
+        return {"turn": Field(("x", "y", "n"), turn_rates)}
 
     def transitions(self):
         found = []

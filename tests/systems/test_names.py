@@ -78,10 +78,8 @@ def test_the_default_input_yields_to_a_state_of_its_name():
     model = hj.linearize(cycle, hj.KinematicPhase(4, "x", "u"), outputs=("u",))
     assert model.inputs == ("input",)
     assert model.outputs == ("u",)
-    pushed, expected = (
-        hj.simulate(system, "plane", (1.0, 0.0), 1.0, input=jnp.cos)
-        for system in (Oscillator(), Named())
-    )
+    pushed = hj.simulate(Oscillator(), "plane", (1.0, 0.0), 1.0, input=jnp.cos)
+    expected = hj.simulate(Named(), "plane", (1.0, 0.0), 1.0, input=jnp.cos)
     assert_array_equal(pushed.after, expected.after)
 
 

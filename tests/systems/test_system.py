@@ -16,13 +16,29 @@ from hybridjax.systems.structure import Structure
 from ..toys import Field, toy
 
 
+def rates(t, q, u):
+    return (q[1], -q[0])
+
+
+def b_rates(t, q, u):
+    return -q
+
+
 ROOM = {
-    "a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0])),
-    "b": Field(("z",), lambda t, q, u: -q),
+    "a": Field(("x", "v"), rates),
+    "b": Field(("z",), b_rates),
 }
-TO_B = hj.Transition(
-    "go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],)
-)
+
+
+def go_guard(t, q, u):
+    return q[0]
+
+
+def go_reset(t, q, u):
+    return (q[0],)
+
+
+TO_B = hj.Transition("go", "a", "b", go_guard, reset=go_reset)
 SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
 
