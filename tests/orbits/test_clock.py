@@ -20,12 +20,12 @@ class WrongPaddle(hj.models.PaddleJuggler):
         return 1.1
 
 
-def PULSE(t):
+def pulse(t):
     return jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))
 
 
 def fall_rates(t, q, u):
-    return (PULSE(t) - q[0],)
+    return (pulse(t) - q[0],)
 
 
 KICKED = toy({"fall": Field(("x",), fall_rates)}, period=1.0)

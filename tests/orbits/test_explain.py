@@ -45,7 +45,7 @@ class Balls(hj.HybridSystem):
 
 
 # A ball that falls through its floor, whose guard should rise.
-def FLOOR(t, q, u):
+def above_floor(t, q, u):
     return q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)
 
 
@@ -53,24 +53,24 @@ def air_rates(t, q, u):
     return (q[1], -1.0)
 
 
-def impact_guard(t, q, u):
+def impact_reset(t, q, u):
     return q
 
 
 WRONG_WAY = toy(
     {"air": Field(("y", "v"), air_rates)},
-    [hj.Transition("impact", "air", "air", FLOOR, "rising", impact_guard)],
+    [hj.Transition("impact", "air", "air", above_floor, "rising", impact_reset)],
     period=1.0,
 )
 
 
 # A pushed mass on a spring with a dashpot that is much too strong.
-def FORCE(t, q):
+def force(t, q):
     return -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)
 
 
 def rates(t, q, u):
-    return (q[1], FORCE(t, q))
+    return (q[1], force(t, q))
 
 
 DAMPED = toy({"a": Field(("y", "v"), rates)}, period=1.0)
@@ -101,23 +101,27 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     assert cycle.result == hj.Result.COINCIDENCE
     (both,) = hj.coincidences(cycle)
     assert not both.commute
-    t0 = both.time - 0.05
-    dt = 0.1
-    fall = np.kron(np.eye(2), [[1.0, dt / 2], [0.0, 1.0]])
-    way = cycle.trajectory(2.0)
-    k = np.flatnonzero((way.event >= 0) & (way.t > both.time - 1e-6))[0]
-    y, v = way.before[k, :2]
-    start = np.array([y - v * 0.05 - 9.81 * 0.05**2 / 2, v + 9.81 * 0.05] * 2)
+
+    # The balls from half a tenth of a second before the impacts to as long after them.
+    half = 0.05
+    orbit = cycle.trajectory(2.0)
+    is_impact = (orbit.event >= 0) & (orbit.t > both.time - 1e-6)
+    y, v = orbit.before[np.flatnonzero(is_impact)[0], :2]
+    ball = [y - v * half - 9.81 * half**2 / 2, v + 9.81 * half]
+    start = np.array([*ball, *ball])
+    fall = np.kron(np.eye(2), [[1.0, half], [0.0, 1.0]])
 
     def ends(q):
-        return hj.simulate(system, "air", q, dt, time=t0).after[-1]
+        path = hj.simulate(system, "air", q, 2 * half, time=both.time - half)
+        return path.after[-1]
 
     for order, derivative in zip(both.orders, both.derivatives, strict=True):
-        early = int(order[0][-1])
+        first = int(order[0][-1])
         step = np.zeros(4)
-        step[2 * early] = -1e-6  # this ball is lower, and lands first
-        change = (ends(start + step) - ends(start)) / 1e-6
-        assert_allclose(change, fall @ derivative @ fall @ step / 1e-6, atol=1e-4)
+        step[2 * first] = -1e-6  # this ball is lower, and lands first
+        change = ends(start + step) - ends(start)
+        expected = fall @ derivative @ fall @ step
+        assert_allclose(change / 1e-6, expected / 1e-6, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -114,10 +114,10 @@ def test_simulations_end_at_what_steps_pass_over():
     def dip(t, q, u):
         return 1.0 - 2.0 * jnp.exp(-(((t - 0.4321) / 1e-3) ** 2))
 
-    def dip_guard(t, q, u):
+    def dip_reset(t, q, u):
         return q
 
-    event = hj.Transition("dip", "on", "on", dip, "falling", dip_guard)
+    event = hj.Transition("dip", "on", "on", dip, "falling", dip_reset)
     dips = type("Dips", (Turns,), {"transitions": lambda self: [event]})(lambda x: 0.0)
     for system in (pulse, dips):
         path = hj.simulate(system, "on", (2.0, -0.1), 6.0, throw=False)
@@ -128,10 +128,10 @@ def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
     def level(t, q, u):
         return 1.5 + 0.1 * jnp.maximum(0.5 - q[0], 0.0) ** 0.0 - q[0]
 
-    def stop_guard(t, q, u):
+    def stop_reset(t, q, u):
         return q
 
-    event = hj.Transition("stop", "on", "on", level, "falling", stop_guard)
+    event = hj.Transition("stop", "on", "on", level, "falling", stop_reset)
     stops = type("Stops", (Turns,), {"transitions": lambda self: [event]})(
         lambda x: 0.0
     )

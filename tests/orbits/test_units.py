@@ -65,20 +65,21 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     assert cycle.iterations == hopper_cycle.iterations
     assert cycle.residual < 1e-12
     assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
-    for name, size in hopper_cycle.scale.items():
-        assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
-        size = hopper_cycle.state.get(name, 0.0) * sizes[name[0]]
-        assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
+    for name, scale in hopper_cycle.scale.items():
+        size = sizes[name[0]]
+        assert_allclose(cycle.scale[name], scale * size, rtol=1e-9)
+        expected = hopper_cycle.state.get(name, 0.0) * size
+        assert_allclose(cycle.state.get(name, 0.0), expected, rtol=1e-9)
+
     model = hj.linearize(hopper_cycle, CLOCK, ("yM", "vM"))
     other = hj.linearize(cycle, CLOCK, ("yM", "vM"))
     assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
-    H = model.htf(FREQUENCIES, (-1, 0, 1)).H
-    theirs = other.htf(FREQUENCIES, (-1, 0, 1)).H
+    expected = model.htf(FREQUENCIES, (-1, 0, 1)).H
+    found = other.htf(FREQUENCIES, (-1, 0, 1)).H
     for k, name in enumerate(model.outputs):
-        mine = H[:, :, k]
-        back = sizes["force"] / sizes[name[0]]
-        tolerance = 1e-9 * np.abs(mine).max()
-        assert_allclose(theirs[:, :, k] * back, mine, atol=tolerance)
+        unit = sizes[name[0]] / sizes["force"]
+        tolerance = 1e-9 * np.abs(expected[:, :, k]).max()
+        assert_allclose(found[:, :, k] / unit, expected[:, :, k], atol=tolerance)
 
 
 @pytest.mark.slow

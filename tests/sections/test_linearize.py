@@ -1,6 +1,7 @@
 """A, B, C, D between sections: against stored references, and against scipy's differences."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -85,35 +86,36 @@ def cycle_points(sections, start, retention=1.0):
 
 
 def check_against_differences(ldtp, sections, points, retention, subset):
+    """Matrices against differences of scipy's flow from section to section."""
     N = len(sections)
-    scale_A = np.max(np.abs(ldtp.A))
-    scale_B = np.max(np.abs(ldtp.B))
+    tolerance_A = 1e-7 * np.max(np.abs(ldtp.A))
+    tolerance_B = 1e-7 * np.max(np.abs(ldtp.B))
+    time_is_known = ldtp.coordinates[0][0] != "t"
     for i in subset:
         here = sections[i]
         there = sections[(i + 1) % N]
-        names = ldtp.coordinates[i]
-        after = ldtp.coordinates[(i + 1) % N]
-        if ldtp.coordinates[0][0] != "t" and i == N - 1:
+        if i == N - 1 and time_is_known:
             there = ("clock", there[1] + 1.0)
-        J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
-        A = np.asarray(ldtp.A)[i, : len(after), : len(names)]
+        before = ldtp.coordinates[i]
+        after = ldtp.coordinates[(i + 1) % N]
+        J = hopper_scipy.jacobian(points[i], here, there, before, after, retention)
+        A = np.asarray(ldtp.A)[i, : len(after), : len(before)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        assert_allclose(A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]")
-        assert_allclose(B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]")
+        assert_allclose(A, J[:, :-1], rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
+        assert_allclose(B, J[:, -1], rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
 
 
 def test_kinematic_sections_agree_with_scipy(
     reference, kinematic_ldtp, placed_kinematic
 ):
     sections = angles((0.0, 2.2, 0.0), 32)  # at the apex vM = 0, so the angle is 0
-    points = cycle_points(
-        sections, (0.5, *reference("limit_cycle")["state_clock_half"])
-    )
-    for i, point in enumerate(points):
-        error = abs(float(placed_kinematic.lanes.t[i]) - point[0])
-        assert error < 1e-10
-        found = placed_kinematic.lanes.q[: len(point) - 1, i]
-        assert_allclose(found, point[1:], rtol=0, atol=1e-10)
+    start = (0.5, *reference("limit_cycle")["state_clock_half"])
+    points = cycle_points(sections, start)
+    times = np.asarray(placed_kinematic.lanes.t)
+    states = np.asarray(placed_kinematic.lanes.q)
+    for i, (time, *state) in enumerate(points):
+        assert_allclose(times[i], time, rtol=0, atol=1e-10)
+        assert_allclose(states[: len(state), i], state, rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
 
 
@@ -160,21 +162,31 @@ def test_a_cycle_that_is_rest():
     assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
 
 
-@pytest.mark.parametrize("late", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)])
-def test_delays_agree_with_finer_sections(hopper_cycle, late):
+@pytest.mark.parametrize(
+    "late_input, late_output", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)]
+)
+def test_delays_agree_with_finer_sections(hopper_cycle, late_input, late_output):
     """100 sections, whose inputs change at every 25th: delays of so many of them."""
-    M = 25
-    fine = hj.linearize(hopper_cycle, hj.ClockPhase(4 * M, anchor=APEX), OUTPUTS)
-    delay = np.array(late) * float(hopper_cycle.period) / (4 * M)
+    finer = 25
+    N = 4 * finer
+    fine = hj.linearize(hopper_cycle, hj.ClockPhase(N, anchor=APEX), OUTPUTS)
+    interval = float(hopper_cycle.period) / N
+    delay = (late_input * interval, late_output * interval)
     sections = hj.ClockPhase(4, anchor=APEX)
     model = hj.linearize(hopper_cycle, sections, OUTPUTS, delay=delay)
-    u = np.random.default_rng(0).normal(size=(24, 1))
-    held = np.concatenate([np.zeros((4 * M + late[0], 1)), np.repeat(u, M, axis=0)])
-    y = np.asarray(fine.simulate(held))[4 * M - late[1] :: M][: len(u)]
-    tolerance = 1e-11 * np.abs(y).max()
-    assert_allclose(model.simulate(u), y, atol=tolerance)
+
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(24, 1))
+    rest = np.zeros((N + late_input, 1))  # a period before the input begins
+    held = np.repeat(u, finer, axis=0)
+    y = np.asarray(fine.simulate(np.concatenate([rest, held])))
+    expected = y[N - late_output :: finer][: len(u)]
+    tolerance = 1e-11 * np.abs(expected).max()
+    assert_allclose(model.simulate(u), expected, atol=tolerance)
     assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
-    assert max(model.dims) == max(fine.dims) + -(-sum(late) // M)
+    # The inputs on their way are states.
+    kept = math.ceil((late_input + late_output) / finer)
+    assert max(model.dims) == max(fine.dims) + kept
 
 
 def test_delays_at_sections_of_the_state_are_refused(hopper_cycle):
@@ -205,31 +217,38 @@ class _Neuron(hj.HybridSystem):
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 
+HALF = hj.Crossing("v", "rising", 0.5)
+
+
+MOST = hj.Crossing("v", "rising", 0.8)
+
+
 @pytest.mark.slow
-def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
+@pytest.mark.parametrize(
+    "sections, dims",
+    [([HALF, hj.AtEvent("spike")], [0, 1]), ([HALF, MOST], [0, 0]), (HALF, [0])],
+)
+def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, dims):
     cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
-    half, most = (hj.Crossing("v", "rising", value) for value in (0.5, 0.8))
+    # The voltage of a section does not change, the current does.
     current = hj.Output("current", lambda t, q, u: 3 * q[0] + 2 * u[0])
-    for sections, dims in (
-        ([half, hj.AtEvent("spike")], [0, 1]),
-        ([half, most], [0, 0]),
-        (half, [0]),
-    ):
-        model = hj.linearize(cycle, sections, outputs=current)
-        assert_array_equal(model.dims, dims)
-        assert [len(x) for x in model.coordinates] == dims
-        assert len(model.multipliers) == 0
-        # The voltage of a section does not change, the current does.
-        H = model.htf((0.1, 0.2, 0.4))
-        assert_allclose(H[0][:, 0, 0], 2)
-        assert all(np.all(H[m] == 0) for m in H.harmonics if m)
-        for system in (model, model.feedback(np.zeros((1, 1)))):
-            measured = system.simulate(np.ones((4, 1)))
-            expected = 2 * np.ones((4, 1))
-            assert_allclose(measured, expected)
-        design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
-        data = hj.run_experiments(cycle, sections, design, current, start="periodic")
-        assert_allclose(data.y, 2 * data.u, rtol=1e-9)
+    model = hj.linearize(cycle, sections, outputs=current)
+    assert_array_equal(model.dims, dims)
+    assert [len(names) for names in model.coordinates] == dims
+    assert len(model.multipliers) == 0
+
+    H = model.htf((0.1, 0.2, 0.4))
+    for m in H.harmonics:
+        gain = 2 if m == 0 else 0
+        assert_allclose(H[m][:, 0, 0], gain)
+    ones = np.ones((4, 1))
+    assert_allclose(model.simulate(ones), 2 * ones)
+    closed = model.feedback(np.zeros((1, 1)))
+    assert_allclose(closed.simulate(ones), 2 * ones)
+
+    design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
+    data = hj.run_experiments(cycle, sections, design, current, start="periodic")
+    assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
 
 def test_a_section_map_waits_for_late_arrivals():

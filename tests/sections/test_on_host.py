@@ -37,37 +37,50 @@ def measured(guess, family):
     return measure
 
 
+def numbers_of(arrays, shapes):
+    """All numbers of arrays in a row, without the zeros by which they are padded."""
+    kept = []
+    for array, shape in zip(arrays, shapes, strict=True):
+        inside = tuple(slice(n) for n in shape)
+        kept.append(np.asarray(array)[inside].ravel())
+    return np.concatenate(kept)
+
+
 def agrees(system, measure, rtol):
     """Derivatives of all outputs in a direction of all parameters, and reverse mode."""
-    numbers, others = eqx.partition(system, eqx.is_inexact_array)
-    flat, unravel = ravel_pytree(numbers)
-    along = flat * np.random.default_rng(0).uniform(-1, 1, flat.shape)
+    parameters, others = eqx.partition(system, eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(parameters)
+    rng = np.random.default_rng(0)
+    direction = flat * rng.uniform(-1, 1, flat.shape)
 
     def at(h):
-        return measure(eqx.combine(unravel(flat + h * along), others))
+        changed = unravel(flat + h * direction)
+        return measure(eqx.combine(changed, others))
 
-    values, reverse = jax.vjp(at, 0.0)
-    # (Under transformations, matrices are padded with zeros.)
-    sizes = [np.shape(x) for x in at(0.0)]
-    kept = lambda xs: np.concatenate(  # noqa: E731
-        [
-            np.asarray(x)[tuple(map(slice, n))].ravel()
-            for x, n in zip(xs, sizes, strict=True)
-        ]
-    )
-    by_host = jax.jvp(at, (0.0,), (1.0,))[1]
-    e = 2e-4
-    minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
-    differences = (8 * (plus - minus) - (plus2 - minus2)) / (12 * e)
-    size = kept(by_host)
-    assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
-    tolerance = rtol * np.max(np.abs(size))
-    assert_allclose(size, differences, rtol=rtol, atol=tolerance)
-    weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
-    expected = sum(
-        np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True)
-    )
-    assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
+    # Under transformations, matrices are padded with zeros.
+    plain = at(0.0)
+    shapes = [np.shape(x) for x in plain]
+    values, pull_back = jax.vjp(at, 0.0)
+    expected = numbers_of(plain, shapes)
+    assert_allclose(numbers_of(values, shapes), expected, rtol=1e-9, atol=1e-9)
+
+    _, tangents = jax.jvp(at, (0.0,), (1.0,))
+    derivative = numbers_of(tangents, shapes)
+    h = 2e-4
+    once = numbers_of(at(h), shapes) - numbers_of(at(-h), shapes)
+    twice = numbers_of(at(2 * h), shapes) - numbers_of(at(-2 * h), shapes)
+    difference = (8 * once - twice) / (12 * h)
+    tolerance = rtol * np.max(np.abs(derivative))
+    assert_allclose(derivative, difference, rtol=rtol, atol=tolerance)
+
+    weights = []
+    for x in values:
+        weights.append(np.cos(np.arange(np.size(x))).reshape(np.shape(x)))
+    forward = 0.0
+    for weight, tangent in zip(weights, tangents, strict=True):
+        forward += np.sum(weight * np.asarray(tangent))
+    (reverse,) = pull_back(tuple(weights))
+    assert_allclose(reverse, forward, rtol=1e-11)
 
 
 FAMILIES = {
