@@ -50,21 +50,11 @@ def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
 
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
-    """Also those that a controller adds."""
     model = hj.linearize(placed.cycle, placed, ("x", "v"))
-    r = 1e-3 * DESIGN.inputs(6)
-    sizes = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2))
-    rng = np.random.default_rng(0)
-    matrices = [0.3 * rng.normal(size=size) for size in sizes]
-    F = hj.LDTP(*matrices, inputs=model.outputs, outputs=model.inputs)
-    for system, controller in ((model, None), (model.feedback(F), F)):
-        data = run(r, discard=0, feedback=controller)
-        exact = np.stack([system.simulate(x) for x in r])
-        tolerance = 1e-3 * np.abs(exact).max()
-        assert_allclose(data.y, exact, rtol=0, atol=tolerance)
-    u = r - np.stack([F.simulate(x) for x in exact])
-    tolerance = 1e-3 * np.abs(u).max()
-    assert_allclose(data.u, np.dstack([u, r]), rtol=0, atol=tolerance)
+    u = 1e-3 * DESIGN.inputs(6)
+    expected = np.stack([model.simulate(experiment) for experiment in u])
+    tolerance = 1e-3 * np.abs(expected).max()
+    assert_allclose(run(u, discard=0).y, expected, rtol=0, atol=tolerance)
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
@@ -92,3 +82,22 @@ def test_process_noise_acts_but_is_not_recorded(run):
     change = np.std(once.y - still.y)
     assert 1e-5 < change < 1e-2
     assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)
+
+
+def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, placed):
+    model = hj.linearize(placed.cycle, placed, ("x", "v"))
+    rng = np.random.default_rng(0)
+    sizes = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2))
+    A, B, C, D = [0.3 * rng.normal(size=size) for size in sizes]
+    controller = hj.LDTP(A, B, C, D, inputs=model.outputs, outputs=model.inputs)
+    loop = model.feedback(controller)
+    reference = 1e-3 * DESIGN.inputs(6)
+    data = run(reference, discard=0, feedback=controller)
+
+    y = np.stack([loop.simulate(experiment) for experiment in reference])
+    tolerance = 1e-3 * np.abs(y).max()
+    assert_allclose(data.y, y, rtol=0, atol=tolerance)
+    u = reference - np.stack([controller.simulate(output) for output in y])
+    tolerance = 1e-3 * np.abs(u).max()
+    expected = np.dstack([u, reference])
+    assert_allclose(data.u, expected, rtol=0, atol=tolerance)
