@@ -4,7 +4,9 @@ import pytest
 import hybridjax as hj
 
 
-DECAY, STRIDES, RATE = 0.15, 200, 64
+DECAY = 0.15
+STRIDES = 200
+RATE = 64
 MULTIPLIER = np.exp(-2 * DECAY)
 
 
@@ -51,7 +53,8 @@ def rhythm():
         pull = -1j * DECAY * 2 * np.angle(w) * w
         return DECAY * (1 - abs(w) ** 2) * w + pull + f * turn
 
-    z, out = 1.0 + 0j, []
+    z = 1.0 + 0j
+    out = []
     for k in range(steps * len(force)):
         t = np.exp(-2j * np.pi * h * (k + np.array([0, 0.5, 1])))
         if k % steps == 0:
