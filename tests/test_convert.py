@@ -208,7 +208,7 @@ def test_tables_of_fits(model):
     assert_array_equal(table["standard_error"], fit.standard_errors)
 
     htf = model.htf(np.linspace(0.01, 0.4, 20))
-    rational = hj.identify.fit_rational(htf, input="u")
+    rational = hj.fit_rational(htf, input="u")
     table = convert.to_pandas(rational)
     poles = table["pole_real"] + 1j * table["pole_imaginary"]
     assert_array_equal(poles, rational.poles[0])

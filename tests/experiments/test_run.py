@@ -56,8 +56,8 @@ def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle)
     true = hopper_cycle.multipliers
     fit = hj.fit_multipliers(estimate, ldtp)
     assert fit.compare(true).max_error < 5e-5
-    rational = hj.identify.fit_rational(estimate)
-    of_exact = hj.identify.fit_rational(exact)
+    rational = hj.fit_rational(estimate)
+    of_exact = hj.fit_rational(exact)
     for output in estimate.outputs:
         error = rational.compare(true, output).max_error
         bias = of_exact.compare(true, output).max_error

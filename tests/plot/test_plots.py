@@ -111,7 +111,7 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         draw(exact, renamed, input=1, **shown)
         assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
         assert_array_equal(first.get_ydata(), second.get_ydata())
-    fit = hj.identify.fit_rational(exact, input=1)
+    fit = hj.fit_rational(exact, input=1)
     with pytest.raises(
         hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
@@ -162,7 +162,7 @@ def test_bodes(estimate, exact, rational):
 
 
 def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
-    fit = hj.identify.fit_rational(two_inputs, input=1)
+    fit = hj.fit_rational(two_inputs, input=1)
     upper = hj.plot.bode(two_inputs, fits=fit).figure.axes[0]
     lines = [line for line in upper.get_lines() if len(line.get_xdata())]
     fitted = [line for line in lines if line.get_color() == "black"]
