@@ -19,7 +19,29 @@ def Field(states, function):
 
 
 def toy(charts, transitions=(), period=None, outputs=(), **names):
-    """Return a system without parameters, whose methods return these."""
+    """Return a system without parameters, whose methods return these.
+
+    `toy({"fall": Field(("y",), rates)}, [impact], period=1.0)` is short for what users write:
+
+    ```python
+    class Fall(hj.Chart):
+        states = ("y",)
+
+        def field(self, t, q, u):
+            return rates(t, q, u)
+
+
+    class Toy(hj.HybridSystem):
+        def charts(self):
+            return {"fall": Fall()}
+
+        def transitions(self):
+            return [impact]
+
+        def period(self):
+            return 1.0
+    ```
+    """
     parts = {
         "charts": charts,
         "transitions": transitions,
