@@ -79,12 +79,16 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
             hj.find_limit_cycle(system, guess)
         return
     cycle = hj.find_limit_cycle(system, guess)
-    later = float(cycle.anchor.t[0]) - duty
-    at_trip = at_tick(duty) * np.exp(-duty) + 1 - np.exp(-duty)
-    if chart == "off":
-        exact = at_trip * np.exp(-later)
+    time = float(cycle.anchor.t[0])
+
+    def charged(time):
+        """x on the cycle while on."""
+        return 1 + (at_tick(duty) - 1) * np.exp(-time)
+
+    if chart == "on":
+        exact = charged(time)
     else:
-        exact = 1 + (at_tick(duty) - 1) * np.exp(-float(cycle.anchor.t[0]))
+        exact = charged(duty) * np.exp(-(time - duty))
     assert_allclose(cycle.state["x"], exact, atol=1e-11)
     assert_allclose(cycle.multipliers, [np.exp(-1)], rtol=1e-9)
 
@@ -170,13 +174,12 @@ def neurons(push):
 def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
     """Also to above where it would come to rest, so that it moves back from there. By hand: x
     spikes first, y at once, and leaves (push, 0)."""
+    system = neurons(push)
     guess = hj.Guess("rest", (push + 0.05, 0.1))
-    cycle = hj.find_limit_cycle(neurons(push), guess)
+    cycle = hj.find_limit_cycle(system, guess)
+    names = [system.transitions()[k].name for k in cycle.event_sequence]
+    assert names == ["X", "Y"]
     period = np.log((1.5 - push) / 0.5)
-    assert [neurons(push).transitions()[g].name for g in cycle.event_sequence] == [
-        "X",
-        "Y",
-    ]
     assert_allclose(cycle.period, period, rtol=1e-10)
     assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
     assert hj.coincidences(cycle) == []

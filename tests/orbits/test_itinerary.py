@@ -96,27 +96,28 @@ def amplitude(drive):
     return drive / np.hypot(1 - 1.3**2, 0.4 * 1.3)
 
 
+def damping_of_a_turn():
+    """The product of the multipliers without a rebound: exp(-damping T)."""
+    return np.exp(-0.4 * 2 * np.pi / 1.3)
+
+
 def test_a_repeated_cycle_is_that_of_the_closed_form(free, compiled):
     cycle = hj.find_limit_cycle(Rebound(drive=0.5), free)
-    x = np.max(np.abs(np.asarray(cycle.legs.q[0])))
-    largest = np.max(cycle.trajectory().dense(64)[2][:, 0])
-    assert abs(largest - amplitude(0.5)) < 1e-3 * x
-    # A turn damps by exp(-damping T) in two directions.
+    _, _, states = cycle.trajectory().dense(64)
+    assert_allclose(np.max(states[:, 0]), amplitude(0.5), rtol=1e-3)
     product = np.prod(cycle.multipliers).real
-    error = abs(product - np.exp(-0.4 * 2 * np.pi / 1.3))
-    assert error < 1e-11
+    assert_allclose(product, damping_of_a_turn(), rtol=0, atol=1e-11)
 
 
 def test_an_event_that_is_new_goes_to_the_search(free, compiled):
-    assert amplitude(2.0) > 1
+    assert amplitude(2.0) > 1, "the free motion would reach the stop"
     cycle = hj.find_limit_cycle(Rebound(drive=2.0), free)
-    assert [cycle.structure.transitions[g].name for g in cycle.event_sequence] == [
-        "bounce"
-    ]
+    names = [cycle.structure.transitions[k].name for k in cycle.event_sequence]
+    assert names == ["bounce"]
     # The rebound keeps the product of the multipliers, less the squared restitution.
     product = np.prod(cycle.multipliers).real
-    error = abs(product - 0.6**2 * np.exp(-0.4 * 2 * np.pi / 1.3))
-    assert error < 1e-9
+    expected = 0.6**2 * damping_of_a_turn()
+    assert_allclose(product, expected, rtol=0, atol=1e-9)
 
 
 def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
@@ -136,15 +137,16 @@ def test_gradients_inside_of_programs_are_differences(free):
         return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
 
     value = jax.jit(state)
-    by_drive, by_damping = jax.jit(jax.grad(state, argnums=(0, 1)))(0.5, 0.4)
+    reverse_mode = jax.jit(jax.grad(state, argnums=(0, 1)))
+    by_drive, by_damping = reverse_mode(0.5, 0.4)
     h = 1e-4
-    differences = (
-        (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h),
-        (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h),
-    )
-    assert np.allclose((by_drive, by_damping), differences, rtol=1e-6)
-    forward = jax.jit(jax.jacfwd(state, argnums=(0, 1)))(0.5, 0.4)
-    assert np.allclose(forward, (by_drive, by_damping), rtol=1e-10)
+    difference = (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h)
+    assert_allclose(by_drive, difference, rtol=1e-6)
+    difference = (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h)
+    assert_allclose(by_damping, difference, rtol=1e-6)
+    forward_mode = jax.jit(jax.jacfwd(state, argnums=(0, 1)))
+    forward = forward_mode(0.5, 0.4)
+    assert_allclose(forward, (by_drive, by_damping), rtol=1e-10)
 
 
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
