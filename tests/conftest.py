@@ -49,7 +49,6 @@ from hybridjax._core.execution import libraries
 # Files whose fast tests cover each capability once, for `-m core`.
 CORE = (
     "test_layers",
-    "test_words",
     "test_release",
     "linear/test_ldtp",
     "linear/test_htf",
@@ -167,7 +166,8 @@ def figures_are_closed():
 def compiled():
     """The names of all that is compiled in this context, where functions of few lanes stay on the
     host: by default the seconds that earlier tests have spent there decide."""
-    names, patience = set(), compilation.WORTH_COMPILING
+    names = set()
+    patience = compilation.WORTH_COMPILING
 
     def listen(event, *_, fun_name="", **__):
         if "backend_compile" in event:
@@ -236,6 +236,6 @@ def kinematic_ldtp(hopper_cycle, placed_kinematic):
 
 @pytest.fixture(scope="session")
 def vanderpol_cycle():
-    return hj.find_limit_cycle(
-        hj.models.VanDerPol(mu=1.0), section=hj.Crossing("v", "falling")
-    )
+    system = hj.models.VanDerPol(mu=1.0)
+    section = hj.Crossing("v", "falling")
+    return hj.find_limit_cycle(system, section=section)

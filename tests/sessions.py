@@ -7,8 +7,6 @@ import subprocess
 import sys
 import types
 
-import numpy as np
-
 
 ROOT = pathlib.Path(__file__).parents[1]
 STEPS = re.compile(r"after \d+ Newton steps?")
@@ -37,30 +35,43 @@ class Session:
     """A module in which a document's blocks are executed."""
 
     def __init__(self, page: str, monkeypatch):
-        self.page, self.module = page, types.ModuleType(re.sub(r"\W", "_", page))
+        self.page = page
+        self.module = types.ModuleType(re.sub(r"\W", "_", page))
         monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
 
     def run(self, code: str) -> None:
         exec(compile(code, self.page, "exec"), vars(self.module))
 
 
+def decimals(number: str) -> int:
+    """The digits after the point, 0 with an exponent."""
+    if "e" in number:
+        return 0
+    return len(number.partition(".")[2])
+
+
 def same_output(shown: str, printed: str) -> bool:
     """The same words, and the same numbers: to 6 digits, to the last of 6 decimals or more, which
     rounding changes, or small ones to a factor of 5."""
     # (A process that has searched for long has compiled the search, which takes other steps.)
-    shown, printed = (STEPS.sub("after some Newton steps", x) for x in (shown, printed))
-    words = [NUMBER.sub("#", text).split() for text in (shown, printed)]
-    a, b = (
-        np.array([float(x.replace(" ", "")) for x in NUMBER.findall(text)])
-        for text in (shown, printed)
-    )
-    if words[0] != words[1] or a.shape != b.shape:
+    shown = STEPS.sub("after some Newton steps", shown)
+    printed = STEPS.sub("after some Newton steps", printed)
+    if NUMBER.sub("#", shown).split() != NUMBER.sub("#", printed).split():
         return False
-    close = np.abs(a - b) <= 1e-6 * np.abs(b)
-    decimals = np.array(
-        [0 if "e" in x else len(x.partition(".")[2]) for x in NUMBER.findall(shown)]
-    )
-    last = (decimals >= 6) & (np.abs(a - b) < 1.01 * 10.0**-decimals)
-    small = (np.abs(a) < 1e-3) & (np.abs(b) < 1e-3)
-    rounding = (np.abs(a) < 1e-11) & (np.abs(b) < 1e-11)
-    return bool(np.all(close | last | rounding | (small & (b < 5 * a) & (a < 5 * b))))
+    numbers = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
+    return all(same_number(a, b) for a, b in numbers)
+
+
+def same_number(shown: str, printed: str) -> bool:
+    a = float(shown.replace(" ", ""))
+    b = float(printed.replace(" ", ""))
+    difference = abs(a - b)
+    if difference <= 1e-6 * abs(b):
+        return True
+    digits = decimals(shown)
+    if digits >= 6 and difference < 1.01 * 10.0**-digits:
+        return True
+    if abs(a) < 1e-11 and abs(b) < 1e-11:
+        return True
+    is_small = abs(a) < 1e-3 and abs(b) < 1e-3
+    return is_small and b < 5 * a and a < 5 * b

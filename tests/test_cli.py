@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
@@ -62,7 +63,7 @@ def test_reproduce_writes_its_results(results):
         model, fit = (
             hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
         )
-        np.testing.assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
+        assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
 
@@ -116,7 +117,8 @@ def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message)
     with pytest.raises(SystemExit) as error:
         main([*command.split(), *options.split()])
     said = capsys.readouterr().err
-    assert error.value.code == 2 and said.startswith("usage: hybridjax")
+    assert error.value.code == 2
+    assert said.startswith("usage: hybridjax")
     assert message in said.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
@@ -151,10 +153,8 @@ def test_an_interruption_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("hybridjax.apps.reproduce._reproduce", interrupted)
     with pytest.raises(SystemExit) as error:
         main(["reproduce", "--out", str(tmp_path / "new")])
-    assert (
-        error.value.code == 130
-        and capsys.readouterr().err == "hybridjax: interrupted.\n"
-    )
+    assert error.value.code == 130
+    assert capsys.readouterr().err == "hybridjax: interrupted.\n"
     assert not list(tmp_path.iterdir())
 
 

@@ -1,7 +1,10 @@
 """Other libraries get the same numbers, and give them back."""
 
+import sys
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -23,142 +26,195 @@ def model():
 def test_the_lifted_system_is_the_periodic_one(model):
     """In time, sample by sample, and in frequency, harmonic by harmonic."""
     lti = convert.to_lti(model)
-    assert lti.n_sections == 1 and lti.A.shape == (1, 2, 2)
-    assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]") and lti.inputs[2].unit == "N"
-    np.testing.assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
-    u = np.random.default_rng(1).normal(size=(4 * N, 2))
-    y = lti.simulate(u.reshape(4, -1))
-    np.testing.assert_allclose(y.reshape(-1, 1), model.simulate(u), rtol=0, atol=1e-13)
-    f, n = np.linspace(0.01, 0.49, 7), np.arange(N)
+    assert lti.n_sections == 1
+    assert lti.A.shape == (1, 2, 2)
+    assert lti.inputs[:3] == ("u[0]", "w[0]", "u[1]")
+    assert lti.inputs[2].unit == "N"
+    assert_allclose(lti.multipliers, model.multipliers, rtol=1e-12)
+
+    periods = 4
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(periods * N, 2))
+    y = lti.simulate(u.reshape(periods, -1))
+    expected = model.simulate(u)
+    assert_allclose(y.reshape(-1, 1), expected, rtol=0, atol=1e-13)
+
+    f = np.linspace(0.01, 0.49, 7)
     H = model.htf(f)
+    # From sample r, input u of a period to sample n, output y of it.
     G = np.asarray(lti.htf(f).H[0]).reshape(len(f), N, 1, N, 2)
-    wave = lambda f: np.exp(2j * np.pi * np.outer(f, n) / N)  # noqa: E731
+
+    def wave(f):
+        return np.exp(2j * np.pi * np.outer(f, np.arange(N)) / N)
+
     for m in H.harmonics:
         found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
-        np.testing.assert_allclose(found, H[m], rtol=0, atol=1e-12)
-
-
-def test_python_control(model):
-    control = pytest.importorskip("control")
-    f = np.linspace(0.01, 0.49, 7)
-    system = convert.to_control(model, period=2.0)
-    assert system.dt == 2.0 and system.input_labels[2] == "u[1]"
-    expected = convert.to_lti(model).htf(f).H[0]
-    response = system(np.exp(2j * np.pi * f))
-    np.testing.assert_allclose(
-        np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12
-    )
-    H = model.htf(f)
-    data = convert.to_control(H, period=2.0)
-    assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
-    np.testing.assert_array_equal(data(1j * data.omega)[1], np.asarray(H[-1])[:, 0].T)
-    np.testing.assert_allclose(data.omega, np.pi * f)
-    assert isinstance(data, control.FrequencyResponseData)
-    lines = control.bode_plot(convert.to_control(H.select([0]))[0, 0]).lines
-    np.testing.assert_allclose(lines[0, 0][0].get_ydata(), np.abs(H[0][:, 0, 0]))
+        assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
 def test_scipy(model):
-    system, lti = convert.to_scipy(model, period=2.0), convert.to_lti(model)
+    system = convert.to_scipy(model, period=2.0)
+    lti = convert.to_lti(model)
     assert system.dt == 2.0
     for name in "ABCD":
-        np.testing.assert_array_equal(getattr(system, name), getattr(lti, name)[0])
+        assert_array_equal(getattr(system, name), getattr(lti, name)[0])
+
+
+def test_python_control_gets_the_lifted_system(model):
+    pytest.importorskip("control")
+    system = convert.to_control(model, period=2.0)
+    assert system.dt == 2.0
+    assert system.input_labels[2] == "u[1]"
+    f = np.linspace(0.01, 0.49, 7)
+    response = system(np.exp(2j * np.pi * f))
+    expected = convert.to_lti(model).htf(f).H[0]
+    assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
+
+
+def test_python_control_gets_frequency_responses(model):
+    control = pytest.importorskip("control")
+    f = np.linspace(0.01, 0.49, 7)
+    H = model.htf(f)
+    data = convert.to_control(H, period=2.0)
+    assert isinstance(data, control.FrequencyResponseData)
+    assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
+    assert_allclose(data.omega, 2 * np.pi * f / 2.0)
+    of_harmonic = data(1j * data.omega)
+    assert_array_equal(of_harmonic[1], np.asarray(H[-1])[:, 0].T)
+
+    one = convert.to_control(H.select([0]))[0, 0]
+    drawn = control.bode_plot(one).lines[0, 0][0]
+    assert_allclose(drawn.get_ydata(), np.abs(H[0][:, 0, 0]))
 
 
 def recording():
+    """Two trials of two signals, one of them with a missing sample."""
     t = np.arange(5) / 10
-    one = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
-    parts = [
-        hj.Recording(
-            t, one, events={"e": [0.1, 0.3], "never": []}, units={"a": "N"}, name=name
+    signals = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
+    events = {"e": [0.1, 0.3], "never": []}
+    trials = []
+    for name in ("first", "second"):
+        trials.append(
+            hj.Recording(t, signals, events=events, units={"a": "N"}, name=name)
         )
-        for name in ("first", "second")
-    ]
-    return hj.Recording.join(parts)
+    return hj.Recording.join(trials)
 
 
-def test_datasets_know_names_and_units(model):
+def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     pytest.importorskip("xarray")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
-    one = dataset.H.sel(harmonic=-1, input="w", output="y").sel(f=0.4)
+    one = dataset.H.sel(f=0.4, harmonic=-1, input="w", output="y")
     assert one.item() == complex(H[-1][-1, 0, 1])
     assert dataset.input_unit.sel(input="u").item() == "N"
-    fewer = convert.from_xarray(
-        dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
-    )
-    assert fewer.harmonics == (-1, 0) and fewer.inputs == ("u",) and len(fewer.f) == 2
-    made = convert.to_xarray(recording())
-    assert made.a.attrs["units"] == "N" and "units" not in made.b.attrs
-    second = made.isel(sample=made.trial.values == 1)
-    np.testing.assert_array_equal(second.b, recording().trials[1].values[:, 1])
-    assert made.event_time[made.event == "e"].values.tolist() == [0.1, 0.3, 0.1, 0.3]
-    dims = {name: x.dims for name, x in convert.to_xarray(model).data_vars.items()}
-    assert dims["A"] == ("section", "next_state", "state")
-    assert dims["B"] == ("section", "next_state", "input")
+    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
+    fewer = convert.from_xarray(part)
+    assert fewer.harmonics == (-1, 0)
+    assert fewer.inputs == ("u",)
+    assert len(fewer.f) == 2
+
+
+def test_a_dataset_of_a_recording_knows_units_and_events():
+    pytest.importorskip("xarray")
+    dataset = convert.to_xarray(recording())
+    assert dataset.a.attrs["units"] == "N"
+    assert "units" not in dataset.b.attrs
+    second = dataset.isel(sample=dataset.trial.values == 1)
+    assert_array_equal(second.b, recording().trials[1].values[:, 1])
+    times = dataset.event_time[dataset.event == "e"]
+    assert times.values.tolist() == [0.1, 0.3, 0.1, 0.3]
+
+
+def test_a_dataset_of_a_model_has_named_dimensions(model):
+    pytest.importorskip("xarray")
+    dataset = convert.to_xarray(model)
+    assert dataset.A.dims == ("section", "next_state", "state")
+    assert dataset.B.dims == ("section", "next_state", "input")
+    for part in (
+        dataset.isel(section=slice(2)),
+        dataset.roll(section=1, roll_coords=True),
+    ):
+        with pytest.raises(hj.DefinitionError, match="`section` must be in order"):
+            convert.from_xarray(part)
+
+
+def test_a_dataset_of_experiments_begins_at_section_0():
+    pytest.importorskip("xarray")
     u = np.zeros((2, 4 * N, 2))
-    data = hj.ExperimentData(u, u + np.arange(4 * N)[:, None], n_sections=N, periods=2)
-    dataset, whole = convert.to_xarray(data), convert.to_xarray(model)
-    later = convert.from_xarray(dataset.isel(sample=slice(N, None)))
-    np.testing.assert_array_equal(later.y, data.y[:, N:])
-    backwards, late = slice(None, None, -1), slice(1, None)
-    for part in (dataset.isel(sample=x) for x in (backwards, late)):
+    y = u + np.arange(4 * N)[:, None]
+    data = hj.ExperimentData(u, y, n_sections=N, periods=2)
+    dataset = convert.to_xarray(data)
+    second_period = convert.from_xarray(dataset.isel(sample=slice(N, None)))
+    assert_array_equal(second_period.y, data.y[:, N:])
+    backwards = slice(None, None, -1)
+    from_section_1 = slice(1, None)
+    for part in (backwards, from_section_1):
         with pytest.raises(
             hj.DefinitionError, match="`sample` must be in order, from section 0"
         ):
-            convert.from_xarray(part)
-    for part in (whole.isel(section=slice(2)), whole.roll(section=1, roll_coords=True)):
-        with pytest.raises(hj.DefinitionError, match="`section` must be in order"):
-            convert.from_xarray(part)
+            convert.from_xarray(dataset.isel(sample=part))
 
 
 def test_section_data(wave):
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
-    crossing, about = hj.Crossing("v", "falling"), {"inputs": "f", "outputs": "x"}
-    data = hj.recordings.section_data(wave, crossing, **about, n_sections=8)
-    dataset, frame = convert.to_xarray(data), convert.to_pandas(data)
-    np.testing.assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
-    np.testing.assert_array_equal(frame["time"], data.times[0])
-    np.testing.assert_array_equal(
-        frame["section"][:8], (frame["section"][0] + np.arange(8)) % 8
+    crossing = hj.Crossing("v", "falling")
+    data = hj.recordings.section_data(
+        wave, crossing, inputs="f", outputs="x", n_sections=8
     )
+    dataset = convert.to_xarray(data)
+    assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
+    average = dataset.average_cycle.sel(signal="x")
+    assert_array_equal(average.values, data.cycle_outputs[:, 0])
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
-    average = dataset.average_cycle.sel(signal="x").values
-    np.testing.assert_array_equal(average, data.cycle_outputs[:, 0])
+
+    frame = convert.to_pandas(data)
+    assert_array_equal(frame["time"], data.times[0])
+    first = frame["section"][0]
+    expected = (first + np.arange(8)) % 8
+    assert_array_equal(frame["section"][:8], expected)
 
 
-def test_pandas(model):
+def test_a_table_of_a_recording_is_read_back():
     pytest.importorskip("pandas")
-    pytest.importorskip("xarray")
     frame = convert.to_pandas(recording())
     first = frame[frame["trial"] == 0].drop(columns="trial")
     again = hj.Recording.from_frame(first, units={"a": "N"})
-    np.testing.assert_array_equal(again.trials[0].values, recording().trials[0].values)
+    assert_array_equal(again.trials[0].values, recording().trials[0].values)
+
+
+def test_a_table_of_an_htf_has_a_row_for_each_value(model):
+    pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
-    row = convert.to_pandas(H).loc[-1, H.f[1].item(), "y", "w"]
-    z = complex(H[-1][1, 0, 1])
-    assert tuple(row) == (z.real, z.imag, np.abs(z))
+    table = convert.to_pandas(H)
+    row = table.loc[-1, H.f[1].item(), "y", "w"]
+    value = complex(H[-1][1, 0, 1])
+    assert tuple(row) == (value.real, value.imag, np.abs(value))
     assert np.asarray(H).tobytes() == H.H.tobytes()
-    u = np.random.default_rng(3).normal(size=(60 * N, 2))
-    fit = hj.fit_series(hj.Record(u, model.simulate(u), n_sections=N), order=1)
+
+
+def test_tables_of_fits(model):
+    pytest.importorskip("pandas")
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(60 * N, 2))
+    record = hj.Record(u, model.simulate(u), n_sections=N)
+    fit = hj.fit_series(record, order=1)
     table = convert.to_pandas(fit)
-    np.testing.assert_array_equal(
-        table["real"] + 1j * table["imaginary"], fit.multipliers
-    )
+    multipliers = table["real"] + 1j * table["imaginary"]
+    assert_array_equal(multipliers, fit.multipliers)
     errors = np.hypot(table["real_error"], table["imaginary_error"])
-    np.testing.assert_array_equal(errors, fit.standard_errors)
-    np.testing.assert_array_equal(table["standard_error"], fit.standard_errors)
-    rational = hj.identify.fit_rational(
-        model.htf(np.linspace(0.01, 0.4, 20)), input="u"
-    )
+    assert_array_equal(errors, fit.standard_errors)
+    assert_array_equal(table["standard_error"], fit.standard_errors)
+
+    htf = model.htf(np.linspace(0.01, 0.4, 20))
+    rational = hj.identify.fit_rational(htf, input="u")
     table = convert.to_pandas(rational)
     poles = table["pole_real"] + 1j * table["pole_imaginary"]
-    np.testing.assert_array_equal(poles, rational.poles[0])
+    assert_array_equal(poles, rational.poles[0])
 
 
-def test_what_is_refused(model, monkeypatch):
+def test_what_is_refused():
     pytest.importorskip("xarray")
     with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray({"a": 1})
@@ -167,9 +223,16 @@ def test_what_is_refused(model, monkeypatch):
         hj.DefinitionError, match="'trial' is also the name of a coordinate"
     ):
         convert.to_xarray(clash)
-    for call, name in ((convert.to_control, "control"), (convert.to_xarray, "xarray")):
-        monkeypatch.setitem(__import__("sys").modules, name, None)
-        with pytest.raises(
-            hj.DefinitionError, match=rf"pip install 'hybridjax\[{name}\]'"
-        ):
-            call(model)
+
+
+@pytest.mark.parametrize(
+    "call, library",
+    [(convert.to_control, "control"), (convert.to_xarray, "xarray")],
+    ids=["control", "xarray"],
+)
+def test_a_library_that_is_missing_is_named(call, library, model, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(
+        hj.DefinitionError, match=rf"pip install 'hybridjax\[{library}\]'"
+    ):
+        call(model)

@@ -9,6 +9,7 @@ import pytest
 import scipy
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
@@ -20,15 +21,19 @@ def same(a, b):
     """Equal types, names, dtypes and bits."""
     assert type(a) is type(b)
     for name in type(a).__dataclass_fields__:
-        x, y = getattr(a, name), getattr(b, name)
+        x = getattr(a, name)
+        y = getattr(b, name)
         assert isinstance(x, jax.Array) == isinstance(y, jax.Array)
         if hasattr(x, "dtype"):
-            x, y = np.asarray(x), np.asarray(y)
-            assert (
-                x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
-            )
+            x = np.asarray(x)
+            y = np.asarray(y)
+            assert x.dtype == y.dtype
+            assert x.shape == y.shape
+            assert x.tobytes() == y.tobytes()
         else:
-            assert x == y and str(x) == str(y)  # also units
+            # also units
+            assert x == y
+            assert str(x) == str(y)
     return True
 
 
@@ -47,10 +52,8 @@ def folder(tmp_path_factory):
 def ldtp():
     rng = np.random.default_rng(0)
     A = [rng.normal(size=s) / 4 for s in ((3, 2), (2, 3))]
-    B, C = (
-        [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))],
-        [np.ones((1, 2)), np.ones((1, 3))],
-    )
+    B = [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))]
+    C = [np.ones((1, 2)), np.ones((1, 3))]
     names = (("x", "v"), ("x", "v", "z"))
     return hj.LDTP.from_blocks(
         A,
@@ -93,15 +96,15 @@ def things(ldtp, htf):
 
 def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     backs = [trip(folder, thing) for thing in things]
-    assert all(map(same, things, backs)) and type(backs[-1].periods) is int
+    assert all(map(same, things, backs))
+    assert type(backs[-1].periods) is int
     assert backs[-1].summary() == things[-1].summary()
     assert {p.name for p in folder.iterdir()} == {"thing.npz"}
     xarray = pytest.importorskip("xarray")
     for thing in things:
         dataset = hj.convert.to_xarray(thing)
-        assert isinstance(dataset, xarray.Dataset) and same(
-            hj.convert.from_xarray(dataset), thing
-        )
+        assert isinstance(dataset, xarray.Dataset)
+        assert same(hj.convert.from_xarray(dataset), thing)
         assert same(
             hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing
         )
@@ -207,7 +210,7 @@ def test_a_matlab_file(folder, ldtp, htf):
         read = scipy.io.loadmat(folder / "thing.mat")
         for name in names.split():
             value = operator.attrgetter(name.replace("_", "."))(thing)
-            np.testing.assert_array_equal(read[name].squeeze(), np.squeeze(value))
+            assert_array_equal(read[name].squeeze(), np.squeeze(value))
         assert json.loads(read["header"].item())["kind"] == type(thing).__name__
 
 

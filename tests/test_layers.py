@@ -24,7 +24,8 @@ LAYERS = (
 @functools.cache
 def imported(file):
     """What a file imports of hybridjax, at its top or inside of functions, as paths."""
-    package, found = file.relative_to(ROOT).parts[:-1], []
+    package = file.relative_to(ROOT).parts[:-1]
+    found = []
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom):
             module = tuple(node.module.split(".")) if node.module else ()
@@ -63,7 +64,8 @@ def test_folders(folder):
     """Imports flow one way between its files and folders, each with all that is in it. No public
     name is also a module, which would make it either of them, by chance."""
     where = folder.relative_to(ROOT).parts
-    depth, needs = len(where), {}
+    depth = len(where)
+    needs = {}
     for file in folder.rglob("*.py"):
         own = file.relative_to(folder).with_suffix("").parts[0]
         others = {

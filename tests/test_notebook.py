@@ -40,15 +40,14 @@ def test_the_executed_notebook_has_the_code_of_its_source(name):
     ]
     assert code == cells((NOTEBOOKS / f"{name}.py").read_text())
     printed = json.dumps([c.get("outputs") for c in notebook["cells"]])
-    assert (
-        "Traceback" not in printed
-        and "Warning" not in printed
-        and "stderr" not in printed
-    )
+    assert "Traceback" not in printed
+    assert "Warning" not in printed
+    assert "stderr" not in printed
 
 
 def how_to_push(found):
-    assert found.study.done and found.study.strides[-1] <= found.budget
+    assert found.study.done
+    assert found.study.strides[-1] <= found.budget
     assert found.study.fit.contains(found.cycle.multipliers, 0.999).all()
 
 
@@ -63,18 +62,16 @@ def strides(found):
 
 
 def own_system(found):
-    assert abs(found.slope - found.cycle.multipliers[0]) < 1e-7
+    error = abs(found.slope - found.cycle.multipliers[0])
+    assert error < 1e-7
     assert found.fit.compare(found.cycle.multipliers).max_error < 1e-5
 
 
 def fit(found):
-    assert found.fit.identifiability.rank == 5 and found.fit.contains(
-        found.truth, 0.999
-    )
-    error, before = (
-        np.abs(c.multipliers - found.real.multipliers).max()
-        for c in (found.found, found.guess)
-    )
+    assert found.fit.identifiability.rank == 5
+    assert found.fit.contains(found.truth, 0.999)
+    error = np.abs(found.found.multipliers - found.real.multipliers).max()
+    before = np.abs(found.guess.multipliers - found.real.multipliers).max()
     assert error < 2e-3 < before
 
 
@@ -84,7 +81,8 @@ def play(found):
 
 
 def sweep(found):
-    assert abs(np.abs(found.best.multipliers).max() - found.winner[2]) < 1e-3
+    error = abs(np.abs(found.best.multipliers).max() - found.winner[2])
+    assert error < 1e-3
 
 
 def recording(found):
@@ -98,20 +96,24 @@ def neurons(found):
 
 def responses(found):
     # The regulator follows slow changes of its reference.
-    assert abs(abs(found.htf[0][0, 0, 0]) - 1) < 0.05
+    error = abs(abs(found.htf[0][0, 0, 0]) - 1)
+    assert error < 0.05
 
 
 def robot(found):
     low, high = found.natural.interval()[0]
-    assert high - low > 0.3 and "feedback" in {f.cause for f in found.looked.findings}
+    assert high - low > 0.3
+    assert "feedback" in {f.cause for f in found.looked.findings}
 
 
 def walking(found):
-    assert abs(found.known.multipliers[0] - 0.6) < 0.2
+    error = abs(found.known.multipliers[0] - 0.6)
+    assert error < 0.2
 
 
 def population(found):
-    low, high = found.test["low"][0], found.test["high"][0]
+    low = found.test["low"][0]
+    high = found.test["high"][0]
     assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
@@ -28,7 +29,8 @@ BYTES = 50_000  # the most that a page of a result may take
 def shown(thing):
     """The texts of a page, and the number of its pictures: every tag that opens is closed."""
     page = thing._repr_html_()
-    assert len(page) < BYTES and "nan" not in page.replace("nanm", "")
+    assert len(page) < BYTES
+    assert "nan" not in page.replace("nanm", "")
     root = ElementTree.fromstring(f"<page>{page}</page>")
     tags = [x.tag.rpartition("}")[2] for x in root.iter()]
     return types.SimpleNamespace(
@@ -46,7 +48,8 @@ def hopper_data(kinematic_ldtp):
 def test_systems_print_values_with_units(name):
     system = getattr(hj.models, name)()
     head, *lines = repr(system).splitlines()
-    assert head == name and len(lines) <= 16
+    assert head == name
+    assert len(lines) <= 16
     for field, line in zip(own_fields(system), lines, strict=True):
         number = f"{float(getattr(system, field.name)):.6g} {field.metadata['unit']}".rstrip()
         assert line.split() == [
@@ -61,11 +64,13 @@ def test_many_systems_print_their_number_and_range():
         jnp.linspace(8.0, 13.0, 100)
     )
     text = " ".join(repr(hoppers).split())
-    assert "k 100 numbers, 8 to 13 N/m" in text and "M 100 numbers, all 2 kg" in text
+    assert "k 100 numbers, 8 to 13 N/m" in text
+    assert "M 100 numbers, all 2 kg" in text
 
 
 def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
-    printed, pages = [], []
+    printed = []
+    pages = []
 
     @jax.jit
     def look(k):
@@ -88,7 +93,8 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
         return k
 
     look(jnp.ones(()))
-    assert all("traced float64[" in text for text in printed) and pages == [None] * 4
+    assert all("traced float64[" in text for text in printed)
+    assert pages == [None] * 4
 
 
 def test_definitions_print_as_they_are_written():
@@ -135,21 +141,21 @@ def test_results_print_briefly(
         Simulated(np.zeros(3, int)),
     ]
     for thing in things:
-        text, widths = repr(thing), [len(line) for line in repr(thing).splitlines()]
-        assert (
-            len(widths) <= 12
-            and max(widths) <= 100
-            and text.startswith(type(thing).__name__)
-        )
-        assert "f64[" not in text and "array(" not in text
-    assert "period       1 s" in repr(hopper_cycle) and "yM = 1.96504037 m, " in repr(
-        hopper_cycle
-    )
+        text = repr(thing)
+        widths = [len(line) for line in repr(thing).splitlines()]
+        assert len(widths) <= 12
+        assert max(widths) <= 100
+        assert text.startswith(type(thing).__name__)
+        assert "f64[" not in text
+        assert "array(" not in text
+    assert "period       1 s" in repr(hopper_cycle)
+    assert "yM = 1.96504037 m, " in repr(hopper_cycle)
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
 
 
 def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
-    m, end = kinematic_ldtp, BranchEnd(1.0, hj.Result.OK, "the <values> end")
+    m = kinematic_ldtp
+    end = BranchEnd(1.0, hj.Result.OK, "the <values> end")
     model = hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
     point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
     branch = Branch(
@@ -158,7 +164,8 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     t = np.linspace(0.0, 20.0, 2001)
     tt, *values = hopper_cycle.trajectory()("yM", "vM")
     y, v = (np.interp(t, tt, x, period=1.0) * (1 + 1e-6 * np.sin(t)) for x in values)
-    signals, events = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}, {"<hit>": [1.0]}
+    signals = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}
+    events = {"<hit>": [1.0]}
     recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
     data = hj.recordings.section_data(
         recording, APEX, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
@@ -184,11 +191,9 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
 
 
 def test_fits_show_standard_errors():
-    A, B, C = (
-        [[[0.6, 0.5], [-0.5, 0.6]]] * 4,
-        [[[1.0], [0.3]]] * 4,
-        [[[1.0, 0.0], [0.2, 1.0]]] * 4,
-    )
+    A = [[[0.6, 0.5], [-0.5, 0.6]]] * 4
+    B = [[[1.0], [0.3]]] * 4
+    C = [[[1.0, 0.0], [0.2, 1.0]]] * 4
     model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
     rng = np.random.default_rng(0)
     u = rng.normal(size=(600, 1))
@@ -197,9 +202,7 @@ def test_fits_show_standard_errors():
     fit = hj.fit_series(record, order=2)
     page = shown(fit)
     errors = [x for x in page.texts if re.fullmatch(r"\d\.\de-\d\d", x)]
-    np.testing.assert_allclose(
-        [float(x) for x in errors], fit.standard_errors, rtol=0.05
-    )
+    assert_allclose([float(x) for x in errors], fit.standard_errors, rtol=0.05)
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1

@@ -1,4 +1,4 @@
-"""What is said twice is the same, and builds of jax that compute wrong numbers are seen."""
+"""Things that are written in two places are the same, and broken builds of jax are noticed."""
 
 import os
 import re
@@ -7,39 +7,47 @@ import tomllib
 
 import pytest
 
+import hybridjax
+
 from .sessions import ROOT, run_python
 
 
 RECIPE = ROOT / "conda/recipe.yaml"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-CALLED = {"matplotlib-base": "matplotlib"}  # what conda calls otherwise
+NAMES_IN_CONDA = {"matplotlib-base": "matplotlib"}
+
+
+def test_all_files_have_the_same_version():
+    version = PROJECT["version"]
+    assert hybridjax.__version__ == version, "hybridjax/__init__.py"
+    assert f'version: "{version}"' in RECIPE.read_text(), "conda/recipe.yaml"
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {version}\n" in citation, "CITATION.cff"
 
 
 def test_the_conda_recipe_requires_what_pyproject_does():
     run = RECIPE.read_text().partition("  run:\n")[2].partition("\ntests:")[0]
-    lines = re.findall(
-        r"^    - (\S+) (\S+)$", run, re.MULTILINE
-    )  # (python's has blanks)
-    required = {CALLED.get(name, name): bounds for name, bounds in lines}
-    names = (
-        re.fullmatch(r"([\w-]+)(.*)", line).groups() for line in PROJECT["dependencies"]
-    )
-    assert required == dict(names)
+    # The line of Python has blanks inside, so that it does not match.
+    lines = re.findall(r"^    - (\S+) (\S+)$", run, re.MULTILINE)
+    recipe = {NAMES_IN_CONDA.get(name, name): bounds for name, bounds in lines}
+    pyproject = {}
+    for line in PROJECT["dependencies"]:
+        name, bounds = re.fullmatch(r"([\w-]+)(.*)", line).groups()
+        pyproject[name] = bounds
+    assert recipe == pyproject
 
 
-def test_the_conda_recipe_has_the_version_and_renders():
-    assert f'version: "{PROJECT["version"]}"' in RECIPE.read_text()
+def test_the_conda_recipe_renders():
     rattler = pytest.importorskip(
         "rattler_build", reason="pip install py-rattler-build renders it"
     )
-    variants = {"python_min": [PROJECT["requires-python"].removeprefix(">=")]}
+    oldest_python = PROJECT["requires-python"].removeprefix(">=")
+    variants = rattler.VariantConfig({"python_min": [oldest_python]})
     recipe = rattler.Stage0Recipe.from_file(RECIPE)
-    (rendered,) = recipe.render(rattler.VariantConfig(variants), rattler.RenderConfig())
-    made = rendered.recipe
-    assert (made.package.name, str(made.package.version)) == (
-        "hybridjax",
-        PROJECT["version"],
-    )
+    (rendered,) = recipe.render(variants, rattler.RenderConfig())
+    package = rendered.recipe.package
+    assert package.name == "hybridjax"
+    assert str(package.version) == PROJECT["version"]
 
 
 def test_the_tables_are_those_of_the_baseline(tmp_path):
@@ -57,10 +65,14 @@ def test_the_tables_are_those_of_the_baseline(tmp_path):
 # In a process of its own, since tests are compiled with other options than users' programs.
 PRODUCTS = """
 import jax, jax.numpy as jnp, numpy as np
+
+def squared_length(row):
+    return jnp.sum((jnp.eye(3) @ row) ** 2)
+
+lengths = jax.vmap(squared_length)
 n = 16385
 rows = np.zeros((n, 3))
 rows[:, 0] = np.arange(n)
-lengths = lambda rows: jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2))(rows)
 np.testing.assert_array_equal(lengths(rows), np.arange(n) ** 2.0)
 np.testing.assert_array_equal(jax.jit(lengths)(rows), np.arange(n) ** 2.0)
 """

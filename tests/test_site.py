@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -81,10 +82,8 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
     pictures = importlib.import_module("pictures")
     for name, plot in pictures.draw().items():
         for now, file in zip(pictures.numbers(plot), pictures.drawn(name), strict=True):
-            off, size = (
-                np.subtract(now["points"], file["points"]),
-                np.abs(file["points"]),
-            )
+            off = np.subtract(now["points"], file["points"])
+            size = np.abs(file["points"])
             assert np.all(
                 np.abs(off) <= file["within"] * size.max(axis=0, initial=1e-9)
             )
@@ -94,10 +93,13 @@ def test_the_pictures_of_the_home_page_are_those_that_are_drawn_now(monkeypatch)
 def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "docs/_site")
     pictures = importlib.import_module("pictures")
-    values = lambda text: np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)  # noqa: E731
+
+    def values(text):
+        return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)
+
     for name in ("compass-gait", "slip", "van-der-pol"):
         file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
-        np.testing.assert_allclose(
+        assert_allclose(
             values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01
         )
 
@@ -144,7 +146,8 @@ def test_links_lead_somewhere(site):
 @pytest.mark.slow
 def test_equations_are_rendered(site):
     page = (site / "mathematics.html").read_text()
-    assert page.count("<math") > 100 and "arithmatex" not in page
+    assert page.count("<math") > 100
+    assert "arithmatex" not in page
     assert "$" not in re.sub(r"<(pre|code|script).*?</\1>", "", page, flags=re.DOTALL)
 
 
@@ -154,9 +157,9 @@ def test_notebooks_come_with_their_pictures(site):
         page = (site / "notebooks" / f"{notebook.stem}.html").read_text()
         pictures = re.findall(r'src="([\w-]+\.png)"', page)
         text = notebook.read_text()
-        assert (
-            len(pictures) == text.count('"image/png"') and "image/" in text
-        )  # or animations
+        # or animations
+        assert len(pictures) == text.count('"image/png"')
+        assert "image/" in text
         assert all((site / "notebooks" / name).exists() for name in pictures)
 
 
@@ -178,7 +181,8 @@ def test_animations_of_notebooks_run_in_a_browser(site, notebook, tmp_path):
     count = (ROOT / f"notebooks/{notebook}.ipynb").read_text().count('id=\\"motion-')
     assert len(first) == count > 0
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
-    profile, moved = f"--user-data-dir={tmp_path}", set()
+    profile = f"--user-data-dir={tmp_path}"
+    moved = set()
     for time in (
         300,
         700,

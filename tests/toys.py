@@ -19,7 +19,29 @@ def Field(states, function):
 
 
 def toy(charts, transitions=(), period=None, outputs=(), **names):
-    """Return a system without parameters, whose methods return these."""
+    """Return a system without parameters, whose methods return these.
+
+    `toy({"fall": Field(("y",), rates)}, [impact], period=1.0)` is short for what users write:
+
+    ```python
+    class Fall(hj.Chart):
+        states = ("y",)
+
+        def field(self, t, q, u):
+            return rates(t, q, u)
+
+
+    class Toy(hj.HybridSystem):
+        def charts(self):
+            return {"fall": Fall()}
+
+        def transitions(self):
+            return [impact]
+
+        def period(self):
+            return 1.0
+    ```
+    """
     parts = {
         "charts": charts,
         "transitions": transitions,
@@ -32,7 +54,8 @@ def toy(charts, transitions=(), period=None, outputs=(), **names):
 
 def resting(t, q, u):
     """A driven oscillator, and beside it a state that only rounding errors move from zero."""
-    (x, v, w), c = q, jnp.cos(3 * t)
+    (x, v, w) = q
+    c = jnp.cos(3 * t)
     return v, c - 4 * x - v + u[0], (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
 
 
@@ -41,7 +64,8 @@ RESTING = toy({"all": Field(("x", "v", "w"), resting)}, period=2 * np.pi / 3)
 
 def hopper_in(length, time):
     """Return the hopper with lengths and times multiplied."""
-    h, force = hj.models.VerticalHopper(), length / time**2
+    h = hj.models.VerticalHopper()
+    force = length / time**2
     return hj.models.VerticalHopper(
         l0=h.l0 * length,
         a=h.a * force,
@@ -74,9 +98,15 @@ class Switched(hj.HybridSystem):
     duty: Float[Array, ""] = hj.parameter(0.3)
 
     def charts(self):
+        def rates(t, q, u):
+            return (1.0 + u[0] - q[0],)
+
+        def off_rates(t, q, u):
+            return (-q[0],)
+
         return {
-            "on": Field(("x",), lambda t, q, u: (1.0 + u[0] - q[0],)),
-            "off": Field(("x",), lambda t, q, u: (-q[0],)),
+            "on": Field(("x",), rates),
+            "off": Field(("x",), off_rates),
         }
 
     def transitions(self):
@@ -101,7 +131,8 @@ def many(cycle, n):
     """Return so many times the same cycle, without a program that finds them."""
     arrays, rest = eqx.partition(cycle, eqx.is_array)
     arrays = jax.tree_util.tree_map(lambda x: np.broadcast_to(x, (n, *x.shape)), arrays)
-    c, codes = eqx.combine(arrays, rest), np.tile(cycle.event_sequence, (n, 1))
+    c = eqx.combine(arrays, rest)
+    codes = np.tile(cycle.event_sequence, (n, 1))
     return LimitCycles(
         c.system,
         cycle.base,

@@ -209,7 +209,7 @@ class _Writer:
         used = len(self.rows)
         self.rows += self.rows[-1:] * (-used % _ROUND)
         number = np.int32
-        types = [number, number, number, number, bool, bool, bool]
+        types: list[type] = [number, number, number, number, bool, bool, bool]
         types += [number, float, float, number, bool, number]
         columns = [
             np.array(x).astype(d)
@@ -295,8 +295,7 @@ class _Writer:
             signs = np.zeros(self.width, int)
             signs[target] = 1
         arrives = event.at_section and is_own
-        about = dict(passed=e, target=target, signs=signs)
-        self._leg(k, a, duration, newton, **about)
+        self._leg(k, a, duration, newton, passed=e, target=target, signs=signs)
         nothing = np.zeros(self.width, int)
         for _ in range(_CORRECTIONS):
             self._add(

@@ -110,9 +110,9 @@ def scale_of(
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
         scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
-    otherwise = 1.0 if otherwise is None else to_host(otherwise)
-    xp = jnp if is_tracer(otherwise) else np
-    return real(xp.where(np.isnan(scale), otherwise, scale))
+    others: ArrayLike = 1.0 if otherwise is None else to_host(otherwise)
+    xp = jnp if is_tracer(others) else np
+    return real(xp.where(np.isnan(scale), others, scale))
 
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:

@@ -104,9 +104,8 @@ def refused(call, path, says):
     finally:
         tracemalloc.stop()
     assert peak < 2**25
-    assert str(path) in str(error.value) and len(str(error.value)) < 400 + len(
-        str(path)
-    )
+    assert str(path) in str(error.value)
+    assert len(str(error.value)) < 400 + len(str(path))
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")

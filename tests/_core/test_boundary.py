@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.boundary.checked import checked
@@ -29,7 +30,8 @@ from hybridjax._core.boundary.kinds import (
 from hybridjax._core.boundary.values import Complexes, Integers, Number, Reals
 
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 MATRIX = Annotated[Numbers, Reals("N d")]
 GAPS = Annotated[Numbers, Reals("n", missing=True)]
 
@@ -133,7 +135,7 @@ def called(annotation, value):
 def test_what_fits_arrives_in_one_form(annotation, given, expected):
     found = called(annotation, given)
     assert type(found) is type(expected)
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
     assert getattr(found, "dtype", None) == getattr(expected, "dtype", None)
 
 
@@ -148,7 +150,9 @@ def test_what_does_not_fit_is_refused_in_one_sentence(annotation, given, said):
         called(annotation, given)
     text = str(caught.value)
     assert said in text, text
-    assert "function: `x" in text and text.endswith(".") and "\n" not in text
+    assert "function: `x" in text
+    assert text.endswith(".")
+    assert "\n" not in text
 
 
 @checked
@@ -171,7 +175,8 @@ def test_every_parameter_is_checked_however_it_is_given():
 
 
 def test_a_checked_function_looks_as_before():
-    assert several.__doc__ == "What it does." and several.__name__ == "several"
+    assert several.__doc__ == "What it does."
+    assert several.__name__ == "several"
     assert list(inspect.signature(several).parameters) == [
         "a",
         "b",
@@ -214,11 +219,9 @@ class Heir(Module):
 
 def test_a_class_is_checked_where_it_is_built_and_used():
     module = Module(np.int64(3), 1)
-    assert (
-        type(module.n) is int
-        and module.make(2).n == 2
-        and module.alone(1) == module(1) == 1
-    )
+    assert type(module.n) is int
+    assert module.make(2).n == 2
+    assert module.alone(1) == module(1) == 1
     for bad, name in [
         (lambda: Module(0), "Module: `n`"),
         (lambda: module.method(0), "Module.method: `k`"),
@@ -229,7 +232,8 @@ def test_a_class_is_checked_where_it_is_built_and_used():
     ]:
         with pytest.raises(hj.DefinitionError, match=f"^{name} must be an integer"):
             bad()
-    assert module._hidden(0) == 0 and Heir(1, z=2).z == 2
+    assert module._hidden(0) == 0
+    assert Heir(1, z=2).z == 2
     assert jax.tree_util.tree_map(lambda x: x, module).n == 3
 
 
@@ -278,7 +282,7 @@ def test_arrays_may_be_traced():
     assert jax.jit(summed)(x) == 6
     assert jax.grad(lambda s: summed(x, s))(2.0) == 6
     assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
-    np.testing.assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
+    assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
     with pytest.raises(
         hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
     ):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core import meaning
@@ -35,8 +36,14 @@ class Slowed(hj.HybridSystem):
 
     def charts(self):
         k = DRAG[0] if self.water is None else self.water.drag
-        force = lambda t, u: jnp.cos(2 * jnp.pi * t) + self.wind + u[0]  # noqa: E731
-        return {"air": Field(("x",), lambda t, q, u: (force(t, u) - k * q[0],))}
+
+        def force(t, u):
+            return jnp.cos(2 * jnp.pi * t) + self.wind + u[0]
+
+        def air_rates(t, q, u):
+            return (force(t, u) - k * q[0],)
+
+        return {"air": Field(("x",), air_rates)}
 
     def guess(self):
         return hj.Guess("air", (0.1,))
@@ -55,7 +62,7 @@ def test_a_function_that_a_public_call_calls_may_change_what_a_system_computes()
 
     draws = hj.monte_carlo(multiplier, 3)
     assert len(np.unique(draws.drag)) == 3
-    np.testing.assert_allclose(draws.value, np.exp(-draws.drag), rtol=1e-9)
+    assert_allclose(draws.value, np.exp(-draws.drag), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +97,7 @@ def test_systems_given_together_that_are_equal_may_compute_something_else():
         hj.find_limit_cycles(systems, first)
     for system, k in zip(systems, (0.7, 1.3), strict=True):
         cycle = hj.find_limit_cycle(system)
-        np.testing.assert_allclose(cycle.multipliers, [np.exp(-k)], rtol=1e-9)
+        assert_allclose(cycle.multipliers, [np.exp(-k)], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +112,8 @@ def test_systems_given_together_that_are_equal_may_compute_something_else():
 )
 def test_code_is_read_once_in_a_public_call(use, most, monkeypatch):
     cycle = hj.find_limit_cycle(Slowed())
-    count, digest_of = [], meaning._digest_of
+    count = []
+    digest_of = meaning._digest_of
 
     def counted(x):
         count.append(type(x).__name__)

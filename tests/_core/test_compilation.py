@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -45,7 +46,7 @@ WAYS = {
 @pytest.mark.parametrize("function", [double, TwoTiers(lambda x: 2 * x, False)])
 @pytest.mark.parametrize("way", WAYS)
 def test_programs_work_wherever_they_are_called(way, function):
-    np.testing.assert_array_equal(WAYS[way](function), 2 * X)
+    assert_array_equal(WAYS[way](function), 2 * X)
 
 
 def test_errors_of_the_function_come_through():
@@ -63,7 +64,8 @@ class Pair(NamedTuple):
 @pytest.fixture
 def tiers(monkeypatch):
     """The options of all programs that are compiled, which begin with none."""
-    compiled, compile = [], jax.stages.Lowered.compile
+    compiled = []
+    compile = jax.stages.Lowered.compile
 
     def count(self, compiler_options=None):
         compiled.append("quick" if compiler_options else "full")
@@ -92,8 +94,9 @@ def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
         program._quick
     ]  # one program for one job
     later = TwoTiers(total, large=False)
-    np.testing.assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
-    assert [x[1] for x in later._chosen.values()] == [program._full] and len(tiers) == 2
+    assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
+    assert [x[1] for x in later._chosen.values()] == [program._full]
+    assert len(tiers) == 2
 
 
 def test_functions_that_are_written_anew_share_a_program(tiers):
@@ -106,7 +109,7 @@ def test_functions_that_are_written_anew_share_a_program(tiers):
         job(X[:2], lambda x: 2 * x, 1),
         job(X, jnp.cos, 4),
     ]
-    np.testing.assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
+    assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
     assert len(tiers) == 4
 
 
@@ -120,18 +123,19 @@ def plain(function, *trees):
 
 @pytest.mark.parametrize("lanes", [1, 3, 4, 8])
 def test_a_kernel_of_any_number_of_lanes(lanes):
-    x, y = np.linspace(0.0, 1.0, 4)[None], np.ones((1, 1))
+    x = np.linspace(0.0, 1.0, 4)[None]
+    y = np.ones((1, 1))
     before = len(compilation._kernels)
     for k in (1.0, 2.0):
         values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
-        np.testing.assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
+        assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
     assert len(compilation._kernels) == before + 1
     some = np.array([False, True, False, True])
     values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(
         x, y, some=some
     )
     expected = (3 * np.sin(x) ** 2 + y)[:, some]
-    np.testing.assert_allclose(values[:, some], expected, rtol=1e-15)
+    assert_allclose(values[:, some], expected, rtol=1e-15)
 
 
 def test_programs_that_call_lapack_take_turns():
@@ -139,8 +143,11 @@ def test_programs_that_call_lapack_take_turns():
     TwoTiers(jnp.linalg.eigvals, False)(A)
     TwoTiers(jnp.linalg.matmul, False)(A, A)
     alone = {key[0]: program._alone for key, program in compilation._by_kind.items()}
-    assert alone[jnp.linalg.eigvals] and not alone[jnp.linalg.matmul]
-    inside, counts, met = [], [], threading.Barrier(2)
+    assert alone[jnp.linalg.eigvals]
+    assert not alone[jnp.linalg.matmul]
+    inside = []
+    counts = []
+    met = threading.Barrier(2)
 
     def work():
         met.wait(10.0)
@@ -293,13 +300,12 @@ def test_loop_kernels_that_come_too_late_are_refused():
     printed = run(LATE)
     if printed.strip() == "done True":
         pytest.skip("this XLA makes single kernels of loops by default")
-    assert (
-        printed.startswith(" XLA has read")
-        and "before JAX computes anything" in printed
-    )
+    assert printed.startswith(" XLA has read")
+    assert "before JAX computes anything" in printed
 
 
 @pytest.mark.slow
 def test_two_workers_with_lapack_do_not_wait_for_each_other():
     printed = run(LAPACK)
-    assert "500/500 found" in printed and "500/500 ok" in printed
+    assert "500/500 found" in printed
+    assert "500/500 ok" in printed

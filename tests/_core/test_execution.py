@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from hybridjax._core import execution
 from hybridjax._core.compilation import host_first
@@ -19,9 +20,11 @@ def test_the_default_device_counts_more_than_the_backend(monkeypatch):
     """A CPU that is asked for on a machine with a GPU is a CPU."""
     assert on_cpu()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert not on_cpu() and Execution().threads == 1
+    assert not on_cpu()
+    assert Execution().threads == 1
     with jax.default_device("cpu"):
-        assert on_cpu() and jnp.ones(1).devices() == {jax.devices("cpu")[0]}
+        assert on_cpu()
+        assert jnp.ones(1).devices() == {jax.devices("cpu")[0]}
     assert not on_cpu()
 
 
@@ -29,20 +32,21 @@ def test_a_machine_with_a_gpu_computes_few_lanes_on_its_cpu(monkeypatch):
     executors = []
     function = host_first(lambda x: (executors.append(on_host(x)), 2 * x)[1])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]} and executors == [
-        True
-    ]
+    assert function(jnp.ones(1)).devices() == {jax.devices("cpu")[0]}
+    assert executors == [True]
 
 
 def test_programs_factorize_one_matrix_at_a_time():
     """Two stacks in one program wait for each other's threads for ever on two cores (JAX 0.10)."""
     rng = np.random.default_rng(0)
-    A, B, C, u = (
-        rng.normal(size=x) for x in ((8, 3, 3), (8, 3, 2), (8, 1, 3), (1, 5, 8, 2))
-    )
-    matrices, right = rng.normal(size=(3, 2, 4, 4)), rng.normal(size=(4, 1))
+    A = rng.normal(size=(8, 3, 3))
+    B = rng.normal(size=(8, 3, 2))
+    C = rng.normal(size=(8, 1, 3))
+    u = rng.normal(size=(1, 5, 8, 2))
+    matrices = rng.normal(size=(3, 2, 4, 4))
+    right = rng.normal(size=(4, 1))
     exact = np.linalg.solve(matrices, right)
-    np.testing.assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
+    assert_allclose(jax.jit(solve)(matrices, right), exact, rtol=1e-10)
     for program, arguments in (
         (solve, (matrices, right)),
         (harmonic_transfer, (A, B, C, np.zeros((8, 1, 2)), np.arange(9.0) / 9)),
@@ -54,7 +58,8 @@ def test_programs_factorize_one_matrix_at_a_time():
             .as_text()
             .split("getrf_ffi")
         )
-        assert len(calls) == 2 and 'num_batch_dims = "0"' in calls[1]
+        assert len(calls) == 2
+        assert 'num_batch_dims = "0"' in calls[1]
 
 
 @pytest.fixture
@@ -81,7 +86,8 @@ def test_threads_come_back(library):
     with pytest.raises(ZeroDivisionError), one_blas_thread():
         1 / 0  # noqa: B018
     assert library.get() == 4
-    entered, leave = threading.Event(), threading.Event()
+    entered = threading.Event()
+    leave = threading.Event()
 
     @one_blas_thread()
     def other():

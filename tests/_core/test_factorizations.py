@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from hybridjax._core.lanes import by_lane
 from hybridjax._core.vector_math.factorizations import solve_positive
@@ -33,7 +34,8 @@ FUNCTIONS = {
 def samples(n, lanes=9):
     """The first number of the first matrix is zero: without pivoting nothing would be right."""
     rng = np.random.default_rng(n)
-    A, b = rng.normal(size=(n, n, lanes)), rng.normal(size=(n, lanes))
+    A = rng.normal(size=(n, n, lanes))
+    b = rng.normal(size=(n, lanes))
     A[0, 0, 0] = 0.0
     return A, b
 
@@ -50,7 +52,8 @@ def test_values_and_derivatives_are_those_of_lapack(name):
     assert "lapack" not in program.lower(A, b).as_text()
     theirs = jax.jit(value_and_gradient(jax.vmap(function, -1, -1)))(A, b)
     for x, y in zip(program(A, b), theirs, strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9 * np.abs(y).max())
+        tolerance = 1e-9 * np.abs(y).max()
+        assert_allclose(x, y, rtol=1e-9, atol=tolerance)
 
 
 @pytest.mark.parametrize(
@@ -65,8 +68,9 @@ def test_other_factorizations_are_left_to_lapack(function):
 
 def test_matrices_that_are_not_positive_are_seen():
     singular = jnp.array([[1.0, 2.0], [2.0, 4.0]])
-    tiny, matrices = 1e-30 * jnp.eye(2), [singular, -jnp.eye(2), jnp.zeros((2, 2))]
+    tiny = 1e-30 * jnp.eye(2)
+    matrices = [singular, -jnp.eye(2), jnp.zeros((2, 2))]
     x = jax.jit(jax.vmap(solve_positive))(
         jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
     )
-    np.testing.assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)
+    assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)

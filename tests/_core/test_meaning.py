@@ -165,7 +165,8 @@ WAYS = {
 def test_a_change_is_noticed(way, named, monkeypatch):
     monkeypatch.setenv("K", "1")
     before, change = WAYS[way]
-    other, inner = (types.ModuleType(x) for x in ("users_other", "users_inner"))
+    other = types.ModuleType("users_other")
+    inner = types.ModuleType("users_inner")
     other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
     space = {**named, "other": other}
     exec(before, space)
@@ -181,14 +182,12 @@ def test_a_change_is_noticed(way, named, monkeypatch):
 def test_what_is_not_read_is_not_noticed(monkeypatch, tmp_path):
     """A global, or a module of Python, that has the name of an attribute; code of packages."""
     assert is_of_package("/home/a/.local/lib/python3.11/site-packages/jax/x.py")
-    assert is_of_package("/usr/lib/python3/dist-packages/x.py") and not is_of_package(
-        "/home/x.py"
-    )
+    assert is_of_package("/usr/lib/python3/dist-packages/x.py")
+    assert not is_of_package("/home/x.py")
     (tmp_path / "a-1.dist-info").mkdir()  # of `pip install --target`
     (tmp_path / "a-1.dist-info/RECORD").write_text("a/x.py,sha256=k,4\nb.py,,")
-    assert [
-        is_of_package(f"{tmp_path}/{x}") for x in ("a/x.py", "b.py", "mine.py")
-    ] == [1, 1, 0]
+    measured = [is_of_package(f"{tmp_path}/{x}") for x in ("a/x.py", "b.py", "mine.py")]
+    assert measured == [1, 1, 0]
     space = {"__name__": "users_module", "m": 1.0}
     exec("class A:\n    m = 1\na = A()\ndef f(x): return a.m * x", space)
     digest = meaning(space["f"])

@@ -6,6 +6,7 @@ import types
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.meaning import code_digest
@@ -509,7 +510,8 @@ def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_
     monkeypatch.chdir(tmp_path)
     before, change = CHANGES[kind][0]
     space = made(f"{before}\n{CLOCKED}")
-    sections, guess = hj.ClockPhase(2), hj.Guess("line", (0.0,))
+    sections = hj.ClockPhase(2)
+    guess = hj.Guess("line", (0.0,))
     cycles = []
     for statement in ("", change):
         exec(statement, space)
@@ -519,7 +521,7 @@ def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_
                 hj.linearize(cycle, sections)
         cycles.append(hj.find_limit_cycle(space["Uses"](), guess))
         model = hj.linearize(cycles[-1], sections)
-        np.testing.assert_allclose(model.multipliers, [np.exp(-k)], rtol=1e-9)
+        assert_allclose(model.multipliers, [np.exp(-k)], rtol=1e-9)
 
 
 # Changes that leave the numbers as they are, for an x that JAX traces.
@@ -530,7 +532,8 @@ SAME = "True for 1", "a function by types"
 def test_a_change_of_what_code_reads_is_seen_by_systems(way, monkeypatch):
     monkeypatch.setenv("K", "1")
     before, change = WAYS[way]
-    other, inner = (types.ModuleType(x) for x in ("users_other", "users_inner"))
+    other = types.ModuleType("users_other")
+    inner = types.ModuleType("users_inner")
     other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
     space = made("")
     space["other"] = other
@@ -546,15 +549,18 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
     """Classes that `type` makes have the module of a package; a number may be anywhere."""
 
     def system(k):
-        field = lambda t, q, u: (k, 1.0)  # noqa: E731
+        def field(t, q, u):
+            return (k, 1.0)
+
         charts = {"line": Field(("x", "y"), field)}
         return type("Made", (hj.HybridSystem,), {"charts": lambda self, x=charts: x})()
 
     for k in (1.0, 1.0 + 1e-15, 2.0):
         way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
-        np.testing.assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
+        assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
     digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
-    assert digests[0] == digests[1] and len(set(digests)) == 3
+    assert digests[0] == digests[1]
+    assert len(set(digests)) == 3
 
 
 MIRRORED = """
@@ -676,7 +682,11 @@ def test_parts_of_one_name_are_all_compared():
             )
             for k in (first, second)
         ]
-        charts = {"line": Field(("x",), lambda t, q, u: (1.0,))}
+
+        def line_rates(t, q, u):
+            return (1.0,)
+
+        charts = {"line": Field(("x",), line_rates)}
         names = {"charts": lambda self: charts, "transitions": lambda self: levels}
         return type("Made", (hj.HybridSystem,), names)()
 

@@ -6,6 +6,7 @@ import types
 import matplotlib
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core import meaning
@@ -247,7 +248,7 @@ def test_a_cycle_of_a_class_whose_cell_runs_again_needs_no_compilation(notebook)
         return cycles[-1].multipliers
 
     with no_compilation(find):
-        np.testing.assert_allclose(find(), [np.exp(-1.5)], rtol=1e-9)
+        assert_allclose(find(), [np.exp(-1.5)], rtol=1e-9)
     first, second = cycles
     assert type(first.system) is not type(second.system)
 

@@ -25,7 +25,9 @@ def test_it_is_computed_once_and_leaves_the_structure_as_it_is():
     calls.clear()
     box = Box(jnp.asarray(3.0))
     before = jax.tree_util.tree_structure(box)
-    assert box.double == 6 and box.double == 6 and len(calls) == 1
+    assert box.double == 6
+    assert box.double == 6
+    assert len(calls) == 1
     assert jax.tree_util.tree_structure(box) == before
     assert eqx.tree_at(lambda x: x.value, box, jnp.asarray(4.0)).double == 8
 
@@ -35,7 +37,8 @@ def test_it_is_forgotten_with_its_object():
     values = Box.double.memory._values
     size = len(values)
     box = Box(jnp.asarray(1.0))
-    assert box.double == 2 and len(values) == size + 1
+    assert box.double == 2
+    assert len(values) == size + 1
     del box
     calls.clear()
     gc.collect()

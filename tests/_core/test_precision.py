@@ -39,10 +39,8 @@ def test_definitions_may_be_built_before_the_switch(define):
 def test_arrays_that_have_lost_their_digits_are_refused():
     with jax.enable_x64(False):
         k = jnp.asarray(10.1)
-        early, guess = (
-            hj.models.VerticalHopper(k=k),
-            hj.Guess("stance", jnp.asarray([2.0, 1.9])),
-        )
+        early = hj.models.VerticalHopper(k=k)
+        guess = hj.Guess("stance", jnp.asarray([2.0, 1.9]))
     with pytest.raises(
         hj.errors.PrecisionError, match="`k` is float32: it was built before"
     ):
@@ -55,9 +53,12 @@ def test_arrays_that_have_lost_their_digits_are_refused():
 def late(hopper_cycle, placed_isochrons, isochron_ldtp):
     """Calls for a time when JAX has been switched back to 32 bits."""
     cycle, placed, ldtp = hopper_cycle, placed_isochrons, isochron_ldtp
-    hopper, design, u = cycle.system, hj.multisine(), np.zeros((1, 32, 1))
+    hopper = cycle.system
+    design = hj.multisine()
+    u = np.zeros((1, 32, 1))
     response = hj.response_function(cycle, placed, OUTPUTS)
-    map, htf = hj.section_map(cycle, placed, 0, 1), ldtp.htf([0.1])
+    map = hj.section_map(cycle, placed, 0, 1)
+    htf = ldtp.htf([0.1])
     return {
         "simulate": lambda: hj.simulate(hopper, "stance", (2.0, 1.9), 1.0),
         "find_limit_cycle": lambda: hj.find_limit_cycle(hopper, cycle),

@@ -35,12 +35,14 @@ class Terminal(io.StringIO):
 def test_a_terminal_is_watched_and_a_log_is_not(monkeypatch):
     """Without a word from the user, and the line is wiped in the end."""
     monkeypatch.setattr(progress, "_DELAY", 0.01)
-    terminal, log = Terminal(), io.StringIO()
+    terminal = Terminal()
+    log = io.StringIO()
     for file in (terminal, log):
         monkeypatch.setattr(sys, "stderr", file)
         with progress.working("call"):
             time.sleep(0.2)
-    assert "call, 00:00" in terminal.getvalue() and log.getvalue() == ""
+    assert "call, 00:00" in terminal.getvalue()
+    assert log.getvalue() == ""
     assert terminal.getvalue().split("\r")[-2].strip() == ""
 
 
@@ -64,6 +66,7 @@ def test_programs_are_said_to_be_compiled_while_they_are():
     with progress.working("call") as call:
         twice = quick_jit(lambda x: seen.append(str(call)) or 2 * x)
         twice(jnp.ones(2))
-        assert seen == ["(compiling)"] and str(call) == ""
+        assert seen == ["(compiling)"]
+        assert str(call) == ""
         twice(jnp.zeros(2))
         assert len(seen) == 1

@@ -10,6 +10,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.vector_math.rewrite import vectorized
@@ -36,10 +37,9 @@ def looped(x, y):
 
 
 def test_vectorized_replaces_everything():
-    assert left(looped, 0.3, 0.7) and not left(vectorized(looped), 0.3, 0.7)
-    np.testing.assert_allclose(
-        vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13
-    )
+    assert left(looped, 0.3, 0.7)
+    assert not left(vectorized(looped), 0.3, 0.7)
+    assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
 
 
 def test_other_types_and_requested_accuracies_stay():
@@ -63,9 +63,8 @@ def test_types_are_kept():
 
     for x in (0.5, jnp.float64(0.5), jnp.ones(3), jnp.ones((2, 0))):
         x = jnp.asarray(x)
-        ours, truth = (
-            jax.eval_shape(f, x, 3) for f in (vectorized(function), function)
-        )
+        ours = jax.eval_shape(vectorized(function), x, 3)
+        truth = jax.eval_shape(function, x, 3)
         assert ours == truth
         weak = [[v.weak_type for v in jax.tree.leaves(tree)] for tree in (ours, truth)]
         assert weak[0] == weak[1]
@@ -87,11 +86,12 @@ def test_closures_over_tracers():
             jax.jit(transform(lambda a, f=f: response(f, a, x)))(jnp.asarray(a))
             for f in (vectorized, same)
         )
-        np.testing.assert_allclose(ours, truth, rtol=1e-13)
+        assert_allclose(ours, truth, rtol=1e-13)
 
 
 def test_every_call_sees_the_present_parameters_and_traces_once():
-    parameters, traces = {"a": 1.0}, []
+    parameters = {"a": 1.0}
+    traces = []
 
     @vectorized
     def function(x):
@@ -100,7 +100,8 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
 
     first = function(0.5)
     parameters["a"] = 2.0
-    assert function(0.5) == 2 * first and len(traces) == 2
+    assert function(0.5) == 2 * first
+    assert len(traces) == 2
 
 
 def test_off_away_from_cpu(monkeypatch):
@@ -110,19 +111,22 @@ def test_off_away_from_cpu(monkeypatch):
 
 def test_vectors_of_several_functions_are_put_together_row_by_row():
     def field(t, q):
-        a, b = jnp.sin(t) + q[0], jnp.cos(2 * t) * q[1]
+        a = jnp.sin(t) + q[0]
+        b = jnp.cos(2 * t) * q[1]
         return jnp.stack([a, q[0], a * b, jnp.tan(b)]), jnp.concatenate(
             [q, jnp.sin(t)[None]]
         )
 
-    t, q = jnp.asarray(0.7), jnp.array([0.3, -1.2])
+    t = jnp.asarray(0.7)
+    q = jnp.array([0.3, -1.2])
     program = str(jax.make_jaxpr(vectorized(field))(t, q))
     assert "stack[" not in program.replace("_stack[", "")
     assert program.count("concatenate[") == 1  # with one function behind it
     for new, old in zip(vectorized(field)(t, q), field(t, q), strict=True):
-        np.testing.assert_allclose(new, old, rtol=1e-15)
-    new, old = (jax.jacfwd(f)(t, q)[0] for f in (vectorized(field), field))
-    np.testing.assert_allclose(new, old, rtol=1e-14)
+        assert_allclose(new, old, rtol=1e-15)
+    new = jax.jacfwd(vectorized(field))(t, q)[0]
+    old = jax.jacfwd(field)(t, q)[0]
+    assert_allclose(new, old, rtol=1e-14)
 
 
 ZOO = {
@@ -157,13 +161,15 @@ ZOO = {
 
 
 def rotation(angle):
-    s, c = jnp.sin(angle), jnp.cos(angle)
+    s = jnp.sin(angle)
+    c = jnp.cos(angle)
     return jnp.array([[c, -s], [s, c]])
 
 
 def test_a_zoo_of_functions_gives_what_it_gave_before():
     """Values and derivatives of both orders of nesting, over 16 lanes."""
-    x, y = np.random.default_rng(0).uniform(-2, 2, (2, 16))
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-2, 2, (2, 16))
 
     def evaluated(f):
         values = jax.vmap(f)(x, y)
@@ -182,6 +188,7 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
         jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(truth), strict=True
     )
     for (path, a), b in pairs:
-        assert a.dtype == b.dtype and a.shape == b.shape
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
         atol = tolerance * max(1.0, np.abs(b).max())
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))
+        assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
 
 from hybridjax._core.vector_math import trigonometry
 
@@ -71,7 +72,7 @@ def test_hardest_arguments():
         k % 4
     ]  # sin(k pi/2 + r) = r, cos r, -r, ..., and so on
     small = np.where(k % 2 == 0, compiled("sin")(x), compiled("cos")(x))
-    np.testing.assert_array_less(ulps(small * sign, truth), 2)
+    assert_array_less(ulps(small * sign, truth), 2)
     assert np.min(np.abs(truth)) < 1e-18
 
 
@@ -86,14 +87,15 @@ def test_special_values(name):
     with np.errstate(invalid="ignore"):
         truth = getattr(np, name)(x)
     value = np.asarray(compiled(name)(x))
-    np.testing.assert_allclose(value, truth, rtol=1e-15, atol=1e-307)
+    assert_allclose(value, truth, rtol=1e-15, atol=1e-307)
     finite = np.isfinite(truth)
-    np.testing.assert_array_equal(np.signbit(value)[finite], np.signbit(truth)[finite])
+    assert_array_equal(np.signbit(value)[finite], np.signbit(truth)[finite])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives(name):
-    ours, plain = getattr(trigonometry, name), getattr(jnp, name)
+    ours = getattr(trigonometry, name)
+    plain = getattr(jnp, name)
     x = jnp.linspace(-0.9, 0.9, 8)
     for derivative in (
         lambda f: jax.vmap(jax.grad(f)),
@@ -101,4 +103,4 @@ def test_derivatives(name):
         lambda f: jax.hessian(lambda x: (f(x) ** 2).sum()),
     ):
         value, truth = jax.jit(lambda x, d=derivative: (d(ours)(x), d(plain)(x)))(x)
-        np.testing.assert_allclose(value, truth, rtol=1e-12, atol=1e-13)
+        assert_allclose(value, truth, rtol=1e-12, atol=1e-13)

@@ -67,7 +67,8 @@ def test_later_results_take_the_place_of_earlier_ones(full):
     write(full, RESULTS | {"figures/old.png": "image"})
     write(full, {"report.html": "new page", "figures/bode.png": "image"})
     after = tree(full)
-    assert after["report.html"] == "new page" and "figures/old.png" not in after
+    assert after["report.html"] == "new page"
+    assert "figures/old.png" not in after
     assert all(after[name] == text for name, text in MINE.items())
     assert set(json.loads(after[LIST])) == set(RESULTS)
 
@@ -132,7 +133,8 @@ def test_an_error_leaves_nothing(tmp_path):
 def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     """Whatever is there then is known to be a result, so that the next call replaces it."""
     write(full, RESULTS | {"summary.json": "1"})
-    replace, left = os.replace, iter([True, True, False])
+    replace = os.replace
+    left = iter([True, True, False])
 
     def interrupted(source, target):
         if not next(left):
@@ -168,7 +170,8 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
     os.symlink(tmp_path / "away", folder / name)
     with pytest.raises(hj.DefinitionError, match="is a link"):
         writer(folder / name)
-    assert (tmp_path / "away").read_text() == "mine" and (folder / name).is_symlink()
+    assert (tmp_path / "away").read_text() == "mine"
+    assert (folder / name).is_symlink()
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
     (folder / name).unlink()
     os.mkfifo(folder / name)

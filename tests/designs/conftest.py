@@ -12,13 +12,14 @@ TWO_NOISE = {"y0": 0.01, "y1": 0.02}
 @pytest.fixture(scope="session")
 def model():
     """Two states, slow and with little damping, with inputs and outputs in rotating directions."""
-    turn = 2 * np.pi * np.arange(8) / 8
-    A = 0.97 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-    B = np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, :, None]
-    C = np.stack(
-        [np.ones((8, 2)), np.stack([np.sin(turn), np.cos(turn)], axis=1)], axis=1
-    )
-    return hj.LDTP(np.broadcast_to(A, (8, 2, 2)), B, C, inputs="u", outputs=("x", "v"))
+    rotation = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    A = np.broadcast_to(0.97 * rotation, (8, 2, 2))
+    angle = 2 * np.pi * np.arange(8) / 8
+    push = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x = np.ones((8, 2))
+    v = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    C = np.stack([x, v], axis=1)
+    return hj.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
 
 
 @pytest.fixture(scope="session")
@@ -43,22 +44,29 @@ def optimal_two(two, two_usual):
 def expected_htf(model, design, noise, harmonics=None):
     """Return the exact HTFs at the lines of a design, with the variance of their estimates."""
     htf = model.htf(design.frequencies, harmonics)
-    variance = (
-        design.expected_variance()[:, None, :]
-        * np.square(list(noise.values()))[:, None]
-    )
-    return dataclasses.replace(htf, variance=np.broadcast_to(variance, htf.H.shape))
+    of_unit_noise = design.expected_variance()[:, None, :]
+    of_outputs = np.square(list(noise.values()))[:, None]
+    variance = np.broadcast_to(of_unit_noise * of_outputs, htf.H.shape)
+    return dataclasses.replace(htf, variance=variance)
 
 
 def total_variance(bound):
     """Return the sum of the variances of real and imaginary parts, pairs once."""
-    pairs = zip(bound.multipliers, bound.multiplier_covariances, strict=True)
-    return sum(np.trace(c) for z, c in pairs if z.imag >= 0)
+    total = 0.0
+    for z, covariance in zip(
+        bound.multipliers, bound.multiplier_covariances, strict=True
+    ):
+        if z.imag >= 0:
+            total += np.trace(covariance)
+    return total
 
 
 def random_designs(number, rms, *arguments, **options):
     """Yield multisines with random amplitudes."""
     rng = np.random.default_rng(0)
     for _ in range(number):
-        amplitude = lambda f: rng.exponential(size=f.shape)  # noqa: E731
+
+        def amplitude(f):
+            return rng.exponential(size=f.shape)
+
         yield hj.multisine(*arguments, amplitude=amplitude, **options).scaled(rms)

@@ -38,7 +38,8 @@ def test_several_limits(linear, quadratic):
     """Against sequential quadratic programming, without majorization or linear limits around
     quadratic ones. The certificate bounds the distance from the optimum, also far from it."""
     rng = np.random.default_rng(3)
-    slopes, factors = rng.normal(size=(3, 14)), rng.uniform(0, 1, (quadratic, 14, 14))
+    slopes = rng.normal(size=(3, 14))
+    factors = rng.uniform(0, 1, (quadratic, 14, 14))
     curved = np.einsum("oik,oil->okl", factors, factors)
     cost = rng.uniform(0.2, 2, (linear, 14))
 

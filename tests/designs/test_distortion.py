@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.designs.candidates import Candidates
@@ -14,7 +15,8 @@ from ..conftest import APEX, OUTPUTS
 from ..toys import Field, toy
 
 
-Limits, Distortion = hj.designs.Limits, hj.designs.Distortion
+Limits = hj.designs.Limits
+Distortion = hj.designs.Distortion
 # (Eight sections: shapes are the same in all tests of the hopper, so that each is compiled once.)
 KINEMATIC = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
@@ -29,7 +31,10 @@ class Quadratic(hj.HybridSystem):
     b: hj.Parameter = hj.parameter(0.7)
 
     def charts(self):
-        return {"rest": Field(("x",), lambda t, q, u: (0.0 * q[0],))}
+        def rest_rates(t, q, u):
+            return (0.0 * q[0],)
+
+        return {"rest": Field(("x",), rest_rates)}
 
     def transitions(self):
         def reset(t, q, u):
@@ -56,9 +61,15 @@ def two_charts():
     def shown(t, q, u):
         return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
 
+    def one_rates(t, q, u):
+        return (0.0 * q[0],)
+
+    def two_rates(t, q, u):
+        return (0.0 * q[0], 0.0 * q[1])
+
     charts = {
-        "one": Field(("x",), lambda t, q, u: (0.0 * q[0],)),
-        "two": Field(("x", "v"), lambda t, q, u: (0.0 * q[0], 0.0 * q[1])),
+        "one": Field(("x",), one_rates),
+        "two": Field(("x", "v"), two_rates),
     }
     transitions = (
         hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
@@ -73,9 +84,8 @@ SHORT = hj.multisine(4, periods=8, inputs=("push", "pull")).scaled(1e-3)
 
 
 def about(system):
-    cycle = hj.find_limit_cycle(
-        system, hj.Guess("rest", (0.0,), time=0.5), scale={"x": 1.0}
-    )
+    guess = hj.Guess("rest", (0.0,), time=0.5)
+    cycle = hj.find_limit_cycle(system, guess, scale={"x": 1.0})
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, "x")
 
@@ -88,20 +98,18 @@ def quadratic():
 @pytest.fixture(scope="module")
 def two():
     cycle = hj.find_limit_cycle(two_charts(), hj.Guess("one", (0.0,), time=0.75))
-    return cycle, hj.ClockPhase(4), hj.linearize(cycle, hj.ClockPhase(4), ("x", "z"))
+    sections = hj.ClockPhase(4)
+    return cycle, sections, hj.linearize(cycle, sections, ("x", "z"))
 
 
 def even_part(cycle, sections, u, outputs):
     """(y(u) + y(-u)) / 2 of the nonlinear system, as it deviates from the cycle."""
-    y = hj.run_experiments(
-        cycle,
-        sections,
-        np.concatenate([u, -u]),
-        outputs,
-        start="steady",
-        accuracy=1e-11,
-    ).y
-    return (y[: len(u)] + y[len(u) :]) / 2
+    both = np.concatenate([u, -u])
+    data = hj.run_experiments(
+        cycle, sections, both, outputs, start="steady", accuracy=1e-11
+    )
+    up, down = np.split(data.y, 2)
+    return (up + down) / 2
 
 
 @pytest.mark.slow
@@ -126,7 +134,8 @@ def test_without_a_clock(vanderpol_cycle):
     quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
     u = hj.multisine(4, periods=4, band=(0.0, 2.0)).scaled(rms=1e-3).inputs()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
-    assert np.abs(even - quadratic.second_order(u)).max() < 1e-4 * np.abs(even).max()
+    error = np.abs(even - quadratic.second_order(u)).max()
+    assert error < 1e-4 * np.abs(even).max()
 
 
 @pytest.mark.slow
@@ -135,98 +144,115 @@ def test_two_inputs(two, inputs):
     """Inputs in any order; charts with one and two states; outputs that depend on the inputs."""
     cycle, sections, _ = two
     quadratic = second_order(cycle, sections, ("x", "z"), inputs)
-    u = SHORT.inputs()[:, :, [SHORT.input_names.index(n) for n in inputs]]
-    full = np.zeros((*u.shape[:2], 2))
-    full[:, :, [("push", "pull").index(n) for n in inputs]] = u
-    even = even_part(cycle, sections, full, ("x", "z"))
-    assert np.abs(even - quadratic.second_order(u)).max() < 1e-5 * np.abs(even).max()
+    everything = SHORT.inputs()
+    u = everything[:, :, [SHORT.input_names.index(name) for name in inputs]]
+    of_system = np.zeros_like(everything)
+    for k, name in enumerate(inputs):
+        of_system[:, :, ("push", "pull").index(name)] = u[:, :, k]
+    even = even_part(cycle, sections, of_system, ("x", "z"))
+    tolerance = 1e-5 * np.abs(even).max()
+    assert_allclose(quadratic.second_order(u), even, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("gaussian", [False, True])
-def test_the_expected_size_with_two_inputs(two, gaussian):
-    """Over draws of the phases; and of amplitudes, too, which makes the inputs Gaussian."""
-    count, cosines = 400, Candidates.of(SHORT)
-    limit = Distortion(*two[:2], {"x": 1.0, "z": 1.0})
-    form = products(limit, cosines, two[2].inputs, cosines.power_of(SHORT))
-    drawn, expected = SHORT.realizations(count), form.rms(SHORT) ** 2
-    if gaussian:
-        size = np.sqrt(np.random.default_rng(0).exponential(size=len(drawn.line)))
-        drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
-        matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
-        expected = np.mean([matrix @ p @ p for p in cosines.powers_in(SHORT)], axis=0)
-    squares = np.mean(form.quadratic.second_order(drawn.inputs()) ** 2, axis=1)
-    each = squares.reshape(count, -1, 2).mean(axis=1)
-    error = np.std(each, axis=0) / np.sqrt(count)
-    assert (np.abs(np.mean(each, axis=0) - expected) < 3.5 * error).all()
-    assert (error < (0.05 if gaussian else 0.02) * expected).all()
+def require_mean_square(outputs, count, expected, precision):
+    """The mean square over draws is what is expected, but for 3.5 standard errors."""
+    in_time = np.mean(outputs**2, axis=1)
+    each = in_time.reshape(count, -1, 2).mean(axis=1)
+    standard_error = np.std(each, axis=0) / np.sqrt(count)
+    assert (np.abs(np.mean(each, axis=0) - expected) < 3.5 * standard_error).all()
+    assert (standard_error < precision * expected).all()
+
+
+def products_of(two):
+    cycle, sections, model = two
+    cosines = Candidates.of(SHORT)
+    limit = Distortion(cycle, sections, {"x": 1.0, "z": 1.0})
+    return cosines, products(limit, cosines, model.inputs, cosines.power_of(SHORT))
+
+
+def test_the_expected_size_with_two_inputs(two):
+    """Over draws of the phases."""
+    count = 400
+    _, form = products_of(two)
+    drawn = SHORT.realizations(count)
+    outputs = form.quadratic.second_order(drawn.inputs())
+    require_mean_square(outputs, count, form.rms(SHORT) ** 2, 0.02)
+
+
+def test_the_expected_size_of_gaussian_inputs(two):
+    """Over draws of phases and amplitudes."""
+    count = 400
+    cosines, form = products_of(two)
+    drawn = SHORT.realizations(count)
+    rng = np.random.default_rng(0)
+    size = np.sqrt(rng.exponential(size=len(drawn.line)))
+    drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
+    outputs = form.quadratic.second_order(drawn.inputs())
+    matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
+    expected = [matrix @ power @ power for power in cosines.powers_in(SHORT)]
+    require_mean_square(outputs, count, np.mean(expected, axis=0), 0.05)
 
 
 @pytest.mark.parametrize("f", [0.125, 0.375])
 def test_one_cosine_in_closed_form(quadratic, f):
     """x2[p+1] = 0.6 x2[p] + 0.7 x1[p]^2, of which the mean and twice the frequency are seen; z has
     the square of the input, too."""
-    a, z = 0.01, np.exp(2j * np.pi * f)
-    design = hj.Design(
-        experiment=[0],
-        line=[round(8 * f)],
-        channel=[0],
-        amplitude=[a],
-        phase=[0.4],
-        n_sections=4,
-        periods=8,
-        experiments=1,
-        input_names=("u",),
+    cycle, sections, _ = quadratic
+    amplitude = 0.01
+    design = hj.Design.from_lines(
+        [[f]], amplitude, 0.4, n_sections=4, periods=8, inputs="u"
     )
     cosines = Candidates.of(design)
-    limit = Distortion(quadratic[0], quadratic[1], {"x": 1.0, "z": 1.0})
+    limit = Distortion(cycle, sections, {"x": 1.0, "z": 1.0})
     found = products(limit, cosines, ("u",), cosines.power_of(design))
-    x1 = a / np.abs(z - 0.6)
-    mean, twice = 0.7 * x1**2 / 2 / 0.4, 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
-    assert found.rms(design)[0] == pytest.approx(
-        np.sqrt(mean**2 + twice**2 / 2), rel=1e-9
-    )
-    np.testing.assert_allclose(
-        found.rms(design, phases=True), found.rms(design), rtol=1e-9
-    )
-    u2 = design.inputs()[0, :, 0] ** 2
-    both = found.quadratic.second_order(design.inputs())[0]
-    np.testing.assert_allclose(both[:, 1], both[:, 0] + u2, atol=1e-15)
+
+    z = np.exp(2j * np.pi * f)
+    x1 = amplitude / np.abs(z - 0.6)
+    mean = 0.7 * x1**2 / 2 / 0.4
+    twice = 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
+    rms_of_x = np.sqrt(mean**2 + twice**2 / 2)
+    assert found.rms(design)[0] == pytest.approx(rms_of_x, rel=1e-9)
+    assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
+    u = design.inputs()
+    x, z = found.quadratic.second_order(u)[0].T
+    assert_allclose(z, x + u[0, :, 0] ** 2, atol=1e-15)
 
 
 @pytest.mark.slow
 def test_designs_within_a_distortion(hopper_cycle):
     """The limit holds for the experiments that are made, and those of equal amplitudes."""
     sections = hj.ClockPhase(8, anchor=APEX)
-    model, usual = (
-        hj.linearize(hopper_cycle, sections, OUTPUTS),
-        hj.multisine(8, periods=32),
-    )
-    distortion = Distortion(hopper_cycle, sections, LEVEL)
-    plan = hj.optimal_design(
-        model, usual, limit=Limits(distortion=distortion), noise=NOISE
-    )
-    ends = {
-        f"distortion of {n}": plan.rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL
-    }
-    assert plan.limited == tuple(n for n, share in ends.items() if share > 0.99) != ()
-    for rms in (plan.rms, plan.usual_rms):
-        assert max(
-            rms[f"distortion of {n}"] / LEVEL[n] for n in LEVEL
-        ) == pytest.approx(1)
-    assert plan.saved > 1.2 and 1 <= plan.certificate < 1.1
+    model = hj.linearize(hopper_cycle, sections, OUTPUTS)
+    usual = hj.multisine(8, periods=32)
+    limit = Limits(distortion=Distortion(hopper_cycle, sections, LEVEL))
+    plan = hj.optimal_design(model, usual, limit=limit, noise=NOISE)
+
+    def shares(rms):
+        """The distortion of each output as a share of its limit."""
+        return {name: rms[f"distortion of {name}"] / LEVEL[name] for name in LEVEL}
+
+    at_limit = [name for name, share in shares(plan.rms).items() if share > 0.99]
+    assert len(at_limit) > 0
+    assert plan.limited == tuple(at_limit)
+    assert max(shares(plan.rms).values()) == pytest.approx(1)
+    assert max(shares(plan.usual_rms).values()) == pytest.approx(1)
+    assert plan.saved > 1.2
+    assert 1 <= plan.certificate < 1.1
     assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
+
     # Twice what is allowed: twice the power, half of the strides.
-    twice = Distortion(hopper_cycle, sections, {n: 2 * x for n, x in LEVEL.items()})
-    more = hj.optimal_design(model, usual, limit=Limits(distortion=twice), noise=NOISE)
+    twice = {name: 2 * level for name, level in LEVEL.items()}
+    limit = Limits(distortion=Distortion(hopper_cycle, sections, twice))
+    more = hj.optimal_design(model, usual, limit=limit, noise=NOISE)
     assert more.criterion == pytest.approx(plan.criterion / 2, rel=0.02)
+
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
-    seen = np.sqrt(
-        np.mean(quadratic.second_order(plan.design.inputs()) ** 2, axis=(0, 1))
-    )
-    said = [plan.rms[f"distortion of {n}"] for n in OUTPUTS]
-    np.testing.assert_allclose(seen, said, rtol=0.1)
+    outputs = quadratic.second_order(plan.design.inputs())
+    rms = np.sqrt(np.mean(outputs**2, axis=(0, 1)))
+    expected = [plan.rms[f"distortion of {name}"] for name in OUTPUTS]
+    assert_allclose(rms, expected, rtol=0.1)
 
 
 def test_beside_other_limits(quadratic):
@@ -247,8 +273,10 @@ def test_beside_other_limits(quadratic):
         robust="worst",
         **options,
     )
-    assert both.limited == ("u",) and both.rms["distortion of x"] < 1e-3
-    assert both.rms["u"] <= 0.01 * (1 + 1e-9) and both.certificate >= 1
+    assert both.limited == ("u",)
+    assert both.rms["distortion of x"] < 1e-3
+    assert both.rms["u"] <= 0.01 * (1 + 1e-9)
+    assert both.certificate >= 1
 
 
 def test_without_distortion(quadratic):

@@ -4,13 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
 from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
 
 
-N, NOISE = 4, {"y": 0.02}
+N = 4
+NOISE = {"y": 0.02}
 GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 
 
@@ -18,10 +20,17 @@ GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
 def model():
     """Two real multipliers."""
     A = np.array(
-        [np.eye(2), [[0.9, 0.1], [0.0, 0.5]], [[1, 0], [0.2, 1]], np.diag([0.7, -0.6])]
+        [
+            [[1.0, 0.0], [0.0, 1.0]],
+            [[0.9, 0.1], [0.0, 0.5]],
+            [[1.0, 0.0], [0.2, 1.0]],
+            [[0.7, 0.0], [0.0, -0.6]],
+        ]
     )
     rng = np.random.default_rng(1)
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 1, 2))
+    return hj.LDTP(A, B, C)
 
 
 @pytest.fixture(scope="module")
@@ -33,16 +42,19 @@ def test_transfer_functions_in_a_band(model, usual):
     """Their mean variance is that of `fit_ldtp`."""
     goal = hj.designs.FrequencyResponse((0.2, 0.8), wanted=(0, 1))
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
-    assert plan.names == ("H_0 of y", "H_1 of y") and plan.certificate < 1.03
+    assert plan.names == ("H_0 of y", "H_1 of y")
+    assert plan.certificate < 1.03
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
-    size = (np.abs(model.htf(f, (0, 1)).H) ** 2).mean(axis=1).sum()
-    for design, said in (
-        (plan.usual, plan.usual_variances),
-        (plan.design, plan.variances),
-    ):
+    power = np.abs(model.htf(f, (0, 1)).H) ** 2
+    size = power.mean(axis=1).sum()
+
+    def require_variances(design, said):
         fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
-        variance = fit.htf(f, (0, 1)).variance.mean(axis=1)[:, 0, 0] / size
-        np.testing.assert_allclose(said, variance, rtol=0.02)
+        variance = fit.htf(f, (0, 1)).variance[:, :, 0, 0]
+        assert_allclose(said, variance.mean(axis=1) / size, rtol=0.02)
+
+    require_variances(plan.usual, plan.usual_variances)
+    require_variances(plan.design, plan.variances)
 
 
 @pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
@@ -55,9 +67,7 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
     bound = hj.identify.ldtp_bound(
         two, expected_htf(two, plan.usual, TWO_NOISE, harmonics)
     )
-    np.testing.assert_allclose(
-        plan.usual_variances.sum(), total_variance(bound), rtol=1e-5
-    )
+    assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
     for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
         bound = hj.identify.ldtp_bound(
             two, expected_htf(two, other, TWO_NOISE, harmonics)
@@ -72,7 +82,8 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
 
 def test_multipliers_keep_the_numbers_of_the_model():
     """Three multipliers, the first of which no input excites."""
-    A, ones = np.diag([0.9, 0.6, 0.3]), np.array([0.0, 1.0, 1.0])
+    A = np.diag([0.9, 0.6, 0.3])
+    ones = np.array([0.0, 1.0, 1.0])
     model = hj.LDTP(
         np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3))
     )
@@ -82,7 +93,8 @@ def test_multipliers_keep_the_numbers_of_the_model():
         goal = hj.designs.Multipliers(which, estimator="fit_ldtp")
         return hj.optimal_design(model, usual, goal=goal, noise={"y": 0.01})
 
-    assert plan(1).names == ("0.6",) and plan(2).names == ("0.3",)
+    assert plan(1).names == ("0.6",)
+    assert plan(2).names == ("0.3",)
     with pytest.raises(hj.DefinitionError, match=r"no input excites.*multiplier 0\.9"):
         plan(0)
 
@@ -90,11 +102,9 @@ def test_multipliers_keep_the_numbers_of_the_model():
 def test_bad_goals(model, usual):
     close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
     double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
-    M, walker, at = (
-        hj.designs.Multipliers,
-        hj.models.SimplestWalker(),
-        hj.AtEvent("heelstrike"),
-    )
+    M = hj.designs.Multipliers
+    walker = hj.models.SimplestWalker()
+    at = hj.AtEvent("heelstrike")
     short = hj.find_limit_cycle(walker, walker.short_gait(), section=at)
     cases = (
         (model, hj.designs.Parameters(short, at, "slope"), "a stable `cycle`"),
@@ -109,12 +119,19 @@ def test_bad_goals(model, usual):
 
 def with_angle(angle):
     """Return a model with a pair of multipliers of modulus 0.9 and this angle."""
-    turn = 0.9 * np.array(
-        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    c = np.cos(angle)
+    s = np.sin(angle)
+    A = np.array(
+        [
+            [[0.9 * c, -0.9 * s], [0.9 * s, 0.9 * c]],
+            [[1.0, 0.0], [0.0, 1.0]],
+            [[1.0, 0.1], [0.0, 1.0]],
+            [[1.0, -0.1], [0.0, 1.0]],
+        ]
     )
-    A = np.array([turn, np.eye(2), [[1, 0.1], [0, 1]], [[1, -0.1], [0, 1]]])
-    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])[..., None]
-    return hj.LDTP(A, B, np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])[:, None])
+    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])
+    C = np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])
+    return hj.LDTP(A, B[:, :, None], C[:, None])
 
 
 def variance(model, design):
@@ -123,57 +140,71 @@ def variance(model, design):
     return total_variance(hj.identify.multiplier_bound(model, htf))
 
 
+@pytest.fixture(scope="module")
+def three():
+    """Models that differ in the angle of their multipliers."""
+    return [with_angle(0.8), with_angle(1.6), with_angle(2.4)]
+
+
 @pytest.mark.parametrize("robust, exponent", [("mean", 1), ("worst", 16)])
-def test_several_models(robust, exponent):
-    """The certificate bounds all designs for the mean of powers, limits hold for each model, and
-    standard errors of 1e-15 have no effect (their 16th powers are zero)."""
-    models = [with_angle(angle) for angle in (0.8, 1.6, 2.4)]
+def test_several_models(robust, exponent, three):
+    """The certificate bounds all designs for the mean of powers, and standard errors of 1e-15 have
+    no effect (their 16th powers are zero)."""
     usual = hj.multisine(N, 32, band=(0, 2))
     about = dict(goal=GOAL, limit={"u": 0.1}, robust=robust)
-    plan = hj.optimal_design(models, usual, noise=NOISE, **about)
+    plan = hj.optimal_design(three, usual, noise=NOISE, **about)
     assert plan.certificate < 1.05
 
     def mean(design):
-        each = [variance(model, design) for model in models]
-        return np.mean(np.power(each, exponent)) ** (1 / exponent)
+        variances = [variance(model, design) for model in three]
+        powers = np.power(variances, exponent)
+        return np.mean(powers) ** (1 / exponent)
 
     assert mean(plan.design) == pytest.approx(plan.criterion, rel=2e-3)
     for other in random_designs(5, 0.1, N, 32, band=(0, 2)):
         assert mean(other) > plan.criterion / plan.certificate
-    alone = hj.optimal_design(
-        models[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1}
+    for_one = hj.optimal_design(
+        three[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1}
     )
-    assert mean(alone.design) > 1.2 * plan.criterion
-    small = hj.optimal_design(models, usual, noise={"y": 2e-15}, **about)
-    assert small.saved == pytest.approx(plan.saved, rel=0.05)
-    about = dict(goal=GOAL, noise=NOISE, limit={"u": 9.0, "y": 0.1})
-    limited = hj.optimal_design(models, usual, **about).design
-    data = [
-        hj.experiments.simulate_experiments(m, limited, start="periodic").y
-        for m in models
-    ]
-    assert max(np.sqrt(np.mean(y**2)) for y in data) == pytest.approx(0.1, rel=1e-2)
+    assert mean(for_one.design) > 1.2 * plan.criterion
+    almost_exact = hj.optimal_design(three, usual, noise={"y": 2e-15}, **about)
+    assert almost_exact.saved == pytest.approx(plan.saved, rel=0.05)
+
+
+def test_limits_hold_for_each_of_several_models(three):
+    usual = hj.multisine(N, 32, band=(0, 2))
+    limit = {"u": 9.0, "y": 0.1}
+    plan = hj.optimal_design(three, usual, goal=GOAL, noise=NOISE, limit=limit)
+    rms = []
+    for model in three:
+        data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
+        rms.append(np.sqrt(np.mean(data.y**2)))
+    assert max(rms) == pytest.approx(0.1, rel=1e-2)
+
+
+def test_several_models_that_do_not_fit_together(three):
+    usual = hj.multisine(N, 32, band=(0, 2))
     with pytest.raises(
         hj.DefinitionError, match="model 1 and model 0 have different n_sections"
     ):
-        hj.optimal_design([models[0], hj.testing.synthetic_ldtp()], usual)
+        hj.optimal_design([three[0], hj.testing.synthetic_ldtp()], usual)
+    unstable = dataclasses.replace(three[1], A=1.1 * three[1].A)
     with pytest.raises(hj.DefinitionError, match="model 1 is unstable"):
-        hj.optimal_design(
-            [models[0], dataclasses.replace(models[1], A=1.1 * models[1].A)], usual
-        )
+        hj.optimal_design([three[0], unstable], usual)
     with pytest.raises(hj.DefinitionError, match="not an empty list"):
         hj.optimal_design([], usual)
 
 
 def test_draws_have_the_covariance_of_the_fit():
-    model, design = with_angle(1.0), hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
+    model = with_angle(1.0)
+    design = hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
     fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
-    c = np.array(
-        [np.poly(draw.multipliers).real[1:] for draw in hj.designs.draws(fit, 400)]
-    )
-    np.testing.assert_allclose(
-        np.cov(c.T), fit.covariance, atol=0.3 * fit.covariance.max()
-    )
+    coefficients = []
+    for draw in hj.designs.draws(fit, 400):
+        coefficients.append(np.poly(draw.multipliers).real[1:])
+    covariance = np.cov(np.transpose(coefficients))
+    tolerance = 0.3 * fit.covariance.max()
+    assert_allclose(covariance, fit.covariance, atol=tolerance)
 
 
 @pytest.mark.slow
@@ -182,19 +213,19 @@ def test_physical_parameters():
     cycle = hj.find_limit_cycle(hj.models.Duffing())
     sections = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
     model = hj.linearize(cycle, sections, outputs=("x", "v"))
-    usual, free = hj.multisine(8, periods=16).scaled(0.001), ("damping", "amplitude")
-    goal = hj.designs.Parameters(cycle, sections, free, harmonics=(-1, 0, 1))
+    usual = hj.multisine(8, periods=16).scaled(0.001)
+    free = ("damping", "amplitude")
+    harmonics = (-1, 0, 1)
+    goal = hj.designs.Parameters(cycle, sections, free, harmonics=harmonics)
     plan = hj.optimal_design(model, usual, goal=goal, noise={"x": 1e-4})
-    assert plan.certificate < 1.03 and plan.saved > 10
+    assert plan.certificate < 1.03
+    assert plan.saved > 10
 
-    htf = model.htf(usual.frequencies, (-1, 0, 1))
-    variance = np.broadcast_to(
-        usual.expected_variance(1e-4)[:, None], (3, len(htf.f), 1, 1)
-    )
-    x = hj.HTF(
-        htf.f, htf.H[:, :, :1], (-1, 0, 1), 8, htf.inputs, "x", variance=variance
-    )
-    observed = hj.ObservedHTF(x, sections)
+    exact = model.htf(usual.frequencies, harmonics)
+    H = exact.H[:, :, :1]
+    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], H.shape)
+    htf = hj.HTF(exact.f, H, harmonics, 8, exact.inputs, "x", variance=variance)
+    observed = hj.ObservedHTF(htf, sections)
     S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
-    np.testing.assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)
+    assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -1,7 +1,10 @@
 """Limits: the signals themselves obey them. Noise: its spectrum attracts or repels power."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -15,25 +18,26 @@ RMS = {"u0": 0.1, "u1": 0.05}
 def test_peaks_hold_in_every_experiment(optimal_two):
     free = optimal_two()
     plan = optimal_two(limit=Limits(rms={"u1": 0.05}, peak={"u0": 0.1}))
-    np.testing.assert_allclose(np.abs(plan.design.inputs()).max(axis=1)[:, 0], 0.1)
+    u = plan.design.inputs()
+    peaks = np.abs(u).max(axis=1)[:, 0]
+    assert_allclose(peaks, 0.1)
+    rms = np.sqrt(np.mean(u[..., 1] ** 2))
+    assert_allclose(rms, plan.rms["u1"])
     assert plan.limited == ("u1", "peak of u0")
     # (The crest factor is about 2.)
-    assert 1.5 < plan.criterion / free.criterion < 5 and plan.certificate > 1.5
+    assert 1.5 < plan.criterion / free.criterion < 5
+    assert plan.certificate > 1.5
     # The usual amplitudes get phases for low peaks, too: the design saves strides by its powers.
-    assert set(np.abs(plan.usual.inputs()).max(axis=1)[:, 0].round(6)) == {0.0, 0.1}
-    np.testing.assert_allclose(
-        np.mean(plan.design.inputs()[..., 1] ** 2), plan.rms["u1"] ** 2
-    )
-    # A peak that nothing exceeds changes nothing.
-    loose = optimal_two(limit=Limits(rms=RMS, peak={"u0": 9.0}))
-    assert loose.criterion == pytest.approx(free.criterion)
+    usual_peaks = np.abs(plan.usual.inputs()).max(axis=1)[:, 0]
+    assert set(usual_peaks.round(6)) == {0.0, 0.1}
 
 
 def test_rates(optimal_two):
     """The change from one section to the next, also from the last one to the first."""
     plan = optimal_two(limit=Limits(rms=RMS, rate={"u0": 0.03}))
     change = np.diff(plan.design.inputs(33), axis=1)[:, : 6 * 32]
-    assert np.sqrt(np.mean(change[..., 0] ** 2)) == pytest.approx(0.03, rel=1e-3)
+    measured = np.sqrt(np.mean(change[..., 0] ** 2))
+    assert measured == pytest.approx(0.03, rel=1e-3)
     assert plan.certificate < 1.03
     assert "rms of u0 and u1 and rate of u0 limited" in plan.advice
 
@@ -41,21 +45,38 @@ def test_rates(optimal_two):
 def test_strides(optimal_two, two_usual):
     """A smaller number of experiments holds fewer lines; words and strides go together."""
     plan = optimal_two(limit=Limits(rms="input", strides=300))
-    assert plan.design.experiments == 300 // 32 and plan.strides <= 300
+    assert plan.design.experiments == 300 // 32
+    assert plan.strides <= 300
     power = np.sqrt(np.mean(two_usual.inputs() ** 2, axis=(0, 1)))
     assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
 
 
+def test_a_peak_that_nothing_exceeds_changes_nothing(optimal_two):
+    free = optimal_two()
+    loose = optimal_two(limit=Limits(rms=RMS, peak={"u0": 9.0}))
+    assert loose.criterion == pytest.approx(free.criterion)
+
+
 def test_noise_that_differs_between_harmonics(two, optimal_two):
     """Against `multiplier_bound`, which takes numerators out in another way."""
-    red = {n: (lambda f, s=s: s / np.sqrt(0.2 + f**2)) for n, s in TWO_NOISE.items()}
-    plan = optimal_two(limit={"u0": 0.1, "u1": 0.1}, noise=red)
+
+    def red(std):
+        return lambda f: std / np.sqrt(0.2 + f**2)
+
+    noise = {output: red(std) for output, std in TWO_NOISE.items()}
+    plan = optimal_two(limit={"u0": 0.1, "u1": 0.1}, noise=noise)
     assert plan.certificate < 1.03
-    harmonics = (-1, 0, 1)
+
+    N = 6
+    harmonics = np.array([-1, 0, 1])
     htf = two.htf(plan.usual.frequencies, harmonics)
-    f = np.abs((htf.f + np.array(harmonics)[:, None] + 3) % 6 - 3)
-    spectrum = np.stack([level(f) ** 2 for level in red.values()], axis=2)[..., None]
+    # Harmonic m of an output is seen at f + m, of which lines between sections are mirrored.
+    shifted = htf.f + harmonics[:, None]
+    seen_at = np.abs((shifted + N / 2) % N - N / 2)
+    spectra = [level(seen_at) ** 2 for level in noise.values()]
+    spectrum = np.stack(spectra, axis=2)[..., None]
     variance = spectrum * plan.usual.expected_variance()[:, None, :]
-    htf = hj.HTF(htf.f, htf.H, harmonics, 6, two.inputs, two.outputs, variance=variance)
-    total = np.trace(hj.identify.multiplier_bound(two, htf).multiplier_covariances[0])
+    uncertain = dataclasses.replace(htf, source="estimate", variance=variance)
+    bound = hj.identify.multiplier_bound(two, uncertain)
+    total = np.trace(bound.multiplier_covariances[0])
     assert plan.usual_criterion == pytest.approx(total, rel=1e-6)

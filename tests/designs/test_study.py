@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.designs.study_estimate import refuse_transient
@@ -29,60 +30,65 @@ def measured(model, design, seed=0, factor=1.0):
 @pytest.fixture(scope="module")
 def studies(model, first):
     """One, after each of its blocks."""
-    found = [hj.designs.Study(first, order=2, standard_error=ASKED)]
-    while not found[-1].done:
-        found.append(found[-1].add(measured(model, found[-1].design, seed=len(found))))
+    study = hj.designs.Study(first, order=2, standard_error=ASKED)
+    found = [study]
+    while not study.done:
+        data = measured(model, study.design, seed=len(found))
+        study = study.add(data)
+        found.append(study)
     return found
 
 
 def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
-    end = studies[-1]
-    assert end.blocks == len(studies) - 1 >= 2
-    assert (
-        end.standard_errors[-1].max() <= ASKED < studies[-2].standard_errors[-1].max()
-    )
+    *_, before, end = studies
+    assert end.blocks == len(studies) - 1
+    assert end.blocks >= 2
+    assert before.standard_errors[-1].max() > ASKED
+    assert end.standard_errors[-1].max() <= ASKED
     assert end.fit.contains(model.multipliers, 0.999).all()
+
     plan = hj.optimal_design(model, first, noise=NOISE)
-    equal = (
-        plan.usual_criterion * plan.usual.cycles(0) / end.standard_errors[-1, 0] ** 2
-    )
-    assert equal > 4 * end.strides[-1]
+    error = end.standard_errors[-1, 0]
+    strides_of_first = plan.usual_criterion * plan.usual.cycles(0) / error**2
+    assert strides_of_first > 4 * end.strides[-1]
     # The bound of as many strides, all of them with the best design for the true model.
-    bound = np.linalg.norm(plan.standard_errors) * np.sqrt(
-        plan.strides / end.strides[-1]
-    )
-    assert end.standard_errors[-1, 0] > 0.95 * bound
+    bound_of_plan = np.linalg.norm(plan.standard_errors)
+    bound = bound_of_plan * np.sqrt(plan.strides / end.strides[-1])
+    assert error > 0.95 * bound
 
 
 def test_every_block_is_counted_and_none_is_changed(studies, model, first):
-    assert [one.blocks for one in studies] == list(range(len(studies)))
-    assert studies[0].design is first and studies[0].fit is None
-    cycles = [one.design.cycles(0) for one in studies[:-1]]
-    np.testing.assert_array_equal(studies[-1].strides, np.cumsum(cycles))
+    blocks = [study.blocks for study in studies]
+    assert blocks == list(range(len(studies)))
+    assert studies[0].design is first
+    assert studies[0].fit is None
+    cycles = [study.design.cycles(0) for study in studies[:-1]]
+    assert_array_equal(studies[-1].strides, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
         assert after.strides[-1] <= 3 * before.strides[-1]
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
-    np.testing.assert_array_equal(again.standard_errors, studies[1].standard_errors)
-    np.testing.assert_array_equal(again.design.phase, studies[1].design.phase)
+    assert_array_equal(again.standard_errors, studies[1].standard_errors)
+    assert_array_equal(again.design.phase, studies[1].design.phase)
 
 
 def test_too_much_noise_to_begin_with(model, first):
     """The first design is repeated with other phases."""
     study = hj.designs.Study(first, order=2, standard_error=1e-3)
     lost = study.add(measured(model, first, factor=1e4))
-    assert not lost.done and np.isnan(lost.standard_errors).all() and lost.plan is None
-    assert "the first design again, since the data " in repr(lost)
-    assert "lower `order` in a new study" in repr(lost) and "check=" not in repr(lost)
-    np.testing.assert_array_equal(lost.design.line, first.line)
+    assert not lost.done
+    assert np.isnan(lost.standard_errors).all()
+    assert lost.plan is None
+    text = repr(lost)
+    assert "the first design again, since the data " in text
+    assert "lower `order` in a new study" in text
+    assert "check=" not in text
+    assert_array_equal(lost.design.line, first.line)
     assert (lost.design.phase != first.phase).all()
     found = lost.add(measured(model, lost.design))
-    assert np.isnan(found.standard_errors[0]).all() and found.plan is not None
-    unstable = dataclasses.replace(model, A=1.05 * model.A)
-    assert "again, since the estimate is unstable" in repr(
-        study.add(measured(unstable, first))
-    )
+    assert np.isnan(found.standard_errors[0]).all()
+    assert found.plan is not None
 
 
 @pytest.mark.parametrize(
@@ -103,7 +109,8 @@ def test_repeated_windows_count(model, first):
     )
     noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
     study = hj.designs.Study(first, 2, 1e-5)
-    once, twice = study.add(noisy), study.add(noisy, repeats=2)
+    once = study.add(noisy)
+    twice = study.add(noisy, repeats=2)
     assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
     assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
@@ -121,7 +128,8 @@ def test_bad_data(model, first):
         hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
     ):
         hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
-    study, data = hj.designs.Study(first, 2, 1e-4), measured(model, first)
+    study = hj.designs.Study(first, 2, 1e-4)
+    data = measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),
         (dict(result=[3] * len(data.u)), "no experiment ran to its end \\(0/8 ok"),
@@ -165,18 +173,30 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     )
 
 
-N, P, S = 4, 8, 40
+N = 4
+P = 8
+S = 40
 MULTIPLIERS = np.array([0.8, 0.3 + 0j])
+
+
+def test_an_unstable_estimate_repeats_the_first_design(model, first):
+    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    unstable = dataclasses.replace(model, A=1.05 * model.A)
+    study = study.add(measured(unstable, first))
+    assert "again, since the estimate is unstable" in repr(study)
 
 
 def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     """Return two outputs of rms one, the second with a transient, larger in the first cycle."""
     cycle = np.repeat(np.arange(before + P * repeats), N)
+    n = np.arange(len(cycle))
+    wave = np.sqrt(2) * np.cos(2 * np.pi * n / (N * P))
+    transient = size * (0.8**cycle + 3 * (cycle == 0))
+    y = np.stack([wave, wave + transient], axis=1)
     rng = np.random.default_rng(seed)
-    wave = np.sqrt(2) * np.cos(2 * np.pi * np.arange(len(cycle)) / (N * P))
-    y = np.stack([wave, wave + size * 0.8**cycle + 3 * size * (cycle == 0)], axis=1)
     y = y + noise * rng.normal(size=(S, *y.shape))
-    return hj.ExperimentData(np.zeros((S, len(cycle), 1)), y, n_sections=N, periods=P)
+    u = np.zeros((S, len(cycle), 1))
+    return hj.ExperimentData(u, y, n_sections=N, periods=P)
 
 
 @pytest.mark.parametrize(
@@ -188,18 +208,20 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     ],
 )
 def test_a_transient_in_the_window_is_refused(before, repeats, left):
-    data, left = records(1e-3, before=before, repeats=repeats), 1e-3 * left
-    arguments = data, repeats, MULTIPLIERS, np.zeros(2)
-    refuse_transient(*arguments, 1.05 * left)
+    size = 1e-3
+    data = records(size, before=before, repeats=repeats)
+    no_noise = np.zeros(2)
+    refuse_transient(data, repeats, MULTIPLIERS, no_noise, 1.05 * size * left)
     with pytest.raises(hj.DefinitionError, match=f"after {before} discarded cycles"):
-        refuse_transient(*arguments, 0.95 * left)
-    refuse_transient(records(1.0, before=0), 1, MULTIPLIERS, np.zeros(2), 0.0)
+        refuse_transient(data, repeats, MULTIPLIERS, no_noise, 0.95 * size * left)
+    refuse_transient(records(1.0, before=0), 1, MULTIPLIERS, no_noise, 0.0)
 
 
 def test_noise_is_no_transient():
     """Unless its mean square is beyond six standard deviations of that of noise, which the
     difference of two cycles contains twice."""
-    noise, level = np.array([0.01, 0.01]), 2 * 0.01**2
+    noise = np.array([0.01, 0.01])
+    level = 2 * 0.01**2
     size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hybridjax._core.executor import from_host
 from hybridjax.engine.lanes import start_lanes
@@ -24,13 +25,19 @@ STEP = 1e-6
 def flow(s, t, q, u, end):
     """(t, q) at the end, the lanes at the start, the target and the tape."""
     lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
-    target, sizes = until(np.array([end])), np.ones((len(s.charts), s.d))
+    target = until(np.array([end]))
+    sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
-    done = move(
-        s, lanes, u[:, None], target, settings, options=Options(True, tangents=True)
-    )
+    options = Options(True, tangents=True)
+    done = move(s, lanes, u[:, None], target, settings, options=options)
     moved = done.moved.lanes
-    return np.concatenate([moved.t, moved.q[:, 0]]), lanes, target, done
+    after = np.concatenate([moved.t, moved.q[:, 0]])
+    return after, lanes, target, done
+
+
+def events_of(done):
+    codes = done.tape.code[:, 0]
+    return codes[codes >= 0]
 
 
 @pytest.mark.parametrize("name", slow_but(STRUCTURES, ("ladder",)))
@@ -38,32 +45,33 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     """By the time, the state and the input at the start, through events and schedules; charts'
     fields and guards depend on time, and resets on the input."""
     sample = jax.tree_util.tree_map(np.asarray, draw(name, 1))
-    s = Structure(from_host(Random(STRUCTURES[name][0], sample.charts, sample.arrows)))
-    x = np.concatenate([[sample.start.t], np.zeros(s.d), np.zeros(s.nu)])
+    system = Random(STRUCTURES[name][0], sample.charts, sample.arrows)
+    s = Structure(from_host(system))
+    # x holds the time, the states (padded) and the inputs at the start.
+    x = np.zeros(1 + s.d + s.nu)
+    x[0] = sample.start.t
     x[1 : 1 + len(sample.start.q)] = sample.start.q
     end = sample.start.t + 3.0
 
     def run(x):
         return flow(s, x[0], x[1 : 1 + s.d], x[1 + s.d :], end)
 
+    states = range(1, 1 + s.dims[0])
+    inputs = range(1 + s.d, len(x))
     with unchecked_host():
         _, lanes, target, done = run(x)
-        exact = chain(s, lanes, target, done.tape, of_states=False)[0][0]
-        codes = done.tape.code[:, 0]
-        for k in range(len(x)):
-            if 1 + s.dims[0] <= k < 1 + s.d:
-                continue  # no state of the first chart
-            ends = []
-            for sign in (1, -1):
-                after, *_, other = run(x + sign * STEP * (np.arange(len(x)) == k))
-                happened = other.tape.code[:, 0]
-                np.testing.assert_array_equal(
-                    happened[happened >= 0], codes[codes >= 0]
-                )
-                ends.append(after)
-            slope = (ends[0] - ends[1]) / (2 * STEP)
-            size = 1 + np.abs(slope).max()
-            np.testing.assert_allclose(
-                exact[:, k] / size, slope / size, atol=1e-6, err_msg=str(k)
+        jacobian = chain(s, lanes, target, done.tape, of_states=False)[0][0]
+        events = events_of(done)
+        assert len(events) > 0
+        for k in (0, *states, *inputs):
+            step = np.zeros(len(x))
+            step[k] = STEP
+            above, *_, done_above = run(x + step)
+            below, *_, done_below = run(x - step)
+            assert_array_equal(events_of(done_above), events)
+            assert_array_equal(events_of(done_below), events)
+            slope = (above - below) / (2 * STEP)
+            tolerance = 1e-6 * (1 + np.abs(slope).max())
+            assert_allclose(
+                jacobian[:, k], slope, rtol=0, atol=tolerance, err_msg=f"by x[{k}]"
             )
-    assert (codes >= 0).any()

@@ -27,10 +27,11 @@ def test_no_operation_outside_of_programs_compiles_one():
             data = hj.run_experiments(cycle, FAMILY, u, OUTPUTS, start=start, discard=0)
         trajectory = cycle.trajectory()
         trajectory(*OUTPUTS)
+        placed = hj.place_sections(cycle, FAMILY)
         print(
             cycle,
             model,
-            hj.place_sections(cycle, FAMILY),
+            placed,
             data,
             trajectory,
             trajectory.events,
@@ -39,16 +40,15 @@ def test_no_operation_outside_of_programs_compiles_one():
 
 
 def test_harmonic_transfer_functions_compile_nothing():
-    ports, f = (
-        {"inputs": ("a", "b"), "outputs": ("a", "b")},
-        np.arange((SECTIONS + 1) // 2),
-    )
-    model = hj.LDTP(
-        *0.1 * np.random.default_rng(0).normal(size=(4, SECTIONS, 2, 2)), **ports
-    )
+    ports = {"inputs": ("a", "b"), "outputs": ("a", "b")}
+    f = np.arange((SECTIONS + 1) // 2)
+    rng = np.random.default_rng(0)
+    model = hj.LDTP(*0.1 * rng.normal(size=(4, SECTIONS, 2, 2)), **ports)
     with compiled() as names:
-        exact, loop = model.htf(f), model.feedback(np.eye(2)).inverse()
-        size, more = np.ones(exact.H.shape), {"n_sections": SECTIONS, **ports}
+        exact = model.htf(f)
+        loop = model.feedback(np.eye(2)).inverse()
+        size = np.ones(exact.H.shape)
+        more = {"n_sections": SECTIONS, **ports}
         scatter = hj.Scatter(np.full(len(f), 4.0), size)
         htf = hj.HTF(
             f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter

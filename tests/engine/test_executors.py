@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -61,32 +62,31 @@ def agree(system, chart, state, u, begin, duration):
     s = Structure(system)
     q = np.zeros((s.d, 1))
     q[: len(state), 0] = state
-    start = np.array([begin], float), np.array([chart], np.int32), q
+    t = np.array([begin], float)
+    inputs = np.reshape(u, (s.nu, 1))
     settings = Settings(1e-9, 1e-9, max_steps=400)
-    arguments = (*start, np.reshape(u, (s.nu, 1)), start[0] + duration, settings)
+    arguments = (t, np.array([chart], np.int32), q, inputs, t + duration, settings)
     with unchecked_host():
         host = flow(system, *to_host(arguments))
         whole = flow(system, *to_host(arguments), at_once=True)
-    assert all(on_host(x) for x in jax.tree_util.tree_leaves(host))
     xla = compiled_flow(system, *from_host(arguments))
-    assert np.sum(host.tape.code != IDLE) > 2
+    for leaf in jax.tree_util.tree_leaves(host):
+        assert on_host(leaf)
+    assert np.sum(host.tape.code != IDLE) > 2, "there are a few steps"
+
     # Steps amplify the rounding errors of their error estimates.
     size = 1 + np.abs(xla.moved.lanes.q)
     for other in (whole, xla):
-        np.testing.assert_array_equal(host.moved.result, other.moved.result)
-        for name in ("code", "chart"):
-            np.testing.assert_array_equal(
-                getattr(host.tape, name), getattr(other.tape, name)
-            )
-        np.testing.assert_allclose(host.moved.lanes.t, other.moved.lanes.t, rtol=1e-12)
-        np.testing.assert_allclose(
-            host.moved.lanes.q / size, other.moved.lanes.q / size, atol=1e-9
-        )
+        assert_array_equal(host.moved.result, other.moved.result)
+        assert_array_equal(host.tape.code, other.tape.code)
+        assert_array_equal(host.tape.chart, other.tape.chart)
+        ours = host.moved.lanes
+        theirs = other.moved.lanes
+        assert_allclose(ours.t, theirs.t, rtol=1e-12)
+        assert_allclose(ours.q / size, theirs.q / size, atol=1e-9)
     moved = host.tape.code[:, 0] != IDLE
-    np.testing.assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
-    np.testing.assert_allclose(
-        whole.tape.before[moved], host.tape.before[moved], atol=1e-7
-    )
+    assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
+    assert_allclose(whole.tape.before[moved], host.tape.before[moved], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
@@ -96,13 +96,14 @@ def test_both_agree_on_the_gallery(name):
     if guess is None:
         pytest.skip("has no guess of its own")
     period = system.period()
-    chart = Structure(system).chart_index(guess.chart)
     duration = 2.0 if period is None else 1.5 * float(period)
-    # (The pitch of a level trot consists of rounding errors, which would decide on the steps.)
-    state = np.asarray(guess.state) + 0.01 * (name == "TrottingQuadruped")
-    agree(
-        system, chart, state, np.zeros(len(system.inputs)), float(guess.time), duration
-    )
+    chart = Structure(system).chart_index(guess.chart)
+    state = np.asarray(guess.state)
+    if name == "TrottingQuadruped":
+        # The pitch of a level trot consists of rounding errors, which would decide on the steps.
+        state = state + 0.01
+    inputs = np.zeros(len(system.inputs))
+    agree(system, chart, state, inputs, float(guess.time), duration)
 
 
 @pytest.mark.slow
@@ -133,7 +134,9 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     with unchecked_host():
         cycle = hj.find_limit_cycle(system)
         map = to_host(cycle.return_map)
-        q, sizes, s = map.anchor.q[:, 0], map.sizes, map.structure
+        q = map.anchor.q[:, 0]
+        sizes = map.sizes
+        s = map.structure
         turn = map.turn_with_jacobian(q)
         x, expected = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), q / sizes)
         if name == "VerticalHopper":  # (moves arm later ones)
@@ -141,7 +144,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
         assert (travelled := travel(map, x * sizes, expected)) is not None
         again = map.turn_with_jacobian(x * sizes, travelled=travelled)
         # Refused: a gap before a move, another first time, an event (not the last) overlooked.
-        third, event = np.arange(len(expected.t)) == 2, expected.code >= 0
+        third = np.arange(len(expected.t)) == 2
+        event = expected.code >= 0
         gap = 1e-6 * third * map.scale[expected.chart].T
         early = expected.t - 1e-6 * map.expected * (expected.order + expected.lane == 0)
         blind = np.where(event & (np.cumsum(event) == 1), MOVE, expected.code)
@@ -163,16 +167,16 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
             False  # (of other charts)
         )
     for field in ("armed", "chart", "events"):
-        np.testing.assert_array_equal(
-            getattr(again.legs, field), getattr(turn.legs, field)
-        )
+        assert_array_equal(getattr(again.legs, field), getattr(turn.legs, field))
     apart = (again.legs.q - turn.legs.q) / map.scale[turn.legs.chart].T
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
     assert np.abs(apart).max() < 1e-8
-    assert abs(again.period / turn.period - 1) < 3e-10
+    error = abs(again.period / turn.period - 1)
+    assert error < 3e-10
     size = np.abs(turn.factors).max(axis=0)
-    assert (np.abs(again.factors - turn.factors) / size).max() < 1e-6
+    error = (np.abs(again.factors - turn.factors) / size).max()
+    assert error < 1e-6
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("PaddleJuggler",)))
@@ -193,10 +197,8 @@ def test_searches_with_moves_side_by_side_end_at_the_same_cycle(name, monkeypatc
     cycles += [hj.find_limit_cycle(moved), hj.find_limit_cycle(moved, guess)]
     for cycle in cycles[:2]:
         assert cycle.event_sequence == cycles[2].event_sequence
-        np.testing.assert_allclose(cycle.period, cycles[2].period, rtol=1e-11)
-        np.testing.assert_allclose(
-            cycle.multipliers, cycles[2].multipliers, rtol=1e-9, atol=1e-10
-        )
+        assert_allclose(cycle.period, cycles[2].period, rtol=1e-11)
+        assert_allclose(cycle.multipliers, cycles[2].multipliers, rtol=1e-9, atol=1e-10)
 
 
 def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
@@ -211,7 +213,7 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
     monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
     results = [call(from_host(np.arange(3.0))) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
-    np.testing.assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
+    assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
     with jax.default_matmul_precision("highest"):
         call(from_host(np.arange(3.0)))
     assert seen == [True, False] * 2  # (as a program of its own)
@@ -220,8 +222,12 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
 def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
     """Its multiplier of 2.9e5 makes Newton steps small where gaps are not."""
     with unchecked_host():
+
+        def rates(t, q, u):
+            return (2 * q[0] - jnp.cos(t),)
+
         grow = toy(
-            {"x": Field(("x",), lambda t, q, u: (2 * q[0] - jnp.cos(t),))},
+            {"x": Field(("x",), rates)},
             period=2 * np.pi,
         )
         map = to_host(hj.find_limit_cycle(grow, hj.Guess("x", (0.4,))).return_map)
@@ -231,4 +237,5 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
         )
         for gap, steps in ((8e-13, 1), (1e-9, 2)):
             end, _, taken = newton._newton(map, x + gap, moves, 0, 9)
-            assert taken == steps and abs(end / map.sizes - x) < 1e-12
+            assert taken == steps
+            assert abs(end / map.sizes - x) < 1e-12

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -55,8 +56,9 @@ def test_reverse_mode_and_second_derivatives_have_a_closed_form():
     slope, exact = jax.jit(
         lambda x: (jax.jacfwd(ball_exact)(x), jax.hessian(ball_exact)(x))
     )(X)
-    np.testing.assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(found, exact, atol=1e-9 * np.max(np.abs(exact)))
+    assert_allclose(first, slope, rtol=1e-11, atol=1e-12)
+    tolerance = 1e-9 * np.max(np.abs(exact))
+    assert_allclose(found, exact, atol=tolerance)
 
 
 def test_lanes_fail_one_by_one():
@@ -69,10 +71,11 @@ def test_lanes_fail_one_by_one():
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
     moved = move(s, lanes, u, until(end), tight(s)).moved
-    bad, zeno = hj.Result.BAD_INPUT, hj.Result.ZENO
+    bad = hj.Result.BAD_INPUT
+    zeno = hj.Result.ZENO
     assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
-    np.testing.assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
+    assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
 
 
 def test_new_numbers_compile_nothing():
@@ -87,12 +90,24 @@ def test_new_numbers_compile_nothing():
 
 def roots(a):
     """Chart "rise" is not defined for negative states, which chart "fall" has."""
-    rise = Field(("z",), lambda t, q, u: (jnp.sqrt(q[0]),))
-    charts = {"fall": Field(("x",), lambda t, q, u: (-a,)), "rise": rise}
-    turn = lambda t, q, u: q[0] + 1.0  # noqa: E731
-    return charts, (
-        hj.Transition("turn", "fall", "rise", turn, reset=lambda t, q, u: -q),
-    )
+
+    def rise_rates(t, q, u):
+        return (jnp.sqrt(q[0]),)
+
+    rise = Field(("z",), rise_rates)
+
+    def fall_rates(t, q, u):
+        return (-a,)
+
+    charts = {"fall": Field(("x",), fall_rates), "rise": rise}
+
+    def turn(t, q, u):
+        return q[0] + 1.0
+
+    def turn_reset(t, q, u):
+        return -q
+
+    return charts, (hj.Transition("turn", "fall", "rise", turn, reset=turn_reset),)
 
 
 def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywhere():
@@ -100,14 +115,21 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     z = (1 + (2 - t1) / 2)^2 with the event at t1 = (x + 1) / a."""
 
     def end(x, a):
-        system, zero = Toys(roots, [a]), jnp.zeros(())
+        system = Toys(roots, [a])
+        zero = jnp.zeros(())
         return flow(system, "fall", x[None], zero[None], zero, jnp.asarray(2.0))[0][0]
 
-    exact = lambda x, a: (1 + (2 - (x + 1) / a) / 2) ** 2  # noqa: E731
-    x, a = jnp.array([-0.5, 0.2]), 1.3
-    loss = lambda f: lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)  # noqa: E731
+    def exact(x, a):
+        return (1 + (2 - (x + 1) / a) / 2) ** 2
+
+    x = jnp.array([-0.5, 0.2])
+    a = 1.3
+
+    def loss(f):
+        return lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)
+
     gradient = jax.jit(jax.grad(loss(end), argnums=(0, 1)))(x, a)
     for value, true in zip(
         gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True
     ):
-        np.testing.assert_allclose(value, true, rtol=1e-10)
+        assert_allclose(value, true, rtol=1e-10)

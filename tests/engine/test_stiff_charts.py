@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import brentq
 
 import hybridjax as hj
@@ -26,9 +27,15 @@ class Thermostat(hj.HybridSystem):
         return {"on": heated, "off": FieldChart(sensed(0.0, self.slow), ("x", "z"))}
 
     def transitions(self):
+        def off_guard(t, q, u):
+            return q[1] - 0.7
+
+        def on_guard(t, q, u):
+            return q[1] - 0.3
+
         return [
-            hj.Transition("off", "on", "off", lambda t, q, u: q[1] - 0.7, "rising"),
-            hj.Transition("on", "off", "on", lambda t, q, u: q[1] - 0.3, "falling"),
+            hj.Transition("off", "on", "off", off_guard, "rising"),
+            hj.Transition("on", "off", "on", on_guard, "falling"),
         ]
 
 
@@ -54,7 +61,8 @@ def exact(fast=1e4, slow=5.0):
 
 def by_differences(order):
     """Derivatives of the period by `slow`."""
-    d, at = 0.02, np.arange(-2, 3)
+    d = 0.02
+    at = np.arange(-2, 3)
     values = [exact(slow=5.0 + d * k)[0] for k in at]
     weights = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}[order]
     return np.dot(weights, values) / 12 / d**order
@@ -70,9 +78,9 @@ def cycle():
 @pytest.mark.slow
 def test_the_cycle(cycle):
     period, x = exact()
-    np.testing.assert_allclose(cycle.period, period, rtol=1e-11)
-    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-11)
-    np.testing.assert_array_equal(cycle.multipliers, [0.0])
+    assert_allclose(cycle.period, period, rtol=1e-11)
+    assert_allclose(cycle.state["x"], x, rtol=1e-11)
+    assert_array_equal(cycle.multipliers, [0.0])
 
 
 def period(cycle):
@@ -82,11 +90,11 @@ def period(cycle):
 @pytest.mark.slow
 def test_derivatives_under_all_transformations(cycle):
     first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(jnp.array([5.0, 5.5]))
-    np.testing.assert_allclose(first[0], by_differences(1), rtol=1e-6)
+    assert_allclose(first[0], by_differences(1), rtol=1e-6)
     backwards = jax.jit(jax.grad(period(cycle)))(5.5)
-    np.testing.assert_allclose(backwards, first[1], rtol=1e-8)
+    assert_allclose(backwards, first[1], rtol=1e-8)
     twice = jax.jit(jax.jacfwd(jax.jacfwd(period(cycle))))(5.0)
-    np.testing.assert_allclose(twice, by_differences(2), rtol=1e-4)
+    assert_allclose(twice, by_differences(2), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -100,6 +108,6 @@ def test_experiments(cycle, start):
     )
     assert (data.result == 0).all()
     x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
-    np.testing.assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
+    assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
     there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
-    np.testing.assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
+    assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -29,28 +30,25 @@ def sizes(length, time):
 
 def begin(system, length, time):
     """A lane at the top of a hop, and one on the ground."""
-    q = np.array([[2.2, 0.0, 0.3, 0.1], [2.0, 1.9, 0.0, 0.0]]) * sizes(length, time)
-    return start_lanes(
-        Structure(system), jnp.zeros(2), jnp.array([0, 1], jnp.int32), q.T
-    )
+    top = [2.2, 0.0, 0.3, 0.1]
+    ground = [2.0, 1.9, 0.0, 0.0]
+    q = np.array([top, ground]) * sizes(length, time)
+    charts = jnp.array([0, 1], jnp.int32)
+    return start_lanes(Structure(system), jnp.zeros(2), charts, q.T)
 
 
 @ft.partial(jax.jit, static_argnums=3)
 def flow(length, time, scale, tangents):
     """Steps, codes and states (in the units of 1, 1) of a second and a half."""
     system = hopper_in(length, time)
-    lanes, u = begin(system, length, time), jnp.zeros((1, 2))
+    lanes = begin(system, length, time)
+    u = jnp.zeros((1, 2))
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
-    moved, tape = move(
-        Structure(system),
-        lanes,
-        u,
-        end,
-        settings,
-        options=Options(True, tangents=tangents),
-    )
-    return tape.h / time, tape.code, moved.lanes.q.T / sizes(length, time), moved.result
+    options = Options(True, tangents=tangents)
+    moved, tape = move(Structure(system), lanes, u, end, settings, options=options)
+    states = moved.lanes.q.T / sizes(length, time)
+    return tape.h / time, tape.code, states, moved.result
 
 
 @pytest.mark.parametrize(
@@ -58,50 +56,61 @@ def flow(length, time, scale, tangents):
 )
 def test_the_same_steps_in_all_units(tangents):
     h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
-    np.testing.assert_array_equal(result, hj.Result.OK)
-    assert jnp.max(code) >= 0
+    assert_array_equal(result, hj.Result.OK)
+    assert jnp.max(code) >= 0, "there are events"
     for length, time in UNITS:
-        other = flow(length, time, SIZES * sizes(length, time), tangents)
-        for x, y in zip((h, code, q), other, strict=False):
-            np.testing.assert_array_equal(x, y)
+        scale = SIZES * sizes(length, time)
+        other_h, other_code, other_q, _ = flow(length, time, scale, tangents)
+        assert_array_equal(other_h, h)
+        assert_array_equal(other_code, code)
+        assert_array_equal(other_q, q)
 
 
 # --- Single trajectories, whose usual sizes are not known -----------------------------------------
 
 
-SPRING = lambda t, q, u: (q[1], 9.81 - 100.3 * (q[0] - 0.1))  # noqa: E731
-CHAIN = lambda t, q, u: (*q[1:], jnp.cos(t))  # noqa: E731
-
-
-@pytest.mark.parametrize(
-    "function, start, end",
-    [
-        pytest.param(lambda t, q, u: (q[1], -q[0]), (0.0, 0.0), (0.0, 0.0), id="zero"),
-        pytest.param(
-            SPRING,
-            (0.1 + 9.81 / 100.3, 0.0),
-            (0.1 + 9.81 / 100.3, 0.0),
-            id="rest up to rounding",
-        ),
-        pytest.param(
-            lambda t, q, u: (-q[0], 1e-17 * q[0]),
-            (1.0, 0.0),
-            (np.exp(-10), 0),
-            id="rounding level",
-        ),
-        pytest.param(CHAIN, (0.0,) * 5, None, id="a chain of integrators from zero"),
-    ],
-)
-def test_states_at_rest_stop_nothing(function, start, end):
+def simulate_rates(rates, start):
+    """The trajectory for ten seconds of a system with one chart."""
     states = tuple(f"x{k}" for k in range(len(start)))
-    found = hj.simulate(toy({"x": Field(states, function)}), "x", start, 10.0)
-    assert len(found.t) < 150
-    if end is None:
-        t = 10.0
-        end = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
-        np.testing.assert_allclose(found.after[-1][1:], end, rtol=1e-9)
-    else:
-        np.testing.assert_allclose(found.after[-1], end, rtol=1e-9, atol=1e-13)
+    system = toy({"x": Field(states, rates)})
+    found = hj.simulate(system, "x", start, 10.0)
+    assert len(found.t) < 150, "steps grow"
+    return found
+
+
+def test_an_oscillator_at_zero():
+    def oscillator(t, q, u):
+        return q[1], -q[0]
+
+    found = simulate_rates(oscillator, (0.0, 0.0))
+    assert_allclose(found.after[-1], [0.0, 0.0], rtol=1e-9, atol=1e-13)
+
+
+def test_a_weight_at_rest_up_to_rounding():
+    def spring(t, q, u):
+        return q[1], 9.81 - 100.3 * (q[0] - 0.1)
+
+    rest = 0.1 + 9.81 / 100.3
+    found = simulate_rates(spring, (rest, 0.0))
+    assert_allclose(found.after[-1], [rest, 0.0], rtol=1e-9, atol=1e-13)
+
+
+def test_a_state_at_the_level_of_rounding():
+    def decay(t, q, u):
+        return -q[0], 1e-17 * q[0]
+
+    found = simulate_rates(decay, (1.0, 0.0))
+    assert_allclose(found.after[-1], [np.exp(-10), 0.0], rtol=1e-9, atol=1e-13)
+
+
+def test_a_chain_of_integrators_from_zero():
+    def integrators(t, q, u):
+        return *q[1:], jnp.cos(t)
+
+    found = simulate_rates(integrators, (0.0, 0.0, 0.0, 0.0, 0.0))
+    t = 10.0
+    expected = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
+    assert_allclose(found.after[-1][1:], expected, rtol=1e-9)
 
 
 def test_derivatives_need_sizes():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.experiments.data import Simulated
@@ -22,10 +23,9 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
-        np.testing.assert_allclose(
-            y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14
-        )
-    assert (data.inputs, data.outputs) == (("a", "b"), ("y0", "y1"))
+        assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
+    assert data.inputs == ("a", "b")
+    assert data.outputs == ("y0", "y1")
     assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"
     for start, cycles in (("cycle", 25), ("periodic", 5)):
         data = hj.experiments.simulate_experiments(model, DESIGN, start=start)
@@ -43,8 +43,10 @@ def test_simulation_from_the_cycle_is_the_definition(model):
 def test_failed_experiments_are_named():
     y = np.ones((80, 84 * 32, 1))
     y[17, 41 * 32 + 21 :] = np.nan
-    result, failed_at = np.zeros(80, int), np.full(80, -1)
-    result[17], failed_at[17] = hj.Result.SECTION_MISSED, 41 * 32 + 21
+    result = np.zeros(80, int)
+    failed_at = np.full(80, -1)
+    result[17] = hj.Result.SECTION_MISSED
+    failed_at[17] = 41 * 32 + 21
     usual = dict(n_sections=32, periods=64, result=result)
     data = hj.ExperimentData(
         np.ones_like(y), y, **usual, simulated=Simulated(failed_at)
@@ -52,7 +54,8 @@ def test_failed_experiments_are_named():
     assert data.summary() == (
         "79/80 ok; #17: section 21, cycle 41: the section was not crossed within the time allowed"
     )
-    assert data.ok.sum() == 79 and not data.ok[17]
+    assert data.ok.sum() == 79
+    assert not data.ok[17]
     assert "79/80 ok" in repr(data)
     result[:8] = hj.Result.BLOW_UP
     assert (

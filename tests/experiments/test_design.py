@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -38,8 +39,10 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
 ):
     N, P, top = band
     arguments = dict(n_sections=N, periods=P, band=(0, top / P), lines=lines, inputs=nu)
-    wanted = [j for j in range(top + 1) if lines == "two-phase" or (2 * j) % P]
-    if not wanted:
+    # Line j is the frequency j / P. Multiples of 1/2 are excited with two phases or not at all.
+    is_half = {j: (2 * j) % P == 0 for j in range(top + 1)}
+    excited = [j for j in range(top + 1) if lines == "two-phase" or not is_half[j]]
+    if not excited:
         with pytest.raises(
             hj.DefinitionError, match="take more periods or a wider band"
         ):
@@ -47,48 +50,57 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
         with pytest.raises(hj.DefinitionError, match="must increase in"):
             hj.multisine(N, P, band=(1.0, 0.5))
         return
-    phases = {j: 2 if (2 * j) % P == 0 and 0 < 2 * j < N * P else 1 for j in wanted}
+    phases = {}
+    for j in excited:
+        inside = 0 < 2 * j < N * P
+        phases[j] = 2 if is_half[j] and inside else 1
     # All lines that disturb j disturb each other: so many experiments are needed at least.
-    needed = max(sum(phases[i] for i in wanted if disturb(i, j, P)) for j in wanted)
+    crowds = []
+    for j in excited:
+        crowds.append(sum(phases[i] for i in excited if disturb(i, j, P)))
+    needed = nu * max(crowds)
 
-    assert hj.multisine(**arguments, seed=seed).experiments == nu * needed
-    if nu * needed > 1:
-        with pytest.raises(hj.DefinitionError, match=f"must be {nu * needed} to "):
-            hj.multisine(**arguments, seed=seed, experiments=nu * needed - 1)
+    smallest = hj.multisine(**arguments, seed=seed)
+    assert smallest.experiments == needed
+    if needed > 1:
+        with pytest.raises(hj.DefinitionError, match=f"must be {needed} to "):
+            hj.multisine(**arguments, seed=seed, experiments=needed - 1)
 
-    number = min(nu * needed + more, nu * sum(phases.values()))
+    largest = nu * sum(phases.values())
+    number = min(needed + more, largest)
     design = hj.multisine(**arguments, seed=seed, experiments=number)
-    np.testing.assert_array_equal(design.frequencies, np.array(wanted) / P)
+    assert_array_equal(design.frequencies, np.array(excited) / P)
     sizes = np.bincount(design.experiment, minlength=number)
     assert sizes.min() >= 1
     if nu == 1:
         assert np.ptp(sizes) <= 1
     for experiment in range(number):
-        pairs = itertools.combinations(lines_of(design, experiment), 2)
-        assert not any(disturb(i, j, P) for i, j in pairs)
-        assert len(set(design.channel[design.experiment == experiment])) == 1
-    for j, channel in itertools.product(wanted, range(nu)):
+        for i, j in itertools.combinations(lines_of(design, experiment), 2):
+            assert not disturb(i, j, P), f"lines {i} and {j} of {experiment}"
+        channels = design.channel[design.experiment == experiment]
+        assert len(set(channels)) == 1
+    for j, channel in itertools.product(excited, range(nu)):
         here = design.phase[(design.line == j) & (design.channel == channel)]
         assert len(here) == phases[j]
         if len(here) == 2:
-            assert abs(np.cos(here[0] - here[1])) < 1e-12
+            cosine = np.cos(here[0] - here[1])
+            assert abs(cosine) < 1e-12
 
 
 def test_the_numbers_of_the_paper():
-    paper, smallest = hj.paper_design(), hj.multisine()
+    paper = hj.paper_design()
+    smallest = hj.multisine()
     both = hj.multisine(lines="two-phase")
     assert len(paper.frequencies) == len(smallest.frequencies) == 620
-    assert (paper.experiments, smallest.experiments, paper.cycles()) == (
-        80,
-        20,
-        80 * 84,
-    )
+    assert paper.experiments == 80
+    assert smallest.experiments == 20
+    assert paper.cycles() == 80 * 84
     assert set(np.bincount(paper.experiment)) == {7, 8}
     assert set(np.bincount(smallest.experiment)) == {31}
-    assert (len(both.frequencies), both.experiments) == (641, 21)
-    assert "80 experiments of 64 periods" in repr(paper) and "620, 0.01562" in repr(
-        paper
-    )
+    assert len(both.frequencies) == 641
+    assert both.experiments == 21
+    assert "80 experiments of 64 periods" in repr(paper)
+    assert "620, 0.01562" in repr(paper)
     with pytest.raises(hj.DefinitionError, match="must be 20 to 620"):
         hj.multisine(experiments=19)
     with pytest.raises(
@@ -100,26 +112,23 @@ def test_the_numbers_of_the_paper():
 
 
 def test_signals_are_sums_of_cosines():
+    N = 7
+    P = 6
     design = hj.multisine(
-        7, 6, (0, 3.5), 0.2, lines="two-phase", inputs=("left", "right")
+        N, P, (0, 3.5), 0.2, lines="two-phase", inputs=("left", "right")
     )
-    n = np.arange(9 * 7)
+    n = np.arange(9 * N)
     expected = np.zeros((design.experiments, len(n), 2))
-    for e, j, i, a, phase in zip(
-        design.experiment,
-        design.line,
-        design.channel,
-        design.amplitude,
-        design.phase,
-        strict=True,
-    ):
-        expected[e, :, i] += a * np.cos(2 * np.pi * j / (6 * 7) * n + phase)
-    np.testing.assert_allclose(design.inputs(9), expected, atol=1e-14)
-    np.testing.assert_allclose(design.inputs(), expected[:, : 6 * 7], atol=1e-14)
-    rms = np.sqrt(np.mean(expected[:, : 6 * 7] ** 2, axis=1)).max(axis=1)
-    np.testing.assert_allclose(
-        design.crest_factors(), np.abs(expected).max(axis=(1, 2)) / rms, rtol=1e-12
-    )
+    for k in range(len(design.line)):
+        angle = 2 * np.pi * design.line[k] / (P * N) * n + design.phase[k]
+        wave = design.amplitude[k] * np.cos(angle)
+        expected[design.experiment[k], :, design.channel[k]] += wave
+    assert_allclose(design.inputs(9), expected, atol=1e-14)
+    one_round = expected[:, : P * N]
+    assert_allclose(design.inputs(), one_round, atol=1e-14)
+    rms = np.sqrt(np.mean(one_round**2, axis=1)).max(axis=1)
+    peak = np.abs(one_round).max(axis=(1, 2))
+    assert_allclose(design.crest_factors(), peak / rms, rtol=1e-12)
 
 
 BAD = {
@@ -145,10 +154,10 @@ def test_designs_that_break_a_rule_name_what_breaks_it(message):
 
 
 def test_half_integers_by_hand():
-    design = hj.Design.from_lines(
+    twice = hj.Design.from_lines(
         [[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8
     )
-    assert design.experiments == 2
+    assert twice.experiments == 2
     hj.Design.from_lines(
         [[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8
     )
@@ -156,118 +165,146 @@ def test_half_integers_by_hand():
         hj.Design.from_lines([[0.0]], 0.1, np.pi / 2, n_sections=8, periods=8)
 
 
-@pytest.mark.parametrize("lines, periods, count", [("odd", 64, 20), ("all", 32, 80)])
-def test_even_products_miss_the_lines(lines, periods, count):
+@pytest.mark.parametrize(
+    "options, count",
+    [
+        (dict(lines="odd", periods=64), 20),
+        (
+            dict(
+                lines="all",
+                periods=32,
+                band=(0, 8.0),
+                experiments=80,
+                division="sum-free",
+            ),
+            80,
+        ),
+    ],
+    ids=["odd", "sum-free"],
+)
+def test_even_products_miss_the_lines(options, count):
     """Sums and differences of odd lines; of any lines in a division that is sum-free."""
-    more = (
-        {}
-        if lines == "odd"
-        else dict(band=(0, 8.0), experiments=count, division="sum-free")
-    )
-    design = hj.multisine(periods=periods, lines=lines, **more)
+    design = hj.multisine(**options)
     assert design.experiments == count
-    for s in range(count):
-        j = np.array(lines_of(design, s))
-        both = (
-            np.concatenate([(j[:, None] + j).ravel(), (j[:, None] - j).ravel()])
-            % periods
-        )
-        products = set(np.minimum(both, periods - both).tolist())
-        assert products.isdisjoint(np.minimum(j % periods, -j % periods).tolist())
+    periods = options["periods"]
+
+    def folded(lines):
+        """Lines as they are seen once in each period."""
+        return set(np.minimum(lines % periods, -lines % periods).ravel().tolist())
+
+    for experiment in range(count):
+        lines = np.array(lines_of(design, experiment))
+        sums = folded(lines[:, None] + lines)
+        differences = folded(lines[:, None] - lines)
+        excited = folded(lines)
+        assert excited.isdisjoint(sums)
+        assert excited.isdisjoint(differences)
 
 
 @pytest.mark.parametrize("division", ["random", "disjoint", "orthogonal"])
-def test_several_inputs(division, lines=12):
-    model = hj.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, 3))
-    design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=3, division=division)
-    assert design.experiments == 3 * 4 and len(design.frequencies) == lines
-    together = np.abs(design.inputs()).max(axis=1) > 0
-    assert together.mean() == {"random": 1 / 3, "orthogonal": 1.0}.get(
-        division, together.mean()
-    )
-    assert together.mean() > 0.6 or division == "random"
-    data = hj.experiments.simulate_experiments(
-        model, design.realizations(2), start="periodic"
-    )
+def test_several_inputs(division):
+    n_inputs = 3
+    n_lines = 12
+    model = hj.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, n_inputs))
+    design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=n_inputs, division=division)
+    assert design.experiments == n_inputs * 4
+    assert len(design.frequencies) == n_lines
+    acts = np.abs(design.inputs()).max(axis=1) > 0
+    if division == "random":
+        assert acts.mean() == 1 / 3
+    elif division == "orthogonal":
+        assert acts.mean() == 1.0
+    else:
+        assert acts.mean() > 0.6
+
+    realizations = design.realizations(2)
+    data = hj.experiments.simulate_experiments(model, realizations, start="periodic")
     estimate = hj.estimate_htf(data)
-    assert len(estimate.f) == lines
-    assert np.abs(estimate.H - model.htf(estimate.f).H).max() < 1e-11
-    # As many experiments give nu times the power, and less variance.
+    assert len(estimate.f) == n_lines
+    exact = model.htf(estimate.f)
+    assert_allclose(estimate.H, exact.H, rtol=0, atol=1e-11)
+
+    # As many experiments give `n_inputs` times the power, and less variance.
     power = 1 / design.expected_variance()
-    np.testing.assert_allclose(power, power[0, 0])
-    np.testing.assert_allclose(
-        power[0, 0], (3 if division == "orthogonal" else 1) * 4 * 8 / 4
-    )
+    gain = n_inputs if division == "orthogonal" else 1
+    assert_allclose(power, gain * 4 * 8 / 4)
 
 
-def test_crest_factors(hopper):
+def test_crest_factors():
     random = hj.multisine(periods=32, band=(0, 3.0), seed=1)
     low = hj.experiments.optimize_phases(random, seed=1)
-    np.testing.assert_array_equal(low.line, random.line)
-    np.testing.assert_array_equal(low.amplitude, random.amplitude)
-    assert random.crest_factors().mean() > 2.9 and low.crest_factors().max() < 2.3
-    again = hj.Design.from_lines(
-        [np.array(lines_of(low, s)) / 32 for s in range(6)] * 2,
-        0.01,
-        [
-            *(low.phase[low.experiment == s] for s in range(6)),
-            *(
-                hj.experiments.optimize_phases(random, 5).phase[low.experiment == s]
-                for s in range(6)
-            ),
-        ],
-        periods=32,
-    )
+    assert_array_equal(low.line, random.line)
+    assert_array_equal(low.amplitude, random.amplitude)
+    assert random.crest_factors().mean() > 2.9
+    assert low.crest_factors().max() < 2.3
+    orthogonal = hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal")
+    with pytest.raises(hj.DefinitionError, match="no phase of this design is free"):
+        hj.experiments.optimize_phases(orthogonal)
+
+
+def test_phases_that_are_not_random_have_no_variance_of_distortion(hopper):
+    random = hj.multisine(periods=32, band=(0, 3.0), seed=1)
+    lines = []
+    phases = []
+    for seed in (1, 5):
+        low = hj.experiments.optimize_phases(random, seed=seed)
+        for experiment in range(6):
+            lines.append(np.array(lines_of(low, experiment)) / 32)
+            phases.append(low.phase[low.experiment == experiment])
+    twice = hj.Design.from_lines(lines, 0.01, phases, periods=32)
     data = hj.experiments.simulate_experiments(
-        hopper, again, start="periodic", discard=32
+        hopper, twice, start="periodic", discard=32
     )
-    data = hj.experiments.add_noise(data, snr=20)
+    noisy = hj.experiments.add_noise(data, snr=20)
     with pytest.raises(
         hj.DefinitionError, match=r"the phases are not random \(12 of 12"
     ):
-        hj.estimate_htf(data, 0, repeats=2, variance="total")
-    auto = hj.estimate_htf(data, 0, repeats=2)
-    assert auto.noise_variance is None
-    np.testing.assert_array_equal(auto.scatter.freedom, 2)
-    with pytest.raises(hj.DefinitionError, match="no phase of this design is free"):
-        hj.experiments.optimize_phases(
-            hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal")
-        )
+        hj.estimate_htf(noisy, 0, repeats=2, variance="total")
+    estimate = hj.estimate_htf(noisy, 0, repeats=2)
+    assert estimate.noise_variance is None
+    assert_array_equal(estimate.scatter.freedom, 2)
 
 
 def test_realizations_pairs_and_scales():
     design = hj.multisine(8, 6, (0, 4.0), lambda f: 1 / (1 + f), lines="two-phase")
-    np.testing.assert_allclose(design.amplitude, 1 / (1 + design.f))
-    many = design.realizations(5, seed=2)
-    assert many.experiments == 5 * design.experiments and many.cycles(
-        0
-    ) == 5 * design.cycles(0)
-    np.testing.assert_array_equal(many.f, np.tile(design.f, 5))
-    assert len(np.unique(many.phase)) > 4 * len(design.f) - 20
+    assert_allclose(design.amplitude, 1 / (1 + design.f))
+
+    five = design.realizations(5, seed=2)
+    assert five.experiments == 5 * design.experiments
+    assert five.cycles(0) == 5 * design.cycles(0)
+    assert_array_equal(five.f, np.tile(design.f, 5))
+    different_phases = len(np.unique(five.phase))
+    assert different_phases > 4 * len(design.f) - 20
+
+    signals = design.inputs()
     pairs = design.with_negatives().inputs()
-    np.testing.assert_allclose(pairs[::2], design.inputs(), atol=1e-14)
-    np.testing.assert_allclose(pairs[1::2], -design.inputs(), atol=1e-14)
-    np.testing.assert_allclose(
-        np.sqrt(np.mean(design.scaled(0.3).inputs() ** 2, axis=1)), 0.3
-    )
-    for bad in (lambda: design.scaled(0.0), lambda: design.realizations(0)):
-        with pytest.raises(hj.DefinitionError):
-            bad()
+    assert_allclose(pairs[::2], signals, atol=1e-14)
+    assert_allclose(pairs[1::2], -signals, atol=1e-14)
+
+    scaled = design.scaled(0.3).inputs()
+    rms = np.sqrt(np.mean(scaled**2, axis=1))
+    assert_allclose(rms, 0.3)
+    with pytest.raises(hj.DefinitionError):
+        design.scaled(0.0)
+    with pytest.raises(hj.DefinitionError):
+        design.realizations(0)
 
 
 def test_expected_variance_is_that_of_the_estimate():
     """Noise of unit variance as output, many realizations."""
     design = hj.multisine(4, 8, (0, 2.0), 0.5)
     u = design.realizations(400).inputs()
-    y = np.random.default_rng(0).normal(size=(*u.shape[:2], 1))
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(*u.shape[:2], 1))
     estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
     expected = design.expected_variance()[:, 0] / 400
-    np.testing.assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
+    assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
 
 
 def test_inputs_in_another_order_are_refused():
     """By position, the amplitudes of one input would be those of another one."""
-    model, inputs = hj.testing.synthetic_ldtp(), ("u1", "u0")
+    model = hj.testing.synthetic_ldtp()
+    inputs = ("u1", "u0")
     design = hj.multisine(model.n_sections, periods=4, inputs=inputs)
     with pytest.raises(
         hj.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"

@@ -6,7 +6,9 @@ import pytest
 import hybridjax as hj
 
 
-N, CYCLES, COUNT = 8, 30, 400
+N = 8
+CYCLES = 30
+COUNT = 400
 STD = np.linspace(0.5, 2.0, N)
 ProcessNoise = hj.experiments.ProcessNoise
 
@@ -22,13 +24,18 @@ def require_color(x, std, memory):
     """Of series (S, n, k): the variance at every section (from the first cycle on), and the
     correlation from each section to later ones, against the closed form."""
     std = np.broadcast_to(std, (N, x.shape[2]))
-    require_mean((x.reshape(len(x), -1, *std.shape) ** 2).mean(axis=1), std**2)
+    cycles = x.reshape(len(x), -1, *std.shape)
+    require_mean((cycles**2).mean(axis=1), std**2)
     require_mean(x[:, 0] ** 2, std[0] ** 2)
-    later = x / np.resize(std, x.shape[1:])
+
+    normal = x / np.resize(std, x.shape[1:])
     for lag in (1, 3, N, 4 * N):
-        found = (later[:, lag:] * later[:, :-lag]).mean(axis=1)
-        require_mean(found, np.exp(-lag / (N * memory)) if memory else 0.0)
-    require_mean((later[:, :, 0] * later[:, :, 1]).mean(axis=1), 0.0)
+        products = normal[:, lag:] * normal[:, :-lag]
+        expected = np.exp(-lag / (N * memory)) if memory else 0.0
+        require_mean(products.mean(axis=1), expected)
+    # Different signals have no correlation.
+    products = normal[:, :, 0] * normal[:, :, 1]
+    require_mean(products.mean(axis=1), 0.0)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.2, 3.0])
@@ -40,10 +47,9 @@ def test_process_noise_has_the_color_that_it_says(std, memory):
 
 @pytest.fixture(scope="module")
 def data():
-    shape = COUNT, N * CYCLES
-    return hj.ExperimentData(
-        np.ones((*shape, 1)), np.zeros((*shape, 2)), n_sections=N, periods=CYCLES
-    )
+    u = np.ones((COUNT, N * CYCLES, 1))
+    y = np.zeros((COUNT, N * CYCLES, 2))
+    return hj.ExperimentData(u, y, n_sections=N, periods=CYCLES)
 
 
 @pytest.mark.parametrize("memory", [0.0, 2.0])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core import compilation
@@ -28,19 +29,25 @@ MODELS = (
 @pytest.mark.parametrize("name", MODELS)
 def test_host_and_program_try_the_same_ways(name, monkeypatch):
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
-    placed = hj.place_sections(cycle, FAMILIES.get(name, hj.ClockPhase(7)))
+    family = FAMILIES.get(name, hj.ClockPhase(7))
+    placed = hj.place_sections(cycle, family)
     settings = Settings(1e-9, 1e-9, PATIENCE, cycle.settings.scale)
-    sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
-    scale = np.concatenate([np.full((7, 1), float(cycle.period)), sizes], axis=1)
-    host = plan._try_ways(placed, settings, np.zeros((1, len(cycle.system.inputs))))
+    no_input = np.zeros((1, len(cycle.system.inputs)))
+    host = plan._try_ways(placed, settings, no_input)
     monkeypatch.setattr(compilation, "WORTH_COMPILING", -1.0)
-    xla = plan._try_ways(placed, settings, np.zeros((1, len(cycle.system.inputs))))
-    after = np.roll(scale, -1, axis=0).T[:, None, None]
-    np.testing.assert_allclose(host.ends / after, xla.ends / after, atol=1e-13)
+    xla = plan._try_ways(placed, settings, no_input)
+
+    # Ends are times and states, at the section after each.
+    states = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
+    times = np.full((7, 1), float(cycle.period))
+    sizes = np.roll(np.concatenate([times, states], axis=1), -1, axis=0)
+    sizes = sizes.T[:, None, None]
+    assert_allclose(host.ends / sizes, xla.ends / sizes, atol=1e-13)
     # Estimates are differences in which the digits of small ones cancel.
-    np.testing.assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
-    for one in ("first", "slack", "lead"):
-        np.testing.assert_allclose(getattr(host, one), getattr(xla, one), rtol=1e-12)
+    assert_allclose(host.estimate, xla.estimate, rtol=1e-4, atol=1e-5)
+    assert_allclose(host.first, xla.first, rtol=1e-12)
+    assert_allclose(host.slack, xla.slack, rtol=1e-12)
+    assert_allclose(host.lead, xla.lead, rtol=1e-12)
 
 
 # Derivatives of the ways from section 0 to 1 and back, and sizes at both.
@@ -51,10 +58,13 @@ def test_errors_are_followed_from_their_section_on():
     """An error made on the way from section 0 shrinks first, one from section 1 grows first; after
     each turn a fifth is left."""
     errors = np.ones((1, 2, 1))
-    worst = plan._impact(BACK_AND_FORTH, errors, np.ones((2, 1)))
-    np.testing.assert_allclose(worst, [[1 / (1 - 0.2), 2 / (1 - 0.2)]], rtol=1e-12)
-    worst = plan._impact(BACK_AND_FORTH, errors, np.array([[1.0], [100.0]]))
-    np.testing.assert_allclose(worst, [[0.1 / (1 - 0.2), 1 / (1 - 0.2)]], rtol=1e-12)
+    all_turns = 1 / (1 - 0.2)
+    same_sizes = np.ones((2, 1))
+    worst = plan._impact(BACK_AND_FORTH, errors, same_sizes)
+    assert_allclose(worst, [[all_turns, 2 * all_turns]], rtol=1e-12)
+    larger_at_1 = np.array([[1.0], [100.0]])
+    worst = plan._impact(BACK_AND_FORTH, errors, larger_at_1)
+    assert_allclose(worst, [[0.1 * all_turns, all_turns]], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -21,7 +22,8 @@ from ..toys import RESTING, Field
 
 
 FAMILIES = ("isochron", pytest.param("kinematic", marks=pytest.mark.slow))
-N, CYCLES = 32, 84
+N = 32
+CYCLES = 84
 BATCH = dict(execution=hj.Execution(batch=40))
 
 
@@ -32,46 +34,55 @@ def design():
 
 @pytest.fixture(scope="module", params=FAMILIES)
 def family(request, hopper_cycle, design):
-    placed = request.getfixturevalue(
-        {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}[request.param]
-    )
-    ldtp = request.getfixturevalue(f"{request.param}_ldtp")
+    name = request.param
+    fixtures = {"isochron": "placed_isochrons", "kinematic": "placed_kinematic"}
+    placed = request.getfixturevalue(fixtures[name])
+    ldtp = request.getfixturevalue(f"{name}_ldtp")
     data = hj.run_experiments(hopper_cycle, placed, design, OUTPUTS, **BATCH)
-    return request.param, placed, ldtp, data
+    return name, placed, ldtp, data
 
 
 def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle):
     name, _, ldtp, data = family
     assert data.summary() == "80/80 ok"
-    assert data.label == name and data.periods == 64
+    assert data.label == name
+    assert data.periods == 64
     exact = ldtp.htf(design.frequencies)
     estimate = hj.estimate_htf(data)
-    bound = {"isochron": 2.5e-4, "kinematic": 6e-4}[name]
     errors = np.asarray(estimate.harmonic_errors(exact))
+    bound = {"isochron": 2.5e-4, "kinematic": 6e-4}[name]
     assert errors[estimate.harmonics.index(0)].max() < bound
+
     true = hopper_cycle.multipliers
-    assert hj.fit_multipliers(estimate, ldtp).compare(true).max_error < 5e-5
-    fits = [hj.identify.fit_rational(htf) for htf in (estimate, exact)]
+    fit = hj.fit_multipliers(estimate, ldtp)
+    assert fit.compare(true).max_error < 5e-5
+    rational = hj.identify.fit_rational(estimate)
+    of_exact = hj.identify.fit_rational(exact)
     for output in estimate.outputs:
-        measured, bias = (fit.compare(true, output).max_error for fit in fits)
-        assert abs(measured - bias) < 0.1 * bias
+        error = rational.compare(true, output).max_error
+        bias = of_exact.compare(true, output).max_error
+        assert abs(error - bias) < 0.1 * bias
 
 
 def test_records_agree_with_scipy(family, design):
     name, placed, _, data = family
-    lanes = placed.lanes
-    apex = np.array([float(lanes.t[0]), *np.asarray(lanes.q[:, 0])])
-    angle = np.arctan2(*hopper_scipy.plane(apex)[::-1])
-    point, y = apex, []
+    apex = np.array([float(placed.lanes.t[0]), *np.asarray(placed.lanes.q[:, 0])])
+    x, y = hopper_scipy.plane(apex)
+    angle = np.arctan2(y, x)
+    cycle = np.asarray(data.cycle_outputs)
+    point = apex
+    deviations = []
     for n in range(40):  # a cycle and a quarter: liftoff, touchdown, liftoff
-        y.append(point[1:3] - np.asarray(data.cycle_outputs)[n % N])
+        deviations.append(point[1:3] - cycle[n % N])
+        turn = (n + 1) / N
         if name == "isochron":
-            section = ("clock", apex[0] + (n + 1) / N)
+            section = ("clock", apex[0] + turn)
         else:
-            section = ("angle", angle - 2 * np.pi * (n + 1) / N)
+            section = ("angle", angle - 2 * np.pi * turn)
         point = hopper_scipy.flow(point, section, data.u[3, n, 0])
-    scale = np.ptp(np.asarray(data.cycle_outputs), axis=0)
-    assert np.max(np.abs(np.array(y) - data.y[3, :40]) / scale) < 1e-8
+    error = np.abs(np.array(deviations) - data.y[3, :40])
+    scale = np.ptp(cycle, axis=0)
+    assert np.max(error / scale) < 1e-8
 
 
 def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, design):
@@ -81,16 +92,16 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20, **BATCH)
     assert list(np.flatnonzero(~broken.ok)) == [17]
     assert 3 * N <= broken.failed_at[17] < 8 * N
-    assert "#17: section" in broken.summary() and "79/80 ok" in broken.summary()
+    assert "#17: section" in broken.summary()
+    assert "79/80 ok" in broken.summary()
     others = np.arange(80) != 17
-    np.testing.assert_allclose(broken.y[others], data.y[others], atol=1e-9)
+    assert_allclose(broken.y[others], data.y[others], atol=1e-9)
     after = broken.failed_at[17] + 1
-    assert np.all(np.isfinite(broken.y[17, :after])) and np.all(
-        np.isnan(broken.y[17, after:])
-    )
+    assert np.all(np.isfinite(broken.y[17, :after]))
+    assert np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
     lost = design.f[design.experiment == 17]
-    np.testing.assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
+    assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
 
 
 def test_large_inputs_that_change_the_order_of_events_are_reported(
@@ -101,7 +112,8 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
         hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH
     )
     assert 0 < data.ok.sum() < 80
-    assert {hj.Result(int(r)) for r in data.result[~data.ok]} == {hj.Result.EVENT_ORDER}
+    measured = {hj.Result(int(r)) for r in data.result[~data.ok]}
+    assert measured == {hj.Result.EVENT_ORDER}
 
 
 def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
@@ -130,7 +142,9 @@ def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
 
 def test_new_values_of_parameters_do_not_compile_again(placed_isochrons, design):
     def run(k):
-        where = lambda p: (p.cycle.system.k, p.cycle.numbers["k"])  # noqa: E731
+        def where(p):
+            return (p.cycle.system.k, p.cycle.numbers["k"])
+
         placed = eqx.tree_at(where, placed_isochrons, (jnp.asarray(k),) * 2)
         hj.run_experiments(placed.cycle, placed, design, OUTPUTS, **BATCH)
 
@@ -139,36 +153,47 @@ def test_new_values_of_parameters_do_not_compile_again(placed_isochrons, design)
         run(10.001)
 
 
+def scipy_speeds(v, inputs):
+    """v of van der Pol's oscillator at the falling zeros of x, with an input from one to the
+    next."""
+
+    def x(t, q):
+        return q[0]
+
+    x.direction = -1
+    speeds = []
+    for u in inputs:
+        speeds.append(v)
+
+        def rates(t, q, u=u):
+            return q[1], (1 - q[0] ** 2) * q[1] - q[0] + u
+
+        path = solve_ivp(
+            rates, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13
+        )
+        after_start = path.t_events[0] > 1
+        v = path.y_events[0][after_start][0, 1]
+    return speeds
+
+
 @pytest.mark.slow
 def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     """No few equal steps will do: they are adapted, and the estimate still bounds the error."""
     placed = hj.place_sections(vanderpol_cycle, [hj.Crossing("x", "falling")])
-    u = 0.1 * np.random.default_rng(0).standard_normal((3, 6, 1))
+    rng = np.random.default_rng(0)
+    u = 0.1 * rng.standard_normal((3, 6, 1))
     data = hj.run_experiments(vanderpol_cycle, placed, u, ("v",), discard=0)
-    assert data.ok.all() and (data.failed_at == -1).all()
+    assert data.ok.all()
+    assert (data.failed_at == -1).all()
 
-    def speeds(u):
-        """v at the falling zeros of x."""
-        v = float(placed.lanes.q[1, 0])
-        for value in u:
-            yield v
-            field = lambda t, q: (q[1], (1 - q[0] ** 2) * q[1] - q[0] + value)  # noqa: B023, E731
-            x = lambda t, q: q[0]  # noqa: E731
-            x.direction = -1
-            run = solve_ivp(
-                field, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13
-            )
-            v = next(
-                q[1]
-                for t, q in zip(run.t_events[0], run.y_events[0], strict=True)
-                if t > 1
-            )
-
-    true = np.array([list(speeds(row)) for row in u[:, :, 0]])
+    start = float(placed.lanes.q[1, 0])
+    true = np.array([scipy_speeds(start, inputs) for inputs in u[:, :, 0]])
+    found = data.y[:, :, 0] + data.cycle_outputs[:, 0]
     size = np.abs(true).max()
-    error = np.abs(data.y[:, :, 0] + data.cycle_outputs[:, 0] - true).max(axis=1) / size
-    assert np.ptp(true) > 0.1 * size  # the inputs do something
-    assert np.all(error <= data.error) and np.all(data.error < 1e-8)
+    error = np.abs(found - true).max(axis=1) / size
+    assert np.ptp(true) > 0.1 * size, "the inputs do something"
+    assert np.all(error <= data.error)
+    assert np.all(data.error < 1e-8)
 
 
 def test_sections_that_are_too_far_apart_for_the_steps_allowed(
@@ -202,19 +227,19 @@ def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
 
 
 def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
-    resting = hj.find_limit_cycle(
-        RESTING, hj.Guess("all", (0.0, 0.0, 0.0)), scale={"w": 1.0}
-    )
+    guess = hj.Guess("all", (0.0, 0.0, 0.0))
+    resting = hj.find_limit_cycle(RESTING, guess, scale={"w": 1.0})
     family = hj.ClockPhase(4)
     design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))
-    assert data.summary() == "2/2 ok" and np.all(data.error < 1e-8)
+    assert data.summary() == "2/2 ok"
+    assert np.all(data.error < 1e-8)
     model = hj.linearize(resting, family, ("x", "w"))  # the system is linear
     expected = hj.experiments.simulate_experiments(model, design).y
-    np.testing.assert_allclose(data.y, expected, atol=1e-9)
+    assert_allclose(data.y, expected, atol=1e-9)
     scales = hj.response_function(resting, family, "x").stepping.scales
     sizes = [float(resting.period), *(resting.scale[name] for name in "xv"), 1.0]
-    np.testing.assert_array_equal(scales, np.tile(sizes, (4, 1)))
+    assert_array_equal(scales, np.tile(sizes, (4, 1)))
 
 
 def pick(hopper):
@@ -230,8 +255,9 @@ def central(f, x, e=1e-4):
 def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
     family = dataclasses.replace(family, n_sections=4)
     response = hj.response_function(lossy_cycle, family, OUTPUTS, accuracy=1e-11)
-    parameters = jnp.stack(pick(lossy_cycle.system))
-    u = 0.1 * jnp.asarray(np.random.default_rng(0).standard_normal(12))
+    x = jnp.stack(pick(lossy_cycle.system))
+    rng = np.random.default_rng(0)
+    u = 0.1 * jnp.asarray(rng.standard_normal(12))
 
     def loss(x, u):
         system = eqx.tree_at(pick, lossy_cycle.system, list(x))
@@ -239,16 +265,20 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
         return jnp.sum(found.y**2), found.result[0]
 
     value = jax.jit(loss)
-    assert value(parameters, u)[1] == hj.Result.OK
-    (by_x, by_u), _ = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(
-        parameters, u
-    )
-    forward, _ = jax.jit(jax.jacfwd(loss, has_aux=True))(parameters, u)
-    np.testing.assert_allclose(forward, by_x, rtol=1e-9)
-    true = central(lambda x: value(x, u)[0], parameters)
-    np.testing.assert_allclose(by_x, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
-    true = central(lambda u: value(parameters, u)[0], u)
-    np.testing.assert_allclose(by_u, true, rtol=1e-6, atol=1e-6 * np.abs(true).max())
+    _, result = value(x, u)
+    assert result == hj.Result.OK
+    reverse_mode = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))
+    (by_x, by_u), _ = reverse_mode(x, u)
+    forward_mode = jax.jit(jax.jacfwd(loss, has_aux=True))
+    forward, _ = forward_mode(x, u)
+    assert_allclose(forward, by_x, rtol=1e-9)
+
+    difference = central(lambda x: value(x, u)[0], x)
+    tolerance = 1e-6 * np.abs(difference).max()
+    assert_allclose(by_x, difference, rtol=1e-6, atol=tolerance)
+    difference = central(lambda u: value(x, u)[0], u)
+    tolerance = 1e-6 * np.abs(difference).max()
+    assert_allclose(by_u, difference, rtol=1e-6, atol=tolerance)
 
 
 class Restarted(hj.HybridSystem):
@@ -266,14 +296,23 @@ class Restarted(hj.HybridSystem):
         return (p(0.0), *(p.deriv(k)(0.0) for k in range(1, 6)))
 
     def charts(self):
-        rates = lambda t, q, u: (q[1] + u[0], *q[2:], 0.0)  # noqa: E731
+        def rates(t, q, u):
+            return (q[1] + u[0], *q[2:], 0.0)
+
         return {"run": Field(tuple("abcdef"), rates)}
 
     def transitions(self):
-        (first, *others), last = self.start(), self.polynomial()(1.0)
-        back = lambda t, q, u: (first + 0.3 * (q[0] - last), *others)  # noqa: E731
+        (first, *others) = self.start()
+        last = self.polynomial()(1.0)
+
+        def back(t, q, u):
+            return (first + 0.3 * (q[0] - last), *others)
+
+        def fall_guard(t, q, u):
+            return q[0]
+
         return (
-            hj.Transition("fall", "run", "run", lambda t, q, u: q[0]),
+            hj.Transition("fall", "run", "run", fall_guard),
             hj.Transition("restart", "run", "run", hj.Scheduled(1.0), reset=back),
         )
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.experiments import start as steady
@@ -15,9 +16,8 @@ ALONE = hj.Execution(workers=1)
 
 @pytest.fixture(scope="module")
 def placed(vanderpol_cycle):
-    return hj.place_sections(
-        vanderpol_cycle, hj.KinematicPhase(4, position="x", velocity="v")
-    )
+    sections = hj.KinematicPhase(4, position="x", velocity="v")
+    return hj.place_sections(vanderpol_cycle, sections)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,8 @@ def run(placed):
     "start, least, most", [("periodic", 1e-5, 1e-2), ("steady", 0, 1e-8)]
 )
 def test_experiments_start_in_their_periodic_response(run, start, least, most):
-    data, n = run(DESIGN, start=start), DESIGN.inputs().shape[1]
+    data = run(DESIGN, start=start)
+    n = DESIGN.inputs().shape[1]
     assert least <= np.abs(data.y[:, :n] - data.y[:, n:]).max() < most
     with no_compilation(after=lambda: run(DESIGN, start=start)):
         run(hj.multisine(4, 3, (0, 1.2), 0.05, seed=2), start=start)
@@ -45,27 +46,15 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
 
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
     whole = run(DESIGN.inputs(6), start="steady", discard=0)
-    np.testing.assert_allclose(
-        whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8
-    )
+    assert_allclose(whole.y, run(DESIGN, start="steady").y, rtol=0, atol=1e-8)
 
 
 def test_small_inputs_have_the_effect_of_the_linearization(run, placed):
-    """Also those that a controller adds."""
-    model, r = hj.linearize(placed.cycle, placed, ("x", "v")), 1e-3 * DESIGN.inputs(6)
-    sizes, rng = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2)), np.random.default_rng(0)
-    matrices = [0.3 * rng.normal(size=size) for size in sizes]
-    F = hj.LDTP(*matrices, inputs=model.outputs, outputs=model.inputs)
-    for system, controller in ((model, None), (model.feedback(F), F)):
-        data = run(r, discard=0, feedback=controller)
-        exact = np.stack([system.simulate(x) for x in r])
-        np.testing.assert_allclose(
-            data.y, exact, rtol=0, atol=1e-3 * np.abs(exact).max()
-        )
-    u = r - np.stack([F.simulate(x) for x in exact])
-    np.testing.assert_allclose(
-        data.u, np.dstack([u, r]), rtol=0, atol=1e-3 * np.abs(u).max()
-    )
+    model = hj.linearize(placed.cycle, placed, ("x", "v"))
+    u = 1e-3 * DESIGN.inputs(6)
+    expected = np.stack([model.simulate(experiment) for experiment in u])
+    tolerance = 1e-3 * np.abs(expected).max()
+    assert_allclose(run(u, discard=0).y, expected, rtol=0, atol=tolerance)
 
 
 def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
@@ -86,9 +75,29 @@ def test_process_noise_acts_but_is_not_recorded(run):
             DESIGN, start="periodic", process_noise=hj.experiments.ProcessNoise(std)
         )
 
-    still, once = run(DESIGN, start="periodic"), noisy(1e-3)
-    np.testing.assert_array_equal(once.u, DESIGN.inputs(6))
-    np.testing.assert_array_equal(once.y, noisy(1e-3).y)
+    still = run(DESIGN, start="periodic")
+    once = noisy(1e-3)
+    assert_array_equal(once.u, DESIGN.inputs(6))
+    assert_array_equal(once.y, noisy(1e-3).y)
     change = np.std(once.y - still.y)
     assert 1e-5 < change < 1e-2
-    np.testing.assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)
+    assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)
+
+
+def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, placed):
+    model = hj.linearize(placed.cycle, placed, ("x", "v"))
+    rng = np.random.default_rng(0)
+    sizes = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2))
+    A, B, C, D = [0.3 * rng.normal(size=size) for size in sizes]
+    controller = hj.LDTP(A, B, C, D, inputs=model.outputs, outputs=model.inputs)
+    loop = model.feedback(controller)
+    reference = 1e-3 * DESIGN.inputs(6)
+    data = run(reference, discard=0, feedback=controller)
+
+    y = np.stack([loop.simulate(experiment) for experiment in reference])
+    tolerance = 1e-3 * np.abs(y).max()
+    assert_allclose(data.y, y, rtol=0, atol=tolerance)
+    u = reference - np.stack([controller.simulate(output) for output in y])
+    tolerance = 1e-3 * np.abs(u).max()
+    expected = np.dstack([u, reference])
+    assert_allclose(data.u, expected, rtol=0, atol=tolerance)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.pieces.store import Blocks
@@ -58,7 +59,7 @@ def records(parts):
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
     u = DESIGN.inputs(9)
     parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
-    np.testing.assert_array_equal(np.concatenate(parts), u)
+    assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
             hj.DefinitionError, match="a slice of consecutive experiments"
@@ -69,13 +70,14 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
     parts = list(stream(*arguments, Options(**BATCH), chunk=5))
     assert [len(part.u) for part in parts] == [5, 5, 2]
-    np.testing.assert_array_equal(records(parts), whole.y)
-    estimate, expected = hj.estimate_htf(part for part in parts), hj.estimate_htf(whole)
-    np.testing.assert_array_equal(estimate.f, expected.f)
-    np.testing.assert_allclose(estimate.H, expected.H, rtol=1e-9)
+    assert_array_equal(records(parts), whole.y)
+    estimate = hj.estimate_htf(part for part in parts)
+    expected = hj.estimate_htf(whole)
+    assert_array_equal(estimate.f, expected.f)
+    assert_allclose(estimate.H, expected.H, rtol=1e-9)
     noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
     parts = stream(*arguments, Options(**BATCH, **NOISE), chunk=5)
-    np.testing.assert_array_equal(records(parts), noisy.y)
+    assert_array_equal(records(parts), noisy.y)
     assert (noisy.y != whole.y).any()
 
 
@@ -88,40 +90,41 @@ def test_workers_and_batches_change_nothing(arguments, whole):
     with no_compilation(after=run):
         for workers in (1, 3):
             data = run(workers)
-            np.testing.assert_array_equal(data.y, whole.y)
-            np.testing.assert_array_equal(data.error, whole.error)
+            assert_array_equal(data.y, whole.y)
+            assert_array_equal(data.error, whole.error)
 
 
 def test_batches_are_alike_and_keep_all_workers_busy():
     for S in (1, 20, 80, 1000, 1001, 99_999):
         for workers in (1, 2, 7, 64):
             divided = divide(S, hj.Execution(workers=workers))
-            size, used = divided.batch, divided.workers
-            assert 1 <= used <= workers and 1 <= size <= min(S, 320)
+            size = divided.batch
+            used = divided.workers
+            assert 1 <= used <= workers
+            assert 1 <= size <= min(S, 320)
             number = -(-S // size)
             assert used == min(workers, number)
             if S >= 64 * workers:  # every worker has about the same to do
-                assert used == workers and number * size < 1.2 * S
+                assert used == workers
+                assert number * size < 1.2 * S
     assert divide(1000, hj.Execution(256, 8)) == hj.Execution(256, 4)
     assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(made, whole):
-    assert len(made) == 3 and made.experiments == COUNT and made.missing() == []
-    np.testing.assert_array_equal(records(made), whole.y)
-    np.testing.assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
-    np.testing.assert_array_equal(
-        np.concatenate([part.error for part in made]), whole.error
-    )
-    np.testing.assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
+    assert len(made) == 3
+    assert made.experiments == COUNT
+    assert made.missing() == []
+    assert_array_equal(records(made), whole.y)
+    assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
+    assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
     assert made[0].outputs[0].unit == "m"
     assert made.summary() == whole.summary() == "12/12 ok"
     assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
     assert made.dataset.y.dims == ("experiment", "sample", "output")
-    np.testing.assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
-    np.testing.assert_allclose(
-        hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9
-    )
+    assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
+    assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -137,7 +140,7 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
         stored[2]
     before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
     again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=5)
-    np.testing.assert_array_equal(records(again), whole.y)
+    assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
 
@@ -152,7 +155,10 @@ def test_a_store_without_what_it_began_with_is_refused(lost, stored, tmp_path):
 
 def test_other_experiments_are_refused(made, arguments):
     cycle, placed, _, _ = arguments
-    where = lambda p: (p.cycle.system.damping, p.cycle.numbers["damping"])  # noqa: E731
+
+    def where(p):
+        return (p.cycle.system.damping, p.cycle.numbers["damping"])
+
     other = eqx.tree_at(where, placed, (jnp.asarray(0.11),) * 2)
     velocity = hj.Output("speed", lambda t, q, u: -q[1], "m/s")
     cases = (
@@ -190,10 +196,11 @@ def test_another_process_can_run_a_piece(arguments, start):
     )
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
-    mine, theirs = job.run(0, None), sent.run(0, 1)
+    mine = job.run(0, None)
+    theirs = sent.run(0, 1)
     assert mine.keys() == theirs.keys()
     for name, values in mine.items():
-        np.testing.assert_array_equal(theirs[name], values)
+        assert_array_equal(theirs[name], values)
 
 
 def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
@@ -201,7 +208,8 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
 ):
     other = hj.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
-    good, high = np.cos(2 * np.pi * n / 64 * 3), np.cos(2 * np.pi * n / 64 * 19)
+    good = np.cos(2 * np.pi * n / 64 * 3)
+    high = np.cos(2 * np.pi * n / 64 * 19)
     good, bad = (
         hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high)
     )

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.experiments.passage import program
@@ -22,7 +23,8 @@ def campaign():
     sections."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sizes = np.linspace(0.005, 0.3, EXPERIMENTS)[:, None, None]
-    u = sizes * np.random.default_rng(1).normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
+    rng = np.random.default_rng(1)
+    u = sizes * rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
     return prepare(cycle, FAMILY, u, ("yM", "vM"), Options(discard=0))
 
 
@@ -65,9 +67,10 @@ def test_experiments_that_leave_the_table_are_run_again(campaign, responses):
     searched = responses[0]
     data = campaign.run()
     y = data.y + np.resize(data.cycle_outputs, data.y.shape[1:])
-    np.testing.assert_array_equal(data.result, searched.result)
+    assert_array_equal(data.result, searched.result)
     sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
-    assert np.nanmax(np.abs(y - searched.y) / sizes) < 2e-9
+    error = np.nanmax(np.abs(y - searched.y) / sizes)
+    assert error < 2e-9
 
 
 def test_other_inputs_and_parameters_compile_nothing(campaign):

@@ -41,9 +41,8 @@ def oscillation():
 
 @pytest.fixture(scope="session")
 def hopper_htf(hopper_cycle):
-    return hj.linearize(hopper_cycle, SECTIONS, OUTPUTS).htf(
-        np.arange(0.1, 4, 0.2), (-1, 0, 1)
-    )
+    ldtp = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS)
+    return ldtp.htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")

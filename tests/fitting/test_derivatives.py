@@ -8,6 +8,7 @@ the inverse factor and the cycle not at all; and a change of the unit of length 
 import equinox as eqx
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -42,8 +43,8 @@ def test_htfs(hopper_htf, seen_in_htf):
     weights = np.asarray(hj.ObservedHTF(hopper_htf, SECTIONS).weights)
     scaled = flat(np.asarray(hopper_htf.H) * weights)
     size = np.abs(S).max()
-    np.testing.assert_allclose(S[:, FORCES].sum(axis=1), -scaled, atol=1e-9 * size)
-    np.testing.assert_allclose(S[:, HOPPER.index("l0")], 0, atol=1e-9 * size)
+    assert_allclose(S[:, FORCES].sum(axis=1), -scaled, atol=1e-9 * size)
+    assert_allclose(S[:, HOPPER.index("l0")], 0, atol=1e-9 * size)
     assert np.abs(S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]).max() < 1e-9 * size
 
 
@@ -52,7 +53,7 @@ def test_states_on_sections_and_times_of_events(
 ):
     S = seen_in_cycle.sensitivity
     size = np.abs(S).max()
-    np.testing.assert_allclose(S[:, FORCES].sum(axis=1), 0, atol=1e-9 * size)
+    assert_allclose(S[:, FORCES].sum(axis=1), 0, atol=1e-9 * size)
 
     def look(cycle):
         parts = []
@@ -64,7 +65,7 @@ def test_states_on_sections_and_times_of_events(
             ]
         return np.concatenate(parts)
 
-    np.testing.assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)
+    assert_allclose(S, by_differences(hopper_cycle, look), atol=1e-6 * size)
 
 
 def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
@@ -85,4 +86,5 @@ def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
         float(getattr(slopes, n) * getattr(hopper_cycle.system, n)) for n in HOPPER
     ]
     true = direction.ravel() @ seen_in_htf.sensitivity
-    np.testing.assert_allclose(found, true, atol=1e-9 * np.abs(true).max())
+    tolerance = 1e-9 * np.abs(true).max()
+    assert_allclose(found, true, atol=tolerance)

@@ -36,7 +36,8 @@ def test_directions_are_said_in_words(rows, words):
     found = diagnose(
         tuple("abcd"), blind(rows, 300_000)
     )  # (whose square no memory holds)
-    assert found.rank == 4 - len(rows) and not found.complete
+    assert found.rank == 4 - len(rows)
+    assert not found.complete
     assert sorted(found.descriptions()) == sorted(words)
     assert all(f"not identified: {text}" in repr(found) for text in words)
 

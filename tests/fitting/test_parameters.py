@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.fitting.problem import free_parameters
@@ -23,9 +24,7 @@ COORDINATES = st.floats(-8.0, 8.0)
 def test_values_come_back_and_keep_to_their_bounds(value, bounds, x):
     parameters = free_parameters(HOPPER(k=value), {"k": bounds})
     values = parameters.read(HOPPER(k=value), ())
-    np.testing.assert_allclose(
-        parameters.decode(parameters.encode(values)), values, rtol=1e-12
-    )
+    assert_allclose(parameters.decode(parameters.encode(values)), values, rtol=1e-12)
     low, high = (0.0, np.inf) if bounds is None else bounds
     assert low <= parameters.decode(jnp.array([x]))[0] <= high
 
@@ -34,13 +33,16 @@ def test_a_parameter_keeps_its_sign_by_default():
     system = HOPPER(k=-3.0, b=0.0)
     parameters = free_parameters(system, ("k", "b", "g"))
     far = parameters.decode(jnp.array([5.0, -5.0, -5.0]))
-    assert far[0] < 0 and far[1] == -5.0 and far[2] > 0
+    assert far[0] < 0
+    assert far[1] == -5.0
+    assert far[2] > 0
     moved = parameters.insert(system, far)
-    np.testing.assert_array_equal([moved.k, moved.b, moved.g], far)
+    assert_array_equal([moved.k, moved.b, moved.g], far)
 
 
 H = np.ones((1, 3, 1, 1), complex)
-F, TIMES = np.array([0.1, 0.2, 0.3]), np.arange(8.0)
+F = np.array([0.1, 0.2, 0.3])
+TIMES = np.arange(8.0)
 
 
 def records(**options):

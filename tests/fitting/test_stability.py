@@ -19,7 +19,8 @@ def model(A):
 def test_it_is_bounded_as_stated(seed, smoothing):
     A = np.random.default_rng(seed).normal(size=(2, 3, 3))
     values, vectors = np.linalg.eig(A[1] @ A[0])
-    true, loss = np.abs(values).max(), np.linalg.cond(vectors) ** 2 * smoothing
+    true = np.abs(values).max()
+    loss = np.linalg.cond(vectors) ** 2 * smoothing
     found = float(hj.spectral_radius(model(jnp.asarray(A)), smoothing))
     assert found >= true / np.sqrt(1 - smoothing / 3) * (1 - 1e-9)
     assert loss >= 1 or found <= true / np.sqrt(1 - loss) * (1 + 1e-9)
@@ -42,7 +43,8 @@ def test_its_derivative_tends_to_that_of_the_radius():
     """A rotation by an angle that changes: the norm of a power would swing with it."""
 
     def radius(p, smoothing):
-        c, s = 0.8 * jnp.cos(1 + 3 * p), 0.8 * jnp.sin(1 + 3 * p)
+        c = 0.8 * jnp.cos(1 + 3 * p)
+        s = 0.8 * jnp.sin(1 + 3 * p)
         skew = jnp.array([[1.0, 2.0], [0.0, 1.0]])
         A = (1 + p) * skew @ jnp.array([[c, -s], [s, c]]) @ jnp.linalg.inv(skew)
         return hj.spectral_radius(model(A[None]), smoothing)
@@ -50,8 +52,6 @@ def test_its_derivative_tends_to_that_of_the_radius():
     errors = [
         abs(float(jax.grad(radius)(0.0, eps)) - 0.8) for eps in (1e-2, 1e-4, 1e-6)
     ]
-    assert (
-        errors[1] < 0.05 * errors[0]
-        and errors[2] < 0.05 * errors[1]
-        and errors[2] < 1e-4
-    )
+    assert errors[1] < 0.05 * errors[0]
+    assert errors[2] < 0.05 * errors[1]
+    assert errors[2] < 1e-4

@@ -28,7 +28,8 @@ TOLERANCE = 1e-8
 # ... and how far scipy at two tolerances may differ before a system counts as ill-conditioned.
 CONDITION = 1e-9
 # Tolerances of hybridjax, and the number of its steps.
-ACCURACY, STEPS = 1e-12, 1000
+ACCURACY = 1e-12
+STEPS = 1000
 # Systems in one compiled call.
 BATCH = 21
 

@@ -33,7 +33,8 @@ def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]
     """Lightly damped oscillators in skew coordinates, forced, in half the systems non-linear."""
     A = np.zeros((n, n))
     for k in range(0, n - 1, 2):
-        w, z = rng.uniform(*rate), rng.uniform(*damping)
+        w = rng.uniform(*rate)
+        z = rng.uniform(*damping)
         A[k : k + 2, k : k + 2] = [[-z, w], [-w, -z]]
     if n % 2:
         A[-1, -1] = -rng.uniform(0.2, 1.0)
@@ -55,7 +56,8 @@ def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]
 
 def drifting(rng, n: int, direction: float) -> dict[str, Any]:
     """The first state moves in one direction at a changing speed, and drives the others."""
-    x, rest = still(n), swinging(rng, n - 1)
+    x = still(n)
+    rest = swinging(rng, n - 1)
     for name in ("A", "S", "T"):
         x[name][1:, 1:] = rest[name]
     x["A"][0, 0] = -rng.uniform(0.0, 0.1)
@@ -114,11 +116,11 @@ def wave(rng, size, rate) -> dict[str, Any]:
 
 def beside(rng, x, sign: float) -> dict[str, Any]:
     """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
-    gap, bend = (
-        rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5),
-        rng.normal(0.0, 3.0),
-    )
-    n, c = x["n"], x["c"]  # sign * (n.q + c + gap + bend * (n.q + c)^2)
+    gap = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5)
+    bend = rng.normal(0.0, 3.0)
+    # sign * (n.q + c + gap + bend * (n.q + c)^2)
+    n = x["n"]
+    c = x["c"]
     return {
         "n": sign * (1 + 2 * bend * c) * n,
         "Q": sign * 2 * bend * np.outer(n, n),
@@ -157,7 +159,8 @@ def dips(rng) -> Sample:
 
     def layer():
         normal = rng.normal(size=2)
-        normal, level = normal / np.linalg.norm(normal), rng.uniform(-0.6, 0.6)
+        normal = normal / np.linalg.norm(normal)
+        level = rng.uniform(-0.6, 0.6)
         width = 10 ** rng.uniform(-2.5, -0.5)  # (n.q - level)^2 - width^2
         return {
             "n": -2 * level * normal,
@@ -174,7 +177,8 @@ def dips(rng) -> Sample:
 def hop(rng) -> Sample:
     """Two oscillators, of which one stops at touchdown and starts again at liftoff, in half of
     the systems where touchdown's guard is zero."""
-    air, ground = swinging(rng, 4), swinging(rng, 2)
+    air = swinging(rng, 4)
+    ground = swinging(rng, 2)
     land = arrow(rng, 4, 2, n=unit(4, 2), R=np.eye(4)[:2], r=rng.normal(0.0, 0.1, 2))
     land |= {"c": 0.0, "m": np.zeros(2)}
     lift = arrow(rng, 2, 4, R=np.eye(4)[:, :2], V=np.zeros((4, 2)))

@@ -48,7 +48,9 @@ class Run:
 def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Run:
     """Follow a system until it has had some number of events, or to its time limit."""
     t, q, u, limit = sample.start
-    found, chart, excluded = [], 0, None
+    found = []
+    chart = 0
+    excluded = None
     while len(found) < events and t < limit:
         stay = _Stay(plan, sample, chart, t, np.asarray(q, float), u)
         t, q, code, reason = stay.follow(limit, rtol, atol)
@@ -56,7 +58,8 @@ def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Ru
         if code is None:
             break
         x = sample.arrows[code]
-        q, chart = x["R"] @ q + x["r"] + x["V"] @ u, plan.arrows[code].target
+        q = x["R"] @ q + x["r"] + x["V"] @ u
+        chart = plan.arrows[code].target
         if found and t - found[-1].t < CLOSE:
             excluded = excluded or "events too close"
         found.append(Event(t, code, chart, q))
@@ -67,11 +70,18 @@ class _Stay:
     """A stay in one chart, from its entry to the next event."""
 
     def __init__(self, plan: Plan, sample: Sample, chart: int, t: float, q, u):
-        self.t, self.q, self.u = t, q, u
-        self.x, self.arrows, self.plan = sample.charts[chart], sample.arrows, plan
-        out = [g for g, arrow in enumerate(plan.arrows) if arrow.source == chart]
-        self.clocks = [g for g in out if plan.arrows[g].kind == "scheduled"]
-        self.guards = [g for g in out if plan.arrows[g].kind != "scheduled"]
+        self.t = t
+        self.q = q
+        self.u = u
+        self.x = sample.charts[chart]
+        self.arrows = sample.arrows
+        self.plan = plan
+        self.clocks = []
+        self.guards = []
+        for g, arrow in enumerate(plan.arrows):
+            if arrow.source == chart:
+                kind = self.clocks if arrow.kind == "scheduled" else self.guards
+                kind.append(g)
         self.armed = {g: self.guard(g, t, q) > LEFT for g in self.guards}
         self.fastest = dict.fromkeys(self.guards, 0.0)
         self.excluded = None
@@ -80,33 +90,38 @@ class _Stay:
         x = self.x
         smooth = x["A"] @ q + x["b"] + x["B"] @ self.u - x["cube"] * q**3
         bounded = x["S"] @ np.sin(q) + x["T"] @ np.tanh(q)
-        return smooth + bounded + x["a"] * np.sin(x["w"] * t + x["p"])
+        wave = x["a"] * np.sin(x["w"] * t + x["p"])
+        return smooth + bounded + wave
 
     def guard(self, g, t, q):
         """Guard g at one state, or at states (n, m), signed so that it falls at its event."""
         x = self.arrows[g]
-        flat = (
-            x["n"] @ q + x["c"] + x["m"] @ self.u + x["a"] * np.sin(x["w"] * t + x["p"])
-        )
-        value = flat + 0.5 * np.sum(q * (x["Q"] @ q), axis=0)
+        wave = x["a"] * np.sin(x["w"] * t + x["p"])
+        flat = x["n"] @ q + x["c"] + x["m"] @ self.u + wave
+        curved = 0.5 * np.sum(q * (x["Q"] @ q), axis=0)
+        value = flat + curved
         return value if self.plan.arrows[g].kind == "falling" else -value
 
     def rate(self, g, t, q):
         """Time derivative of `guard` at one state."""
         x = self.arrows[g]
         slope = x["n"] + 0.5 * (x["Q"] + x["Q"].T) @ q
-        rate = slope @ self.field(t, q) + x["a"] * x["w"] * np.cos(x["w"] * t + x["p"])
+        wave = x["a"] * x["w"] * np.cos(x["w"] * t + x["p"])
+        rate = slope @ self.field(t, q) + wave
         return rate if self.plan.arrows[g].kind == "falling" else -rate
 
     def enabled(self, g, q):
+        if not self.plan.arrows[g].gated:
+            return True
         x = self.arrows[g]
-        return not self.plan.arrows[g].gated or x["k"] @ q + x["k0"] > 0
+        return x["k"] @ q + x["k0"] > 0
 
     def tick(self):
         """The next scheduled event: time, transition."""
         times = []
         for g in self.clocks:
-            period, offset = self.arrows[g]["period"], self.arrows[g]["offset"]
+            period = self.arrows[g]["period"]
+            offset = self.arrows[g]["offset"]
             k = np.floor((self.t - offset) / period + 1e-9) + 1
             times.append((offset + k * period, g))
         return min(times, default=(np.inf, None))
@@ -125,22 +140,42 @@ class _Stay:
                 self.look(t, q, g, min(due, limit))
                 return t, q, g, self.excluded
         self.look(end, solver.y, None, np.inf)
-        return end, solver.y, clock if due < limit else None, self.excluded
+        event = clock if due < limit else None
+        return end, solver.y, event, self.excluded
 
     def first(self, a, b, dense):
         """The first event in a step: time, state, transition."""
         t = np.linspace(a, b, SAMPLES + 1)
         q = dense(t)
-        crossings = sorted(
-            c for g in self.guards for c in self.crossings(g, t, q, dense)
-        )
+        crossings = []
+        for g in self.guards:
+            crossings += self.crossings(g, t, q, dense)
+        crossings.sort()
         for k, (time, g) in enumerate(crossings):
             state = dense(time)
             if self.enabled(g, state):
-                if any(later - time < CLOSE for later, _ in crossings[k + 1 :]):
-                    self.excluded = "events too close"
+                for later, _ in crossings[k + 1 :]:
+                    if later - time < CLOSE:
+                        self.excluded = "events too close"
                 return time, state, g
         return None
+
+    def with_minima(self, value, t, v):
+        """Samples, and the minima below zero between them."""
+        inner = v[1:-1]
+        is_dip = (inner > 0) & (inner <= v[:-2]) & (inner <= v[2:])
+        for k in np.flatnonzero(is_dip)[::-1] + 1:
+            low = minimize_scalar(
+                value,
+                bounds=(t[k - 1], t[k + 1]),
+                method="bounded",
+                options={"xatol": 1e-12},
+            )
+            if low.fun < 0 and low.x != t[k]:
+                place = k if low.x < t[k] else k + 1
+                t = np.insert(t, place, low.x)
+                v = np.insert(v, place, low.fun)
+        return t, v
 
     def crossings(self, g, t, q, dense):
         """All falls of a guard through zero in a step."""
@@ -148,28 +183,17 @@ class _Stay:
         def value(time):
             return self.guard(g, time, dense(time))
 
-        v = self.guard(g, t, q)
-        dips = (
-            np.flatnonzero((v[1:-1] > 0) & (v[1:-1] <= v[:-2]) & (v[1:-1] <= v[2:])) + 1
-        )
-        for k in dips[::-1]:
-            span = t[k - 1], t[k + 1]
-            low = minimize_scalar(
-                value, bounds=span, method="bounded", options={"xatol": 1e-12}
-            )
-            if low.fun < 0 and low.x != t[k]:
-                place = k if low.x < t[k] else k + 1
-                t, v = np.insert(t, place, low.x), np.insert(v, place, low.fun)
+        t, v = self.with_minima(value, t, self.guard(g, t, q))
         rates = np.abs(np.diff(v) / np.diff(t))
         self.fastest[g] = max(self.fastest[g], rates.max())
         found = []
         for k in range(1, len(t)):
             self.armed[g] |= v[k - 1] > LEFT
             if self.armed[g] and v[k] <= 0:
-                lo = t[k - 1]
-                found.append(
-                    (brentq(value, lo, t[k], xtol=1e-15) if v[k - 1] > 0 else lo, g)
-                )
+                time = t[k - 1]
+                if v[k - 1] > 0:
+                    time = brentq(value, time, t[k], xtol=1e-15)
+                found.append((time, g))
                 self.armed[g] = False
         self.armed[g] |= v[-1] > LEFT
         return found
@@ -177,7 +201,8 @@ class _Stay:
     def look(self, t, q, fired, known):
         """Whether an event is a border case."""
         for g in self.guards:
-            value, rate = self.guard(g, t, q), self.rate(g, t, q)
+            value = self.guard(g, t, q)
+            rate = self.rate(g, t, q)
             if g != fired and self.armed[g] and abs(value) < CLOSE * abs(rate):
                 self.excluded = "events too close"
             if g == fired and -rate < SLOW * self.fastest[g]:

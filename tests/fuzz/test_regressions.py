@@ -4,8 +4,8 @@ import functools as ft
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import hybridjax as hj
 from hybridjax.engine.lanes import start_lanes
@@ -21,23 +21,38 @@ SETTINGS = Settings(1e-10, 1e-10)
 
 
 # x' = -1, with an event where x + u falls through zero: the input moves the guard.
+def line_rates(t, q, u):
+    return (-1.0,)
+
+
+def fall_guard(t, q, u):
+    return q[0] + u[0]
+
+
 THRESHOLD = toy(
-    {"line": Field(("x",), lambda t, q, u: (-1.0,))},
-    [hj.Transition("fall", "line", "line", lambda t, q, u: q[0] + u[0])],
+    {"line": Field(("x",), line_rates)},
+    [hj.Transition("fall", "line", "line", fall_guard)],
 )
 
 
 def rounded(level):
     """An event that changes nothing: its guard is zero afterwards, but for rounding errors, which
     grow with the state and with time."""
-    guard = lambda t, q, u: q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level  # noqa: E731
-    charts = {"line": Field(("x", "y"), lambda t, q, u: (-1.0, -1.0))}
+
+    def guard(t, q, u):
+        return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level
+
+    def line_rates(t, q, u):
+        return (-1.0, -1.0)
+
+    charts = {"line": Field(("x", "y"), line_rates)}
     return charts, (hj.Transition("fall", "line", "line", guard),)
 
 
 def test_a_guard_that_the_input_makes_negative_is_not_armed():
     run = hj.simulate(THRESHOLD, "line", (0.5,), 1.0, input=-1.0, throw=False)
-    assert run.result == hj.Result.OK and not run.events
+    assert run.result == hj.Result.OK
+    assert not run.events
 
 
 def two_pieces(x, first, second):
@@ -49,7 +64,8 @@ def two_pieces(x, first, second):
         moved = move(
             s, lanes, jnp.full((1, 1), u), until(jnp.full(1, end)), SETTINGS, h
         ).moved
-        lanes, h = moved.lanes, moved.h
+        lanes = moved.lanes
+        h = moved.h
     return hj.Result(int(moved.result[0])), int(lanes.events[0])
 
 
@@ -62,8 +78,8 @@ def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32
     result, events = across(size * jnp.linspace(0.5, 2.0, 100), time, duration)
-    np.testing.assert_array_equal(result, hj.Result.OK)
-    np.testing.assert_array_equal(events, 1)
+    assert_array_equal(result, hj.Result.OK)
+    assert_array_equal(events, 1)
 
 
 @jax.jit

@@ -89,7 +89,10 @@ def cycles(t):
 
 
 def linear(t):
-    A, B, C, D = (np.asarray(x) for x in (t.model.A, t.model.B, t.model.C, t.model.D))
+    A = np.asarray(t.model.A)
+    B = np.asarray(t.model.B)
+    C = np.asarray(t.model.C)
+    D = np.asarray(t.model.D)
     yield hj.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
     square = [np.eye(2)] * 3
     yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
@@ -104,7 +107,8 @@ def linear(t):
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
-    f, H = (np.asarray(t.estimate.f), np.asarray(t.estimate.H))
+    f = np.asarray(t.estimate.f)
+    H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
     scatter = hj.Scatter(f, size)
     errors = dict(
@@ -237,10 +241,8 @@ def recordings(t):
     yield t.recording.with_trials, dict(trials=t.recording.trials)
     yield hj.Recording.join, dict(recordings=[t.recording])
     yield hj.Recording.beside, dict(recordings=[t.recording])
-    rises, angle = (
-        hj.Crossing("x", "rising"),
-        hj.KinematicPhase(4, position="x", velocity="v"),
-    )
+    rises = hj.Crossing("x", "rising")
+    angle = hj.KinematicPhase(4, position="x", velocity="v")
     yield t.recording.mark, dict(event="e", crossing=rises)
     for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
@@ -275,7 +277,8 @@ def recordings(t):
 
 
 def subjects(t):
-    population, maps = t.population, t.maps
+    population = t.population
+    maps = t.maps
     yield population.from_fits, dict(fits=[t.fit, t.fit], table={"subject": ["a", "b"]})
     for call in (population.mean, population.predictions, population.allocation):
         yield call, dict(quantity="m")
@@ -374,7 +377,8 @@ def rhythms(t):
 
 def without_arguments(t):
     natural = hj.recordings.natural_multipliers(t.variability)
-    data, design = t.data, t.design
+    data = t.data
+    design = t.design
     for call in (
         hj.Execution,
         hj.designs.Multipliers,

@@ -38,7 +38,9 @@ class Other:
 
 PACKAGE = str(pathlib.Path(hj.__file__).parent)
 SECONDS = 5  # of computing, which no refusal takes
-NAN, INF, HUGE = float("nan"), float("inf"), 10**12
+NAN = float("nan")
+INF = float("inf")
+HUGE = 10**12
 TRACED = "the good argument, traced by JAX"
 VALUES = [
     None,
@@ -185,7 +187,8 @@ def wrong_with(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
     """What is wrong with a refusal. It is one line of text, which names the argument, another with
     which it does not agree, or a part of the value, and is raised by this package. (Only a value
     that is wrong by its kind must be named.)"""
-    text, last = str(error), error.__traceback__
+    text = str(error)
+    last = error.__traceback__
     while last.tb_next is not None:
         last = last.tb_next
     if not last.tb_frame.f_code.co_filename.startswith(PACKAGE):
@@ -226,7 +229,10 @@ def main() -> None:
     hj.enable_x64()
     matplotlib.use("agg")
     signal.signal(signal.SIGPROF, ring)
-    wrong, home, things, turn = {}, os.getcwd(), Things(), 0
+    wrong = {}
+    home = os.getcwd()
+    things = Things()
+    turn = 0
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         for function, good in (call for part in PARTS for call in part(things)):

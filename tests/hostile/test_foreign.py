@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.recordings.sampling import without_drift
@@ -20,8 +21,12 @@ class Neuron(hj.HybridSystem):
         return {"below": Leaky()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0,)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0,)
+
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 
@@ -112,9 +117,9 @@ def test_bandwidths_and_drifts_beyond_all_records():
         without_drift(recording, phase, "x", cycles).trials[0].values
         for cycles in (1e9, 1e300)
     ]
-    np.testing.assert_allclose(*flat, rtol=1e-6)  # a straight line is left out
+    assert_allclose(*flat, rtol=1e-6)  # a straight line is left out
     slopes = (np.polyfit(time, values, 1)[0] for values in (flat[1][:, 0], x))
-    np.testing.assert_allclose(*slopes, atol=2e-4)
+    assert_allclose(*slopes, atol=2e-4)
     refused(
         "`drift` must be two cycles or more",
         lambda: hj.Record(np.ones((8, 1)), np.ones((8, 1)), n_sections=4, drift=1e-20),
@@ -136,4 +141,4 @@ def test_settings_of_jax_for_the_lines_of_users():
     expected = results()
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
         for x, y in zip(results(), expected, strict=True):
-            np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12)
+            assert_allclose(x, y, rtol=1e-9, atol=1e-12)

@@ -21,16 +21,16 @@ GOAL = hj.designs.Multipliers(harmonics=0)
 
 
 def repeated(t):
-    u, y = (np.concatenate([x, x], axis=1) for x in (t.data.u, t.data.y))
+    u = np.concatenate([t.data.u, t.data.u], axis=1)
+    y = np.concatenate([t.data.y, t.data.y], axis=1)
     return hj.ExperimentData(u, y, n_sections=6, periods=16, result=t.data.result)
 
 
 def record(t):
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = np.asarray(t.model.simulate(u))
-    return hj.Record(
-        u, y + 1e-3 * np.random.default_rng(1).normal(size=y.shape), n_sections=6
-    )
+    rng = np.random.default_rng(1)
+    return hj.Record(u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6)
 
 
 def run(t, u):
@@ -42,7 +42,8 @@ def run(t, u):
 def recording(t):
     """Sixty turns that a force disturbs a little, by the law of an oscillator."""
     z = [1.0 + 0j]
-    force = np.random.default_rng(0).normal(size=121).repeat(20)[: len(TIME)]
+    rng = np.random.default_rng(0)
+    force = rng.normal(size=121).repeat(20)[: len(TIME)]
     for f in force[:-1]:
         z.append(
             z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2))

@@ -18,7 +18,9 @@ def blocks_at_random(seed, dims, ny, nu, gain=0.7):
 def simulate_blocks(blocks, u, x0, start=0):
     """The definition of an LDTP, in a loop over unpadded matrices."""
     A, B, C, D = blocks
-    x, xs, ys = x0, [x0], []
+    x = x0
+    xs = [x0]
+    ys = []
     for i, value in enumerate(u):
         n = (start + i) % len(A)
         ys.append(C[n] @ x + D[n] @ value)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -13,7 +14,8 @@ from .conftest import blocks_at_random
 
 
 N = 4
-IN, OUT = {"u": "N", "w": ""}, {"y": "m", "v": ""}
+IN = {"u": "N", "w": ""}
+OUT = {"y": "m", "v": ""}
 # All lines f + integers of four classes, among them those that are their own mirror images.
 F = np.array([0, 0.5, 1, 1.5, 2, 0.3, 1.3, 0.7, 1.7, -0.2, 0.8, 1.8, -1.2])
 
@@ -25,17 +27,21 @@ def system(seed, dims, inputs=IN, outputs=OUT, through=1.0):
 
 def lifted(ldtp, z):
     """The transfer matrices from all inputs of a period to all outputs of it."""
-    A, B, C, D = map(np.asarray, (ldtp.A, ldtp.B, ldtp.C, ldtp.D))
-    n, nu = A.shape[1], D.shape[2]
-    x = np.eye(
-        n, n + N * nu
-    )  # as a function of the state at section 0, and of all inputs
-    rows = []
+    A = np.asarray(ldtp.A)
+    B = np.asarray(ldtp.B)
+    C = np.asarray(ldtp.C)
+    D = np.asarray(ldtp.D)
+    n = A.shape[1]
+    nu = D.shape[2]
+    # States and inputs as functions of the state at section 0 and of all inputs.
+    everything = np.eye(n + N * nu)
+    x = everything[:n]
+    outputs = []
     for k in range(N):
-        u = np.eye(N * nu, n + N * nu, n)[k * nu : (k + 1) * nu]
-        rows.append(C[k] @ x + D[k] @ u)
+        u = everything[n + k * nu : n + (k + 1) * nu]
+        outputs.append(C[k] @ x + D[k] @ u)
         x = A[k] @ x + B[k] @ u
-    y = np.concatenate(rows)
+    y = np.concatenate(outputs)
     resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - x[:, :n])
     return y[:, :n] @ resolvent @ x[:, n:] + y[:, n:]
 
@@ -46,27 +52,34 @@ def pair():
 
 
 def test_systems_against_lifted_ones(pair):
-    P, F = pair
+    P, K = pair
     z = np.exp(2j * np.pi * np.array([0.0, 0.17, 0.5]))
-    a, b, one = lifted(P, z), lifted(F, z), np.eye(2 * N)
-    for ours, exact in (
-        (P @ F, a @ b),
-        (P + P, a + a),
-        (P.inverse(), np.linalg.inv(a)),
-        (P.feedback(F), np.linalg.solve(one + a @ b, a)),
-        (P.feedback(0.1 * np.eye(2)), np.linalg.solve(one + 0.1 * a, a)),
-    ):
-        np.testing.assert_allclose(lifted(ours, z), exact, rtol=0, atol=1e-12)
-    assert P.feedback(F).inputs == tuple(IN) and (P @ F).inputs == (
-        P @ F
-    ).outputs == tuple(OUT)
-    inside = eqx.filter_jit(lambda P, F: P.feedback(F).htf(0.3).H)(P, F)
-    np.testing.assert_allclose(inside, P.feedback(F).htf(0.3).H, rtol=0, atol=1e-12)
+    plant = lifted(P, z)
+    controller = lifted(K, z)
+    one = np.eye(2 * N)
+
+    def require(system, expected):
+        assert_allclose(lifted(system, z), expected, rtol=0, atol=1e-12)
+
+    require(P @ K, plant @ controller)
+    require(P + P, plant + plant)
+    require(P.inverse(), np.linalg.inv(plant))
+    closed = np.linalg.solve(one + plant @ controller, plant)
+    require(P.feedback(K), closed)
+    gain = 0.1 * np.eye(2)
+    require(P.feedback(gain), np.linalg.solve(one + 0.1 * plant, plant))
+
+    assert P.feedback(K).inputs == tuple(IN)
+    assert (P @ K).inputs == tuple(OUT)
+    assert (P @ K).outputs == tuple(OUT)
+    inside = eqx.filter_jit(lambda P, K: P.feedback(K).htf(0.3).H)(P, K)
+    assert_allclose(inside, P.feedback(K).htf(0.3).H, rtol=0, atol=1e-12)
 
 
 def test_transfer_functions_against_systems(pair):
     P, K = pair
-    H, G = P.htf(F), K.htf(F)
+    H = P.htf(F)
+    G = K.htf(F)
     for ours, exact in (
         (H @ G, P @ K),
         (H @ K, P @ K),
@@ -74,42 +87,56 @@ def test_transfer_functions_against_systems(pair):
         (H.inverse(), P.inverse()),
         (H.feedback(G), P.feedback(K)),
     ):
-        np.testing.assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
-        assert ours.source == "exact" and ours.variance is None
-        assert (ours.inputs, ours.outputs) == (exact.inputs, exact.outputs)
+        assert_allclose(ours.H, exact.htf(F).H, rtol=0, atol=1e-12)
+        assert ours.source == "exact"
+        assert ours.variance is None
+        assert ours.inputs == exact.inputs
+        assert ours.outputs == exact.outputs
 
 
-def test_variances_are_those_of_draws(pair):
-    H, G = (x.htf(F[5:]) for x in pair)
-    rng, size = np.random.default_rng(0), 1e-5
+@pytest.mark.parametrize(
+    "operation",
+    [hj.HTF.__matmul__, lambda H, G: H.inverse(), hj.HTF.feedback],
+    ids=["series", "inverse", "feedback"],
+)
+def test_variances_are_those_of_draws(operation, pair):
+    P, K = pair
+    H = P.htf(F[5:])
+    G = K.htf(F[5:])
+    rng = np.random.default_rng(0)
+    size = 1e-5
 
-    def drawn(x):
-        noise = rng.normal(size=(200, *x.H.shape, 2)) @ [1, 1j] * size / np.sqrt(2)
-        return np.asarray(x.H) + noise
+    def draws(htf):
+        parts = rng.normal(size=(200, *htf.H.shape, 2))
+        noise = size / np.sqrt(2) * (parts @ [1, 1j])
+        return np.asarray(htf.H) + noise
 
-    def known(x):
-        return dataclasses.replace(
-            x, source="estimate", variance=np.full(x.H.shape, size**2)
-        )
+    def with_variance(htf):
+        variance = np.full(htf.H.shape, size**2)
+        return dataclasses.replace(htf, source="estimate", variance=variance)
 
-    for operation in (hj.HTF.__matmul__, lambda H, G: H.inverse(), hj.HTF.feedback):
+    @jax.jit
+    @jax.vmap
+    def results(H_draw, G_draw):
+        noisy_H = eqx.tree_at(lambda htf: htf.H, H, H_draw)
+        noisy_G = eqx.tree_at(lambda htf: htf.H, G, G_draw)
+        return operation(noisy_H, noisy_G).H
 
-        @jax.jit
-        @jax.vmap
-        def values(*of_htfs):
-            pairs = zip((H, G), of_htfs, strict=True)
-            return operation(*(eqx.tree_at(lambda x: x.H, *pair) for pair in pairs)).H  # noqa: B023
-
-        error = np.asarray(values(drawn(H), drawn(G))) - operation(H, G).H
-        variance = operation(known(H), known(G)).variance
-        ratio = np.mean(np.abs(error) ** 2, axis=0) / np.asarray(variance)
-        # (Errors of neighboring entries are those of the same draws.)
-        assert abs(ratio.mean() - 1) < 0.08 and ratio.std() < 0.1
+    error = np.asarray(results(draws(H), draws(G))) - operation(H, G).H
+    scatter = np.mean(np.abs(error) ** 2, axis=0)
+    variance = operation(with_variance(H), with_variance(G)).variance
+    ratio = scatter / np.asarray(variance)
+    # (Errors of neighboring entries are those of the same draws.)
+    assert abs(ratio.mean() - 1) < 0.08
+    assert ratio.std() < 0.1
 
 
 def test_what_does_not_fit_is_refused(pair):
     P, K = pair
-    refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
+
+    def refused(text):
+        return pytest.raises(hj.DefinitionError, match=text)
+
     with refused(r"'y' \(m\).*'y' \(mm\)"):
         P.feedback(system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN))
     with refused("are not the inputs"):

@@ -7,6 +7,7 @@ import jax.test_util
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.linear.frequency_response import all_harmonics
@@ -27,84 +28,102 @@ def test_three_ways_agree(seed, shape, f):
     blocks = blocks_at_random(seed, dims, ny, nu)
     ldtp = hj.LDTP.from_blocks(*blocks)
     htf = ldtp.htf([f])
-    assert htf.harmonics == all_harmonics(N) and len(htf.harmonics) == N
-    assert htf.harmonics[0] == -(N // 2)
+    m = np.array(htf.harmonics)
+    H = np.asarray(htf.H)[:, 0]
+    assert htf.harmonics == all_harmonics(N)
+    assert_array_equal(m, np.arange(N) - N // 2)
 
     # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
-    w, m = 2 * np.pi * f / N, np.array(htf.harmonics)
+    omega = 2 * np.pi * f / N
     h = np.asarray(ldtp.impulse_response(120))
-    G = np.einsum("nrij,r->nij", h, np.exp(-1j * w * np.arange(120)))
-    H = (
-        np.einsum("mn,nij->mij", np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N), G)
-        / N
-    )
-    np.testing.assert_allclose(np.asarray(htf.H)[:, 0], H, rtol=0, atol=1e-12)
+    G = np.einsum("nrij,r->nij", h, np.exp(-1j * omega * np.arange(120)))
+    fourier = np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N) / N
+    expected = np.einsum("mn,nij->mij", fourier, G)
+    assert_allclose(H, expected, rtol=0, atol=1e-12)
 
     # The DFT of the response to a cosine, once the transient has died.
-    periods, settle = 8, 160 // N
-    u = np.zeros(((settle + periods) * N, nu))
-    j = seed % nu
-    u[:, j] = np.cos(w * np.arange(len(u)) + 0.3)
+    periods = 8
+    transient = 160 // N
+    channel = seed % nu
+    n = np.arange((transient + periods) * N)
+    u = np.zeros((len(n), nu))
+    u[:, channel] = np.cos(omega * n + 0.3)
     _, y = simulate_blocks(blocks, u, np.zeros(dims[0]))
-    Y, U = np.fft.fft(y[settle * N :], axis=0), np.fft.fft(u[settle * N :, j])
-    k = round(f * periods)
-    lines = (k + m * periods) % (periods * N)
-    np.testing.assert_allclose(
-        np.asarray(htf.H)[:, 0, :, j], Y[lines] / U[k], rtol=0, atol=1e-12
-    )
+    Y = np.fft.fft(y[transient * N :], axis=0)
+    U = np.fft.fft(u[transient * N :, channel])
+    line = round(f * periods)
+    lines = (line + m * periods) % (periods * N)
+    assert_allclose(H[:, :, channel], Y[lines] / U[line], rtol=0, atol=1e-12)
 
 
 @settings(max_examples=4)
 @given(seeds, st.sampled_from(SHAPES[:2]))
 def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
-    N, P = len(dims), 4
+    N = len(dims)
+    periods = 4
     ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
-    u = np.random.default_rng(seed).normal(size=(P * N, nu))
-    y = ldtp.simulate(u, ldtp.periodic_state(u, P))
-    htf = ldtp.htf(np.arange(P * N // 2 + 1) / P)  # negative frequencies by symmetry
-    np.testing.assert_allclose(htf.predict(u), y, rtol=0, atol=1e-11)
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(periods * N, nu))
+    start = ldtp.periodic_state(u, periods)
+    expected = ldtp.simulate(u, start)
+    # Negative frequencies follow by symmetry.
+    f = np.arange(periods * N // 2 + 1) / periods
+    assert_allclose(ldtp.htf(f).predict(u), expected, rtol=0, atol=1e-11)
 
 
-def test_derivatives(synthetic):
-    f = np.array([0.4, 1.7])
-
+def test_derivatives_by_matrices_and_frequencies(synthetic):
     @jax.jit
     def values(A, B, C, D, f):
         htf = hj.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
 
+    f = np.array([0.4, 1.7])
     arrays = (synthetic.A, synthetic.B, synthetic.C, synthetic.D, f)
     jax.test_util.check_grads(values, arrays, order=1, modes=("rev",), eps=1e-6)
-    u = np.cos(2 * np.pi * 0.5 * np.arange(12) / 6)[:, None] * np.ones(2)
 
+
+def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     htf = synthetic.htf([0.5])
+    wave = np.cos(2 * np.pi * 0.5 * np.arange(12) / 6)
+    u = np.stack([wave, wave], axis=1)
 
     @jax.jit
     def loss(H):
-        return jnp.sum(eqx.tree_at(lambda h: h.H, htf, H).predict(u) ** 2)
+        changed = eqx.tree_at(lambda htf: htf.H, htf, H)
+        return jnp.sum(changed.predict(u) ** 2)
 
     gradient = jax.jit(jax.grad(loss))(htf.H)
-    bump = np.zeros(htf.H.shape)
-    bump[2, 0, 1, 0] = 1e-6
-    up, down = (loss(np.asarray(htf.H) + s * bump) for s in (1, -1))
-    slope = np.asarray(gradient)[2, 0, 1, 0].real
-    np.testing.assert_allclose((up - down) / 2e-6, slope, rtol=1e-6)
+    entry = (2, 0, 1, 0)
+    h = 1e-6
+    step = np.zeros(htf.H.shape)
+    step[entry] = h
+    H = np.asarray(htf.H)
+    difference = (loss(H + step) - loss(H - step)) / (2 * h)
+    assert_allclose(difference, gradient[entry].real, rtol=1e-6)
 
 
 def test_a_multiplier_on_the_unit_circle_is_named():
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    ldtp = hj.LDTP.from_blocks([turn] * 3, [np.ones((2, 1))] * 3, [np.ones((1, 2))] * 3)
-    f = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
-    assert np.all(np.isfinite(ldtp.htf([0.1, f + 1e-6]).H))
+    B = np.ones((2, 1))
+    C = np.ones((1, 2))
+    ldtp = hj.LDTP.from_blocks([turn] * 3, [B] * 3, [C] * 3)
+    resonance = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
+    beside = ldtp.htf([0.1, resonance + 1e-6])
+    assert np.all(np.isfinite(beside.H))
     with pytest.raises(
-        hj.DefinitionError, match=rf"f = {f:g} .* unbounded: the multiplier"
+        hj.DefinitionError, match=rf"f = {resonance:g} .* unbounded: the multiplier"
     ):
-        ldtp.htf([0.1, f])
-    integrator = hj.LDTP(np.ones((4, 1, 1)), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+        ldtp.htf([0.1, resonance])
+
+    ones = np.ones((4, 1, 1))
+    integrator = hj.LDTP(ones, ones, ones)
     with pytest.raises(
         hj.DefinitionError, match="f = 2 cycles per period is unbounded"
     ):
         integrator.htf([0.3, 2.0, 0.7])
+
+
+def test_frequencies_are_given_once():
     with pytest.raises(hj.DefinitionError, match="`f` holds 0.1 .* twice"):
         hj.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)

@@ -7,6 +7,7 @@ import jax.test_util
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -20,44 +21,49 @@ seeds = st.integers(0, 2**32)
 
 @settings(max_examples=6)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([0, 1, -3]))
-def test_simulation_follows_the_definition(seed, shape, start):
+def test_simulation_follows_the_definition(seed, shape, first_section):
     dims, ny, nu = shape
     blocks = blocks_at_random(seed, dims, ny, nu, gain=1.0)
     ldtp = hj.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(seed)
-    u, x0 = rng.normal(size=(11, nu)), rng.normal(size=dims[start % len(dims)])
-    xs, ys = simulate_blocks(blocks, u, x0, start)
-    states = np.asarray(ldtp.states(u, x0, start))
-    for row, x in zip(states, xs, strict=True):
-        np.testing.assert_allclose(row[: len(x)], x, rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(row[len(x) :], 0)
-    np.testing.assert_allclose(ldtp.simulate(u, x0, start), ys, rtol=0, atol=1e-12)
+    u = rng.normal(size=(11, nu))
+    x0 = rng.normal(size=dims[first_section % len(dims)])
+    expected_states, expected_outputs = simulate_blocks(blocks, u, x0, first_section)
+
+    states = np.asarray(ldtp.states(u, x0, first_section))
+    for padded, expected in zip(states, expected_states, strict=True):
+        d = len(expected)
+        assert_allclose(padded[:d], expected, rtol=0, atol=1e-12)
+        assert_array_equal(padded[d:], 0)
+    outputs = ldtp.simulate(u, x0, first_section)
+    assert_allclose(outputs, expected_outputs, rtol=0, atol=1e-12)
 
 
 def test_periodic_state_of_an_unstable_system():
-    # Phi^20 has the entries 1e20 and 1e-20; the stable part must not drown.
-    A = [np.array([[10.0, 0.0], [3.0, 0.1]])]
-    ldtp = hj.LDTP.from_blocks(A, [np.ones((2, 1))], [np.eye(2)])
-    u = np.random.default_rng(0).normal(size=(20, 1))
-    expected = np.linalg.solve(
-        np.eye(40) - np.kron(np.roll(np.eye(20), 1, axis=0), A[0]),
-        np.kron(np.roll(np.eye(20), 1, axis=0), np.ones((2, 1))) @ u[:, 0],
+    # A^20 has the entries 1e20 and 1e-20; the stable part must not drown.
+    A = np.array([[10.0, 0.0], [3.0, 0.1]])
+    B = np.ones((2, 1))
+    ldtp = hj.LDTP.from_blocks([A], [B], [np.eye(2)])
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(20, 1))
+    # One linear system for the states of all periods: x[k+1] = A x[k] + B u[k], cyclically.
+    next_period = np.roll(np.eye(20), 1, axis=0)
+    states = np.linalg.solve(
+        np.eye(40) - np.kron(next_period, A), np.kron(next_period, B) @ u[:, 0]
     )
-    np.testing.assert_allclose(ldtp.periodic_state(u, 20), expected[:2], rtol=1e-12)
+    assert_allclose(ldtp.periodic_state(u, 20), states[:2], rtol=1e-12)
 
 
 def test_jit_vmap_and_gradients(synthetic):
     u = np.random.default_rng(1).normal(size=(18, 2))
     plain = synthetic.simulate(u)
-    np.testing.assert_allclose(
-        eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14
-    )
+    assert_allclose(eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14)
     many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
-    np.testing.assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
+    assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
     batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
     many = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
-    np.testing.assert_allclose(many[0], plain, atol=1e-14)
+    assert_allclose(many[0], plain, atol=1e-14)
     assert not np.allclose(many[1], plain)
 
     @jax.jit
@@ -70,26 +76,70 @@ def test_jit_vmap_and_gradients(synthetic):
     jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("rev",), eps=1e-6)
 
 
+def test_jit_and_vmap(synthetic):
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(18, 2))
+    plain = synthetic.simulate(u)
+    compiled = eqx.filter_jit(hj.LDTP.simulate)(synthetic, u)
+    assert_allclose(compiled, plain, atol=1e-14)
+    two_inputs = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
+    assert_allclose(two_inputs, np.stack([plain, 2 * plain]), atol=1e-13)
+
+    # The second system of a batch has no feedthrough.
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    two_systems = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
+    assert_allclose(two_systems[0], plain, atol=1e-14)
+    assert not np.allclose(two_systems[1], plain)
+
+
+def test_gradients(synthetic):
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(18, 2))
+
+    @jax.jit
+    def response(s):
+        A = s * synthetic.A
+        ldtp = hj.LDTP(A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        last = ldtp.simulate(u)[-1]
+        periodic = ldtp.periodic_state(u, 3)
+        return jnp.concatenate([last, periodic])
+
+    jax.test_util.check_grads(response, (0.9,), order=1, modes=("rev",), eps=1e-6)
+
+
 def test_systems_known_outside_of_jit_work_inside(synthetic):
+    s = synthetic
+    f = [0.3, 0.4]
+    harmonics = (0, 1)
+
     @jax.jit
     def inside(u):
-        ldtp = hj.LDTP(
-            synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
-        )
-        htf = ldtp.htf([0.3, 0.4], (0, 1))
-        repr(ldtp), repr(htf), repr(synthetic.htf([0.3]))
-        x0 = synthetic.periodic_state(u, 2)
-        return ldtp.simulate(u, x0[:3]), htf.error(synthetic.htf([0.3, 0.4], (0, 1)))
+        ldtp = hj.LDTP(s.A, s.B, s.C, s.D, s.dims)
+        htf = ldtp.htf(f, harmonics)
+        for printed in (ldtp, htf, s.htf([0.3])):
+            repr(printed)
+        x0 = s.periodic_state(u, 2)
+        return ldtp.simulate(u, x0[:3]), htf.error(s.htf(f, harmonics))
 
-    u = np.random.default_rng(2).normal(size=(12, 2))
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(12, 2))
     y, error = inside(u)
-    np.testing.assert_allclose(
-        y, synthetic.simulate(u, synthetic.periodic_state(u, 2)), atol=1e-13
-    )
-    np.testing.assert_allclose(error, 0, atol=1e-14)
+    expected = s.simulate(u, s.periodic_state(u, 2))
+    assert_allclose(y, expected, atol=1e-13)
+    assert_allclose(error, 0, atol=1e-14)
 
 
-GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1, 3))}
+A = np.zeros((2, 3, 3))
+
+
+B = np.zeros((2, 3, 1))
+
+
+C = np.zeros((2, 1, 3))
+
+
+GOOD = {"A": A, "B": B, "C": C}
 
 
 @pytest.mark.parametrize(
@@ -97,9 +147,9 @@ GOOD = {"A": np.zeros((2, 3, 3)), "B": np.zeros((2, 3, 1)), "C": np.zeros((2, 1,
     [
         ({"C": np.zeros((2, 0, 3))}, "without empty axes"),
         ({"dims": [3, 4]}, "`dims` must lie between 0 and 3"),
-        ({"dims": [3, 2], "A": np.ones((2, 3, 3))}, r"`A\[0\]` has entries outside"),
-        ({"dims": [3, 2], "B": np.ones((2, 3, 1))}, r"`B\[0\]` has entries outside"),
-        ({"dims": [3, 2], "C": np.ones((2, 1, 3))}, r"`C\[1\]` has entries outside"),
+        ({"dims": [3, 2], "A": A + 1}, r"`A\[0\]` has entries outside"),
+        ({"dims": [3, 2], "B": B + 1}, r"`B\[0\]` has entries outside"),
+        ({"dims": [3, 2], "C": C + 1}, r"`C\[1\]` has entries outside"),
     ],
 )
 def test_bad_definitions(change, message):
@@ -113,9 +163,8 @@ def test_single_precision_is_refused():
 
 
 def test_a_response_without_bounds_is_refused():
-    rotation = hj.LDTP(
-        [[[0.0, -1.0], [1.0, 0.0]]], np.ones((1, 2, 1)), np.ones((1, 1, 2))
-    )
+    quarter_turn = [[[0.0, -1.0], [1.0, 0.0]]]
+    rotation = hj.LDTP(quarter_turn, np.ones((1, 2, 1)), np.ones((1, 1, 2)))
     rotation.periodic_state(np.ones((3, 1)), 3)
     with pytest.raises(
         hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 import hybridjax as hj
@@ -12,13 +13,15 @@ F = np.arange(1, 20) / 20
 
 
 def an_htf(**more):
-    H = np.random.default_rng(0).normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
+    rng = np.random.default_rng(0)
+    H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
     return hj.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
 @pytest.fixture(scope="module")
 def htf():
-    size = np.random.default_rng(1).uniform(1, 2, (3, len(F), 2, 1))
+    rng = np.random.default_rng(1)
+    size = rng.uniform(1, 2, (3, len(F), 2, 1))
     scatter = hj.Scatter(np.full(len(F), 4.0), size)
     return an_htf(variance=2 * size, noise_variance=size, scatter=scatter)
 
@@ -26,13 +29,13 @@ def htf():
 def test_the_radius_is_that_of_the_f_distribution(htf):
     expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
     plain = an_htf(variance=htf.variance, scatter=hj.Scatter(htf.scatter.freedom))
-    np.testing.assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
+    assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
     level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
     expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
     for radius in (hj.HTF.confidence_radius, jax.jit(hj.HTF.confidence_radius)):
-        np.testing.assert_allclose(radius(htf), expected, rtol=1e-9)
+        assert_allclose(radius(htf), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
-    np.testing.assert_allclose(
+    assert_allclose(
         known,
         np.sqrt(stats.chi2.ppf(0.9, 2) / 2 * np.asarray(htf.variance)),
         rtol=1e-12,
@@ -41,8 +44,8 @@ def test_the_radius_is_that_of_the_f_distribution(htf):
 
 def test_variances_go_along(htf):
     one = htf.select((0, 1))
-    np.testing.assert_array_equal(one.variance, htf.variance[1:])
-    np.testing.assert_array_equal(one.noise_variance, htf.noise_variance[1:])
-    np.testing.assert_array_equal(one.scatter.freedom, htf.scatter.freedom)
-    np.testing.assert_array_equal(one.scatter.roundness, htf.scatter.roundness[1:])
+    assert_array_equal(one.variance, htf.variance[1:])
+    assert_array_equal(one.noise_variance, htf.noise_variance[1:])
+    assert_array_equal(one.scatter.freedom, htf.scatter.freedom)
+    assert_array_equal(one.scatter.roundness, htf.scatter.roundness[1:])
     assert an_htf().select(0).variance is None

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -201,11 +202,11 @@ def marks(name):
 def test_cycle_and_multipliers(name):
     case = CASES[name]()
     cycle = hj.find_limit_cycle(case.system, case.guess, section=case.section)
-    np.testing.assert_allclose(cycle.period, case.period, rtol=1e-9)
+    assert_allclose(cycle.period, case.period, rtol=1e-9)
     for state, value in case.state.items():
-        np.testing.assert_allclose(cycle.state[state], value, rtol=1e-9, atol=1e-12)
+        assert_allclose(cycle.state[state], value, rtol=1e-9, atol=1e-12)
     size = np.max(np.abs(case.multipliers))
-    np.testing.assert_allclose(
+    assert_allclose(
         cycle.multipliers, case.multipliers, rtol=0, atol=case.accuracy * size
     )
 
@@ -217,9 +218,10 @@ def test_where_no_section_is_met_again_one_is_asked_for():
     with pytest.raises(hj.ComputationError, match=r"section=AtEvent\('impact'\)"):
         hj.find_limit_cycle(wheel, after_impact)
     cycle = hj.find_limit_cycle(wheel, after_impact, section=hj.AtEvent("impact"))
-    np.testing.assert_allclose(cycle.multipliers, [wheel.exact()[1]], rtol=1e-9)
+    assert_allclose(cycle.multipliers, [wheel.exact()[1]], rtol=1e-9)
     # A guess that says so is enough, and is where Newton's method starts.
     said = hj.Guess("swing", after_impact.state, after="impact")
     again = hj.find_limit_cycle(wheel, said)
-    assert again.base.name == "impact" and float(again.anchor.t[0]) == 0
-    np.testing.assert_allclose(again.multipliers, cycle.multipliers, rtol=1e-9)
+    assert again.base.name == "impact"
+    assert float(again.anchor.t[0]) == 0
+    assert_allclose(again.multipliers, cycle.multipliers, rtol=1e-9)

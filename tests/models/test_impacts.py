@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.engine.events import keep_pace
@@ -22,25 +23,25 @@ LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
     "n", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 5, 10))]
 )
 def test_the_cycle_and_its_multipliers(n):
-    cycle, truth = hj.find_limit_cycle(hj.models.BouncingChain(n=n)), TRUTH[str(n)]
-    np.testing.assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
-    apart = np.abs(
-        (np.array(truth["multipliers"]) @ [1, 1j])[:, None] - cycle.multipliers
-    )
-    assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-12
+    cycle = hj.find_limit_cycle(hj.models.BouncingChain(n=n))
+    truth = TRUTH[str(n)]
+    assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
+    multipliers = np.array(truth["multipliers"]) @ [1, 1j]
+    differences = np.abs(multipliers[:, None] - cycle.multipliers)
+    assert differences.min(axis=0).max() < 1e-12, "each that was found is a true one"
+    assert differences.min(axis=1).max() < 1e-12, "each true one was found"
+
     events = cycle.trajectory().events
-    np.testing.assert_allclose(
-        [e.time for e in events], [t for t, _ in truth["impacts"]]
-    )
-    assert [e.name for e in events] == [f"impact {i}" for _, i in truth["impacts"]]
+    times, masses = zip(*truth["impacts"], strict=True)
+    assert_allclose([event.time for event in events], times)
+    assert [event.name for event in events] == [f"impact {i}" for i in masses]
 
 
 def test_events_that_coincide_neither_graze_nor_accumulate():
-    assert (
-        len(hj.find_limit_cycle(hj.models.TrottingQuadruped()).trajectory(2.0).events)
-        == 8
-    )
-    pace, event = np.array([[0.0], [np.inf], [0.0], [0.0]]), np.ones(1, bool)
+    cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped())
+    assert len(cycle.trajectory(2.0).events) == 8
+    pace = np.array([[0.0], [np.inf], [0.0], [0.0]])
+    event = np.ones(1, bool)
     for moved in [1.0, 0.0] * 9:
         pace, zeno = keep_pace(pace, np.array([moved]), event, ~event, 2.0)
         assert not zeno
@@ -50,14 +51,14 @@ def test_events_that_coincide_neither_graze_nor_accumulate():
 def test_each_order_of_the_feet_has_its_derivative():
     cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped(thrust=1.0), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
-    found = sorted(hj.coincidences(cycle), key=lambda x: x.time)
-    np.testing.assert_allclose(
-        [x.time for x in found], [0.48890534976601, 0.79608769379953]
-    )
-    for both, expected in zip(found, (LET_GO, LAND), strict=True):
-        assert not both.commute and len(both.orders) == 2
+    let_go, land = sorted(hj.coincidences(cycle), key=lambda both: both.time)
+    assert_allclose(let_go.time, 0.48890534976601)
+    assert_allclose(land.time, 0.79608769379953)
+    for both, size in ((let_go, LET_GO), (land, LAND)):
+        assert not both.commute
+        assert len(both.orders) == 2
         for order, derivative in zip(both.orders, both.derivatives, strict=True):
             sign = 1 if order[0].startswith("hind") else -1
-            whole = np.eye(4)
-            whole[1::2, ::2] = expected * np.array([[1, sign], [1, 1]])
-            np.testing.assert_allclose(derivative, whole, atol=1e-6)
+            expected = np.eye(4)
+            expected[1::2, ::2] = size * np.array([[1, sign], [1, 1]])
+            assert_allclose(derivative, expected, atol=1e-6)

@@ -5,6 +5,7 @@ The truth is `benchmarks/walkers_truth.py`: differences of another simulation, e
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -20,37 +21,49 @@ WALKERS = {
 
 def placed(name):
     leg, levels = WALKERS[name]
-    angle = lambda t, q: np.array(leg) @ q[: len(leg)]  # noqa: E731
+
+    def angle(t, q):
+        return np.array(leg) @ q[: len(leg)]
+
     levels = [hj.Crossing(angle, "rising", level) for level in levels]
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
     return hj.place_sections(cycle, [hj.AtEvent("touchdown"), *levels])
 
 
+def along_section(left_out, leg):
+    """Moves in one coordinate take the one that is left out along the section."""
+    moves = np.eye(len(leg))
+    if left_out >= 0:
+        moves[left_out] -= leg / leg[left_out]
+    return moves
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WALKERS)
 def test_A_and_B(name):
-    truth, sections = np.load(DATA / "walkers.npz"), placed(name)
-    model = hj.linearize(
-        sections.cycle, sections, sections.cycle.system.charts()["step"].states[0]
-    )
-    state, by_state, by_input = (
-        truth[f"{name}.{x}"] for x in ("state", "by_state", "by_input")
-    )
-    np.testing.assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
-    leg, d = (
-        np.pad(WALKERS[name][0], (0, len(state) - len(WALKERS[name][0]))),
-        len(state),
-    )
+    truth = np.load(DATA / "walkers.npz")
+    state = truth[f"{name}.state"]
+    by_state = truth[f"{name}.by_state"]
+    by_input = truth[f"{name}.by_input"]
+    sections = placed(name)
+    assert_allclose(sections.lanes.q[:, 0], state, rtol=0, atol=1e-10)
+    output = sections.cycle.system.charts()["step"].states[0]
+    model = hj.linearize(sections.cycle, sections, output)
+
+    d = len(state)
+    leg = np.zeros(d)
+    leg[: len(WALKERS[name][0])] = WALKERS[name][0]
     for n in range(4):
-        # A move in one coordinate takes the one that is left out along the section.
-        out, dropped = int(sections.drop[n]) - 1, int(sections.drop[(n + 1) % 4]) - 1
-        moves = (
-            np.eye(d)
-            if out < 0
-            else np.eye(d) - np.outer(np.eye(d)[out], leg / leg[out])
-        )
-        rows, columns = (np.flatnonzero(np.arange(d) != k) for k in (dropped, out))
-        A, B = (by_state[n] @ moves)[np.ix_(rows, columns)], by_input[n][rows]
-        ours = model.A[n][: len(rows), : len(columns)], model.B[n][: len(rows), 0]
-        np.testing.assert_allclose(ours[0], A, rtol=0, atol=1e-8 * np.max(np.abs(A)))
-        np.testing.assert_allclose(ours[1], B, rtol=0, atol=1e-8 * np.max(np.abs(B)))
+        out_before = int(sections.drop[n]) - 1
+        out_after = int(sections.drop[(n + 1) % 4]) - 1
+        rows = np.flatnonzero(np.arange(d) != out_after)
+        columns = np.flatnonzero(np.arange(d) != out_before)
+        moved = by_state[n] @ along_section(out_before, leg)
+        A = moved[np.ix_(rows, columns)]
+        B = by_input[n][rows]
+        tolerance = 1e-8 * np.max(np.abs(A))
+        found = model.A[n][: len(rows), : len(columns)]
+        assert_allclose(found, A, rtol=0, atol=tolerance, err_msg=f"A[{n}]")
+        tolerance = 1e-8 * np.max(np.abs(B))
+        found = model.B[n][: len(rows), 0]
+        assert_allclose(found, B, rtol=0, atol=tolerance, err_msg=f"B[{n}]")

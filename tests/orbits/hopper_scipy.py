@@ -4,6 +4,8 @@ A point is (t, yM, vM, ym, vm) in flight and (t, yM, vM) in stance. A section is
 ("angle", angle): the level set of the angle of (yM - 1.9) / 0.3 + i vM / 1.9, which decreases.
 """
 
+import functools
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -48,45 +50,53 @@ def _polish(function, t, q, u):
         f = _field(t, q, u)
         rate = (function(t + e, q + e * f) - function(t - e, q - e * f)) / (2 * e)
         dt = -function(t, q) / rate
-        t, q = t + dt, q + dt * f
+        t = t + dt
+        q = q + dt * f
     return t, q
+
+
+def solve(t, q, u, end, events=()):
+    return solve_ivp(
+        lambda t, q: _field(t, q, u),
+        (t, end),
+        q,
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-14,
+        events=list(events),
+    )
 
 
 def flow(point, section, u=0.0, retention=1.0):
     """The point at which the flow from `point` reaches `section`."""
-    t, q = point[0], np.asarray(point[1:])
+
+    def guard(t, q):
+        return _guard(t, q)
+
+    def level(t, q):
+        return _level(section, t, q)
+
+    for watched in (guard, level):
+        watched.terminal = True
+        watched.direction = -1.0
+    t = point[0]
+    q = np.asarray(point[1:])
     while True:
-        watched = [lambda t, q: _guard(t, q), lambda t, q: _level(section, t, q)]
-        for function in watched:
-            function.terminal, function.direction = True, -1.0
-        run = solve_ivp(
-            lambda t, q: _field(t, q, u),
-            (t, t + 2.0),
-            q,
-            method="DOP853",
-            rtol=1e-13,
-            atol=1e-14,
-            events=watched,
-        )
-        assert run.status == 1, f"nothing happens after {point}"
-        which = int(len(run.t_events[1]) > 0)
+        path = solve(t, q, u, t + 2.0, events=(guard, level))
+        assert path.status == 1, f"nothing happens after {point}"
+        at_section = len(path.t_events[1]) > 0
         # Once more over the last step, so that its end is a true step and no interpolant.
-        last, start = run.t[-2], run.y[:, -2]
-        if run.t[-1] > last:
-            again = solve_ivp(
-                lambda t, q: _field(t, q, u),
-                (last, run.t[-1]),
-                start,
-                method="DOP853",
-                rtol=1e-13,
-                atol=1e-14,
-            )
-            t, q = _polish(watched[which], run.t[-1], again.y[:, -1], u)
-        if which == 1:
+        before = path.t[-2]
+        end = path.t[-1]
+        if end > before:
+            last = solve(before, path.y[:, -2], u, end)
+            watched = level if at_section else guard
+            t, q = _polish(watched, end, last.y[:, -1], u)
+        if at_section:
             return np.array([t, *q])
-        if len(q) == 4:
+        if len(q) == 4:  # touchdown
             q = np.array([q[0], retention * q[1]])
-        else:
+        else:  # liftoff
             q = np.array([q[0], q[1], 0.0, 0.0])
 
 
@@ -107,19 +117,24 @@ def onto(section, point, names):
 def jacobian(point, here, there, names, names_after, retention=1.0, e=2e-4):
     """Derivatives of the coordinates `names_after` on `there` with respect to `names` on `here`,
     and (last column) to an input held in between; central differences of fourth order."""
-    columns = [NAMES.index(n) for n in names] + [None]
-    rows = [NAMES.index(n) for n in names_after]
-    out = np.empty((len(rows), len(columns)))
-    for j, k in enumerate(columns):
+    rows = [NAMES.index(name) for name in names_after]
 
-        def value(x, k=k):
-            start = np.array(point)
-            if k is not None:
-                start[k] += x
-            start = onto(here, start, names)
-            return flow(start, there, x if k is None else 0.0, retention)[rows]
+    def by_coordinate(name, x):
+        start = np.array(point)
+        start[NAMES.index(name)] += x
+        return flow(onto(here, start, names), there, 0.0, retention)[rows]
 
-        out[:, j] = (8 * (value(e) - value(-e)) - (value(2 * e) - value(-2 * e))) / (
-            12 * e
-        )
-    return out
+    def by_input(x):
+        start = onto(here, np.array(point), names)
+        return flow(start, there, x, retention)[rows]
+
+    def derivative(value):
+        once = value(e) - value(-e)
+        twice = value(2 * e) - value(-2 * e)
+        return (8 * once - twice) / (12 * e)
+
+    columns = []
+    for name in names:
+        columns.append(derivative(functools.partial(by_coordinate, name)))
+    columns.append(derivative(by_input))
+    return np.stack(columns, axis=1)

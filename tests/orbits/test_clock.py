@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -19,8 +20,15 @@ class WrongPaddle(hj.models.PaddleJuggler):
         return 1.1
 
 
-PULSE = lambda t: jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))  # noqa: E731
-KICKED = toy({"fall": Field(("x",), lambda t, q, u: (PULSE(t) - q[0],))}, period=1.0)
+def pulse(t):
+    return jnp.exp(-((((t / 2 + 0.2) % 1.0 - 0.5) / 1e-3) ** 2))
+
+
+def fall_rates(t, q, u):
+    return (pulse(t) - q[0],)
+
+
+KICKED = toy({"fall": Field(("x",), fall_rates)}, period=1.0)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +54,10 @@ def test_a_period_that_does_not_follow_a_parameter():
         hj.DefinitionError, match="does not have the period 12.5664 that Fixed"
     ):
         hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
-    every = lambda self: hj.Scheduled(20 * np.pi * self.damping, 1.0)  # noqa: E731
+
+    def every(self):
+        return hj.Scheduled(20 * np.pi * self.damping, 1.0)
+
     tick = {
         "transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]
     }
@@ -62,12 +73,17 @@ def test_a_period_that_does_not_follow_a_parameter():
 def test_a_force_that_jumps_with_the_clock():
     """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
 
-    force = lambda t: jnp.where(t % 1.0 < 0.5, 1.0, 0.0)  # noqa: E731
-    charts = {"a": Field(("x",), lambda t, q, u: (-q[0] + force(t),))}
+    def force(t):
+        return jnp.where(t % 1.0 < 0.5, 1.0, 0.0)
+
+    def rates(t, q, u):
+        return (-q[0] + force(t),)
+
+    charts = {"a": Field(("x",), rates)}
     square = toy(
         charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0
     )
     cycle = hj.find_limit_cycle(square, hj.Guess("a", (0.3,), 0.25))
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))
-    np.testing.assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)
-    np.testing.assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)
+    assert_allclose(cycle.state["x"], 1 + (x - 1) * np.exp(-0.25), rtol=1e-6)
+    assert_allclose(cycle.settings.scale, 1 / (1 + np.exp(-0.5)), rtol=1e-3)

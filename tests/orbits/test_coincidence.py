@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -12,14 +13,26 @@ from .test_explain import BALLS, Balls
 
 
 # x and y relax to 1, and are set back to 0 together at the level 1/2.
+def rates(t, q, u):
+    return (1.0 - q[0], 1.0 - q[1])
+
+
+def x_guard(t, q, u):
+    return q[0] - 0.5
+
+
+def y_guard(t, q, u):
+    return q[1] - 0.5
+
+
 PAIR = toy(
-    {"a": Field(("x", "y"), lambda t, q, u: (1.0 - q[0], 1.0 - q[1]))},
+    {"a": Field(("x", "y"), rates)},
     [
         hj.Transition(
             "x",
             "a",
             "a",
-            lambda t, q, u: q[0] - 0.5,
+            x_guard,
             "rising",
             lambda t, q, u: (0.5 * (q[1] - 0.5), q[1]),
         ),
@@ -27,7 +40,7 @@ PAIR = toy(
             "y",
             "a",
             "a",
-            lambda t, q, u: q[1] - 0.5,
+            y_guard,
             "rising",
             lambda t, q, u: (q[0], 0.0),
         ),
@@ -37,18 +50,26 @@ PAIR = toy(
 
 def ticked(height=1.0, other=0.0):
     """A saw-tooth that is set back when it comes to `height`, and by a clock at whole times."""
-    back = lambda t, q, u: (0.2,)  # noqa: E731
+
+    def back(t, q, u):
+        return (0.2,)
+
+    def full_guard(t, q, u):
+        return q[0] - height
+
     transitions = [
-        hj.Transition("full", "a", "a", lambda t, q, u: q[0] - height, "rising", back),
+        hj.Transition("full", "a", "a", full_guard, "rising", back),
         hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
     ]
     if other:
         transitions.append(
             hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back)
         )
-    charts = {
-        "a": Field(("x",), lambda t, q, u: (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),))
-    }
+
+    def rates(t, q, u):
+        return (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),)
+
+    charts = {"a": Field(("x",), rates)}
     return toy(charts, transitions, period=1.0)
 
 
@@ -66,7 +87,10 @@ def race():
         for name, speed in speeds.items()
     }
     x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
-    again = lambda t, q, u: (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))  # noqa: E731
+
+    def again(t, q, u):
+        return (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))
+
     transitions = (
         hj.Transition("x", "a", "x first", x, "rising"),
         hj.Transition("y", "a", "y first", y, "rising"),
@@ -82,14 +106,15 @@ def test_derivatives_of_both_orders():
     cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
     assert cycle.result == hj.Result.COINCIDENCE
     (found,) = hj.coincidences(cycle)
-    assert found.time % 1.0 == pytest.approx(0.5) and not found.commute
+    assert found.time % 1.0 == pytest.approx(0.5)
+    assert not found.commute
     exact = {
         ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),
         ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
     }
     assert set(found.orders) == set(exact)
     for order, derivative in zip(found.orders, found.derivatives, strict=True):
-        np.testing.assert_allclose(derivative, exact[order], atol=1e-12)
+        assert_allclose(derivative, exact[order], atol=1e-12)
 
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
@@ -105,10 +130,12 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(jnp.array([0.0, 0.2, 0.4]))
     begin = hj.find_limit_cycle(Balls(), BALLS)
     found = hj.find_limit_cycles(systems, begin)
-    ok, not_ok = hj.Result.OK, hj.Result.COINCIDENCE
-    np.testing.assert_array_equal(found.result, [ok, not_ok, not_ok])
+    ok = hj.Result.OK
+    not_ok = hj.Result.COINCIDENCE
+    assert_array_equal(found.result, [ok, not_ok, not_ok])
     branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
-    assert branch.cycles.result[0] == ok and (branch.cycles.result[1:] == not_ok).all()
+    assert branch.cycles.result[0] == ok
+    assert (branch.cycles.result[1:] == not_ok).all()
 
 
 @pytest.mark.slow

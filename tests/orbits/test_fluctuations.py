@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.linalg import solve_discrete_lyapunov
 
 import hybridjax as hj
@@ -9,13 +10,22 @@ import hybridjax as hj
 from .test_responses import Juggler, Neuron, StuartLandau
 
 
-G, TABLE, SPEED = 9.81, 2e-3, 3e-3
+G = 9.81
+TABLE = 2e-3  # standard deviation of the height of the table
+SPEED = 3e-3  # and of the speed after a bounce
 NOISE = dict(guards={"impact": TABLE}, resets={"impact": {"v": SPEED}})
-paddle, slope, bend = (
-    lambda t: 0.15 * np.sin(2 * np.pi * t),
-    lambda t: 0.3 * np.pi * np.cos(2 * np.pi * t),
-    lambda t: -0.6 * np.pi**2 * np.sin(2 * np.pi * t),
-)
+
+
+def paddle(t):
+    return 0.15 * np.sin(2 * np.pi * t)
+
+
+def slope(t):
+    return 0.3 * np.pi * np.cos(2 * np.pi * t)
+
+
+def bend(t):
+    return -0.6 * np.pi**2 * np.sin(2 * np.pi * t)
 
 
 @pytest.fixture(scope="module")
@@ -34,102 +44,118 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
     cycle = hj.find_limit_cycle(Neuron())
     period = np.log(6)
     threshold = cycle.fluctuations(guards={"spike": 0.01})  # where v' = 0.2
-    np.testing.assert_allclose(threshold.durations(), [[0.05**2]], rtol=1e-12)
-    np.testing.assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
-    np.testing.assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
+    assert_allclose(threshold.durations(), [[0.05**2]], rtol=1e-12)
+    assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
+    assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
     white = cycle.fluctuations(white={"u": 0.01})  # its integral with exp(t) / 1.2
-    np.testing.assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
+    assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
     assert "standard deviation from spike to spike" in str(white)
 
 
 @pytest.mark.core
 def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
-    section, guess = hj.Crossing("y", "rising"), hj.Guess("plane", (0.33, 0.0))
-    noisy = hj.find_limit_cycle(StuartLandau(), guess, section=section).fluctuations(
-        {"x": 1e-3}
-    )
-    # Of the amplitude r: r' = -0.2 r + cos(t w) dW; of the phase: see the closed form of Z.
-    angle, w = 2 * np.pi * np.array([0.0, 0.2, 0.7]), 1.0 + 0.4 * 0.1
-    wave = 0.4 * np.cos(2 * angle) + 2 * w * np.sin(2 * angle)
-    radial = 1e-6 / 2 * (1 / 0.4 + wave / (0.4**2 + 4 * w**2))
-    # At equal phases d angle = alpha dr / r.
-    along = np.cos(angle) + 0.4 * np.sin(angle), np.sin(angle) - 0.4 * np.cos(angle)
-    C, later = (noisy.covariance([0.0, 0.2, 0.7], lag) for lag in (0, 1))
-    np.testing.assert_allclose(C[:, 0, 1], radial * along[0] * along[1], rtol=1e-11)
-    decay = np.exp(-0.2 * 2 * np.pi / w)
-    np.testing.assert_allclose(
-        later[:, 1, 1], decay * radial * along[1] ** 2, rtol=1e-11
-    )
-    np.testing.assert_allclose(
-        noisy.diffusion, 1e-6 * (1 + 0.4**2) / 0.2 / w**2, rtol=1e-11
-    )
+    mu = 0.1
+    alpha = -0.4
+    omega = 1.0 - alpha * mu
+    strength = 1e-3
+    phases = np.array([0.0, 0.2, 0.7])
+    angle = 2 * np.pi * phases
+    section = hj.Crossing("y", "rising")
+    guess = hj.Guess("plane", (0.33, 0.0))
+    cycle = hj.find_limit_cycle(StuartLandau(), guess, section=section)
+    noisy = cycle.fluctuations({"x": strength})
+
+    # The amplitude r follows r' = -2 mu r + cos(omega t) dW.
+    double = 0.4 * np.cos(2 * angle) + 2 * omega * np.sin(2 * angle)
+    variance = strength**2 / 2 * (1 / 0.4 + double / (0.4**2 + 4 * omega**2))
+    # At equal phases d angle = alpha dr / r, so that deviations have one direction.
+    x = np.cos(angle) - alpha * np.sin(angle)
+    y = np.sin(angle) + alpha * np.cos(angle)
+    now = noisy.covariance(phases)
+    assert_allclose(now[:, 0, 1], variance * x * y, rtol=1e-11)
+    later = noisy.covariance(phases, 1)
+    decay = np.exp(-2 * mu * 2 * np.pi / omega)
+    assert_allclose(later[:, 1, 1], decay * variance * y**2, rtol=1e-11)
+
+    diffusion = strength**2 * (1 + alpha**2) / (2 * mu) / omega**2
+    assert_allclose(noisy.diffusion, diffusion, rtol=1e-11)
     # Periods are correlated, and over many of them their variance is that of the diffusion.
-    both = noisy.durations()[0, 0] + 2 * sum(
-        noisy.durations(k)[0, 0] for k in range(1, 40)
-    )
-    np.testing.assert_allclose(both, noisy.diffusion * noisy.period, rtol=1e-11)
+    alone = noisy.durations()[0, 0]
+    together = [noisy.durations(lag)[0, 0] for lag in range(1, 40)]
+    total = alone + 2 * sum(together)
+    assert_allclose(total, noisy.diffusion * noisy.period, rtol=1e-11)
 
 
 def test_states_may_have_no_correlation():
     noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
-    np.testing.assert_allclose(
-        noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12
-    )
+    assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     """The chain of times, heights and speeds (t, y, v) after bounces."""
-    noisy, (t, v) = juggler.fluctuations(**NOISE), _at_impact(juggler)
-    fall = v - G  # the speed with which it lands, after a period of 1
-    late = np.array([fall, -1.0, -1.0]) / (fall - slope(t))
-    early = late - [1, 0, 0]
-    step = np.stack(
-        [late, slope(t) * late, 1.7 * bend(t) * late + 0.7 * G * early - [0, 0, 0.7]]
-    )
-    table = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G]) / (fall - slope(t)) + [
-        0,
-        1,
-        0,
-    ]
-    noise = TABLE**2 * np.outer(table, table) + np.diag([0, 0, SPEED**2])
+    noisy = juggler.fluctuations(**NOISE)
+    (t, v) = _at_impact(juggler)
+    landing = v - G  # the speed after a period of 1
+    relative = landing - slope(t)
+
+    # How the next time, height and speed depend on those of this bounce.
+    time = np.array([landing, -1.0, -1.0]) / relative
+    duration = time - [1, 0, 0]
+    height = slope(t) * time
+    speed = 1.7 * bend(t) * time + 0.7 * G * duration - [0, 0, 0.7]
+    step = np.stack([time, height, speed])
+    # How they depend on a height of the table, and on a speed that is added after the bounce.
+    by_time = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G])
+    by_table = by_time / relative + [0, 1, 0]
+    noise = TABLE**2 * np.outer(by_table, by_table) + np.diag([0, 0, SPEED**2])
     C = solve_discrete_lyapunov(step, noise)
-    ago = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
-    now = np.array([[-(v - G * ago), 1.0, ago], [G, 0.0, 1.0]])
-    np.testing.assert_allclose(noisy.covariance([0.0])[0], now @ C @ now.T, rtol=1e-11)
-    np.testing.assert_allclose(
-        noisy.covariance([0.0], 2)[0], now @ step @ step @ C @ now.T, rtol=1e-11
-    )
-    lags = [C[0, 0], *((np.linalg.matrix_power(step, k) @ C)[0, 0] for k in (1, 2))]
-    np.testing.assert_allclose(
-        noisy.durations()[0, 0], 2 * (lags[0] - lags[1]), rtol=1e-12
-    )
-    np.testing.assert_allclose(
-        noisy.durations(1)[0, 0], 2 * lags[1] - lags[0] - lags[2], rtol=1e-11
-    )
+
+    since = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
+    now = np.array([[-(v - G * since), 1.0, since], [G, 0.0, 1.0]])
+    expected = now @ C @ now.T
+    assert_allclose(noisy.covariance([0.0])[0], expected, rtol=1e-11)
+    expected = now @ step @ step @ C @ now.T
+    assert_allclose(noisy.covariance([0.0], 2)[0], expected, rtol=1e-11)
+
+    # A duration is the difference of two times.
+    times = [C[0, 0], (step @ C)[0, 0], (step @ step @ C)[0, 0]]
+    expected = 2 * (times[0] - times[1])
+    assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
+    expected = 2 * times[1] - times[0] - times[2]
+    assert_allclose(noisy.durations(1)[0, 0], expected, rtol=1e-11)
 
 
 def test_a_million_simulated_bounces_scatter_as_computed(juggler):
-    noisy, (t, v) = juggler.fluctuations(**NOISE), _at_impact(juggler)
-    rng, draws = np.random.default_rng(0), 2000
-    t, y, v = np.full(draws, t), np.full(draws, paddle(t)), np.full(draws, v)
-    durations = []
-    for k in range(560):
-        table, tau = TABLE * rng.normal(size=draws), np.ones(draws)
-        for _ in range(8):
-            off = y + v * tau - G / 2 * tau**2 - paddle(t + tau) - table
-            tau = tau - off / (v - G * tau - slope(t + tau))
-        t = t + tau
-        y, v = paddle(t) + table, 1.7 * slope(t) - 0.7 * (v - G * tau)
-        v = v + SPEED * rng.normal(size=draws)
-        if k >= 60:
-            durations.append(tau - 1)
-    x = np.array(durations)
+    noisy = juggler.fluctuations(**NOISE)
+    rng = np.random.default_rng(0)
+    jugglers = 2000
+    transient = 60
+    start, speed = _at_impact(juggler)
+    t = np.full(jugglers, start)
+    y = np.full(jugglers, paddle(start))
+    v = np.full(jugglers, speed)
+    deviations = []
+    for bounce in range(560):
+        table = TABLE * rng.normal(size=jugglers)
+        duration = np.ones(jugglers)
+        for _ in range(8):  # Newton's method
+            height = y + v * duration - G / 2 * duration**2
+            gap = height - paddle(t + duration) - table
+            rate = v - G * duration - slope(t + duration)
+            duration = duration - gap / rate
+        t = t + duration
+        y = paddle(t) + table
+        v = 1.7 * slope(t) - 0.7 * (v - G * duration)
+        v = v + SPEED * rng.normal(size=jugglers)
+        if bounce >= transient:
+            deviations.append(duration - 1)
+    x = np.array(deviations)
     for lag in (0, 1, 2):
-        each = (x[lag:] * x[: len(x) - lag]).mean(
-            axis=0
-        )  # one for each of independent jugglers
-        error = each.std(ddof=1) / np.sqrt(draws)
-        assert abs(each.mean() - noisy.durations(lag)[0, 0]) < 3 * error
+        products = x[lag:] * x[: len(x) - lag]
+        covariance = products.mean(axis=0)  # of each of the independent jugglers
+        standard_error = covariance.std(ddof=1) / np.sqrt(jugglers)
+        error = covariance.mean() - noisy.durations(lag)[0, 0]
+        assert abs(error) < 3 * standard_error, f"lag {lag}"
 
 
 def test_noise_that_does_not_fit_is_refused(juggler):
@@ -166,8 +192,12 @@ class _Follower(hj.HybridSystem):
         return {"sub": _Adaptive()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0, q[1] + 1)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0, q[1] + 1)
+
         return [hj.Transition("spike", "sub", "sub", guard=threshold, reset=after)]
 
 
@@ -181,4 +211,4 @@ def test_noise_without_an_effect_gives_zero():
         assert np.array_equal(noisy.durations(lag=1), [[0]])
         assert "0: standard deviation from spike to spike" in str(noisy)
         for C in noisy.covariance([0.2, 0.7]):
-            np.testing.assert_allclose(C, expected, rtol=1e-10, atol=0)
+            assert_allclose(C, expected, rtol=1e-10, atol=0)

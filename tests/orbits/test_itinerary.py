@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.orbits import batches, find, limit_cycles, near
@@ -65,7 +66,8 @@ class Pulses(hj.HybridSystem):
         return {"off": Circuit(0.0), "on": Circuit(1.0)}
 
     def transitions(self):
-        up, down = (hj.Scheduled(1.0, x) for x in (self.rise, self.fall))
+        up = hj.Scheduled(1.0, self.rise)
+        down = hj.Scheduled(1.0, self.fall)
         return [
             hj.Transition("up", "off", "on", up),
             hj.Transition("down", "on", "off", down),
@@ -94,25 +96,28 @@ def amplitude(drive):
     return drive / np.hypot(1 - 1.3**2, 0.4 * 1.3)
 
 
+def damping_of_a_turn():
+    """The product of the multipliers without a rebound: exp(-damping T)."""
+    return np.exp(-0.4 * 2 * np.pi / 1.3)
+
+
 def test_a_repeated_cycle_is_that_of_the_closed_form(free, compiled):
     cycle = hj.find_limit_cycle(Rebound(drive=0.5), free)
-    x = np.max(np.abs(np.asarray(cycle.legs.q[0])))
-    largest = np.max(cycle.trajectory().dense(64)[2][:, 0])
-    assert abs(largest - amplitude(0.5)) < 1e-3 * x
-    # A turn damps by exp(-damping T) in two directions.
+    _, _, states = cycle.trajectory().dense(64)
+    assert_allclose(np.max(states[:, 0]), amplitude(0.5), rtol=1e-3)
     product = np.prod(cycle.multipliers).real
-    assert abs(product - np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-11
+    assert_allclose(product, damping_of_a_turn(), rtol=0, atol=1e-11)
 
 
 def test_an_event_that_is_new_goes_to_the_search(free, compiled):
-    assert amplitude(2.0) > 1
+    assert amplitude(2.0) > 1, "the free motion would reach the stop"
     cycle = hj.find_limit_cycle(Rebound(drive=2.0), free)
-    assert [cycle.structure.transitions[g].name for g in cycle.event_sequence] == [
-        "bounce"
-    ]
+    names = [cycle.structure.transitions[k].name for k in cycle.event_sequence]
+    assert names == ["bounce"]
     # The rebound keeps the product of the multipliers, less the squared restitution.
     product = np.prod(cycle.multipliers).real
-    assert abs(product - 0.6**2 * np.exp(-0.4 * 2 * np.pi / 1.3)) < 1e-9
+    expected = 0.6**2 * damping_of_a_turn()
+    assert_allclose(product, expected, rtol=0, atol=1e-9)
 
 
 def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
@@ -132,15 +137,16 @@ def test_gradients_inside_of_programs_are_differences(free):
         return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
 
     value = jax.jit(state)
-    by_drive, by_damping = jax.jit(jax.grad(state, argnums=(0, 1)))(0.5, 0.4)
+    reverse_mode = jax.jit(jax.grad(state, argnums=(0, 1)))
+    by_drive, by_damping = reverse_mode(0.5, 0.4)
     h = 1e-4
-    differences = (
-        (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h),
-        (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h),
-    )
-    assert np.allclose((by_drive, by_damping), differences, rtol=1e-6)
-    forward = jax.jit(jax.jacfwd(state, argnums=(0, 1)))(0.5, 0.4)
-    assert np.allclose(forward, (by_drive, by_damping), rtol=1e-10)
+    difference = (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h)
+    assert_allclose(by_drive, difference, rtol=1e-6)
+    difference = (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h)
+    assert_allclose(by_damping, difference, rtol=1e-6)
+    forward_mode = jax.jit(jax.jacfwd(state, argnums=(0, 1)))
+    forward = forward_mode(0.5, 0.4)
+    assert_allclose(forward, (by_drive, by_damping), rtol=1e-10)
 
 
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
@@ -169,13 +175,15 @@ def test_programs_of_many_systems_factorize_nothing(free):
     times = np.zeros(4), np.full(4, float(free.period))
     q = np.repeat(route.map.anchor.q.T, 4, axis=0)
     ends = np.repeat(route.first.ends[None], 4, axis=0)
-    map, plan = on_device(route.map), Plan.of(route.first)
+    map = on_device(route.map)
+    plan = Plan.of(route.first)
 
     def program(leaves, t, expected, q, ends):
         return correct(Maps(map, leaves, t, expected), route.first.form, plan, q, ends)
 
     text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
-    assert "while" in text and "@lapack_" not in text
+    assert "while" in text
+    assert "@lapack_" not in text
 
 
 def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
@@ -185,7 +193,7 @@ def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper(), guess)
     true = -0.24898333 + 0.69933325j
     values = cycle.multipliers
-    np.testing.assert_allclose(values[np.argmax(values.imag)], true, atol=1e-8)
+    assert_allclose(values[np.argmax(values.imag)], true, atol=1e-8)
 
 
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
@@ -195,4 +203,5 @@ def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     after = np.flatnonzero(path.event == 0)[0]
     # In closed form, the charge with which a pulse of 0.35 begins.
     begin = np.exp(-0.65) * (1 - np.exp(-0.35)) / (1 - np.exp(-1.0))
-    assert abs(path.after[after, 0] - begin) < 1e-10
+    error = abs(path.after[after, 0] - begin)
+    assert error < 1e-10

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -15,7 +16,10 @@ def decaying(rates):
     modes = np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.6, 1.0]])
     A = jnp.asarray(modes @ np.diag(-np.array(rates)) @ np.linalg.inv(modes))
     force = jnp.array([1.0, 2.0, 3.0])
-    field = lambda t, q, u: A @ q + force * jnp.cos(2 * jnp.pi * t)  # noqa: E731
+
+    def field(t, q, u):
+        return A @ q + force * jnp.cos(2 * jnp.pi * t)
+
     return toy({"a": Field(("x", "y", "z"), field)}, period=1.0)
 
 
@@ -31,7 +35,7 @@ def test_a_small_multiplier_of_an_autonomous_cycle():
 
     multiplier, by_mu = jax.jvp(return_map, (40.0,), (1.0,))
     values = [jnp.log(return_map(40.0)), jnp.log(multiplier), by_mu / multiplier]
-    np.testing.assert_allclose(values, [-80.0, -80.0, -2.0], rtol=1e-9)
+    assert_allclose(values, [-80.0, -80.0, -2.0], rtol=1e-9)
 
 
 def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
@@ -41,13 +45,18 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
         small * jnp.cos(2 * jnp.pi * t) - q[0] / 2,
         q[0] / small * large - q[1],
     )
-    reset = lambda t, q, u: (q[0], 0.0)  # noqa: E731
+
+    def reset(t, q, u):
+        return (q[0], 0.0)
+
     tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0, 0.5), reset=reset)
+    system = toy({"a": Field(("x", "y"), field)}, [tick], period=1.0)
+    guess = hj.Guess("a", (small, large))
     cycle = hj.find_limit_cycle(
-        toy({"a": Field(("x", "y"), field)}, [tick], period=1.0),
-        hj.Guess("a", (small, large)),
+        system,
+        guess,
     )
-    np.testing.assert_allclose(cycle.multipliers, [np.exp(-0.5)], rtol=1e-12)
+    assert_allclose(cycle.multipliers, [np.exp(-0.5)], rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -56,6 +65,6 @@ def test_modes_that_decay_fast_beside_one_that_does_not():
     rates = (0.5, 45.0, 250.0)
     truth = np.exp(-np.array(rates))
     cycle = hj.find_limit_cycle(decaying(rates), hj.Guess("a", (0.1, 0.2, 0.3)))
-    np.testing.assert_allclose(cycle.multipliers, truth, rtol=1e-10, atol=0)
+    assert_allclose(cycle.multipliers, truth, rtol=1e-10, atol=0)
     found = hj.linearize(cycle, hj.ClockPhase(40)).multipliers
-    np.testing.assert_allclose(found, truth, rtol=1e-8, atol=0)
+    assert_allclose(found, truth, rtol=1e-8, atol=0)

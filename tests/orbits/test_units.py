@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -59,24 +60,26 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     length, time = UNITS[unit]
     sizes = dimensions(length, time)
     cycle = hopper_cycle_in(length, time)
-    assert (cycle.result, cycle.event_sequence) == (
-        hj.Result.OK,
-        hopper_cycle.event_sequence,
-    )
-    assert cycle.iterations == hopper_cycle.iterations and cycle.residual < 1e-12
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
-    for name, size in hopper_cycle.scale.items():
-        np.testing.assert_allclose(cycle.scale[name], size * sizes[name[0]], rtol=1e-9)
-        size = hopper_cycle.state.get(name, 0.0) * sizes[name[0]]
-        np.testing.assert_allclose(cycle.state.get(name, 0.0), size, rtol=1e-9)
-    model, other = (hj.linearize(x, CLOCK, ("yM", "vM")) for x in (hopper_cycle, cycle))
-    np.testing.assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
-    H, theirs = (x.htf(FREQUENCIES, (-1, 0, 1)).H for x in (model, other))
+    assert cycle.result == hj.Result.OK
+    assert cycle.event_sequence == hopper_cycle.event_sequence
+    assert cycle.iterations == hopper_cycle.iterations
+    assert cycle.residual < 1e-12
+    assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    for name, scale in hopper_cycle.scale.items():
+        size = sizes[name[0]]
+        assert_allclose(cycle.scale[name], scale * size, rtol=1e-9)
+        expected = hopper_cycle.state.get(name, 0.0) * size
+        assert_allclose(cycle.state.get(name, 0.0), expected, rtol=1e-9)
+
+    model = hj.linearize(hopper_cycle, CLOCK, ("yM", "vM"))
+    other = hj.linearize(cycle, CLOCK, ("yM", "vM"))
+    assert_allclose(other.multipliers, model.multipliers, rtol=1e-9)
+    expected = model.htf(FREQUENCIES, (-1, 0, 1)).H
+    found = other.htf(FREQUENCIES, (-1, 0, 1)).H
     for k, name in enumerate(model.outputs):
-        mine, back = H[:, :, k], sizes["force"] / sizes[name[0]]
-        np.testing.assert_allclose(
-            theirs[:, :, k] * back, mine, atol=1e-9 * np.abs(mine).max()
-        )
+        unit = sizes[name[0]] / sizes["force"]
+        tolerance = 1e-9 * np.abs(expected[:, :, k]).max()
+        assert_allclose(found[:, :, k] / unit, expected[:, :, k], atol=tolerance)
 
 
 @pytest.mark.slow
@@ -86,10 +89,8 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     length, time = UNITS[unit]
     cycle = relaxation_in(length, time)
     assert cycle.result == hj.Result.OK
-    np.testing.assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
-    np.testing.assert_allclose(
-        cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9
-    )
+    assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
+    assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
 
 
 def test_states_that_rest_stop_nothing(relaxation):
@@ -97,8 +98,9 @@ def test_states_that_rest_stop_nothing(relaxation):
     these. Both have the multiplier exp(-period) of their decay."""
     truth = [8.59695063603805e-4, np.exp(-6.66328685932313), np.exp(-6.66328685932313)]
     found = np.sort_complex(relaxation.multipliers)
-    np.testing.assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
-    assert relaxation.scale["nothing"] == 1.0 and relaxation.scale["rounding"] > 1e-7
+    assert_allclose(found, np.sort_complex(truth), rtol=1e-7)
+    assert relaxation.scale["nothing"] == 1.0
+    assert relaxation.scale["rounding"] > 1e-7
 
 
 def test_a_state_that_rounding_moves_by_time_stops_nothing():
@@ -108,10 +110,10 @@ def test_a_state_that_rounding_moves_by_time_stops_nothing():
         cycle = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0), time))
         assert cycle.scale["w"] > 1e-7
         x = (amplitude * np.exp(3j * time)).real
-        np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
+        assert_allclose(cycle.state["x"], x, rtol=1e-9)
         decay = np.sort(np.abs(cycle.multipliers))
         truth = np.exp(-np.array([1.0, 0.5, 0.5]) * 2 * np.pi / 3)
-        np.testing.assert_allclose(decay, truth, rtol=1e-9)
+        assert_allclose(decay, truth, rtol=1e-9)
 
 
 @pytest.mark.parametrize("factor", [100.0, 0.5])
@@ -125,4 +127,4 @@ def test_sizes_that_are_given(hopper_cycle, factor):
     assert dict(cycle.scale) == pytest.approx(
         hopper_cycle.scale | {"ym": 5.0}, rel=1e-9
     )
-    np.testing.assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)
+    assert_allclose(cycle.multipliers, hopper_cycle.multipliers, rtol=1e-9)

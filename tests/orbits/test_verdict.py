@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.results import Result
@@ -37,8 +38,12 @@ class SchmittTrigger(hj.HybridSystem):
         return {"up": Charging(self, 1.0), "down": Charging(self, -1.0)}
 
     def transitions(self):
-        high = lambda t, q, u: q[0] - self.threshold(t)  # noqa: E731
-        low = lambda t, q, u: q[0] + self.threshold(t)  # noqa: E731
+        def high(t, q, u):
+            return q[0] - self.threshold(t)
+
+        def low(t, q, u):
+            return q[0] + self.threshold(t)
+
         return [
             hj.Transition("to down", "up", "down", guard=high, direction="rising"),
             hj.Transition("to up", "down", "up", guard=low),
@@ -67,8 +72,12 @@ class TwoCells(hj.HybridSystem):
         return {"rest": Potentials(self)}
 
     def transitions(self):
-        first = lambda t, q, u: (0.0, q[1] - self.inhibition)  # noqa: E731
-        second = lambda t, q, u: (q[0] - self.inhibition, 0.0)  # noqa: E731
+        def first(t, q, u):
+            return (0.0, q[1] - self.inhibition)
+
+        def second(t, q, u):
+            return (q[0] - self.inhibition, 0.0)
+
         return [
             hj.Transition(
                 f"spike {k + 1}",
@@ -84,7 +93,9 @@ class TwoCells(hj.HybridSystem):
 
 def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
     """Times of the last two spikes of the first cell, by the closed form of the potentials."""
-    v, t, times = np.array(state, float), 0.0, []
+    v = np.array(state, float)
+    t = 0.0
+    times = []
     while len(times) < count:
         wait = np.log((drive - v) / (drive - 1.0))
         k = int(np.argmin(wait))
@@ -103,7 +114,8 @@ def test_a_guess_on_the_right_side_of_the_guards_finds_the_rhythm():
         cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess(chart, (x,)))
         assert sorted(cycle.event_sequence) == [0, 1]
         assert 0.69 < cycle.multipliers[0].real < 0.70
-        assert not cycle.findings and not cycle.not_reached
+        assert not cycle.findings
+        assert not cycle.not_reached
 
 
 def test_a_cycle_beyond_a_guard_is_refused_by_name():
@@ -112,21 +124,20 @@ def test_a_cycle_beyond_a_guard_is_refused_by_name():
     section = hj.AtEvent("spike 1")
     with pytest.raises(ComputationError, match="beyond the guard of 'spike 2'"):
         hj.find_limit_cycle(TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section)
-    ghost = hj.find_limit_cycle(
-        TwoCells(), hj.Guess("rest", (0.0, 1.2)), section=section, throw=False
-    )
+    guess = hj.Guess("rest", (0.0, 1.2))
+    ghost = hj.find_limit_cycle(TwoCells(), guess, section=section, throw=False)
     assert ghost.result == Result.GUARD_BEYOND
     with pytest.raises(hj.errors.DefinitionError, match="beyond a guard"):
         hj.linearize(ghost, [section, section])
 
 
 def test_the_rhythm_of_two_cells_is_that_of_the_closed_form():
-    cycle = hj.find_limit_cycle(
-        TwoCells(), hj.Guess("rest", (0.0, 0.5)), section=hj.AtEvent("spike 1")
-    )
+    guess = hj.Guess("rest", (0.0, 0.5))
+    cycle = hj.find_limit_cycle(TwoCells(), guess, section=hj.AtEvent("spike 1"))
     before, last = spikes_by_hand((0.0, 0.5))
-    np.testing.assert_allclose(cycle.period, last - before, rtol=1e-12)
-    assert "checked by" in repr(cycle) and "not reached" not in repr(cycle)
+    assert_allclose(cycle.period, last - before, rtol=1e-12)
+    assert "checked by" in repr(cycle)
+    assert "not reached" not in repr(cycle)
 
 
 def ghost_beside(cycle):
@@ -142,7 +153,8 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
     widths = jnp.linspace(0.297, 0.303, 4)
     systems = eqx.filter_vmap(lambda w: SchmittTrigger(width=w))(widths)
     cycles = hj.find_limit_cycles(systems, cycle)
-    assert cycles.ok.all() and ((cycles.codes >= 0).sum(axis=1) == 2).all()
+    assert cycles.ok.all()
+    assert ((cycles.codes >= 0).sum(axis=1) == 2).all()
     ghosts = hj.find_limit_cycles(systems, ghost)
     assert (ghosts.result == Result.GUARD_BEYOND).all()
     with pytest.raises(hj.errors.DefinitionError, match="guess is none"):

@@ -15,24 +15,33 @@ class Hopper:
     period = 1.0
 
     def __init__(self, accuracy=1e-10, dt=1 / 40):
-        self.accuracy, self.dt = accuracy, dt
-        how = {"rtol": accuracy, "atol": accuracy, "nsteps": 10000}
-        fields = self.stance, self.flight
-        self.solvers = [ode(f).set_integrator("dop853", **how) for f in fields]
+        self.accuracy = accuracy
+        self.dt = dt
+        self.in_stance = self.integrator(self.stance)
+        self.in_flight = self.integrator(self.flight)
+
+    def integrator(self, field):
+        solver = ode(field)
+        return solver.set_integrator(
+            "dop853", rtol=self.accuracy, atol=self.accuracy, nsteps=10000
+        )
 
     def __reduce__(self):
         return type(self), (self.accuracy, self.dt)
 
     @staticmethod
     def leg(t, yM, ym):
+        """The force of the leg."""
         return 10 * (2 - (yM - ym)) + 20 * math.sin(2 * math.pi * t)
 
     def stance(self, t, q, u):
-        return q[1], (self.leg(t, q[0], 0.0) + u) / 2 - 2
+        yM, vM = q
+        return vM, (self.leg(t, yM, 0.0) + u) / 2 - 2
 
     def flight(self, t, q, u):
-        leg = self.leg(t, q[0], q[2])
-        return q[1], (leg + u) / 2 - 2, q[3], -leg - 5 * q[3] - 2
+        yM, vM, ym, vm = q
+        leg = self.leg(t, yM, ym)
+        return vM, (leg + u) / 2 - 2, vm, -leg - 5 * vm - 2
 
     def reset(self, seed):
         self.set_state((0.0, 2.2, -0.5, 0.3, -0.5))
@@ -42,32 +51,51 @@ class Hopper:
         return {"yM": self.q[0], "vM": self.q[1]}
 
     def get_state(self):
-        return (self.t, *self.q, 0.0, 0.0)[:5]
+        foot = self.q[2:] if self.flies(self.q) else (0.0, 0.0)
+        return (self.t, *self.q[:2], *foot)
 
     def set_state(self, x):
         self.t, *q = map(float, x)
-        self.q = q if q[2] or q[3] else q[:2]
+        foot_rests = q[2] == 0 and q[3] == 0
+        self.q = q[:2] if foot_rests else q
+
+    @staticmethod
+    def flies(q):
+        return len(q) == 4
 
     def guard(self, t, q):
-        return q[2] if len(q) == 4 else self.leg(t, q[0], 0.0) + 2
+        """The height of the foot, or the force that holds it on the ground."""
+        if self.flies(q):
+            return q[2]
+        return self.leg(t, q[0], 0.0) + 2
 
     def flow(self, h, u):
-        if h < 1e-9:  # (shorter than steps of the method can be)
-            rate = (self.flight if len(self.q) == 4 else self.stance)(self.t, self.q, u)
-            return [x + h * r for x, r in zip(self.q, rate, strict=True)]
-        solver = self.solvers[len(self.q) == 4]
+        """The state after a time h without an event."""
+        flies = self.flies(self.q)
+        if h < 1e-9:  # shorter than steps of the method can be
+            field = self.flight if flies else self.stance
+            rates = field(self.t, self.q, u)
+            return [x + h * rate for x, rate in zip(self.q, rates, strict=True)]
+        solver = self.in_flight if flies else self.in_stance
         solver.set_initial_value(self.q, self.t).set_f_params(u)
         return solver.integrate(self.t + h).tolist()
 
     def step(self, u, duration):
         end = self.t + duration
-        while (left := end - self.t) > 1e-15:
+        while end - self.t > 1e-15:
+            left = end - self.t
             q = self.flow(left, u[0])
-            if not self.guard(self.t, self.q) > 0 > self.guard(end, q):
-                self.t, self.q = end, q
+            has_event = self.guard(self.t, self.q) > 0 > self.guard(end, q)
+            if not has_event:
+                self.t = end
+                self.q = q
                 break
-            ahead = lambda h: self.guard(self.t + h, self.flow(h, u[0]))  # noqa: E731
-            when = brentq(ahead, 1e-15, left, xtol=1e-15)
-            q, self.t = self.flow(when, u[0]), self.t + when
-            self.q = q[:2] if len(q) == 4 else [*q, 0.0, 0.0]
+
+            def guard_after(h):
+                return self.guard(self.t + h, self.flow(h, u[0]))
+
+            until_event = brentq(guard_after, 1e-15, left, xtol=1e-15)
+            q = self.flow(until_event, u[0])
+            self.t = self.t + until_event
+            self.q = q[:2] if self.flies(q) else [*q, 0.0, 0.0]
         return self.observe()

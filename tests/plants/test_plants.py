@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -26,65 +27,69 @@ def circle():
     return hj.plants.settle(Circle(), ANGLE, ("x", "y"), cycles=20)
 
 
+MULTIPLIER = math.exp(-0.4 * math.pi)  # of the circle's radius
+
+
 def test_a_plant_in_closed_form(circle):
-    assert abs(circle.period - 2 * math.pi) < 1e-9
+    assert_allclose(circle.period, 2 * math.pi, rtol=0, atol=1e-9)
     angle = 2 * math.pi * np.arange(8) / 8
-    assert (
-        np.abs(circle.cycle_outputs - np.c_[np.cos(angle), np.sin(angle)]).max() < 1e-9
-    )
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert_allclose(circle.cycle_outputs, directions, rtol=0, atol=1e-9)
+
+
+def test_returns_of_a_plant_have_the_multiplier_of_its_closed_form(circle):
     returns = circle.perturbed_returns()
-    assert (
-        returns.contains(math.exp(-0.4 * math.pi)).all()
-        and len(returns.multipliers) == 1
-    )
-    assert (
-        abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-9
-        and returns.bound < 1e-6
-    )
-    # A push held over one eighth of a turn moves the radius by push / rate (1 - exp(-rate T / 8)).
+    assert returns.contains(MULTIPLIER).all()
+    assert_allclose(returns.multipliers, [MULTIPLIER], rtol=0, atol=1e-9)
+    assert returns.bound < 1e-6
+    alone = circle.perturbed_returns("x")
+    assert len(alone.coordinates) == 1
+
+
+def test_a_push_moves_a_plant_as_its_closed_form(circle):
+    """Held over one eighth of a turn, it moves the radius by push / rate (1 - exp(-rate T / 8))."""
+    push = 0.1
+    rate = 0.2
     u = np.zeros((1, 16, 1))
-    u[0, 3] = 0.1
+    u[0, 3] = push
     data = circle.run_experiments(u, discard=0, processes=0)
-    away = (
-        0.5
-        * (1 - math.exp(-0.05 * math.pi))
-        * math.exp(-0.05 * math.pi) ** np.arange(12)
-    )
-    y = data.y[0, 4:, 0] * np.cos(angle)[np.arange(4, 16) % 8]
-    y += data.y[0, 4:, 1] * np.sin(angle)[np.arange(4, 16) % 8]
-    assert np.abs(y - away).max() < 1e-8 and np.abs(data.y[0, :4]).max() < 1e-8
-    assert data.outputs[0].unit == "m" and data.inputs[0].unit == "m/s"
-    assert len(circle.perturbed_returns("x").coordinates) == 1
+    before = data.y[0, :4]
+    after = data.y[0, 4:]
+    assert_allclose(before, 0, rtol=0, atol=1e-8)
+    angle = 2 * math.pi * np.arange(4, 16) / 8
+    radius = after[:, 0] * np.cos(angle) + after[:, 1] * np.sin(angle)
+    decay = math.exp(-rate * math.tau / 8)
+    expected = push / rate * (1 - decay) * decay ** np.arange(12)
+    assert_allclose(radius, expected, rtol=0, atol=1e-8)
+    assert data.outputs[0].unit == "m"
+    assert data.inputs[0].unit == "m/s"
 
 
 def test_sections_at_events():
     """Crossings of signals, at angles 0.2 and pi - 0.2: exact places, and the multiplier."""
     level = math.sin(0.2)
-    items = [hj.Crossing("y", "rising", level), hj.Crossing("y", "falling", level)]
-    cycle = hj.plants.settle(Circle(), items, ("x", "y"), cycles=20)
-    true = [[math.cos(0.2), level], [-math.cos(0.2), level]]
-    assert (
-        abs(cycle.period - math.tau) < 1e-9
-        and np.abs(cycle.cycle_outputs - true).max() < 1e-8
-    )
+    rising = hj.Crossing("y", "rising", level)
+    falling = hj.Crossing("y", "falling", level)
+    cycle = hj.plants.settle(Circle(), [rising, falling], ("x", "y"), cycles=20)
+    assert_allclose(cycle.period, math.tau, rtol=0, atol=1e-9)
+    places = [[math.cos(0.2), level], [-math.cos(0.2), level]]
+    assert_allclose(cycle.cycle_outputs, places, rtol=0, atol=1e-8)
     returns = cycle.perturbed_returns()
-    assert abs(returns.multipliers[0] - math.exp(-0.4 * math.pi)) < 1e-6
-    assert len(returns.multipliers) == 1
-    single = hj.plants.settle(Circle(), items[0], "x", cycles=20)
-    assert single.perturbed_returns().contains(math.exp(-0.4 * math.pi)).all()
-    data = single.run_experiments(np.full((1, 8, 1), 0.01), discard=0, processes=0)
-    # The radius returns to 1.05 by the multiplier; a push that lasts for one turn is a new cycle.
-    radius = np.hypot(math.sqrt(1 - level**2) + data.y[0, :, 0], level)
-    decay = math.exp(-0.4 * math.pi) ** np.arange(8)
-    assert data.ok.all() and np.abs(radius - 1.05 + 0.05 * decay).max() < 2e-3
+    assert_allclose(returns.multipliers, [MULTIPLIER], rtol=0, atol=1e-6)
 
 
 def test_a_motion_is_recorded_up_to_a_fall(circle):
-    picture = lambda z: hj.Drawing(circles={"point": (z["x"], z["y"], 0.1)})  # noqa: E731
+    def picture(z):
+        return hj.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
+
     motion = circle.trajectory(picture)
     t, x = motion("x")
-    assert abs(motion.t[-1] - 2 * math.pi) < 1e-8 and np.abs(x - np.cos(t)).max() < 1e-3
-    assert np.abs(motion.after[:, 0] - np.cos(motion.t)).max() < 1e-9
+    error = abs(motion.t[-1] - 2 * math.pi)
+    assert error < 1e-8
+    error = np.abs(x - np.cos(t)).max()
+    assert error < 1e-3
+    error = np.abs(motion.after[:, 0] - np.cos(motion.t)).max()
+    assert error < 1e-9
     assert len(hj.plot.animate(motion, "x", "y").times) > 4
 
     class Falls(Circle):
@@ -95,9 +100,9 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
 
     cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
     fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
-    assert (
-        fall.result == hj.Result.PLANT_STOPPED and abs(fall.t[-1] - math.pi / 2) < 1e-8
-    )
+    assert fall.result == hj.Result.PLANT_STOPPED
+    error = abs(fall.t[-1] - math.pi / 2)
+    assert error < 1e-8
     with pytest.raises(ZeroDivisionError):  # a mistake in the plant is no fall
         cycle.trajectory(u=[[3.0]])
 
@@ -107,15 +112,13 @@ def test_an_unstable_cycle_is_found_from_a_guess():
         rate = -0.2
 
     cycle = hj.plants.settle(Unstable(), ANGLE, "x", guess=(1.02, 0.0))
-    assert (
-        abs(cycle.period - 2 * math.pi) < 1e-6
-        and abs(cycle.cycle_outputs[0, 0] - 1) < 1e-8
-    )
+    error = abs(cycle.period - 2 * math.pi)
+    assert error < 1e-6
+    error = abs(cycle.cycle_outputs[0, 0] - 1)
+    assert error < 1e-8
     returns = cycle.perturbed_returns()
-    assert (
-        returns.contains(math.exp(0.4 * math.pi)).all()
-        and len(returns.multipliers) == 1
-    )
+    assert returns.contains(math.exp(0.4 * math.pi)).all()
+    assert len(returns.multipliers) == 1
 
 
 def test_failures_are_named_and_the_others_go_on():
@@ -138,17 +141,17 @@ def test_failures_are_named_and_the_others_go_on():
     )
     assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
     assert (data.result[1:8] == 7 * [hj.Result.PLANT_STOPPED]).all()
-    assert (
-        np.isfinite(data.y[[0, 8]]).all()
-        and np.isnan(data.y[1, data.failed_at[1] :]).all()
-    )
-    assert "#1: section" in data.summary(9) and "the hip broke" in data.summary(9)
+    assert np.isfinite(data.y[[0, 8]]).all()
+    assert np.isnan(data.y[1, data.failed_at[1] :]).all()
+    assert "#1: section" in data.summary(9)
+    assert "the hip broke" in data.summary(9)
 
 
 def test_a_store_continues(circle, tmp_path, monkeypatch):
     u = 0.01 * np.random.default_rng(0).standard_normal((10, 16, 1))
     whole = circle.run_experiments(u, discard=0, processes=0)
-    experiment, seeds = type(circle.drive), []
+    experiment = type(circle.drive)
+    seeds = []
     run = experiment.run
 
     def interrupted(self, seed, u):
@@ -163,7 +166,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
     assert seeds == [*range(1, 10), 9, 10]
-    assert np.array_equal(data.y, whole.y) and data.simulated.causes == 10 * ("",)
+    assert np.array_equal(data.y, whole.y)
+    assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(
         circle.run_experiments(2 * u[:1], **options).y, data.y[:1]
     )
@@ -212,21 +216,42 @@ def hopper():
     return hj.find_limit_cycle(hj.models.VerticalHopper())
 
 
+def test_a_lasting_push_leads_to_another_cycle():
+    """The radius tends to 1.05 by the multiplier."""
+    level = math.sin(0.2)
+    section = hj.Crossing("y", "rising", level)
+    cycle = hj.plants.settle(Circle(), section, "x", cycles=20)
+    assert cycle.perturbed_returns().contains(MULTIPLIER).all()
+    push = np.full((1, 8, 1), 0.01)
+    data = cycle.run_experiments(push, discard=0, processes=0)
+    assert data.ok.all()
+    x = math.sqrt(1 - level**2) + data.y[0, :, 0]
+    radius = np.hypot(x, level)
+    expected = 1.05 - 0.05 * MULTIPLIER ** np.arange(8)
+    assert_allclose(radius, expected, rtol=0, atol=2e-3)
+
+
 @pytest.mark.parametrize(
     "family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)]
 )
 def test_the_hopper_is_that_of_the_equations(hopper, family):
     """Perturbed returns against the exact multipliers; records against exact experiments."""
-    cycle = hj.plants.settle(Hopper(), SECTIONS[family], ("yM", "vM"))
+    outputs = ("yM", "vM")
+    cycle = hj.plants.settle(Hopper(), SECTIONS[family], outputs)
     returns = cycle.perturbed_returns()
-    assert np.abs(returns.compare(hopper.multipliers).error).max() < 1e-7
-    assert returns.contains(hopper.multipliers).all() and len(returns.multipliers) == 2
-    u = 0.02 * np.random.default_rng(0).standard_normal((2, 64, 1))
+    assert len(returns.multipliers) == 2
+    assert returns.compare(hopper.multipliers).max_error < 1e-7
+    assert returns.contains(hopper.multipliers).all()
+
+    rng = np.random.default_rng(0)
+    u = 0.02 * rng.standard_normal((2, 64, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
-    exact = hj.run_experiments(hopper, SECTIONS[family], u, ("yM", "vM"), discard=0)
-    assert np.abs(data.cycle_outputs - exact.cycle_outputs).max() < 1e-9
-    assert np.abs(data.y - exact.y).max() < 1e-8 < 1e-3 < np.abs(data.y).max()
+    exact = hj.run_experiments(hopper, SECTIONS[family], u, outputs, discard=0)
+    assert_allclose(data.cycle_outputs, exact.cycle_outputs, rtol=0, atol=1e-9)
+    assert_allclose(data.y, exact.y, rtol=0, atol=1e-8)
+    assert np.abs(data.y).max() > 1e-3, "the input moves the hopper"
     assert data.simulated.late.max() < 1e-9
     if family == "kinematic":
         estimate = hj.estimate_htf(cycle.run_experiments(DESIGN, discard=40))
-        assert hj.fit_multipliers(estimate, order=2).contains(hopper.multipliers).all()
+        fit = hj.fit_multipliers(estimate, order=2)
+        assert fit.contains(hopper.multipliers).all()

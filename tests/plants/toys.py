@@ -28,7 +28,8 @@ class Circle:
 
     def step(self, u, duration):
         self.steps += 1
-        r, angle = math.hypot(*self.q), math.atan2(self.q[1], self.q[0]) + duration
+        r = math.hypot(*self.q)
+        angle = math.atan2(self.q[1], self.q[0]) + duration
         rest = 1 + u[0] / self.rate
         r = rest + (r - rest) * math.exp(-self.rate * duration)
         return self.set_state((r * math.cos(angle), r * math.sin(angle)))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -21,12 +22,11 @@ def test_the_spectrum_of_a_design(plan):
     above, below = hj.plot.spectrum(plan, MODEL).axes[:, 0]
     f = np.unique(plan.frequencies)
     H = np.abs(np.asarray(MODEL.htf(f, 0).H)[0, :, 0, 0])
-    np.testing.assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
+    assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
     usual, optimal = below.get_lines()
-    np.testing.assert_allclose(
-        np.sum(np.square(optimal.get_ydata()) / 2), plan.power.sum()
-    )
-    np.testing.assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
+    measured = np.sum(np.square(optimal.get_ydata()) / 2)
+    assert_allclose(measured, plan.power.sum())
+    assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
     legend = [x.get_text() for x in below.get_legend().get_texts()]
     assert legend == [plan.usual_name, "optimal"] == ["equal amplitudes", "optimal"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
+from numpy.testing import assert_allclose
 from PIL import Image
 
 import hybridjax as hj
@@ -19,7 +20,7 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer = hj.explore(hj.models.RimlessWheel(), "slope")
     explorer.move({"slope": 0.1})
     expected = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.1))
-    np.testing.assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
+    assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
     explorer.move({"slope": 0.001})  # too flat to roll
     assert explorer.message.startswith("The cycle is lost at slope = 0.0")
     found = float(explorer.cycle.system.slope)
@@ -29,13 +30,14 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer.move({"slope": 0.1})
     assert explorer.message == ""
     assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("white")}
-    np.testing.assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
+    assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
 
 
 def test_an_event_passes_the_phase_at_which_the_clock_begins():
     explorer = hj.explore(hj.models.VerticalHopper(), "k")
     explorer.move({"k": 14.4})  # (at 10 it is in flight, here in stance)
-    assert explorer.message == "" and float(explorer.cycle.system.k) == 14.4
+    assert explorer.message == ""
+    assert float(explorer.cycle.system.k) == 14.4
 
 
 def test_the_widget_sends_pictures():
@@ -47,9 +49,8 @@ def test_the_widget_sends_pictures():
     before = widget.answer
     widget.asked = {"values": {"mu": 1.2}, "gain": False, "number": 1}
     assert float(explorer.cycle.system.mu) == 1.2
-    assert (
-        widget.answer["number"] == 1 and widget.answer["picture"] != before["picture"]
-    )
+    assert widget.answer["number"] == 1
+    assert widget.answer["picture"] != before["picture"]
     # Only what moves is drawn anew, and the picture is that of the whole figure.
     with io.BytesIO(base64.b64decode(widget.answer["picture"].split(",")[1])) as file:
         sent = np.asarray(Image.open(file).convert("RGB")).astype(int)
@@ -57,7 +58,8 @@ def test_the_widget_sends_pictures():
     for artist in explorer.figure.findobj():
         artist.set_animated(False)
     canvas.draw()
-    assert np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64) < 1e-3
+    error = np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64)
+    assert error < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,8 @@ def test_what_is_refused(names, options, message):
 
 
 def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
-    explorer, seen = hj.explore(hj.models.VanDerPol(), "mu"), []
+    explorer = hj.explore(hj.models.VanDerPol(), "mu")
+    seen = []
     drawn = explorer.figure.canvas.draw
 
     def draw():
@@ -85,7 +88,8 @@ def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
     monkeypatch.setattr(explorer.figure.canvas, "draw", draw)
     explorer._slide("mu", 1.3)
     assert seen[0] == ("Searching for the cycle at mu = 1.3.", True)
-    assert float(explorer.cycle.system.mu) == 1.3 and explorer.message == ""
+    assert float(explorer.cycle.system.mu) == 1.3
+    assert explorer.message == ""
     assert explorer.figure.axes[0].get_facecolor() == to_rgba("white")
 
 
@@ -128,7 +132,8 @@ setTimeout(() => {{
 </script>"""
     )
     options = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage")
-    profile, budget = f"--user-data-dir={tmp_path}/new", "--virtual-time-budget=1500"
+    profile = f"--user-data-dir={tmp_path}/new"
+    budget = "--virtual-time-budget=1500"
     run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
     shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout
     lines = shown.split('<pre id="log">')[1].split("</pre>")[0].splitlines()

@@ -49,5 +49,7 @@ def test_a_column_has_150_points_per_inch(outputs):
 
 def test_what_a_long_call_says_is_gone_when_it_ends(outputs):
     line, text = outputs[5]
-    assert line.output_type == "display_data" and line.data == {}
-    assert (text.name, text.text) == ("stdout", "result\n")
+    assert line.output_type == "display_data"
+    assert line.data == {}
+    assert text.name == "stdout"
+    assert text.text == "result\n"

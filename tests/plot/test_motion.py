@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 import hybridjax as hj
@@ -24,8 +25,8 @@ def test_states_at_times_lie_on_the_trajectory(walk):
     t, chart, q = path.dense(7)
     once = np.append(np.diff(t) > 0, False)  # at an event both sides have one time
     found = path.at(t[once])
-    np.testing.assert_array_equal(found[0], chart[once])
-    np.testing.assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
+    assert_array_equal(found[0], chart[once])
+    assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
     with pytest.raises(hj.DefinitionError, match="times must lie between"):
         path.at([path.t[-1] + 1])
 
@@ -37,28 +38,31 @@ def test_feet_do_not_slide_and_the_loop_closes(walk):
     strike = path.t[path.event >= 0][-1]
     before, after = pictures.at(np.array([strike - 1e-9, strike]))
     for new, old in (("stance foot", "swing foot"), ("swing foot", "stance foot")):
-        np.testing.assert_allclose(after.points[new], before.points[old], atol=1e-7)
+        assert_allclose(after.points[new], before.points[old], atol=1e-7)
     times = path.t[0] + np.linspace(0.01, 0.9, 20) * period
     feet = [x.points["stance foot"] for x in pictures.at(times)] + pictures.camera(
         times
     )
-    np.testing.assert_allclose(feet - feet[0], 0, atol=1e-12)
+    assert_allclose(feet - feet[0], 0, atol=1e-12)
     # A step has the length of the line between the feet.
     step = before.points["swing foot"] - before.points["stance foot"]
-    np.testing.assert_allclose(pictures.stride, step, atol=1e-7)
+    assert_allclose(pictures.stride, step, atol=1e-7)
 
 
 def test_files_and_refusals(walk, tmp_path):
     motion = hj.plot.animate(walk)
-    assert abs(motion.interval * len(motion.times) - float(walk.period)) < 1e-9
+    error = abs(motion.interval * len(motion.times) - float(walk.period))
+    assert error < 1e-9
     assert motion.save(tmp_path / "walk.gif").read_bytes().startswith(b"GIF89a")
     page = motion.save(tmp_path / "walk.html").read_text()
-    assert "<script>" in page and 'src="http' not in page
+    assert "<script>" in page
+    assert 'src="http' not in page
     pictures = [
         base64.b64decode(x) for x in re.findall(r"base64,([\w+/=]+)['\"]", page)
     ]
     still, first, *shown = (Image.open(io.BytesIO(x)).convert("RGBA") for x in pictures)
-    assert len(shown) == len(motion.times) and first == shown[0]
+    assert len(shown) == len(motion.times)
+    assert first == shown[0]
     for frame, over in zip(motion._frames(107), shown, strict=True):
         assert Image.alpha_composite(still, over) == frame.convert("RGBA")
     with pytest.raises(hj.DefinitionError, match="name it .gif, .html or .mp4"):
@@ -74,9 +78,7 @@ def test_both_halves_of_a_cycle_are_drawn():
     )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]
-    np.testing.assert_allclose(
-        [span, 2 * half.period], float(duffing.period()), rtol=1e-9
-    )
+    assert_allclose([span, 2 * half.period], float(duffing.period()), rtol=1e-9)
 
 
 def test_no_input_gives_the_cycle():
@@ -84,12 +86,13 @@ def test_no_input_gives_the_cycle():
     placed = hj.place_sections(cycle, hj.ClockPhase(4))
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
-    np.testing.assert_allclose(end, 0, atol=1e-9)
+    assert_allclose(end, 0, atol=1e-9)
     data = hj.ExperimentData(
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
     )
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
-    assert abs(motion.interval * len(motion.times) - 2 * float(cycle.period)) < 1e-9
+    error = abs(motion.interval * len(motion.times) - 2 * float(cycle.period))
+    assert error < 1e-9
     motion.figure.draw_without_rendering()
     assert all(
         motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -13,7 +14,8 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
         hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0])
     )
     ax = hj.plot.cycle(hopper_cycle, sections=placed_kinematic, perturbed=perturbed).ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("yM (m)", "vM (m/s)")
+    assert ax.get_xlabel() == "yM (m)"
+    assert ax.get_ylabel() == "vM (m/s)"
     lines = labeled(ax)
     assert set(lines) == {"stance", "flight", "sections (32)", "perturbed"}
     arrow, *texts = ax.texts
@@ -21,19 +23,20 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
         1
     ] > 0  # x moves as its velocity says
     assert arrow.xy[1] < -1  # (both events lie above)
-    assert [t.get_text() for t in texts] == [
+    expected = [
         "liftoff",
         "touchdown",
         *map(str, range(0, 32, 4)),
     ]
+    assert [t.get_text() for t in texts] == expected
 
     # Bars lie on their sections: rays from the center of the kinematic phase, in equal angles.
     bars = lines["sections (32)"].get_xydata().reshape(32, 3, 2)[:, :2]
     r = (bars - [1.9, 0.0]) / [0.3, 1.9]
     angle = np.unwrap(np.angle(r[..., 0] + 1j * r[..., 1]), axis=0)
-    np.testing.assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
-    np.testing.assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
-    np.testing.assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
+    assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
+    assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
+    assert_allclose(bars.mean(axis=1).T, lanes.q[:2], atol=1e-9)
 
 
 def test_a_cycle_that_was_not_found_is_refused():
@@ -50,16 +53,15 @@ def test_resets_that_jump_are_dashed(hopper_cycle):
     ax = hj.plot.cycle(hopper_cycle, "ym", "vm").ax
     (jump,) = [x for x in ax.get_lines() if x.get_linestyle() == "--"]
     touchdown = hopper_cycle.trajectory().events[1].before
-    np.testing.assert_allclose(
-        jump.get_xydata(), [[0, touchdown["vm"]], [0, 0]], atol=1e-12
-    )
+    expected = [[0, touchdown["vm"]], [0, 0]]
+    assert_allclose(jump.get_xydata(), expected, atol=1e-12)
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     placed = hj.place_sections(vanderpol_cycle, hj.ClockPhase(6))
     ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed).ax
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v", "x")
+    assert ax.get_xlabel() == "v"
+    assert ax.get_ylabel() == "x"
     bars = labeled(ax)["sections (6)"].get_xydata().reshape(6, 3, 2)
-    np.testing.assert_allclose(
-        bars[:, :2].mean(axis=1).T, placed.lanes.q[::-1], atol=1e-9
-    )
+    measured = bars[:, :2].mean(axis=1).T
+    assert_allclose(measured, placed.lanes.q[::-1], atol=1e-9)

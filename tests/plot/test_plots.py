@@ -8,6 +8,7 @@ from matplotlib import pyplot
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
@@ -25,44 +26,48 @@ def test_magnitude_draws_the_values(estimate, exact):
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
-    np.testing.assert_array_equal(drawn.get_xdata(), estimate.f)
-    np.testing.assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
+    assert_array_equal(drawn.get_xdata(), estimate.f)
+    assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
     assert (
         drawn.get_color()
         == lines["$H_{-1}$"].get_color()
         != lines["$H_{0}$"].get_color()
     )
-    assert drawn.get_linestyle() == "-" and lines["$H_{-1}$"].get_linestyle() == "--"
-    assert ax.get_yscale() == "log" and "cycles/period" in ax.get_xlabel()
+    assert drawn.get_linestyle() == "-"
+    assert lines["$H_{-1}$"].get_linestyle() == "--"
+    assert ax.get_yscale() == "log"
+    assert "cycles/period" in ax.get_xlabel()
     assert ax.get_ylabel() == "$|H_m|$, vM"
 
 
 def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
-    for draw in (
-        hj.plot.magnitude,
-        hj.plot.bode,
-        lambda *x: hj.plot.harmonics({"a": x}),
-    ):
-        drawn = [
-            [x.get_xydata() for x in draw(estimate, m).ax.lines]
-            for m in (hopper, exact)
-        ]
-        for line, expected in zip(*drawn, strict=True):
-            np.testing.assert_allclose(line, expected, rtol=1e-9)
+    def harmonics(*given):
+        return hj.plot.harmonics({"a": given})
+
+    for draw in (hj.plot.magnitude, hj.plot.bode, harmonics):
+        from_model = draw(estimate, hopper).ax.lines
+        from_htf = draw(estimate, exact).ax.lines
+        for line, expected in zip(from_model, from_htf, strict=True):
+            assert_allclose(line.get_xydata(), expected.get_xydata(), rtol=1e-9)
     with pytest.raises(hj.DefinitionError, match="model alone"):
         hj.plot.bode(hopper)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
-    figure = hj.plot.harmonics({"isochron": (estimate, exact), "again": exact}).figure
+    families = {"isochron": (estimate, exact), "again": exact}
+    figure = hj.plot.harmonics(families).figure
     assert isinstance(figure, Figure)
-    grid = np.reshape(figure.axes, (2, 2))
-    assert [ax.get_title() for ax in grid[0]] == ["isochron", "again"]
-    assert [ax.get_ylabel() for ax in grid[:, 0]] == ["$|H_m|$, yM", "$|H_m|$, vM"]
-    assert [ax.get_title(loc="left") for ax in grid.ravel()] == list("ABCD")
-    assert sum(ax.get_legend() is not None for ax in grid.ravel()) == 1
-    assert grid[0, 0].get_ylim() == grid[0, 1].get_ylim()
+    upper_left, upper_right, lower_left, lower_right = figure.axes
+    assert upper_left.get_title() == "isochron"
+    assert upper_right.get_title() == "again"
+    assert upper_left.get_ylabel() == "$|H_m|$, yM"
+    assert lower_left.get_ylabel() == "$|H_m|$, vM"
+    letters = [ax.get_title(loc="left") for ax in figure.axes]
+    assert letters == ["A", "B", "C", "D"]
+    legends = [ax for ax in figure.axes if ax.get_legend() is not None]
+    assert len(legends) == 1
+    assert upper_left.get_ylim() == upper_right.get_ylim()
 
 
 def test_bode_with_fits(estimate, exact, rational, structured):
@@ -75,24 +80,28 @@ def test_bode_with_fits(estimate, exact, rational, structured):
         "structured fit",
         "exact",
     ]
-    assert upper.get_ylabel() == "$|H_{0}|$" and "degrees" in lower.get_ylabel()
+    assert upper.get_ylabel() == "$|H_{0}|$"
+    assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
     fitted = rational.htf(estimate.f).H[0, :, 0, 0]
-    np.testing.assert_allclose(curves[2].get_ydata(), np.abs(fitted))
+    assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
-    np.testing.assert_allclose(
-        phases[0], phases[3], atol=2
-    )  # no curve is a whole turn away
-    np.testing.assert_allclose(phases[1], phases[0], atol=2)
+    assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
+    assert_allclose(phases[1], phases[0], atol=2)
 
 
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
-    names = exact.inputs[::-1], exact.outputs[::-1]
     swapped = hj.HTF(
-        exact.f, exact.H[..., ::-1, ::-1], 0, exact.n_sections, *names, "exact"
+        exact.f,
+        exact.H[..., ::-1, ::-1],
+        0,
+        exact.n_sections,
+        exact.inputs[::-1],
+        exact.outputs[::-1],
+        "exact",
     )
     renamed = hj.HTF(
         exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact"
@@ -100,45 +109,51 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
-        np.testing.assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
-        np.testing.assert_array_equal(first.get_ydata(), second.get_ydata())
+        assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
+        assert_array_equal(first.get_ydata(), second.get_ydata())
+    fit = hj.identify.fit_rational(exact, input=1)
     with pytest.raises(
         hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
-        hj.plot.bode(exact, fits=hj.identify.fit_rational(exact, input=1), input=0)
+        hj.plot.bode(exact, fits=fit, input=0)
 
 
-def test_every_input_is_drawn_and_named():
+def bodes(*given, **options):
+    return hj.plot.bodes({"a": given}, **options)
+
+
+def harmonics(*given, **options):
+    return hj.plot.harmonics({"a": given}, **options)
+
+
+@pytest.fixture
+def two_inputs():
+    """An exact HTF from two inputs to two outputs."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
-    fit = hj.identify.fit_rational(exact, input=1)
     assert len(exact.inputs) == 2
-    pairs = [(i, j) for i in range(len(exact.outputs)) for j in range(2)]
-    names = [f"{exact.outputs[i]} from {exact.inputs[j]}" for i, j in pairs]
-    expected = [np.abs(exact[0][:, i, j]) for i, j in pairs]
-    for draw in (hj.plot.bode, lambda *x, **y: hj.plot.bodes({"a": x}, **y)):
-        upper = np.ravel(draw(exact).figure.axes)[0]
-        curves = [x for x in upper.get_lines() if len(x.get_xdata())]
-        for line, values in zip(curves, expected, strict=True):
-            np.testing.assert_allclose(line.get_ydata(), values)
-        assert len({x.get_color() for x in curves}) == len(pairs)
-        assert list(labeled(upper)) == [*names, "exact"]
-    # A fit lies over the curves of its own input.
-    with_fit = hj.plot.bode(exact, fits=fit).figure.axes[0].get_lines()
-    fitted = [x for x in with_fit if len(x.get_xdata()) and x.get_color() == "black"]
-    assert len(fitted) == len(exact.outputs)
-    # Where one input is drawn, its name is on the axis.
-    for draw in (hj.plot.magnitude, lambda x, **y: hj.plot.harmonics({"a": x}, **y)):
-        for given, pushed in (({}, 0), ({"input": 1}, 1)):
-            label = draw(exact, harmonics=[0], **given).figure.axes[0].get_ylabel()
-            assert label.startswith(
-                f"$|H_m|$, {exact.outputs[0]} from {exact.inputs[pushed]}"
-            )
+    assert len(exact.outputs) == 2
+    return exact
+
+
+@pytest.mark.parametrize("draw", [hj.plot.bode, bodes])
+def test_every_input_is_drawn_and_named(draw, two_inputs):
+    upper = draw(two_inputs).figure.axes[0]
+    curves = [line for line in upper.get_lines() if len(line.get_xdata())]
+    pairs = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    names = []
+    for curve, (i, j) in zip(curves, pairs, strict=True):
+        assert_allclose(curve.get_ydata(), np.abs(two_inputs[0][:, i, j]))
+        names.append(f"{two_inputs.outputs[i]} from {two_inputs.inputs[j]}")
+    assert list(labeled(upper)) == [*names, "exact"]
+    colors = {curve.get_color() for curve in curves}
+    assert len(colors) == 4, "a color for each pair"
 
 
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
-    assert [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]] == [4, 4]
+    measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
+    assert measured == [4, 4]
     with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bodes(families, fits={"c": rational})
 
@@ -146,28 +161,46 @@ def test_bodes(estimate, exact, rational):
 # The complex plane
 
 
+def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
+    fit = hj.identify.fit_rational(two_inputs, input=1)
+    upper = hj.plot.bode(two_inputs, fits=fit).figure.axes[0]
+    lines = [line for line in upper.get_lines() if len(line.get_xdata())]
+    fitted = [line for line in lines if line.get_color() == "black"]
+    assert len(fitted) == len(two_inputs.outputs)
+
+
+@pytest.mark.parametrize("draw", [hj.plot.magnitude, harmonics])
+def test_the_name_of_a_single_input_is_on_the_axis(draw, two_inputs):
+    output = two_inputs.outputs[0]
+    first, second = two_inputs.inputs
+    label = draw(two_inputs, harmonics=[0]).figure.axes[0].get_ylabel()
+    assert label.startswith(f"$|H_m|$, {output} from {first}")
+    label = draw(two_inputs, harmonics=[0], input=1).figure.axes[0].get_ylabel()
+    assert label.startswith(f"$|H_m|$, {output} from {second}")
+
+
 def test_multipliers(hopper, rational, structured):
-    ax = hj.plot.multipliers(hopper, {"2p1z": rational, "structured": structured}).ax
+    fits = {"2p1z": rational, "structured": structured}
+    ax = hj.plot.multipliers(hopper, fits).ax
     lines = labeled(ax)
-    assert [name.split(":")[0] for name in lines] == [
-        "exact",
-        "2p1z, yM",
-        "2p1z, vM",
-        "structured",
-    ]
-    z = hopper.multipliers
-    np.testing.assert_array_equal(
-        lines["exact"].get_xydata(), np.stack([z.real, z.imag], 1)
-    )
-    assert len({(x.get_marker(), x.get_color()) for x in lines.values()}) == 4
-    assert f"{structured.compare(z).max_error:.1e}".split("e")[0] in list(lines)[-1]
+    names = [label.split(":")[0] for label in lines]
+    assert names == ["exact", "2p1z, yM", "2p1z, vM", "structured"]
+    exact = hopper.multipliers
+    points = np.stack([exact.real, exact.imag], 1)
+    assert_array_equal(lines["exact"].get_xydata(), points)
+    styles = {(line.get_marker(), line.get_color()) for line in lines.values()}
+    assert len(styles) == 4
+    error = f"{structured.compare(exact).max_error:.1e}"
+    mantissa = error.split("e")[0]
+    assert mantissa in list(lines)[-1]
+
     (inset,) = ax.child_axes
-    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
-    for points in (z, *rational.multipliers, structured.multipliers):
-        first = points[points.imag > 0][0]
-        assert left < first.real < right and low < first.imag < high
-    crowd = (np.arange(-4, 5)[:, None] + 1j * np.arange(-4, 5)).ravel() / 6
-    assert not hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax.child_axes
+    (left, right) = inset.get_xlim()
+    (low, high) = inset.get_ylim()
+    for values in (exact, *rational.multipliers, structured.multipliers):
+        upper = values[values.imag > 0][0]
+        assert left < upper.real < right
+        assert low < upper.imag < high
 
 
 def test_poles_and_zeros(rational):
@@ -178,7 +211,7 @@ def test_poles_and_zeros(rational):
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
         poles = labeled(ax)["poles, isochron"].get_xydata()
-        np.testing.assert_array_equal(poles[:, 1], rational.poles[i].imag)
+        assert_array_equal(poles[:, 1], rational.poles[i].imag)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
     with pytest.raises(hj.DefinitionError, match="one or more fits"):
@@ -195,8 +228,8 @@ def test_experiment(hopper):
         r"$\delta$ vM",
     ]
     y = figure.axes[2].get_lines()[0]
-    np.testing.assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
-    np.testing.assert_allclose(y.get_xdata()[32], 1.0)
+    assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
+    assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.DefinitionError, match="no experiment 99"):
         hj.plot.experiment(data, 99)
@@ -207,11 +240,11 @@ def test_saved_in_several_formats(tmp_path):
     png, pdf, svg = hj.plot.save(
         tmp_path / "multipliers.png", plot, ("png", "pdf", "svg")
     )
-    assert png.read_bytes()[:4] == b"\x89PNG" and pdf.read_bytes()[:5] == b"%PDF-"
+    assert png.read_bytes()[:4] == b"\x89PNG"
+    assert pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
-    assert [p.name for p in (png, pdf, svg)] == [
-        f"multipliers.{x}" for x in ("png", "pdf", "svg")
-    ]
+    expected = [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
+    assert [p.name for p in (png, pdf, svg)] == expected
     assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
@@ -219,46 +252,56 @@ def test_saved_in_several_formats(tmp_path):
         hj.plot.save(tmp_path / "x.bmp", plot)
 
 
+def test_a_crowd_of_multipliers_has_no_inset():
+    ticks = np.arange(-4, 5) / 6
+    crowd = (ticks[:, None] + 1j * ticks).ravel()
+    ax = hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax
+    assert not ax.child_axes
+
+
 def test_bands_hold_the_values(estimate):
     """Where there is a variance; the phase is drawn where it is known."""
-    sure = dataclasses.replace(estimate, variance=np.full(estimate.H.shape, 1e-6))
     assert not hj.plot.magnitude(estimate).ax.collections
-    ax = hj.plot.magnitude(sure, harmonics=(0,)).ax
+    variance = np.full(estimate.H.shape, 1e-6)
+    sure = dataclasses.replace(estimate, variance=variance)
     radius = float(sure.confidence_radius().max())
-    top = ax.collections[0].get_paths()[0].vertices[:, 1].max()
-    np.testing.assert_allclose(top, np.abs(sure[0][:, 0, 0]).max() + radius)
+    modulus = np.abs(sure[0][:, 0, 0])
+
+    (band,) = hj.plot.magnitude(sure, harmonics=(0,), output="yM").ax.collections
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert_allclose(heights.max(), modulus.max() + radius)
+
     upper, lower = hj.plot.bode(sure, outputs="yM").axes[:, 0]
-    known = np.isfinite(lower.get_lines()[0].get_ydata())
-    np.testing.assert_array_equal(known, np.abs(sure[0][:, 0, 0]) > radius)
-    assert len(upper.collections) == len(lower.collections) == 1
+    phase = lower.get_lines()[0].get_ydata()
+    assert_array_equal(np.isfinite(phase), modulus > radius)
+    assert len(upper.collections) == 1
+    assert len(lower.collections) == 1
 
 
 @pytest.fixture(scope="module")
 def found(hopper):
     u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
-    y = y + 0.1 * y.std(axis=0) * np.random.default_rng(1).normal(size=y.shape)
+    rng = np.random.default_rng(1)
+    y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
     return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
 
 
 def test_validation_draws_signals_and_correlations(found):
-    grid = np.reshape(hj.plot.validation(found, cycles=2).figure.axes, (2, 3))
-    simulated, measured = grid[1, 0].get_lines()
-    np.testing.assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
-    np.testing.assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
-    np.testing.assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
-    assert grid[1, 0].get_ylabel() == r"$\delta$ vM"
-    assert grid[0, 0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
-    for k, values in (
-        (1, found.autocorrelation[:, :, 0]),
-        (2, found.cross_correlation[:, :, 0]),
-    ):
-        heights = [
-            path.vertices[1, 1] for path in grid[0, k].collections[0].get_paths()
-        ]
-        np.testing.assert_allclose(
-            heights, values.sum(axis=0).ravel() / np.sqrt(32), atol=1e-12
-        )
+    figure = hj.plot.validation(found, cycles=2).figure
+    upper, lower = np.reshape(figure.axes, (2, 3))
+    simulated, measured = lower[0].get_lines()
+    assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
+    assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
+    assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    assert lower[0].get_ylabel() == r"$\delta$ vM"
+    assert upper[0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
+    drawn = {upper[1]: found.autocorrelation, upper[2]: found.cross_correlation}
+    for ax, correlation in drawn.items():
+        bars = ax.collections[0].get_paths()
+        heights = [bar.vertices[1, 1] for bar in bars]
+        expected = correlation[:, :, 0].sum(axis=0).ravel() / np.sqrt(32)
+        assert_allclose(heights, expected, atol=1e-12)
 
 
 def test_no_texts_overlap_at_the_width_of_a_column(found):
@@ -267,40 +310,49 @@ def test_no_texts_overlap_at_the_width_of_a_column(found):
         figure, axes = pyplot.subplots(2, 3, figsize=(3.5, 3.0), layout="constrained")
         hj.plot.validation(found, ax=axes)
         figure.canvas.draw()
-    texts = [
-        x for x in figure.findobj(Text) if "mathdefault" not in x.get_text()
-    ]  # no ticks
-    words = [x for x in texts if any(map(str.isalpha, x.get_text()))]
-    boxes = [x.get_window_extent().padded(-1) for x in words]
+    boxes = {}
+    for text in figure.findobj(Text):
+        words = text.get_text()
+        is_tick = "mathdefault" in words
+        if any(map(str.isalpha, words)) and not is_tick:
+            boxes[text] = text.get_window_extent().padded(-1)
     assert len(boxes) == 13  # six titles, and seven labels of axes
-    assert all(figure.bbox.count_contains(box.corners()) == 4 for box in boxes)
-    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    for text, box in boxes.items():
+        assert figure.bbox.count_contains(box.corners()) == 4, f"{text} is cut"
+    for a, b in itertools.combinations(boxes, 2):
+        assert not boxes[a].overlaps(boxes[b]), f"{a} lies on {b}"
 
 
 def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
+    value = 0.3
+    half_width = 0.196  # of a 95 % interval
     estimate = MultiplierEstimate(
-        np.array([0.3 + 0j]), -np.ones(1) * 0.3, np.eye(1) / 100, np.inf
+        np.array([value + 0j]), np.array([-value]), np.eye(1) / 100, np.inf
     )
-    plot = hj.plot.multipliers([0.3], {"fit": estimate}, zoom=False)
+    plot = hj.plot.multipliers([value], {"fit": estimate}, zoom=False)
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())
-    blue = np.abs(picture[..., :3] - [0, 0x72, 0xB2]).sum(axis=2) < 60
-    for x in (0.3 - 0.196, 0.3 + 0.196):
-        column, row = plot.ax.transData.transform((x, 0)).round().astype(int)
-        cap = blue[len(blue) - row - 8 : len(blue) - row + 8, column - 2 : column + 3]
-        assert cap.any(axis=1).sum() > 6  # pixels high, where the line is one or two
+    blue = [0, 0x72, 0xB2]
+    is_blue = np.abs(picture[..., :3] - blue).sum(axis=2) < 60
+    for end in (value - half_width, value + half_width):
+        column, height = plot.ax.transData.transform((end, 0)).round().astype(int)
+        row = len(picture) - height
+        cap = is_blue[row - 8 : row + 8, column - 2 : column + 3]
+        pixels_high = cap.any(axis=1).sum()
+        assert pixels_high > 6, "the line itself is one or two pixels high"
 
 
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
-    c = np.poly(true).real[1:]
-    estimate = MultiplierEstimate(true * 1.01, c, 1e-4 * np.eye(2), np.inf)
-    (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
-    drawn = [
-        line.get_xydata() for line in inset.get_lines() if len(line.get_xdata()) == 100
-    ]
-    np.testing.assert_array_equal(drawn[0] @ [1, 1j], estimate.ellipse(0))
-    (left, right), (low, high) = inset.get_xlim(), inset.get_ylim()
+    coefficients = np.poly(true).real[1:]
+    estimate = MultiplierEstimate(true * 1.01, coefficients, 1e-4 * np.eye(2), np.inf)
     border = estimate.ellipse(0)
-    assert left < border.real.min() < border.real.max() < right
-    assert low < border.imag.min() < border.imag.max() < high
+    (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
+    ellipses = [line for line in inset.get_lines() if len(line.get_xdata()) == 100]
+    assert_array_equal(ellipses[0].get_xydata() @ [1, 1j], border)
+    (left, right) = inset.get_xlim()
+    (low, high) = inset.get_ylim()
+    assert left < border.real.min()
+    assert border.real.max() < right
+    assert low < border.imag.min()
+    assert border.imag.max() < high

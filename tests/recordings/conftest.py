@@ -4,7 +4,9 @@ import pytest
 import hybridjax as hj
 
 
-DECAY, STRIDES, RATE = 0.15, 200, 64
+DECAY = 0.15
+STRIDES = 200
+RATE = 64
 MULTIPLIER = np.exp(-2 * DECAY)
 
 
@@ -28,8 +30,10 @@ def angle():
 def wave():
     """Twenty turns of a circle, nearly, with an input that does nothing."""
     t = np.linspace(0.0, 20.0, 2001)
-    noise = 1e-6 * np.random.default_rng(0).normal(size=(2, len(t)))
-    x, v = np.array([np.cos(2 * np.pi * t), -np.sin(2 * np.pi * t)]) + noise
+    rng = np.random.default_rng(0)
+    x_noise, v_noise = 1e-6 * rng.normal(size=(2, len(t)))
+    x = np.cos(2 * np.pi * t) + x_noise
+    v = -np.sin(2 * np.pi * t) + v_noise
     return hj.Recording(t, {"f": np.cos(3 * t), "x": x, "v": v})
 
 
@@ -41,27 +45,28 @@ def rhythm():
     with the clock of a drive: its angle is pulled towards 2 pi t at the same rate.
     """
     force = hj.testing.random_force(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
-    steps = 2
+    steps = 2  # from one sample to the next
     h = 1 / RATE / steps
-    fine = np.interp(
-        np.arange(2 * steps * len(force)) * h / 2, np.arange(len(force)) / RATE, force
-    )
+    sampled = np.arange(len(force)) / RATE
+    halves = np.arange(2 * steps * len(force) + 1) * h / 2
+    fine = np.interp(halves, sampled, force)
 
-    def field(w, f, turn):  # w = z exp(-2 pi i t)
+    def field(w, f, turn):
+        """Of w = z exp(-2 pi i t), with turn = exp(-2 pi i t)."""
         pull = -1j * DECAY * 2 * np.angle(w) * w
         return DECAY * (1 - abs(w) ** 2) * w + pull + f * turn
 
-    z, out = 1.0 + 0j, []
+    w = 1.0 + 0j
+    samples = []
     for k in range(steps * len(force)):
-        t = np.exp(-2j * np.pi * h * (k + np.array([0, 0.5, 1])))
+        begin, middle, end = np.exp(-2j * np.pi * halves[2 * k : 2 * k + 3])
+        f_begin, f_middle, f_end = fine[2 * k : 2 * k + 3]
         if k % steps == 0:
-            out.append(z / t[0])
-        f = fine[2 * k : 2 * k + 3]
-        f = np.append(f, [f[-1]] * (3 - len(f)))
-        a = field(z, f[0], t[0])
-        b = field(z + h / 2 * a, f[1], t[1])
-        c = field(z + h / 2 * b, f[1], t[1])
-        z = z + h / 6 * (a + 2 * b + 2 * c + field(z + h * c, f[2], t[2]))
-    z = np.array(out)
-    time = np.arange(len(force)) / RATE
-    return hj.Recording(time, {"force": force, "x": z.real, "v": z.imag})
+            samples.append(w / begin)
+        a = field(w, f_begin, begin)
+        b = field(w + h / 2 * a, f_middle, middle)
+        c = field(w + h / 2 * b, f_middle, middle)
+        d = field(w + h * c, f_end, end)
+        w = w + h / 6 * (a + 2 * b + 2 * c + d)
+    z = np.array(samples)
+    return hj.Recording(sampled, {"force": force, "x": z.real, "v": z.imag})

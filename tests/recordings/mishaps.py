@@ -140,7 +140,8 @@ def overflow(bits):
 
 
 def renumbered(trial, s):
-    n, step = len(trial.time), np.median(np.diff(trial.time))
+    n = len(trial.time)
+    step = np.median(np.diff(trial.time))
     t = kept(
         trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False))
     )
@@ -159,7 +160,8 @@ def hidden(choose):
     """Outputs are missing around those events that `choose(events, scene)` returns."""
 
     def hide(trial, s):
-        values, middles = trial.values.copy(), choose(trial.events[s.event], s)
+        values = trial.values.copy()
+        middles = choose(trial.events[s.event], s)
         away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
         values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
         return replace(trial, values=values)
@@ -168,7 +170,8 @@ def hidden(choose):
 
 
 def swapped(trial, s):
-    values, places = trial.values.copy(), [s.recording.column(x) for x in s.outputs[:2]]
+    values = trial.values.copy()
+    places = [s.recording.column(x) for x in s.outputs[:2]]
     values[:, places] = values[:, places[::-1]]
     return replace(trial, values=values)
 
@@ -203,7 +206,8 @@ def misjudged(lost=0.0, doubled=0.0, off=0.0):
 
     def misjudge(trial, s):
         at = trial.events[s.event]
-        order, n = s.rng.permutation(len(at)), round(lost * len(at))
+        order = s.rng.permutation(len(at))
+        n = round(lost * len(at))
         again = order[n : n + round(doubled * len(at))]
         at = np.concatenate([np.delete(at, order[:n]), at[again] + 0.05 * s.period])
         at = np.sort(at + off * s.period * s.rng.normal(size=len(at)))

@@ -30,10 +30,14 @@ def multipliers():
 @pytest.fixture(scope="module")
 def recording():
     """300 cycles with u = r - 4 x - v, of noisy measurements, and forces that nobody measured."""
-    rng, n, h = np.random.default_rng(1), 310 * RATE, 1 / RATE
+    rng = np.random.default_rng(1)
+    n = 310 * RATE
+    h = 1 / RATE
     r, w = (hj.testing.random_force(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
     e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
-    x, y, u = np.zeros(2), np.zeros((2, n)), np.zeros(n)
+    x = np.zeros(2)
+    y = np.zeros((2, n))
+    u = np.zeros(n)
     for i in range(n):
         y[:, i] = x + e[:, i]
         u[i] = r[i] - 4 * y[0, i] - y[1, i]
@@ -48,7 +52,8 @@ def recording():
 
 @pytest.mark.slow
 def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
-    trial, out = (str(tmp_path / name) for name in ("trial.npz", "o"))
+    trial = str(tmp_path / "trial.npz")
+    out = str(tmp_path / "o")
     np.savez(trial, **recording)
     options = (
         "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
@@ -56,11 +61,13 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     with pytest.warns(FindingWarning):
         assert not main(["identify", trial, *options.split(), "--out", out])
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
-    assert summary["references"] == ["r"] and "u" in summary["inputs"]
+    assert summary["references"] == ["r"]
+    assert "u" in summary["inputs"]
     assert not any("feedback" in x.lower() for x in summary["warnings"])
     assert "A controller makes u" in (tmp_path / "o" / "report.html").read_text()
     fit = hj.load(tmp_path / "o" / "fit.npz")
-    assert fit.contains(multipliers).all() and fit.standard_errors.max() < 0.2
+    assert fit.contains(multipliers).all()
+    assert fit.standard_errors.max() < 0.2
     data = hj.Recording(
         recording["time"], {k: x for k, x in recording.items() if k != "time"}
     )

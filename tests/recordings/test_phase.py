@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose
 from scipy.interpolate import CubicSpline, make_smoothing_spline
 
 import hybridjax as hj
@@ -14,9 +15,12 @@ from hybridjax.recordings.smoothing import spline
 CIRCLE = hj.KinematicPhase(8, position="x", velocity="v")
 
 
-def whole(phase, winding=0):
-    w = phase.stretches[0][winding]
-    return w.when(np.arange(np.ceil(w.phase[0]), np.floor(w.phase[-1]) + 1))
+def times_of_section_0(phase, winding=0):
+    """The times at which a winding has a whole phase."""
+    found = phase.stretches[0][winding]
+    first = np.ceil(found.phase[0])
+    last = np.floor(found.phase[-1])
+    return found.when(np.arange(first, last + 1))
 
 
 @settings(max_examples=15)
@@ -25,39 +29,59 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     rng = np.random.default_rng(seed)
     t = np.sort(rng.uniform(0, 12, 3000))
     sense = -1 if turned else 1
-    x = 3 + 2 * np.cos(2 * np.pi * t) + 2 * noise * rng.normal(size=t.size)
-    v = 5 * sense * np.sin(2 * np.pi * t) + 5 * noise * rng.normal(size=t.size)
-    x[(t > 5.2) & (t < 7.1)] = np.nan
-    phase = hj.recordings.estimate_phase(hj.Recording(t, {"x": x, "v": v}), CIRCLE)
-    assert [len(s) for s in phase.stretches] == [2]
-    for k in (0, 1):
-        found = whole(phase, k)
-        assert np.abs(found - np.round(found)).max() < 0.02 + noise / 2
-        assert (np.diff(phase.stretches[0][k].time) > 0).all()
-        assert (np.diff(phase.stretches[0][k].phase) > 0).all()
+    x_noise = noise * rng.normal(size=t.size)
+    v_noise = noise * rng.normal(size=t.size)
+    x = 3 + 2 * (np.cos(2 * np.pi * t) + x_noise)
+    v = 5 * (sense * np.sin(2 * np.pi * t) + v_noise)
+    gap = (t > 5.2) & (t < 7.1)
+    x[gap] = np.nan
+    recording = hj.Recording(t, {"x": x, "v": v})
+    phase = hj.recordings.estimate_phase(recording, CIRCLE)
+    (windings,) = phase.stretches
+    before, after = windings
+    for k, winding in enumerate((before, after)):
+        times = times_of_section_0(phase, k)
+        error = np.abs(times - np.round(times)).max()
+        assert error < 0.02 + noise / 2
+        assert (np.diff(winding.time) > 0).all()
+        assert (np.diff(winding.phase) > 0).all()
 
 
-def test_a_crossing_as_the_anchor(wave):
-    """Section 0 lies at the angle at which the signal crosses the level, or at a given one."""
-    late = hj.recordings.estimate_phase(
-        wave, dataclasses.replace(CIRCLE, anchor=-np.pi / 2)
-    )
-    np.testing.assert_allclose(whole(late) % 1, 0.25, atol=2e-4)
-    for crossing, clock in [
+def test_an_angle_as_the_anchor(wave):
+    family = dataclasses.replace(CIRCLE, anchor=-np.pi / 2)
+    phase = hj.recordings.estimate_phase(wave, family)
+    assert_allclose(times_of_section_0(phase) % 1, 0.25, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "crossing, time",
+    [
         (hj.Crossing("v", "rising"), 0.5),
         (hj.Crossing("x", "falling"), 0.25),
         (hj.Crossing("x", "rising", value=0.5), 5 / 6),
-    ]:
-        definition = dataclasses.replace(CIRCLE, anchor=crossing)
-        phase = hj.recordings.estimate_phase(wave, definition)
-        np.testing.assert_allclose(whole(phase)[1:-1] % 1, clock, atol=1e-3)
-    thrice = hj.Crossing("w", "falling")
-    t, (_, x, v) = wave.trials[0].time, wave.trials[0].values.T
-    recording = hj.Recording(t, {"x": x, "v": v, "w": np.cos(6 * np.pi * t)})
+    ],
+)
+def test_a_crossing_as_the_anchor(crossing, time, wave):
+    """Section 0 lies at the angle at which the signal crosses the level."""
+    family = dataclasses.replace(CIRCLE, anchor=crossing)
+    phase = hj.recordings.estimate_phase(wave, family)
+    assert_allclose(times_of_section_0(phase)[1:-1] % 1, time, atol=1e-3)
+
+
+def test_a_signal_that_crosses_at_several_angles_is_no_anchor(wave):
+    (trial,) = wave.trials
+    _, x, v = trial.values.T
+    thrice = np.cos(6 * np.pi * trial.time)
+    recording = hj.Recording(trial.time, {"x": x, "v": v, "w": thrice})
+    family = dataclasses.replace(CIRCLE, anchor=hj.Crossing("w", "falling"))
     with pytest.raises(hj.DefinitionError, match="w falling, .* all around the cycle"):
-        hj.recordings.estimate_phase(
-            recording, dataclasses.replace(CIRCLE, anchor=thrice)
-        )
+        hj.recordings.estimate_phase(recording, family)
+
+
+def recording_of(events):
+    """A recording of a minute with these events."""
+    t = np.arange(0, 61, 0.5)
+    return hj.Recording(t, {"x": np.zeros(len(t))}, events={"e": events})
 
 
 @settings(max_examples=15)
@@ -66,25 +90,23 @@ def test_irregular_events(seed, jitter):
     """Jitter, missed and doubled events: the phase grows, is right at the events, or nearly so."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.3, 60) + jitter * rng.uniform(-1, 1, 60)
-    missed, doubled = 10 + rng.permutation(20)[0], 40 + rng.permutation(10)[0]
-    events = np.sort(np.append(np.delete(t, missed), t[doubled] + 0.1))
-    recording = hj.Recording(
-        np.arange(0, 61, 0.5), {"x": np.zeros(122)}, events={"e": events}
-    )
-    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("e"))
-    assert phase.dropped == 1 and phase.missed == 2 and len(phase.stretches[0]) == 2
+    missed = 10 + rng.permutation(20)[0]
+    doubled = 40 + rng.permutation(10)[0]
+    seen = np.delete(t, missed)
+    events = np.sort(np.append(seen, t[doubled] + 0.1))
+    phase = hj.recordings.estimate_phase(recording_of(events), hj.AtEvent("e"))
+    assert phase.dropped == 1
+    assert phase.missed == 2
     assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
-    for w in phase.stretches[0]:
-        assert (np.diff(w.phase) > 0).all() and (np.diff(w.time) > 0).all()
-        own = t[(t >= w.time[0]) & (t <= w.time[-1])]
-        at = np.interp(own, w.time, w.phase)
-        assert np.abs(at - at[0] - np.arange(len(own))).max() <= 1e-9
-    exact = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
-    hj.plot.phase(hj.recordings.estimate_phase(exact, hj.AtEvent("e")))
-    twice = hj.Recording(
-        np.arange(62), {"x": np.zeros(62)}, events={"e": [*t, *(t + 0.02)]}
-    )
-    assert hj.recordings.estimate_phase(twice, hj.AtEvent("e")).dropped == 60
+    (windings,) = phase.stretches
+    assert len(windings) == 2
+    for winding in windings:
+        assert (np.diff(winding.phase) > 0).all()
+        assert (np.diff(winding.time) > 0).all()
+        inside = t[(t >= winding.time[0]) & (t <= winding.time[-1])]
+        at_events = np.interp(inside, winding.time, winding.phase)
+        counted = at_events[0] + np.arange(len(inside))
+        assert_allclose(at_events, counted, rtol=0, atol=1e-9)
 
 
 def test_what_is_no_phase(wave):
@@ -110,18 +132,29 @@ def test_what_is_no_phase(wave):
             hj.recordings.estimate_phase(still, definition)
 
 
+def test_events_without_jitter():
+    t = 0.3 + np.arange(60)
+    recording = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
+    hj.plot.phase(hj.recordings.estimate_phase(recording, hj.AtEvent("e")))
+
+
+def test_events_that_all_come_twice():
+    t = np.arange(0.3, 60)
+    twice = recording_of([*t, *(t + 0.02)])
+    phase = hj.recordings.estimate_phase(twice, hj.AtEvent("e"))
+    assert phase.dropped == 60
+
+
 @settings(max_examples=15)
 @given(st.integers(0, 1000), st.integers(8, 60), st.floats(0.02, 0.3))
 def test_splines_are_those_of_scipy(seed, n, bandwidth):
     rng = np.random.default_rng(seed)
-    t, y = np.cumsum(rng.uniform(0.5, 1.5, n)), rng.normal(size=n)
+    t = np.cumsum(rng.uniform(0.5, 1.5, n))
+    y = rng.normal(size=n)
     x = np.linspace(t[0], t[-1], 200)
     step = np.median(np.diff(t))
-    reference = make_smoothing_spline(
-        t / step, y, lam=(2 * np.pi * bandwidth * step) ** -4
-    )
-    np.testing.assert_allclose(
-        spline(t, y, bandwidth)(x), reference(x / step), atol=1e-9
-    )
+    penalty = (2 * np.pi * bandwidth * step) ** -4
+    smooth = make_smoothing_spline(t / step, y, lam=penalty)
+    assert_allclose(spline(t, y, bandwidth)(x), smooth(x / step), atol=1e-9)
     through = CubicSpline(t, y, bc_type="natural")
-    np.testing.assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)
+    assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.recordings.smoothing import input_spikes, spike_heights, without_spikes
@@ -24,16 +25,18 @@ def test_all_spikes_are_found_and_little_else(noise):
     struck &= np.convolve(struck, [1, 1, 1, 1], "same") < 4  # three in a row at most
     x = clean + struck * rng.choice([-15, 15], len(T))
     found = spike_heights(x)
-    assert (found != 0)[struck].mean() > 0.999 and (found != 0)[~struck].mean() < 1e-3
-    np.testing.assert_allclose(np.abs(found[struck & (found != 0)]), 15, atol=1)
+    assert (found != 0)[struck].mean() > 0.999
+    assert (found != 0)[~struck].mean() < 1e-3
+    assert_allclose(np.abs(found[struck & (found != 0)]), 15, atol=1)
     kept = without_spikes(x)
-    np.testing.assert_array_equal(np.isnan(kept), found != 0)
-    np.testing.assert_array_equal(kept[found == 0], x[found == 0])
+    assert_array_equal(np.isnan(kept), found != 0)
+    assert_array_equal(kept[found == 0], x[found == 0])
 
 
 def pulse(width):
     """Of half a sine, once in a second; the first sample is not zero."""
-    x, shape = np.zeros(len(T)), np.sin(np.pi * (np.arange(width) + 0.5) / width)
+    x = np.zeros(len(T))
+    shape = np.sin(np.pi * (np.arange(width) + 0.5) / width)
     for first in range(100, len(T) - width, 500):
         x[first : first + width] += shape
     return x
@@ -72,14 +75,14 @@ def test_pulses_are_the_input_and_spikes_are_not():
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
     assert not input_spikes(hj.testing.random_force(40, 500, 8)[:, 0]).any()
-    assert not input_spikes(
-        np.repeat(np.random.default_rng(0).normal(size=5000), 4)
-    ).any()
+    rng = np.random.default_rng(0)
+    assert not input_spikes(np.repeat(rng.normal(size=5000), 4)).any()
 
 
 def test_impacts_are_part_of_the_motion(wave):
     """A transient of one sample in every cycle stays, those in between are left out."""
-    t, (f, x, v) = wave.trials[0].time, wave.trials[0].values.T
+    t = wave.trials[0].time
+    (f, x, v) = wave.trials[0].values.T
     impact = np.zeros(len(t))
     impact[30::100] = 3.0
     spikes = np.zeros(len(t))
@@ -93,8 +96,7 @@ def test_impacts_are_part_of_the_motion(wave):
 
     assert sampled(impact).spikes == (0, 0, 0)
     both = sampled(impact + spikes)
-    assert both.spikes == (0, 3, 0) and "spikes left out: x 3)" in repr(both)
-    np.testing.assert_allclose(
-        both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3
-    )
+    assert both.spikes == (0, 3, 0)
+    assert "spikes left out: x 3)" in repr(both)
+    assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
     assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05

@@ -11,6 +11,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -71,15 +72,15 @@ def test_draws_have_streams_of_their_own(whole):
     for i in (0, 3, DRAWS - 1):
         stream = np.random.SeedSequence(7, spawn_key=(i,))
         expected = walk(np.random.default_rng(stream))
-        np.testing.assert_array_equal(whole.end[i], expected["end"])
+        assert_array_equal(whole.end[i], expected["end"])
         assert whole.far[i] == expected["far"]
-    np.testing.assert_array_equal(hj.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
+    assert_array_equal(hj.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
 
 
 def test_draws_that_fail_are_named():
     found = hj.monte_carlo(fails, 20, seed=1)
     assert 0 < found.failed.sum() < 20
-    np.testing.assert_array_equal(np.isnan(found.value), found.failed == 1)
+    assert_array_equal(np.isnan(found.value), found.failed == 1)
 
 
 def test_an_interruption_leaves_whole_pieces(tmp_path):
@@ -87,7 +88,8 @@ def test_an_interruption_leaves_whole_pieces(tmp_path):
         np.random.default_rng(np.random.SeedSequence(0, spawn_key=(i,)))
         for i in range(10)
     ]
-    expected, again = [rng.normal() for rng in expected], tmp_path / "again"
+    expected = [rng.normal() for rng in expected]
+    again = tmp_path / "again"
     seventh = expected[6]
 
     def drawn(rng):
@@ -101,7 +103,7 @@ def test_an_interruption_leaves_whole_pieces(tmp_path):
     assert len(list(tmp_path.glob("draws.zarr/value/c/*"))) == 3
     again.touch()
     draws = hj.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
-    np.testing.assert_array_equal(draws.value, expected)
+    assert_array_equal(draws.value, expected)
 
 
 def test_draws_must_stay_alike():
@@ -128,11 +130,9 @@ def test_a_store_knows_its_function(tmp_path):
 )
 def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     """A store that was made to look like that of the call."""
-    first, victim, store = (
-        partial(np.random.Generator.normal),
-        tmp_path / "x",
-        tmp_path / "s.zarr",
-    )
+    first = partial(np.random.Generator.normal)
+    victim = tmp_path / "x"
+    store = tmp_path / "s.zarr"
     hj.monte_carlo(first, 4, chunk=2, store=store)
     values = store / "value"
     victim.mkdir()
@@ -219,7 +219,8 @@ def test_workers_with_other_code_are_refused(client, monkeypatch):
 def experiments():
     """A stable linear oscillator with a clock: compiled in a moment."""
     cycle = hj.find_limit_cycle(Driven(), hj.Guess("all", (0.0, 0.0)))
-    u = 0.1 * np.random.default_rng(0).normal(size=(6, 4 * 14, 1))
+    rng = np.random.default_rng(0)
+    u = 0.1 * rng.normal(size=(6, 4 * 14, 1))
     return cycle, hj.ClockPhase(4), u, "x"
 
 
@@ -229,13 +230,13 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     stream = hj.experiments.stream_experiments
     stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
     alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
-    assert len(stored) == 3 and stored.missing() == []
+    assert len(stored) == 3
+    assert stored.missing() == []
     for mine, theirs in zip(alone, stored, strict=True):
-        np.testing.assert_array_equal(mine.y, theirs.y)
+        assert_array_equal(mine.y, theirs.y)
     data = list(stored)
-    parts, whole = (hj.fit_series(x, 2, check=False) for x in (stored, data))
-    np.testing.assert_allclose(
-        parts.coefficients, whole.coefficients, rtol=0, atol=1e-12
-    )
-    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
+    parts = hj.fit_series(stored, 2, check=False)
+    whole = hj.fit_series(data, 2, check=False)
+    assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
+    assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
     assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.apps.cli import main
@@ -43,11 +44,12 @@ def whole(wheel, options):
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
     expected = np.broadcast_to(np.cos(2 * np.pi / OVER["spokes"]) ** 2, (3, 3))
-    np.testing.assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
+    assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
-    assert (whole.result == 0).all() and (whole.residual < 1e-8).all()
+    assert (whole.result == 0).all()
+    assert (whole.residual < 1e-8).all()
     assert whole.slope.attrs["units"] == "rad"
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.abs(whole.multipliers).max("multiplier"), whole.spectral_radius
     )
     assert list(whole.coords) == ["slope", "spokes", "state_name", "state_unit"]
@@ -63,11 +65,10 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
         {"slope": [0.075, 0.08, 0.03, 0.09], "spokes": [8.0, 8.5, 7.0, 9.0]}
     )
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
-    assert np.flatnonzero(found.result).tolist() == [2] and np.isnan(found.period[2])
+    assert np.flatnonzero(found.result).tolist() == [2]
+    assert np.isnan(found.period[2])
     expected = np.delete(np.cos(2 * np.pi / found.spokes.values) ** 2, 2)
-    np.testing.assert_allclose(
-        np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7
-    )
+    assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
 
 def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path):
@@ -125,13 +126,12 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
         return jnp.stack([cycle.period, cycle.trajectory(2.0).t[-1]])
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
-    assert found.period.dims == ("point",) and set(found.coords) == {"slope", "spokes"}
-    np.testing.assert_allclose(
-        found.period, whole.period.values[::2, ::2].T.ravel(), rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        found.twice[0], float(found.period[0]) * np.array([1, 2])
-    )
+    assert found.period.dims == ("point",)
+    assert set(found.coords) == {"slope", "spokes"}
+    expected = whole.period.values[::2, ::2].T.ravel()
+    assert_allclose(found.period, expected, rtol=1e-9)
+    expected = float(found.period[0]) * np.array([1, 2])
+    assert_allclose(found.twice[0], expected)
     assert np.isnan(found.twice[1]).all()
     for wrong, message in (
         (lambda x: x, "a function of parameters that returns one"),
@@ -146,20 +146,20 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
     points = Points.sobol(ranges, 48, seed=3)
     for name, (low, high) in ranges.items():
         values = points.values[name]
-        assert len(points) == 48 and low <= values.min() and values.max() <= high
-        assert np.histogram(values, 4, (low, high))[0].tolist() == pytest.approx(
-            [12] * 4, abs=2
-        )
-        np.testing.assert_array_equal(
-            values, Points.sobol(ranges, 48, seed=3).values[name]
-        )
+        assert len(points) == 48
+        assert low <= values.min()
+        assert values.max() <= high
+        measured = np.histogram(values, 4, (low, high))[0].tolist()
+        assert measured == (pytest.approx([12] * 4, abs=2))
+        assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
     (tmp_path / "my_wheel.py").write_text(
         "from hybridjax.models import RimlessWheel as Mine\n"
     )
-    model, out = f"{tmp_path}/my_wheel.py:Mine", str(tmp_path / "map.zarr")
+    model = f"{tmp_path}/my_wheel.py:Mine"
+    out = str(tmp_path / "map.zarr")
     axes = ["--over", "slope=0.075:0.09:2", "--over", "spokes=8:9:2"]
     assert main(["sweep", model, *axes, "--want", "spectral_radius", "--out", out]) == 0
     assert "4 of 4 points have a limit cycle" in capsys.readouterr().out
@@ -179,21 +179,20 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
     """Three hoppers near the paper's, one that is in the air when its clock is at 0.5, to which
     turns lead, and one that has no cycle with a touchdown: its spring pushes nothing."""
     monkeypatch.setattr(batches, "_SETTLE", ())
-    k, b = jnp.array([8.0, 10.0, 13.0, 13.0, 0.0]), jnp.array([3.0, 5.0, 7.0, 3.0, 5.0])
+    k = jnp.array([8.0, 10.0, 13.0, 13.0, 0.0])
+    b = jnp.array([3.0, 5.0, 7.0, 3.0, 5.0])
     hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
     found = hj.find_limit_cycles(hoppers, hopper_cycle)
     for i in range(4):
         cycle = found[i]
         alone = hj.find_limit_cycle(cycle.system, cycle)
         assert cycle.event_sequence == alone.event_sequence
-        np.testing.assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
-        np.testing.assert_allclose(
-            found.multipliers[i, :2], alone.multipliers, atol=1e-8
-        )
-        np.testing.assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
+        assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
+        assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
+        assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
     assert len(np.unique(found.anchor.chart[:4])) == 2  # also in other charts
-    np.testing.assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
+    assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
 
 
 def test_without_a_clock_and_in_waves(wheel):
@@ -202,9 +201,10 @@ def test_without_a_clock_and_in_waves(wheel):
     slopes = np.linspace(0.08, 0.16, 11)
     systems = [hj.models.RimlessWheel(slope=x) for x in slopes]
     found = hj.find_limit_cycles(systems, wheel, execution=FOUR)
-    assert found.ok.all() and np.all(np.diff(found.period) < 0)
+    assert found.ok.all()
+    assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
-    np.testing.assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
+    assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
     assert {found[i].event_sequence for i in range(11)} == {(0,)}
 
 
@@ -213,16 +213,15 @@ def test_systems_that_are_alike_or_undefined(wheel):
     slopes = jnp.array([0.08] * 9 + [np.nan, 0.08])
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
     found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
-    np.testing.assert_array_equal(found.failed, [9])
-    assert (
-        np.isnan(found.multipliers[9]).all()
-        and np.isfinite(found.multipliers[:9]).all()
-    )
+    assert_array_equal(found.failed, [9])
+    assert np.isnan(found.multipliers[9]).all()
+    assert np.isfinite(found.multipliers[:9]).all()
     assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
     assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
 
 
 def test_a_guess_with_too_long_a_period(wheel):
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel(slope=0.16), wheel)
-    assert cycle.event_sequence == (0,) and cycle.period < 0.7 * wheel.period
-    np.testing.assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)
+    assert cycle.event_sequence == (0,)
+    assert cycle.period < 0.7 * wheel.period
+    assert_allclose(cycle.multipliers, [0.5], rtol=1e-9)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -56,20 +57,22 @@ class FallingPast(Chosen):
 
 def test_a_family_of_clock_phases(hopper_cycle):
     placed = hj.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
-    np.testing.assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
+    assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
-    np.testing.assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
+    assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_a_family_of_levels(vanderpol_cycle):
     family = FallingPast([1.0, 0.0, -1.0])
     one_by_one = [hj.Crossing("x", "falling", value=float(x)) for x in family.values]
-    own, listed = (hj.place_sections(vanderpol_cycle, x) for x in (family, one_by_one))
-    np.testing.assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
-    np.testing.assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
-    a, b = (hj.linearize(vanderpol_cycle, x, "v") for x in (own, listed))
-    np.testing.assert_allclose(a.A, b.A, atol=1e-12)
+    own = hj.place_sections(vanderpol_cycle, family)
+    listed = hj.place_sections(vanderpol_cycle, one_by_one)
+    assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
+    assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
+    a = hj.linearize(vanderpol_cycle, own, "v")
+    b = hj.linearize(vanderpol_cycle, listed, "v")
+    assert_allclose(a.A, b.A, atol=1e-12)
 
 
 def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
@@ -84,7 +87,7 @@ def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
         t[0] - placed.lanes.t[0]
     )
     pieces = np.diff(np.interp(at, t, length))
-    np.testing.assert_allclose(pieces, pieces.mean(), rtol=2e-3)
+    assert_allclose(pieces, pieces.mean(), rtol=2e-3)
     assert np.ptp(placed.duration) > 0.004
     ldtp = hj.linearize(hopper_cycle, placed, OUTPUTS)
-    np.testing.assert_allclose(ldtp.multipliers, isochron_ldtp.multipliers, atol=1e-9)
+    assert_allclose(ldtp.multipliers, isochron_ldtp.multipliers, atol=1e-9)

@@ -1,11 +1,13 @@
 """A, B, C, D between sections: against stored references, and against scipy's differences."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -24,17 +26,15 @@ def padded(x):
 def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochron_ldtp):
     data = reference("ldtp_isochron")
     clock = np.asarray(placed_isochrons.lanes.t) % 1
-    np.testing.assert_allclose(clock, data["clock"] % 1, atol=1e-10)
-    np.testing.assert_allclose(
-        placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10
-    )
-    np.testing.assert_array_equal(isochron_ldtp.dims, data["dim"])
-    np.testing.assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
-    np.testing.assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
-    np.testing.assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
-    np.testing.assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
+    assert_allclose(clock, data["clock"] % 1, atol=1e-10)
+    assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
+    assert_array_equal(isochron_ldtp.dims, data["dim"])
+    assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
+    assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
+    assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
+    assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
     markov = isochron_ldtp.impulse_response(97)[..., 0]
-    np.testing.assert_allclose(markov, data["markov"], atol=1e-8)
+    assert_allclose(markov, data["markov"], atol=1e-8)
 
 
 def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
@@ -48,13 +48,12 @@ def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
 def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, request):
     ldtp = request.getfixturevalue(family)
     truth = np.array([LAMBDA, np.conj(LAMBDA)])
-    np.testing.assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
-    np.testing.assert_allclose(ldtp.multipliers, truth, atol=1e-9)
+    assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
+    assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
         found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
-        np.testing.assert_allclose(
-            sorted(found[-2:], key=np.imag), truth[::-1], atol=1e-9
-        )
+        measured = sorted(found[-2:], key=np.imag)
+        assert_allclose(measured, truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
 
 
@@ -63,14 +62,12 @@ def test_resets_that_depend_on_time():
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     time, *state, exact = cycle.system.exact()
     (impact,) = cycle.trajectory().events
-    np.testing.assert_allclose(
+    assert_allclose(
         [impact.time % 1, *impact.after.values()], [time, *state], atol=1e-9
     )
-    np.testing.assert_allclose(*np.sort_complex([cycle.multipliers, exact]), atol=1e-9)
+    assert_allclose(*np.sort_complex([cycle.multipliers, exact]), atol=1e-9)
     found = hj.linearize(cycle, hj.ClockPhase(8)).multipliers
-    np.testing.assert_allclose(
-        np.sort_complex(found), np.sort_complex(exact), atol=1e-9
-    )
+    assert_allclose(np.sort_complex(found), np.sort_complex(exact), atol=1e-9)
 
 
 def angles(apex, count):
@@ -89,35 +86,36 @@ def cycle_points(sections, start, retention=1.0):
 
 
 def check_against_differences(ldtp, sections, points, retention, subset):
+    """Matrices against differences of scipy's flow from section to section."""
     N = len(sections)
-    scale_A, scale_B = np.max(np.abs(ldtp.A)), np.max(np.abs(ldtp.B))
+    tolerance_A = 1e-7 * np.max(np.abs(ldtp.A))
+    tolerance_B = 1e-7 * np.max(np.abs(ldtp.B))
+    time_is_known = ldtp.coordinates[0][0] != "t"
     for i in subset:
-        here, there = sections[i], sections[(i + 1) % N]
-        names, after = ldtp.coordinates[i], ldtp.coordinates[(i + 1) % N]
-        if ldtp.coordinates[0][0] != "t" and i == N - 1:
+        here = sections[i]
+        there = sections[(i + 1) % N]
+        if i == N - 1 and time_is_known:
             there = ("clock", there[1] + 1.0)
-        J = hopper_scipy.jacobian(points[i], here, there, names, after, retention)
-        A = np.asarray(ldtp.A)[i, : len(after), : len(names)]
+        before = ldtp.coordinates[i]
+        after = ldtp.coordinates[(i + 1) % N]
+        J = hopper_scipy.jacobian(points[i], here, there, before, after, retention)
+        A = np.asarray(ldtp.A)[i, : len(after), : len(before)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        np.testing.assert_allclose(
-            A, J[:, :-1], rtol=0, atol=1e-7 * scale_A, err_msg=f"A[{i}]"
-        )
-        np.testing.assert_allclose(
-            B, J[:, -1], rtol=0, atol=1e-7 * scale_B, err_msg=f"B[{i}]"
-        )
+        assert_allclose(A, J[:, :-1], rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
+        assert_allclose(B, J[:, -1], rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
 
 
 def test_kinematic_sections_agree_with_scipy(
     reference, kinematic_ldtp, placed_kinematic
 ):
     sections = angles((0.0, 2.2, 0.0), 32)  # at the apex vM = 0, so the angle is 0
-    points = cycle_points(
-        sections, (0.5, *reference("limit_cycle")["state_clock_half"])
-    )
-    for i, point in enumerate(points):
-        assert abs(float(placed_kinematic.lanes.t[i]) - point[0]) < 1e-10
-        found = placed_kinematic.lanes.q[: len(point) - 1, i]
-        np.testing.assert_allclose(found, point[1:], rtol=0, atol=1e-10)
+    start = (0.5, *reference("limit_cycle")["state_clock_half"])
+    points = cycle_points(sections, start)
+    times = np.asarray(placed_kinematic.lanes.t)
+    states = np.asarray(placed_kinematic.lanes.q)
+    for i, (time, *state) in enumerate(points):
+        assert_allclose(times[i], time, rtol=0, atol=1e-10)
+        assert_allclose(states[: len(state), i], state, rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
 
 
@@ -141,7 +139,7 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
         else dataclasses.replace(KINEMATIC, n_sections=N)
     )
     ldtp = hj.linearize(lossy_cycle, family, OUTPUTS)
-    np.testing.assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
+    assert_allclose(ldtp.multipliers, [LOSSY, np.conj(LOSSY)], atol=1e-9)
     sections, points = lossy_sections(kind, N)
     dims = [len(p) for p in points]
     changes = [i for i in range(N) if dims[i] != dims[(i + 1) % N]]
@@ -161,24 +159,34 @@ def test_a_cycle_that_is_rest():
     """Where the state stands still, only its derivatives say how short steps must be."""
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
     found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
-    np.testing.assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
+    assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
 
 
-@pytest.mark.parametrize("late", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)])
-def test_delays_agree_with_finer_sections(hopper_cycle, late):
+@pytest.mark.parametrize(
+    "late_input, late_output", [(7, 16), (40, 9), (0, 16), (10, 15), (0, 0)]
+)
+def test_delays_agree_with_finer_sections(hopper_cycle, late_input, late_output):
     """100 sections, whose inputs change at every 25th: delays of so many of them."""
-    M = 25
-    fine = hj.linearize(hopper_cycle, hj.ClockPhase(4 * M, anchor=APEX), OUTPUTS)
-    delay = np.array(late) * float(hopper_cycle.period) / (4 * M)
-    model = hj.linearize(
-        hopper_cycle, hj.ClockPhase(4, anchor=APEX), OUTPUTS, delay=delay
-    )
-    u = np.random.default_rng(0).normal(size=(24, 1))
-    held = np.concatenate([np.zeros((4 * M + late[0], 1)), np.repeat(u, M, axis=0)])
-    y = np.asarray(fine.simulate(held))[4 * M - late[1] :: M][: len(u)]
-    np.testing.assert_allclose(model.simulate(u), y, atol=1e-11 * np.abs(y).max())
-    np.testing.assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
-    assert max(model.dims) == max(fine.dims) + -(-sum(late) // M)
+    finer = 25
+    N = 4 * finer
+    fine = hj.linearize(hopper_cycle, hj.ClockPhase(N, anchor=APEX), OUTPUTS)
+    interval = float(hopper_cycle.period) / N
+    delay = (late_input * interval, late_output * interval)
+    sections = hj.ClockPhase(4, anchor=APEX)
+    model = hj.linearize(hopper_cycle, sections, OUTPUTS, delay=delay)
+
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(24, 1))
+    rest = np.zeros((N + late_input, 1))  # a period before the input begins
+    held = np.repeat(u, finer, axis=0)
+    y = np.asarray(fine.simulate(np.concatenate([rest, held])))
+    expected = y[N - late_output :: finer][: len(u)]
+    tolerance = 1e-11 * np.abs(expected).max()
+    assert_allclose(model.simulate(u), expected, atol=tolerance)
+    assert_allclose(model.multipliers, hopper_cycle.multipliers, atol=1e-9)
+    # The inputs on their way are states.
+    kept = math.ceil((late_input + late_output) / finer)
+    assert max(model.dims) == max(fine.dims) + kept
 
 
 def test_delays_at_sections_of_the_state_are_refused(hopper_cycle):
@@ -200,36 +208,47 @@ class _Neuron(hj.HybridSystem):
         return {"below": _Leaky()}
 
     def transitions(self):
-        threshold = lambda t, q, u: 1 - q[0]  # noqa: E731
-        after = lambda t, q, u: (0.0,)  # noqa: E731
+        def threshold(t, q, u):
+            return 1 - q[0]
+
+        def after(t, q, u):
+            return (0.0,)
+
         return [hj.Transition("spike", "below", "below", guard=threshold, reset=after)]
 
 
+HALF = hj.Crossing("v", "rising", 0.5)
+
+
+MOST = hj.Crossing("v", "rising", 0.8)
+
+
 @pytest.mark.slow
-def test_sections_of_a_chart_with_one_state_have_the_dimension_zero():
+@pytest.mark.parametrize(
+    "sections, dims",
+    [([HALF, hj.AtEvent("spike")], [0, 1]), ([HALF, MOST], [0, 0]), (HALF, [0])],
+)
+def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, dims):
     cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
-    half, most = (hj.Crossing("v", "rising", value) for value in (0.5, 0.8))
+    # The voltage of a section does not change, the current does.
     current = hj.Output("current", lambda t, q, u: 3 * q[0] + 2 * u[0])
-    for sections, dims in (
-        ([half, hj.AtEvent("spike")], [0, 1]),
-        ([half, most], [0, 0]),
-        (half, [0]),
-    ):
-        model = hj.linearize(cycle, sections, outputs=current)
-        np.testing.assert_array_equal(model.dims, dims)
-        assert [len(x) for x in model.coordinates] == dims
-        assert len(model.multipliers) == 0
-        # The voltage of a section does not change, the current does.
-        H = model.htf((0.1, 0.2, 0.4))
-        np.testing.assert_allclose(H[0][:, 0, 0], 2)
-        assert all(np.all(H[m] == 0) for m in H.harmonics if m)
-        for system in (model, model.feedback(np.zeros((1, 1)))):
-            np.testing.assert_allclose(
-                system.simulate(np.ones((4, 1))), 2 * np.ones((4, 1))
-            )
-        design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
-        data = hj.run_experiments(cycle, sections, design, current, start="periodic")
-        np.testing.assert_allclose(data.y, 2 * data.u, rtol=1e-9)
+    model = hj.linearize(cycle, sections, outputs=current)
+    assert_array_equal(model.dims, dims)
+    assert [len(names) for names in model.coordinates] == dims
+    assert len(model.multipliers) == 0
+
+    H = model.htf((0.1, 0.2, 0.4))
+    for m in H.harmonics:
+        gain = 2 if m == 0 else 0
+        assert_allclose(H[m][:, 0, 0], gain)
+    ones = np.ones((4, 1))
+    assert_allclose(model.simulate(ones), 2 * ones)
+    closed = model.feedback(np.zeros((1, 1)))
+    assert_allclose(closed.simulate(ones), 2 * ones)
+
+    design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
+    data = hj.run_experiments(cycle, sections, design, current, start="periodic")
+    assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
 
 def test_a_section_map_waits_for_late_arrivals():
@@ -237,13 +256,15 @@ def test_a_section_map_waits_for_late_arrivals():
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     paddle = hj.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
     state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
-    begin = float(hj.place_sections(cycle, [hj.AtEvent("impact")]).lanes.t[0])
+    placed = hj.place_sections(cycle, [hj.AtEvent("impact")])
+    begin = float(placed.lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
-    alone, inside = paddle(state), eqx.filter_jit(paddle)(state)
+    alone = paddle(state)
+    inside = eqx.filter_jit(paddle)(state)
     both = jax.vmap(paddle)(np.stack([state, state]))
     assert float(alone.t) - begin > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):
-        np.testing.assert_allclose(t, path.events[0].time, rtol=1e-9)
+        assert_allclose(t, path.events[0].time, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -256,6 +277,6 @@ def test_second_derivatives_of_a_period():
     h = 1e-3
     second = (period(1 + h) - 2 * period(1.0) + period(1 - h)) / h**2
     exact = jax.jacrev(jax.jacfwd(period))(1.0)
-    np.testing.assert_allclose(exact, second, rtol=1e-5)
+    assert_allclose(exact, second, rtol=1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="jacrev.*jacfwd"):
         jax.hessian(period)(1.0)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 
@@ -44,6 +45,4 @@ def test_many_systems_side_by_side(lossy_cycle):
         alone = loop(STIFFNESS[index])
         assert alone["result"] == hj.Result.OK
         for name, value in alone.items():
-            np.testing.assert_allclose(
-                mapped[name][index], value, atol=1e-9, err_msg=name
-            )
+            assert_allclose(mapped[name][index], value, atol=1e-9, err_msg=name)

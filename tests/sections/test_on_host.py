@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.host_derivatives import only_on_host
@@ -36,37 +37,50 @@ def measured(guess, family):
     return measure
 
 
+def numbers_of(arrays, shapes):
+    """All numbers of arrays in a row, without the zeros by which they are padded."""
+    kept = []
+    for array, shape in zip(arrays, shapes, strict=True):
+        inside = tuple(slice(n) for n in shape)
+        kept.append(np.asarray(array)[inside].ravel())
+    return np.concatenate(kept)
+
+
 def agrees(system, measure, rtol):
     """Derivatives of all outputs in a direction of all parameters, and reverse mode."""
-    numbers, others = eqx.partition(system, eqx.is_inexact_array)
-    flat, unravel = ravel_pytree(numbers)
-    along = flat * np.random.default_rng(0).uniform(-1, 1, flat.shape)
-    at = lambda h: measure(eqx.combine(unravel(flat + h * along), others))  # noqa: E731
-    values, reverse = jax.vjp(at, 0.0)
-    # (Under transformations, matrices are padded with zeros.)
-    sizes = [np.shape(x) for x in at(0.0)]
-    kept = lambda xs: np.concatenate(  # noqa: E731
-        [
-            np.asarray(x)[tuple(map(slice, n))].ravel()
-            for x, n in zip(xs, sizes, strict=True)
-        ]
-    )
-    by_host = jax.jvp(at, (0.0,), (1.0,))[1]
-    e = 2e-4
-    minus2, minus, plus, plus2 = (kept(at(k * e)) for k in (-2, -1, 1, 2))
-    differences, size = (
-        (8 * (plus - minus) - (plus2 - minus2)) / (12 * e),
-        kept(by_host),
-    )
-    np.testing.assert_allclose(kept(values), kept(at(0.0)), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(
-        size, differences, rtol=rtol, atol=rtol * np.max(np.abs(size))
-    )
-    weights = [np.cos(np.arange(np.size(x)).reshape(np.shape(x))) for x in values]
-    expected = sum(
-        np.sum(w * np.asarray(x)) for w, x in zip(weights, by_host, strict=True)
-    )
-    np.testing.assert_allclose(reverse(tuple(weights))[0], expected, rtol=1e-11)
+    parameters, others = eqx.partition(system, eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(parameters)
+    rng = np.random.default_rng(0)
+    direction = flat * rng.uniform(-1, 1, flat.shape)
+
+    def at(h):
+        changed = unravel(flat + h * direction)
+        return measure(eqx.combine(changed, others))
+
+    # Under transformations, matrices are padded with zeros.
+    plain = at(0.0)
+    shapes = [np.shape(x) for x in plain]
+    values, pull_back = jax.vjp(at, 0.0)
+    expected = numbers_of(plain, shapes)
+    assert_allclose(numbers_of(values, shapes), expected, rtol=1e-9, atol=1e-9)
+
+    _, tangents = jax.jvp(at, (0.0,), (1.0,))
+    derivative = numbers_of(tangents, shapes)
+    h = 2e-4
+    once = numbers_of(at(h), shapes) - numbers_of(at(-h), shapes)
+    twice = numbers_of(at(2 * h), shapes) - numbers_of(at(-2 * h), shapes)
+    difference = (8 * once - twice) / (12 * h)
+    tolerance = rtol * np.max(np.abs(derivative))
+    assert_allclose(derivative, difference, rtol=rtol, atol=tolerance)
+
+    weights = []
+    for x in values:
+        weights.append(np.cos(np.arange(np.size(x))).reshape(np.shape(x)))
+    forward = 0.0
+    for weight, tangent in zip(weights, tangents, strict=True):
+        forward += np.sum(weight * np.asarray(tangent))
+    (reverse,) = pull_back(tuple(weights))
+    assert_allclose(reverse, forward, rtol=1e-11)
 
 
 FAMILIES = {
@@ -106,9 +120,7 @@ def test_numbers_of_sections(hopper_cycle):
 
     e = 1e-4
     differences = (determinant(e) - determinant(-e)) / (2 * e)
-    np.testing.assert_allclose(
-        jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9
-    )
+    assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.usefixtures("compiles_none")
@@ -133,9 +145,8 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
 
     def multiplier(hopper):
         cycle = hj.find_limit_cycle(hopper, hopper_cycle)
-        monodromy = hj.linearize(
-            cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM"
-        ).monodromy(5)
+        ldtp = hj.linearize(cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM")
+        monodromy = ldtp.monodromy(5)
         trace = jax.numpy.trace(monodromy)
         determinant = (trace**2 - jax.numpy.trace(monodromy @ monodromy)) / 2
         return jax.numpy.stack([trace / 2, jax.numpy.sqrt(determinant - trace**2 / 4)])
@@ -153,11 +164,9 @@ def test_later_calls_repeat_the_first_to_the_last_bit():
     class Hopper(hj.models.VerticalHopper):
         """Its programs are its own."""
 
-    cycle, matrices = hj.find_limit_cycle(Hopper()), []
+    cycle = hj.find_limit_cycle(Hopper())
+    matrices = []
     for _ in range(10):
-        matrices.append(
-            hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM").matrices
-        )
-    np.testing.assert_array_equal(
-        ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0]
-    )
+        ldtp = hj.linearize(dataclasses.replace(cycle), KINEMATIC, "yM")
+        matrices.append(ldtp.matrices)
+    assert_array_equal(ravel_pytree(matrices[-1])[0], ravel_pytree(matrices[0])[0])

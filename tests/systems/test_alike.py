@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.executor import to_host
@@ -56,7 +57,10 @@ class Circle(hj.HybridSystem):
     levels: jax.Array = eqx.field(default_factory=lambda: jnp.array([0.6, -0.2, 0.1]))
 
     def charts(self):
-        return {"turn": Field(("x", "y", "n"), lambda t, q, u: (-q[1], q[0], 0.0))}
+        def turn_rates(t, q, u):
+            return (-q[1], q[0], 0.0)
+
+        return {"turn": Field(("x", "y", "n"), turn_rates)}
 
     def transitions(self):
         found = []
@@ -90,18 +94,18 @@ def test_kinds_are_found():
 
 @pytest.mark.parametrize("other", [Circle(apart=True)])
 def test_events_are_those_of_transitions_of_their_own(other):
-    one, two = run(Circle()), run(other)
+    one = run(Circle())
+    two = run(other)
     assert len(one.events) == 8
     assert [e.name for e in one.events] == [e.name for e in two.events]
-    np.testing.assert_allclose(
-        [e.time for e in one.events], [e.time for e in two.events]
-    )
+    assert_allclose([e.time for e in one.events], [e.time for e in two.events])
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
 
 
 def test_numbers_are_those_of_python():
     """In JAX, an integer to the power of one that is negative is another number."""
-    one, two = run(Circle(mark=Halving)), run(Circle(mark=Halving, apart=True))
+    one = run(Circle(mark=Halving))
+    two = run(Circle(mark=Halving, apart=True))
     assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
     assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
 
@@ -114,4 +118,4 @@ def test_jacobians_are_those_of_each():
         )
         jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
     assert end[3] == 6.0  # three different factors
-    np.testing.assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)
+    assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)

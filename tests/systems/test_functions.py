@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -18,25 +19,35 @@ def test_a_network_and_a_scan():
     coefficients = jnp.array([-0.1, 0.2, 0.3])
 
     def learned(t, q, u):
-        horner = lambda value, c: (value * q[0] + c, None)  # noqa: E731
-        value, _ = jax.lax.scan(horner, 0.0 * q[0], coefficients)
-        return (-q[0] + network(jnp.stack([q[0], jnp.cos(t)]))[0] + value + u[0],)
+        x = q[0]
+
+        def horner(value, coefficient):
+            return (value * x + coefficient, None)
+
+        polynomial, _ = jax.lax.scan(horner, 0.0 * x, coefficients)
+        output = network(jnp.stack([x, jnp.cos(t)]))[0]
+        return (-x + output + polynomial + u[0],)
 
     system = toy({"a": Field(("x",), learned)}, period=2 * np.pi)
     cycle = hj.find_limit_cycle(system, hj.Guess("a", (0.3,)))
-    (W, a), (V, b) = (
-        (np.asarray(x.weight), np.asarray(x.bias)) for x in network.layers
+
+    first, second = network.layers
+    W = np.asarray(first.weight)
+    V = np.asarray(second.weight)
+
+    def rates(t, state):
+        """Of x, and of the logarithm of a deviation."""
+        x = state[0]
+        hidden = np.tanh(W @ [x, np.cos(t)] + np.asarray(first.bias))
+        output = V @ hidden + np.asarray(second.bias)
+        slope = V @ ((1 - hidden**2) * W[:, 0])
+        polynomial = -0.1 * x**2 + 0.2 * x + 0.3
+        return [-x + output[0] + polynomial, -1 + slope[0] - 0.2 * x + 0.2]
+
+    start = cycle.state["x"]
+    path = solve_ivp(
+        rates, (0, 2 * np.pi), [start, 0.0], method="DOP853", rtol=1e-12, atol=1e-12
     )
-
-    def field(t, z):
-        x = z[0]
-        hidden = np.tanh(W @ [x, np.cos(t)] + a)
-        slope = V @ ((1 - hidden**2) * W[:, 0]) - 1 - 0.2 * x + 0.2
-        return [-x + (V @ hidden + b)[0] - 0.1 * x**2 + 0.2 * x + 0.3, slope[0]]
-
-    start = [cycle.state["x"], 0.0]
-    there = solve_ivp(field, (0, 2 * np.pi), start, "DOP853", rtol=1e-12, atol=1e-12).y[
-        :, -1
-    ]
-    np.testing.assert_allclose(there[0], start[0], rtol=1e-10)
-    np.testing.assert_allclose(cycle.multipliers, [np.exp(there[1])], rtol=1e-9)
+    end, growth = path.y[:, -1]
+    assert_allclose(end, start, rtol=1e-10)
+    assert_allclose(cycle.multipliers, [np.exp(growth)], rtol=1e-9)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 
@@ -57,34 +58,36 @@ def _cycle(system):
 
 
 def test_the_default_input_yields_to_a_state_of_its_name():
-    cycle, named = _cycle(Oscillator()), _cycle(Named())
+    cycle = _cycle(Oscillator())
+    named = _cycle(Named())
     assert Oscillator().inputs == cycle.system.inputs == ("input",)
     phase = np.array([0.1, 0.4, 0.8])
-    responses, expected = cycle.responses().phase(phase), named.responses().phase(phase)
+    responses = cycle.responses().phase(phase)
+    expected = named.responses().phase(phase)
     assert list(responses) == ["x", "u", "input"]
     # At the angle a of the unit circle, the angle changes by -sin(a) dx + cos(a) du.
     angle = 2 * np.pi * phase - np.pi / 2
-    np.testing.assert_allclose(responses["u"], np.cos(angle) / ANGULAR, atol=1e-9)
-    np.testing.assert_allclose(responses["input"], -np.sin(angle) / ANGULAR, atol=1e-9)
-    np.testing.assert_allclose(responses["u"], expected["u"], rtol=1e-12)
+    assert_allclose(responses["u"], np.cos(angle) / ANGULAR, atol=1e-9)
+    assert_allclose(responses["input"], -np.sin(angle) / ANGULAR, atol=1e-9)
+    assert_allclose(responses["u"], expected["u"], rtol=1e-12)
     # White noise of the state and of the input are two things, with equal effects here.
     diffusion = PUSH**2 / 2 / ANGULAR**2
     for name in ("u", "input"):
         noisy = cycle.fluctuations(white={name: PUSH})
-        np.testing.assert_allclose(noisy.diffusion, diffusion, rtol=1e-9)
+        assert_allclose(noisy.diffusion, diffusion, rtol=1e-9)
     model = hj.linearize(cycle, hj.KinematicPhase(4, "x", "u"), outputs=("u",))
-    assert (model.inputs, model.outputs) == (("input",), ("u",))
-    pushed, expected = (
-        hj.simulate(system, "plane", (1.0, 0.0), 1.0, input=jnp.cos)
-        for system in (Oscillator(), Named())
-    )
-    np.testing.assert_array_equal(pushed.after, expected.after)
+    assert model.inputs == ("input",)
+    assert model.outputs == ("u",)
+    pushed = hj.simulate(Oscillator(), "plane", (1.0, 0.0), 1.0, input=jnp.cos)
+    expected = hj.simulate(Named(), "plane", (1.0, 0.0), 1.0, input=jnp.cos)
+    assert_array_equal(pushed.after, expected.after)
 
 
 def test_the_default_input_yields_to_an_output_of_its_name():
     cycle = _cycle(Shadowed())
     model = hj.linearize(cycle, hj.KinematicPhase(4, "x", "y"), outputs=("u",))
-    assert (model.inputs, model.outputs) == (("input",), ("u",))
+    assert model.inputs == ("input",)
+    assert model.outputs == ("u",)
 
 
 def test_an_input_with_the_name_of_a_state_or_an_output_is_refused():
@@ -108,8 +111,12 @@ def test_an_input_with_the_name_of_a_state_or_an_output_is_refused():
 
 
 def test_an_output_of_a_call_with_the_name_of_a_state_or_an_input_is_refused():
-    cycle, phase = _cycle(Named()), hj.KinematicPhase(4, "x", "u")
-    twice = lambda t, q, u: 2 * q[0]  # noqa: E731
+    cycle = _cycle(Named())
+    phase = hj.KinematicPhase(4, "x", "u")
+
+    def twice(t, q, u):
+        return 2 * q[0]
+
     with pytest.raises(hj.DefinitionError, match="'x' has the name of a state"):
         hj.linearize(cycle, phase, outputs=(hj.Output("x", twice),))
     with pytest.raises(hj.DefinitionError, match="'force' is an input and a state or"):

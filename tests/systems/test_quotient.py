@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax.models.walkers import _heelstrike
@@ -78,7 +79,8 @@ FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
 PLACED = type("Placed", (Full,), {"outputs": lambda self: [FAR]})()
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
 MIRROR = {"swap": {"left stands": "right stands"}, "relabel": PARTNERS}
-ODD, SIZES = {"flipped": ("x", "v"), "half_period": True}, np.r_[1, 1, 1, 1, 1e-9]
+ODD = {"flipped": ("x", "v"), "half_period": True}
+SIZES = np.r_[1, 1, 1, 1, 1e-9]
 STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.slow)
 
 
@@ -88,9 +90,9 @@ STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.s
 def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section):
     walker = hj.Quotient(Full(), **symmetry, translation=("x",))
     cycle = hj.find_limit_cycle(walker, section=section)
-    np.testing.assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
+    assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
     expected = np.sort_complex(np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** steps)
-    np.testing.assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
+    assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -120,16 +122,14 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
 
 
 def test_an_odd_oscillator_closes_after_half_a_period():
-    pol, duffing, at = (
-        hj.models.VanDerPol(),
-        hj.models.Duffing(),
-        hj.AtEvent("half period"),
-    )
+    pol = hj.models.VanDerPol()
+    duffing = hj.models.Duffing()
+    at = hj.AtEvent("half period")
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
     folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
-    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-11)
-    np.testing.assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
+    assert_allclose(2 * half.period, whole.period, rtol=1e-11)
+    assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
     with pytest.raises(
         hj.DefinitionError, match="must be True if a clock drives the system"
     ):
@@ -144,7 +144,9 @@ class Biased(hj.models.Duffing):
 
 
 def test_the_symmetry_is_that_of_all_systems_in_all_units():
-    half = lambda x: hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)  # noqa: E731
+    def half(x):
+        return hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)
+
     cycle = hj.find_limit_cycle(half(0.0), section=hj.AtEvent("half period"))
     seen = hj.ObservedCycle(cycle.base, period=6.0)
     for use in (
@@ -194,11 +196,9 @@ def test_scheduled_switches_close_after_half_a_period():
     half = hj.Quotient(Inverter(), **symmetry)
     half = hj.find_limit_cycle(half, section=hj.AtEvent("half period (minus)"))
     whole = hj.find_limit_cycle(Inverter())
-    np.testing.assert_allclose(2 * half.period, whole.period, rtol=1e-12)
-    np.testing.assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
-    np.testing.assert_allclose(
-        half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10
-    )
+    assert_allclose(2 * half.period, whole.period, rtol=1e-12)
+    assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
+    assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
     assert [half.structure.transitions[g].name for g in half.event_sequence][
         0
     ] == "down"

@@ -1,7 +1,7 @@
 """Motion along a surface at which the field jumps."""
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -16,20 +16,27 @@ hj.enable_x64()
 def test_a_block_on_a_belt_sticks_and_slips():
     """It leaves the belt where the spring is as strong as friction; slipping by DOP853."""
     F, belt, decay = 1.0, 0.2, 3.0
-    slip = lambda t, q: [q[1], -q[0] + F / (1 + decay * (belt - q[1]))]  # noqa: E731
-    caught = lambda t, q: q[1] - belt  # noqa: E731
+
+    def slip(t, q):
+        return [q[1], -q[0] + F / (1 + decay * (belt - q[1]))]
+
+    def caught(t, q):
+        return q[1] - belt
+
     caught.direction, caught.terminal = 1, True
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
     begin = solve_ivp(slip, (0, 0.5), [F, belt], **options).y[:, -1]
     way = solve_ivp(slip, (0.5, 20), begin, events=caught, **options)
-    t, (x, _) = way.t_events[0][0], way.y_events[0][0]
+    t = way.t_events[0][0]
+    (x, _) = way.y_events[0][0]
     period = t + (F - x) / belt
 
     section = hj.AtEvent("behind to sticks")
     cycle = hj.find_limit_cycle(hj.models.BeltOscillator(), section=section)
-    np.testing.assert_allclose(cycle.period, period, rtol=1e-9)
-    np.testing.assert_allclose(cycle.state["x"], x, rtol=1e-9)
-    assert len(cycle.multipliers) == 0 and cycle.stable
+    assert_allclose(cycle.period, period, rtol=1e-9)
+    assert_allclose(cycle.state["x"], x, rtol=1e-9)
+    assert len(cycle.multipliers) == 0
+    assert cycle.stable
     names = [x.name for x in hj.models.BeltOscillator().transitions()]
     assert sorted(names[g] for g in cycle.event_sequence) == [
         "behind to sticks",
@@ -59,7 +66,7 @@ def field(drift, push):
 def test_it_slides_or_crosses(push, end, chart):
     parts = hj.sliding({"up": field(0.5, -1.0), "down": field(2.0, push)}, height)
     way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
-    np.testing.assert_allclose(way.after[-1], end, atol=1e-9)
+    assert_allclose(way.after[-1], end, atol=1e-9)
     assert way.chart[-1] == chart
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax.systems.check import check_system
@@ -15,26 +16,43 @@ from hybridjax.systems.structure import Structure
 from ..toys import Field, toy
 
 
+def rates(t, q, u):
+    return (q[1], -q[0])
+
+
+def b_rates(t, q, u):
+    return -q
+
+
 ROOM = {
-    "a": Field(("x", "v"), lambda t, q, u: (q[1], -q[0])),
-    "b": Field(("z",), lambda t, q, u: -q),
+    "a": Field(("x", "v"), rates),
+    "b": Field(("z",), b_rates),
 }
-TO_B = hj.Transition(
-    "go", "a", "b", lambda t, q, u: q[0], reset=lambda t, q, u: (q[0],)
-)
+
+
+def go_guard(t, q, u):
+    return q[0]
+
+
+def go_reset(t, q, u):
+    return (q[0],)
+
+
+TO_B = hj.Transition("go", "a", "b", go_guard, reset=go_reset)
 SUM = hj.Output("sum", lambda t, q, u: q.sum())
 HOPPER = hj.models.VerticalHopper()
 
 
 def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
     hopper = hj.models.VerticalHopper(M=3)
-    assert hopper.M == 3.0 and hopper.M.dtype == np.float64
+    assert hopper.M == 3.0
+    assert hopper.M.dtype == np.float64
     period = eqx.filter_grad(lambda h: h.period())(hopper)
-    np.testing.assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
+    assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
     many = eqx.filter_vmap(lambda M: hj.models.VerticalHopper(M=M))(
         jnp.arange(1.0, 4.0)
     )
-    np.testing.assert_array_equal(many.M, [1.0, 2.0, 3.0])
+    assert_array_equal(many.M, [1.0, 2.0, 3.0])
     with pytest.raises(
         hj.DefinitionError, match="no parameter 'K'; parameters are m, M, k"
     ):
@@ -117,8 +135,9 @@ def test_outputs_by_name_by_function_and_by_chart():
     z = s.resolve_outputs(("x", "energy", SUM))
     assert z.names == ("x", "energy", "sum")
     values = z(0, 1.0, jnp.array([2.0, 3.0]), jnp.array([10.0]))
-    np.testing.assert_array_equal(values, [2.0, 24.0, 5.0])
-    assert z.defined(0) and not z.defined(1)
+    assert_array_equal(values, [2.0, 24.0, 5.0])
+    assert z.defined(0)
+    assert not z.defined(1)
     with pytest.raises(
         hj.DefinitionError, match="output 'x' is not defined in chart 'b'"
     ):

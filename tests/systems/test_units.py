@@ -19,9 +19,8 @@ def small_htf(**names):
 
 
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
-    assert units(kinematic_ldtp.outputs) == ["m", "m/s"] and units(
-        kinematic_ldtp.inputs
-    ) == ["N"]
+    assert units(kinematic_ldtp.outputs) == ["m", "m/s"]
+    assert units(kinematic_ldtp.inputs) == ["N"]
     design = hj.multisine(periods=16, band=(0, 4.0))
     data = hj.experiments.simulate_experiments(kinematic_ldtp, design, start="periodic")
     estimate = hj.estimate_htf(data)
@@ -38,7 +37,8 @@ def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
     for thing in (kinematic_ldtp, data, estimate, fit):
         hj.save(tmp_path / "thing.npz", thing)
         loaded = hj.load(tmp_path / "thing.npz")
-        assert units(loaded.outputs) == ["m", "m/s"] and units(loaded.inputs) == ["N"]
+        assert units(loaded.outputs) == ["m", "m/s"]
+        assert units(loaded.inputs) == ["N"]
 
 
 def test_what_has_other_units_is_not_compared():
@@ -48,7 +48,9 @@ def test_what_has_other_units_is_not_compared():
 
 
 def test_units_that_do_not_fit_are_refused():
-    still = lambda t, q, u: q  # noqa: E731
+    def still(t, q, u):
+        return q
+
     charts = {unit: FieldChart(still, ("y",), (unit,)) for unit in ("m", "mm")}
     with pytest.raises(hj.DefinitionError, match=r"two units: 'y' \(m\), .*'y' \(mm\)"):
         hj.simulate(toy(charts), "m", (1.0,), 1.0)
