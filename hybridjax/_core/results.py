@@ -38,11 +38,12 @@ class Result(enum.IntEnum):
     )
     COINCIDENCE = (
         13,
-        "two events coincide on the cycle: their order is not fixed beside it",
+        "two events coincide on the cycle: trajectories near it may meet them in either order",
     )
     STEP_COLLAPSE = (
         14,
-        "steps shrank to nothing: a field may jump only where a transition does",
+        "the step size underflowed, which happens if a vector field is discontinuous without a "
+        "transition",
     )
     FIELD_NOT_FINITE = (
         15,
@@ -51,7 +52,7 @@ class Result(enum.IntEnum):
     )
     GUARD_PASSED = (
         16,
-        "a reset put the state on a guard: what comes to rest there needs a chart",
+        "a reset put the state on a guard: add a chart for the resting state",
     )
     PULSE_PASSED = (
         17,

@@ -84,7 +84,8 @@ class StructuredFit(MultiplierEstimate):
         misfit = ", ".join(
             f"{n} {x:.1e}" for n, x in zip(self.outputs, self.residual, strict=True)
         )
-        about = f"residual {misfit}; {self.cost / self.freedom:.3g} times what is expected; "
+        reduced = self.cost / self.freedom
+        about = f"residual {misfit}; chi-square / degrees of freedom {reduced:.3g}; "
         about += (
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )

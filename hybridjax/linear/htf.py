@@ -182,9 +182,12 @@ class HTF(eqx.Module):
 
     def __repr__(self) -> str:
         count, span = self.f.shape[-1], ""
+        frequencies = "1 frequency" if count == 1 else f"{count} frequencies"
         if count and not is_traced(self.f):
             f = np.asarray(self.f)
-            span = f" {f.min():.4g} to {f.max():.4g}"
+            span = (
+                f" {f.min():.4g}" if count == 1 else f" {f.min():.4g} to {f.max():.4g}"
+            )
         low, high, number = self.harmonics[0], self.harmonics[-1], len(self.harmonics)
         sections = (
             f"{self.n_sections} sections" if self.n_sections else "continuous time"
@@ -196,7 +199,7 @@ class HTF(eqx.Module):
             else ", ".join(map(str, self.harmonics))
         )
         return folded(
-            f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
+            f"HTF({self.source}; harmonics {shown}; {frequencies}{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 

@@ -151,7 +151,7 @@ class SectionData(eqx.Module):
         spikes = f"; spikes left out: {', '.join(struck)}" if struck else ""
         return folded(
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records{lost}; period {self.period:.6g}; rms deviations: "
+            f"{len(self.records)} records{lost}; period {self.period:.6g} s; rms deviations: "
             f"{sizes}{spikes})"
         )
 

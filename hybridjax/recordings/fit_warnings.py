@@ -62,7 +62,10 @@ class Advice(eqx.Module):
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
-        return print_findings(self.warnings) or "Nothing speaks against the fit."
+        return (
+            print_findings(self.warnings)
+            or "No reason to doubt the multipliers was found."
+        )
 
 
 @checked

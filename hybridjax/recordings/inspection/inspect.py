@@ -226,7 +226,8 @@ def _odd(
     disturbed = left > np.maximum(_DISTURBED * np.median(left), explained / 4)
     first = np.select([turned, foreign, disturbed], [0, 1, 2], -1)
     texts = {
-        "another sign": "the outputs answer {} with the other sign ({}): turn it.",
+        "another sign": "the outputs respond to {0} with the opposite sign ({1}): change the sign "
+        "of {0} there.",
         "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another "
         "trial, or came earlier or later.",
         "disturbed": "something else than {} moved the outputs ({}).",

@@ -52,9 +52,11 @@ class MapResult:
             if len(i)
         )
         where = ", ".join(spans) or "none"
+        largest = f"largest {size:.4g} {self.unit}".rstrip()
+        half_width = f"{np.median(self.reach):.3g} {self.unit}".rstrip()
         return (
-            f"MapResult({' x '.join(self.axes)}: largest {size:.4g} {self.unit}".rstrip()
-            + f", band of +- {np.median(self.reach):.3g} (median)\n"
+            f"MapResult({' x '.join(self.axes)}: {largest}\n"
+            f"  median half-width of the 95 % band {half_width}\n"
             f"  largest |t| {t:.3g}, {p_value(float(self.p.min()))}\n"
             f"  significant: {self.significant.sum()} of {self.t.size} points, {where})"
         )
