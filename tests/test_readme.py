@@ -57,7 +57,8 @@ def read_section(tmp_path_factory):
             if language in ("python", "py"):
                 session.run(text)
             elif language == "bash":
-                assert main(shlex.split(text)[1:]) in (None, 0)
+                command = text.replace("\\\n", "")
+                assert main(shlex.split(command)[1:]) in (None, 0)
         return session.module
 
     with pytest.MonkeyPatch.context() as patch:
