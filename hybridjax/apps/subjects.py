@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__, plot
+from .._core import html
 from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, OptionalNames
@@ -42,6 +43,11 @@ _COLUMNS = {
     "period_error": "period_standard_error",
 }
 _FILES = ("subjects.csv", "population.csv", "population.html")
+_FOREST = (
+    '<figure><img alt="Modulus of the leading multiplier" src="forest.png">'
+    "<figcaption>Modulus of the leading multiplier of each subject, with 95 % intervals."
+    "</figcaption></figure>"
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -259,10 +265,12 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
         for n in population.table["report"]
     )
     errors = {f"{name}_error": error for name, error in population.errors.items()}
+    columns = results.T.to_html(
+        header=False, border=0, float_format="{:.4g}".format, na_rep=""
+    )
     parts = [
         *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
-        f"<ul>{''.join(links)}</ul>",
-        results.T.to_html(header=False, float_format="{:.4g}".format, na_rep=""),
+        html.card("Means and differences", "of the leading modulus", columns),
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
     with results_folder(study.folder, "population", _FILES) as new:
@@ -270,13 +278,12 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
             save_and_close(
                 new / "forest", plot.forest(population, "modulus"), with_png(formats)
             )
-            parts.append(
-                '<img alt="Modulus of the leading multiplier" src="forest.png">'
-            )
+            parts.append(_FOREST)
+        parts.append(html.card("Reports", "", f"<ul>{''.join(links)}</ul>"))
         population.table.assign(**population.values, **errors).to_csv(
             new / _FILES[0], index=False
         )
         results.to_csv(new / _FILES[1], index=False)
         (new / _FILES[2]).write_text(
-            page_of(f"{len(study.fits)} reports", parts), encoding="utf-8"
+            page_of("Floquet multipliers of several subjects", parts), encoding="utf-8"
         )
