@@ -24,8 +24,8 @@ CHARTS = [
 """Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
-# What a corner of a name outside of the axes counts, in points of the orbit that it covers. Smaller:
-# names lie on ticks where the orbit is dense.
+# What a corner of a name outside of the axes counts, in points of the orbit that it covers.
+# Smaller: names lie on ticks where the orbit is dense.
 _OUTSIDE = 10_000
 _TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
 _NUMBER: dict[str, Any] = {
