@@ -328,8 +328,8 @@ def select_order(
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 
-    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is removed. The rest
-    has one independent component for each multiplier (D at most), and noise. Components are
+    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is removed. The
+    rest has one independent component for each multiplier (D at most), and noise. Components are
     counted by generalized singular values: each above the largest value of noise alone counts.
     *MDL*: Rissanen's criterion for a fit of each order, with numerators of the degree that belongs
     to this order.
