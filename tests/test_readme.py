@@ -34,6 +34,12 @@ def test_a_newcomer_meets_a_picture_and_code_first():
     assert (picture <= 8, code <= 12, len(lines) <= 90) == (True, True, True)
 
 
+def test_every_how_to_page_is_one_click_from_the_index():
+    index = (ROOT / "docs/index.md").read_text()
+    pages = {page.name for page in (ROOT / "docs/how-to").glob("*.md")}
+    assert pages == set(re.findall(r"\]\(how-to/([\w-]+\.md)", index))
+
+
 def test_sessions_print_what_the_readme_shows(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     session = Session("README.md", monkeypatch)
