@@ -236,3 +236,16 @@ def test_p_values_have_few_digits():
         0.997: "p > 0.99",
     }
     assert {p: p_value(p) for p in given} == given
+
+
+def test_prints_are_true():
+    odd = hj.multisine(8, periods=16, lines="odd")
+    assert set(np.diff(odd.frequencies * 16).round().astype(int)) >= {2}
+    assert "in steps of 1/8" in repr(odd) and "in steps of 1/16" in repr(
+        hj.multisine(8, periods=16)
+    )
+    alone = hj.Design.from_lines([[0.1]], 1.0, n_sections=8, periods=10)
+    assert "steps" not in repr(alone)
+    model = hj.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]])
+    assert "; 1 frequency 0.1 cycles/period; " in repr(model.htf([0.1]))
+    assert "; 2 frequencies 0.1 to 0.2 cycles/period; " in repr(model.htf([0.1, 0.2]))

@@ -52,7 +52,6 @@ GIVEN = UNCHECKED["made by this package"] | {
     "PrecisionError",
     "SettledCycle",
     "StoredExperiments",
-    "FMUPlant",  # (an example would need an FMU)
 }
 
 

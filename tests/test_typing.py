@@ -1,4 +1,4 @@
-"""Type checkers see what users see: no false errors in the README's sessions, and public signatures
+"""Type checkers see what users see: no false errors in the tour's sessions, and public signatures
 that say what they take."""
 
 import importlib
@@ -16,7 +16,7 @@ from .sessions import ROOT, run_python
 
 BLOCK = re.compile(r"^```(?:python|py)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
-# What the README leaves out, and users write.
+# What the tour leaves out, and users write.
 MORE = """
 hj.models.VerticalHopper(k=11.0)
 hj.find_limit_cycle(Juggler(g=9.8), hj.Guess("flight", (0.2, 4.5), time=0.1))
@@ -50,8 +50,9 @@ hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
 
 @pytest.fixture(scope="module")
 def script():
-    """The README's sessions as one script."""
-    return "\n\n".join(BLOCK.findall((ROOT / "README.md").read_text())) + MORE
+    """The tour's sessions as one script."""
+    tour = (ROOT / "docs/how-to/tour.md").read_text()
+    return "\n\n".join(BLOCK.findall(tour)) + MORE
 
 
 @pytest.mark.slow

@@ -43,9 +43,12 @@ def _code(name: str, case: ast.Call, values: dict[str, ast.expr]) -> tuple[str, 
     system = re.sub(r"\bm\.", "hj.models.", ast.unparse(case.args[1]))
     find = ", ".join(["system", *options]).replace("m.Simplest", "hj.models.Simplest")
     shown = "".join(f", {x!r}" for x in plane or ()).replace("'", '"')
+    call = f"cycle = hj.find_limit_cycle({find})"
+    if len(call) > 88:  # (longer lines run out of their block)
+        call = f"cycle = hj.find_limit_cycle(\n    {find}\n)"
     return case.args[0].value, (
         f"import hybridjax as hj\n\nhj.enable_x64()\nsystem = {system}\n"
-        f"cycle = hj.find_limit_cycle({find})\nprint(cycle)\n"
+        f"{call}\nprint(cycle)\n"
         f'hj.plot.animate(cycle{shown}).save("{name}.gif")\n'
     ).replace("'", '"')
 

@@ -32,6 +32,7 @@ _TERMS = {
     "htf": r"harmonic transfer functions?(?: \(HTFs?\))?|HTFs?",
     "ldtp": "LDTPs?(?: systems?)?",
     "limit-cycle": "limit cycles?",
+    "modulus": "modul(?:us|i)",
     "multiplier": "(?:Floquet )?multipliers?",
     "section": "(?:Poincaré )?sections?",
     "return-map": "return maps?",

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import json
 import re
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -198,6 +199,14 @@ def of_pages() -> None:
                 )
 
 
+def of_motion() -> None:
+    """Draw the animation of the page on motion, by its first block."""
+    text = (IMAGES.parent / "how-to/motion.md").read_text()
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], {})
+        shutil.copy("hopper.gif", IMAGES)
+
+
 def of_page() -> pyplot.Figure:
     """The figure that the page on responses draws."""
     text = (IMAGES.parent / "how-to" / "responses.md").read_text()
@@ -223,6 +232,7 @@ if __name__ == "__main__":
             (IMAGES / f"gallery/{name}.svg").write_text(thumbnail(*run(name)))
         sys.exit()
     of_pages()
+    of_motion()
     for name, figure in (("converter", of_page()), ("loop", of_notebook())):
         figure.savefig(IMAGES / f"{name}.png", metadata={"Software": None})
     walk().save(IMAGES / "walk.gif")

@@ -39,7 +39,7 @@ class Result(enum.IntEnum):
     )
     COINCIDENCE = (
         13,
-        "two events coincide on the cycle: their order is not fixed beside it",
+        "two events coincide on the cycle: trajectories near it may meet them in either order",
     )
     STEP_COLLAPSE = (
         14,

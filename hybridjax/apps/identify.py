@@ -300,7 +300,11 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         f"as {escape(listed(loop))} tells, which acts from outside.</p>" * bool(loop),
         result.fit._repr_html_(),
         *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in warnings),
-        *([] if warnings else ['<p class="fine">Nothing speaks against the fit.</p>']),
+        *(
+            []
+            if warnings
+            else ['<p class="fine">No reason to doubt the multipliers was found.</p>']
+        ),
         html.card("Left out", "" if left_out else "nothing", html.facts(left_out)),
         f"<ul>{notes}</ul>" if notes else "",
         html.card("Phase", "", html.text(repr(result.phase))),

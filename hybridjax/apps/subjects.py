@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__, plot
+from .._core import html
 from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, OptionalNames
@@ -44,6 +45,11 @@ _COLUMNS = {
 _FILES = ("subjects.csv", "population.csv", "population.html")
 # The file of a report that says of which files and options it was made.
 _JOB = "job.json"
+_FOREST = (
+    '<figure><img alt="Modulus of the leading multiplier" src="forest.png">'
+    "<figcaption>Modulus of the leading multiplier of each subject, with 95 % intervals."
+    "</figcaption></figure>"
+)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -273,23 +279,25 @@ def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) ->
     """Write the tables, and the report for all."""
     population = study.population
     results = study.results
-    parts = [f'<p class="warn">{escape(x)}</p>' for x in study.remarks]
     names = [escape(name) for name in population.table["report"]]
     links = [f'<li><a href="{name}/{PAGE}">{name}</a></li>' for name in names]
-    parts.append(f"<ul>{''.join(links)}</ul>")
-    numbers = "{:.4g}".format
-    parts.append(results.T.to_html(header=False, float_format=numbers, na_rep=""))
-    parts += [f"<p>{escape(x)}</p>" for x in methods]
     errors = {f"{name}_error": error for name, error in population.errors.items()}
+    columns = results.T.to_html(
+        header=False, border=0, float_format="{:.4g}".format, na_rep=""
+    )
+    parts = [
+        *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
+        html.card("Means and differences", "of the leading modulus", columns),
+        *(f"<p>{escape(x)}</p>" for x in methods),
+    ]
     subjects = population.table.assign(**population.values, **errors)
     with results_folder(study.folder, "population", _FILES) as new:
         with contextlib.suppress(DefinitionError):  # for too few subjects
             figure = plot.forest(population, "modulus")
             save_and_close(new / "forest", figure, with_png(formats))
-            parts.append(
-                '<img alt="Modulus of the leading multiplier" src="forest.png">'
-            )
+            parts.append(_FOREST)
+        parts.append(html.card("Reports", "", f"<ul>{''.join(links)}</ul>"))
         subjects.to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)
-        page = page_of(f"{len(study.fits)} reports", parts)
+        page = page_of("Floquet multipliers of several subjects", parts)
         (new / _FILES[2]).write_text(page, encoding="utf-8")

@@ -316,7 +316,11 @@ class Study(eqx.Module):
             )
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
-        comparison = f"{plan.usual_name} would take about {equal:.3g} strides for the last errors"
+        usual_name = plan.usual_name.capitalize()
+        comparison = (
+            f"{usual_name} would need about {equal:.3g} strides for the same standard "
+            "errors."
+        )
         if self.done:
             return comparison
         design = plan.design

@@ -91,8 +91,9 @@ class StructuredFit(MultiplierFit):
     def _about(self) -> str:
         pairs = zip(self.outputs, self.residual, strict=True)
         misfit = ", ".join(f"{name} {x:.1e}" for name, x in pairs)
+        reduced = self.cost / self.dof
         return (
-            f"residual {misfit}; {self.cost / self.dof:.3g} times what is expected; "
+            f"residual {misfit}; chi-square / degrees of freedom {reduced:.3g}; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )
 
@@ -343,11 +344,11 @@ def select_order(
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 
-    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators do not explain has as many
-    independent components as there are multipliers (D at most), and otherwise only noise, whose
-    covariance is known up to a factor. The generalized singular values are compared with those of
-    noise alone, from the smallest on. *MDL*: Rissanen's criterion for a fit of each order, with
-    numerators of the degree that belongs to this order.
+    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is removed. The
+    rest has one independent component for each multiplier (D at most), and noise. Components are
+    counted by generalized singular values: each above the largest value of noise alone counts.
+    *MDL*: Rissanen's criterion for a fit of each order, with numerators of the degree that belongs
+    to this order.
 
     **Arguments:** as in `fit_multipliers`. Without variances the misfit of the largest order is
     taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors

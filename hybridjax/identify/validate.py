@@ -132,16 +132,16 @@ class Validation(eqx.Module):
                 p_value(self.independence[i]),
             )
             rows.append(
-                f"{name:>{width}}  {self.fit[i]:8.4f}%  {self.noise[i]:9.2e}  "
+                f"{name:>{width}}  {self.fit[i]:7.2f} %  {self.noise[i]:9.2e}  "
                 f"{white:>11}  {independent:>11}"
             )
         if self.unexplained:
             rows.append(
                 f"predicted no better than by the mean cycle: {listed(self.unexplained)}"
             )
-        verdict = {True: "no sign of it", False: "yes"}
+        verdict = {True: "not rejected", False: "rejected"}
         rows.append(
-            f"correlated in time: {verdict[self.white]}; with the input: "
+            f"residuals: whiteness {verdict[self.white]}, independence of the input "
             f"{verdict[self.independent]} (level {self.level:g})"
         )
         if self.left_out:
@@ -149,9 +149,7 @@ class Validation(eqx.Module):
         pairs = zip(self.visible, self.outputs, strict=True)
         visible = ", ".join(f"{100 * x:.2g} % of {name}" for x, name in pairs)
         rows.append(
-            folded(
-                f"misfits that would be noticed in four of five such data: {visible}"
-            )
+            folded(f"smallest model error detectable with 80 % power: {visible}")
         )
         return "\n".join(rows)
 

@@ -183,10 +183,13 @@ class HTF(eqx.Module):
 
     def __repr__(self) -> str:
         count = self.f.shape[-1]
+        frequencies = "1 frequency" if count == 1 else f"{count} frequencies"
         span = ""
         if count and not is_traced(self.f):
             f = np.asarray(self.f)
-            span = f" {f.min():.4g} to {f.max():.4g}"
+            span = f" {f.min():.4g}"
+            if count > 1:
+                span = f" {f.min():.4g} to {f.max():.4g}"
         low = self.harmonics[0]
         high = self.harmonics[-1]
         shown = ", ".join(map(str, self.harmonics))
@@ -196,7 +199,7 @@ class HTF(eqx.Module):
         if self.n_sections:
             sections = f"{self.n_sections} sections"
         return folded(
-            f"HTF({self.source}; harmonics {shown}; {count} frequencies{span} cycles/period; "
+            f"HTF({self.source}; harmonics {shown}; {frequencies}{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 

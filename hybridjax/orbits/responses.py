@@ -438,7 +438,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
         smallest = svdvals(closed * size / size[:, None])[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
-                "the cycle has no phase of its own: its multiplier 1 is double, as in a family of "
+                "the cycle has no defined phase: its multiplier 1 is double, as in a family of "
                 "cycles with a conserved quantity, where pushes change the period."
             )
     return closed, xp.linalg.solve(closed.T, along)

@@ -19,9 +19,9 @@ from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
 def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -> Plot:
     """The spectrum of an optimal design, and of that which it improves, below |H_0| of all outputs.
 
-    Above: |H_0|, each relative to its largest value. Below: the amplitude of each line, of all
-    inputs together, over three decades: its rms over the experiments, most of which leave the line
-    out. Lines that no experiment excites are not drawn.
+    The upper panel shows |H_0|, each relative to its largest value. The lower panel shows the
+    amplitude of each excited frequency, over three decades: the rms over all experiments and
+    inputs, although most experiments leave this frequency out. Other frequencies are not drawn.
 
     **Raises:** `DefinitionError` for a model of other signals.
     """

@@ -24,6 +24,9 @@ CHARTS = [
 """Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
+# What a corner of a name outside of the axes counts, in points of the orbit that it covers.
+# Smaller: names lie on ticks where the orbit is dense.
+_OUTSIDE = 10_000
 _TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
 _NUMBER: dict[str, Any] = {
     "fontsize": "x-small",
@@ -211,9 +214,8 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
         note.set_ha(_side(x, "right", "left"))
         note.set_va(_side(y, "top", "bottom"))
         box = note.get_window_extent()
-        # (A corner outside of the picture counts as 20 points.)
         outside = 4 - ax.bbox.count_contains(box.corners())
-        return 20 * outside + box.padded(4).count_contains(drawn)
+        return _OUTSIDE * outside + box.padded(4).count_contains(drawn)
 
     covered(min(_TURNS, key=covered))
     box = note.get_window_extent()

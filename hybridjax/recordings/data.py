@@ -156,7 +156,7 @@ class SectionData(eqx.Module):
         )
         if self.missing:
             summary += f", {100 * self.missing:.2g} % missing"
-        summary += f"; period {self.period:.6g}; rms deviations: {', '.join(sizes)}"
+        summary += f"; period {self.period:.6g} s; rms deviations: {', '.join(sizes)}"
         counts = zip(self.signals, self.spikes, strict=True)
         spikes = [f"{name} {count}" for name, count in counts if count]
         if spikes:

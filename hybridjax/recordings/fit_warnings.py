@@ -68,7 +68,8 @@ class Advice(eqx.Module):
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
-        return print_findings(self.findings) or "Nothing speaks against the fit."
+        findings = print_findings(self.findings)
+        return findings or "No reason to doubt the multipliers was found."
 
     def with_earlier(self, findings: Sequence[Finding]) -> "Advice":
         """Return the advice with other findings before its own."""

@@ -134,7 +134,7 @@ class Phase(eqx.Module):
         pieces = sum(len(s) for s in self.stretches)
         text = (
             f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
-            f"period {self.period:.6g}, jitter {100 * self.jitter:.2g} %, drift "
+            f"period {self.period:.6g} s, jitter {100 * self.jitter:.2g} %, drift "
             f"{100 * self.drift:.2g} % per cycle"
         )
         if self.backwards:

@@ -47,15 +47,14 @@ class Quotient(Derived):
     - `flipped`: states that change their sign in the mirror.
     - `translation`: states that have no effect on others, nor on outputs, such as the position
         along the floor. They are left out.
-    - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. True if a
-        clock drives the system; otherwise the name of a state, or a function of (t, q), that S
-        multiplies by -1 and that rises through zero once in half a period. There, or after half a
-        period of the clock, the transition "half period" (with several charts, "half period
-        (chart)") puts the mirror image of the state. The
-        multipliers are those of this half map, whose squares are those of the cycle. All charts are
-        kept; if one is its own mirror image, its last transition is the image of its first. The
-        state `clock`, the time since that transition, makes a system with a clock autonomous.
-        Default: False.
+    - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. For a
+        system that is driven by a clock: True. Otherwise: the name of a state, or a function of
+        (t, q), that changes its sign under S and rises through zero once per half period. At this
+        zero, or after half a period of the clock, the transition "half period" (with several
+        charts, "half period (chart)") replaces the state by its mirror image. The multipliers of
+        the full cycle are the squares of those of this half map. All charts are kept; if one is its
+        own mirror image, its last transition is the image of its first. A clock becomes the state
+        `clock`, the time since the transition, so that the system is autonomous. Default: False.
 
     Inputs are those of the charts that are kept; with `half_period`, they act on the mirror image
     in every second half of a cycle.

@@ -42,7 +42,7 @@ def test_the_fit_is_the_share_explained(small):
     left = np.sqrt(np.mean((data.y - clean) ** 2, axis=0))
     np.testing.assert_allclose(found.noise, left)
     np.testing.assert_allclose(found.fit, 100 * (1 - left / data.y.std(axis=0)))
-    assert found.white and "with the input: no sign of it" in repr(found)
+    assert found.white and "independence of the input not rejected" in repr(found)
 
 
 def test_a_wrong_model_is_refused(small):
@@ -50,7 +50,10 @@ def test_a_wrong_model_is_refused(small):
     found = hj.validate(
         eqx.tree_at(lambda m: m.B, small, small.B.at[2].multiply(1.3)), data
     )
-    assert found.independence.min() < 1e-6 and "with the input: yes" in repr(found)
+    assert (
+        found.independence.min() < 1e-6
+        and "independence of the input rejected" in repr(found)
+    )
     turned = hj.validate(eqx.tree_at(lambda m: m.C, small, -small.C), data)
     assert "no better than by the mean cycle: y0, y1" in repr(turned)
     with pytest.raises(hj.DefinitionError, match="unstable plant grows without bound"):
@@ -71,7 +74,7 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         data.y[:, 1] += found.visible[1] * size * hidden / np.sqrt(np.mean(hidden**2))
         noticed += hj.validate(small, data).independence[1] < found.level / 2
     assert covered(noticed, runs, 0.8)
-    assert "noticed in four of five such data: " in repr(found)
+    assert "detectable with 80 % power: " in repr(found)
     few, more = (
         hj.validate(small, record(small, N * n, 0, 0.5)).visible for n in (80, 320)
     )

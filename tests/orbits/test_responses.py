@@ -550,6 +550,6 @@ def test_bad_questions_are_refused_in_one_sentence():
     family = dict(section=apex, conserved={"energy": 1784.8})
     runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)
     with pytest.raises(
-        hj.ComputationError, match="has no phase of its own: its multiplier 1 is"
+        hj.ComputationError, match="has no defined phase: its multiplier 1 is"
     ):
         runner.responses()

@@ -1,6 +1,7 @@
 """Multisine designs: which cosines, with which phases, in which experiment."""
 
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Annotated
 
 import equinox as eqx
@@ -328,13 +329,20 @@ class Design(eqx.Module):
         rows = [
             f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
             f"{self.n_sections} sections, inputs {', '.join(self.input_names)})",
-            f"  frequencies  {len(f)}, {_span(f)} cycles per period in steps of 1/{self.periods}",
+            f"  frequencies  {len(f)}, {_span(f)} cycles per period{self._steps()}",
             f"  each         {_count(_span(sizes), 'cosine')} of amplitude {_span(self.amplitude)}"
             f", crest factor {_span(crest)}",
-            f"  cost         {self.cycles(0)} cycles, without those discarded",
-            f"  noise        of std 1 in an output gives H_m a std of {_span(np.sqrt(per))}",
+            f"  cost         {self.cycles(0)} cycles (plus discarded cycles)",
+            f"  errors       standard error of H_m: {_span(np.sqrt(per))} times the output noise",
         ]
         return "\n".join(rows)
+
+    def _steps(self) -> str:
+        """The distance of which all distances between frequencies are multiples, for a `repr`."""
+        distances = np.diff(np.unique(self.line))
+        if not len(distances):
+            return ""
+        return f" in steps of {Fraction(int(np.gcd.reduce(distances)), self.periods)}"
 
 
 def ordered(

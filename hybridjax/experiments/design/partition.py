@@ -146,7 +146,8 @@ def avoid_second_order(
             else "more experiments"
         )
         raise DefinitionError(
-            f"second-order products remain: take {more}, or division='random'."
+            "no division was found in which second-order products avoid the excited lines: take "
+            f"{more}, or division='random'."
         )
     out = np.empty_like(experiment)
     for e, m in enumerate(members):

@@ -262,14 +262,16 @@ def fit_ldtp(
       residuals of time series depend on the inputs, and whether drift explains the multipliers;
       `findings`, and warnings (`FindingWarning`), then say so. Default: True.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
-      the other inputs; the plant from these to the outputs is fitted, stable or unstable, always
-      with innovations. The fit is consistent if D is zero at sections where the controller responds
-      without delay; the response of the outputs to the reference shows whether D is zero. If the
-      reference was not recorded, pass noise="innovations". Then D is zero if outputs do not depend
-      on inputs at the same section, or if inputs respond to earlier residuals; otherwise D is
-      fitted, and a finding reports that a controller could cause the dependence. If the past
-      determines the inputs (few lines), D is zero if a fit with D is not better (at 5 %), and it is
-      free, and printed as not determined, if the data do not determine it. Default: None.
+      the other inputs. The plant from these to the outputs is fitted with innovations; it may be
+      unstable. The fit is consistent if D is zero at sections where the controller responds without
+      delay, which the response of the outputs to the reference shows. If the reference was not
+      recorded, pass noise="innovations". Default: None.
+
+    Without a reference, D is fixed to zero in three cases: outputs do not depend on inputs at the
+    same section; inputs depend on earlier residuals; or the past determines the inputs (few
+    excited frequencies) and a fit with D is not better (at 5 %). Otherwise D is fitted, and
+    a finding reports that a controller could cause the dependence. If the data do not determine
+    D, the printed fit reports this.
 
     **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
     variances that are not positive, a guess with an unobservable state, fewer numbers in the data

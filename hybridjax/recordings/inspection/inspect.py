@@ -46,7 +46,8 @@ _TEXTS = {
     "no value": "{} has samples that stand for no value, such as -9999 ({}): taken for missing.",
     "frozen": "{} does not change at all, as if a sensor or wire had failed ({}): taken for "
     "missing.",
-    "another sign": "the outputs answer {} with the other sign ({}): turn it.",
+    "another sign": "the outputs respond to {0} with the opposite sign ({1}): change the sign "
+    "of {0} there.",
     "foreign input": "the outputs do not answer {} as elsewhere ({}): it belongs to another trial, "
     "or came earlier or later.",
     "disturbed": "something else than {} moved the outputs ({}).",

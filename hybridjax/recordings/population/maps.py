@@ -60,9 +60,10 @@ class MapResult:
                 spans.append(f"{name} {x[place].min():.3g} to {x[place].max():.3g}")
         where = ", ".join(spans) or "none"
         largest = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
+        half_width = f"{np.median(self.reach):.3g} {self.unit}".rstrip()
         return (
-            f"MapResult({' x '.join(self.axes)}: largest {largest}, "
-            f"band of +- {np.median(self.reach):.3g} (median)\n"
+            f"MapResult({' x '.join(self.axes)}: largest {largest}\n"
+            f"  median half-width of the 95 % band {half_width}\n"
             f"  largest |t| {np.abs(self.t).max():.3g}, {p_value(float(self.p.min()))}\n"
             f"  significant: {self.significant.sum()} of {self.t.size} points, {where})"
         )
