@@ -224,7 +224,9 @@ figure = hj.plot.harmonics(pairs)
 # even on exact data, since the true $H_0$ has all $N$-th roots of each multiplier as poles:
 
 # %%
-rational = {name: hj.identify.fit_rational(estimate) for name, estimate in estimates.items()}
+rational = {
+    name: hj.identify.fit_rational(estimate) for name, estimate in estimates.items()
+}
 for name, fit in rational.items():
     biased = hj.identify.fit_rational(exact[name])
     for output in outputs:
