@@ -23,7 +23,7 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
-from .batches import Known, Rounds, Tiles, tiles_of
+from .batches import Known, Rounds, Tiles, numbers_of, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes, together
 from .crossing import AtEvent, Crossing
@@ -349,9 +349,7 @@ def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
 
 def known_from(cycles: LimitCycles) -> Known:
     """Cycles as guesses for others."""
-    unit = np.eye(cycles.factors.shape[-1])
-    jacobian = turn_product(np.asarray(cycles.factors)) - unit
-    return Known(None, cycles.anchor, cycles.period, jacobian, cycles.result)
+    return Known(None, cycles.anchor, cycles.period, cycles.result)
 
 
 def _some_known(cycles: LimitCycles) -> Known | None:
@@ -360,9 +358,9 @@ def _some_known(cycles: LimitCycles) -> Known | None:
     if not len(rows):
         return None
     rows = rows[:: -(-len(rows) // _GUESSES)]
-    known = known_from(cycles)._replace(systems=None)
-    some = jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], known)
-    return some._replace(systems=_some(cycles.systems, rows))
+    numbers = numbers_of(cycles.systems)
+    known = known_from(cycles)._replace(numbers=numbers)
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], known)
 
 
 def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:

@@ -220,16 +220,16 @@ def _step(
     plain = lambda: flow.step(t, q, tau, unroll)  # noqa: E731
     if along is not None and flow.method.implicit:
         return cond(
-            present & task.tangents,
+            present,
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
     step = cond(present, plain, lambda: Step(*[q] * len(Step._fields)))
-    if task.tangents is False:
+    if not task.tangents:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
     shifted = cond(
-        present & task.tangents,
+        present,
         lambda: flow.step(t, q + shift * _direction(len(q)), tau, unroll).estimate,
         lambda: step.estimate,
     )

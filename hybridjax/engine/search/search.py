@@ -101,7 +101,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
     )
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows, along = implicit and task.tangents is not False, task.stride.along
+    follows, along = implicit and task.tangents, task.stride.along
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
     return State(
         arm(s, lanes, watched, task.span) if new_input else lanes,

@@ -38,7 +38,7 @@ class Options(NamedTuple):
     skipped."""
     new_input: bool = True
     """Arm the guards for the input u, which may have jumped; otherwise they stay as they are."""
-    tangents: Bool[Array, ""] | bool = False
+    tangents: bool = False
     """Make steps also short enough for the derivatives of a replay."""
     at_once: bool = False
     """On the host: one program for all pieces of a turn."""
@@ -75,7 +75,7 @@ class Task(NamedTuple):
     """Time from the start to the limit, relative to which rounding errors of times are judged."""
     stride: Stride
     settings: Settings
-    tangents: Bool[Array, ""] | bool
+    tangents: bool
     """Whether steps are also short enough for the derivatives of a replay."""
 
 
