@@ -2,8 +2,7 @@
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.
-- `TwoTiers` compiles experiments twice: a quick executable for the first answer, and the
-  fully optimized one in a thread beside it.
+- `Program` compiles experiments: with few optimizations, or for loops that run many times.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once.
 """
@@ -14,7 +13,6 @@ import functools as ft
 import gc
 import hashlib
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -44,10 +42,6 @@ _UNDIVIDED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1}
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
-# Seconds in a quick executable after which a script compiles the optimized one, in about as much
-# time. Less: it waits at its end for the compiling thread longer than it has computed. More:
-# repeated calls stay slow for longer.
-_WORTH_OPTIMIZING = 8.0
 # XLA emits a loop on CPU as one kernel if an iteration touches fewer bytes than this; its own value
 # is 1024.
 _LOOP_KERNELS = (
@@ -250,58 +244,58 @@ def kind(arguments) -> tuple:
     return structure, *(getattr(jax.config, name) for name in _SETTINGS), *types
 
 
-class TwoTiers:
-    """`function(*arguments)` for one job, all of which is done by one executable.
+class Program:
+    """`function(*arguments)`, compiled once for all arguments of a kind.
 
-    A job that is `large` waits for the fully optimized executable, so its results do not depend on
-    time. Another job uses it if it is there, and else the one that compiles in a third of the time.
-    A thread compiles the optimized one for later jobs: in Jupyter and other interactive sessions
-    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use.
+    **Arguments:** `loops`: whether it runs through loops many times, and is optimized for these.
+    Otherwise it compiles in 60 % of the time, and takes four times as long to run.
     """
 
-    def __init__(self, function: Callable, large: bool):
-        self._function, self.large = function, large
-        self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
+    def __init__(self, function: Callable, loops: bool):
+        self._function, self._loops = function, loops
+        self._plain = eqx.filter_jit(function)
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_hidden(arguments):
-            return one_tier(self._function, self.large)(*arguments)
-        key, leaves, program = _program_of(self._function, arguments)
-        if key not in self._chosen:
-            with _choosing:
-                if key not in self._chosen:  # by another thread in the meantime
-                    say_compiling(True)
-                    self._chosen[key] = program, program.choose(self.large)
-                    say_compiling(False)
-        program, executable = self._chosen[key]
-        return program.run(executable, leaves)
+            return self._plain(*arguments)
+        lowered, leaves = _lowered(self._function, arguments)
+        executable = lowered.executable(self._loops)
+        with in_turn(lowered.alone):
+            return jax.block_until_ready(executable(leaves))
 
 
-class OneTier:
-    """`function(*arguments)`, compiled once by options that suit it.
+class _Lowered:
+    """A program that is lowered, and its executables, with and without optimized loops.
 
-    For functions that compile in about a second: of these a quick executable is no gain.
+    **Fields:** `alone`: whether it calls LAPACK (see `in_turn`).
     """
 
-    def __init__(self, function: Callable, options: dict[str, Any]):
-        self._function, self._options = function, options
+    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
+        self._lowered, self.alone = lowered, alone
+        self._executables: dict[bool, jax.stages.Compiled] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
-        if not _is_simple() or is_hidden(arguments):
-            return one_tier(self._function, True)(*arguments)
-        _, leaves, program = _program_of(self._function, arguments)
+    def executable(self, loops: bool) -> jax.stages.Compiled:
         with _choosing:
-            executable = program.only(self._options)
-        return program.run(executable, leaves)
+            if loops not in self._executables:
+                options = loop_options() if loops else compiler_options()
+                say_compiling(True)
+                compiled = self._lowered.compile(compiler_options=options)
+                self._executables[loops] = compiled
+                say_compiling(False)
+            return self._executables[loops]
 
 
 _choosing = threading.Lock()
-_by_kind: dict[tuple, "_Program"] = {}
-_by_text: dict[Hashable, "_Program"] = {}
+_by_kind: dict[tuple, _Lowered] = {}
+_by_text: dict[Hashable, _Lowered] = {}
 
 
-def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Program"]:
-    """The kind of arguments, their arrays, and the program of a function for them."""
+def _lowered(function: Callable, arguments: tuple) -> tuple[_Lowered, list]:
+    """The program of a function for arguments of this kind, and their arrays.
+
+    Objects that hold the same functions written anew (an `Output` with a `lambda`) are of other
+    kinds, but have the same text and share executables.
+    """
     key = function, kind(arguments)
     arrays, static = eqx.partition(arguments, _is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
@@ -310,82 +304,20 @@ def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Pr
         arrays = jax.tree_util.tree_unflatten(structure, leaves)
         return function(*eqx.combine(arrays, static))
 
-    if key not in _by_kind:
-        with _choosing, uncollected():
-            say_compiling(True)
-            _lowered(key, run, leaves)
-            say_compiling(False)
-    return key, leaves, _lowered(key, run, leaves)
-
-
-def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
-    """The program for arguments of this kind. Objects that hold the same functions written anew
-    (an `Output` with a `lambda`) are of other kinds, but have the same text and share executables.
-    """
-    if key not in _by_kind:
-        if len(_by_kind) >= _KEPT:
-            _by_kind.clear()
-            _by_text.clear()
-        lowered = jax.jit(run).lower(leaves)
-        text = lowered.as_text()
-        digest = key[0], hashlib.sha256(text.encode()).digest()
-        _by_kind[key] = _by_text.setdefault(
-            digest, _Program(lowered, "@lapack_" in text)
-        )
-    return _by_kind[key]
-
-
-@ft.lru_cache(_KEPT)
-def one_tier(function: Callable, large: bool) -> Callable:
-    """Return `function` compiled: fully optimized if the job is `large`."""
-    return eqx.filter_jit(function) if large else quick_jit(function)
-
-
-class _Program:
-    """A program that is lowered, and its executables."""
-
-    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
-        self._lowered, self._alone = lowered, alone
-        self._quick: jax.stages.Compiled | None = None
-        self._full: jax.stages.Compiled | None = None
-        self._seconds, self._lock = 0.0, threading.Lock()
-        self._thread: threading.Thread | None = None
-
-    def choose(self, large: bool) -> jax.stages.Compiled:
-        if large and self._thread is not None:
-            self._thread.join()
-        if large or self._full is not None:
-            return self._optimize()
-        if self._quick is None:
-            self._quick = self._lowered.compile(compiler_options=compiler_options())
-        return self._quick
-
-    def only(self, options: dict[str, Any]) -> jax.stages.Compiled:
-        """The executable that these options give, of a program that has no other."""
-        if self._full is None:
-            known = {name: x for name, x in options.items() if _is_known(name, x)}
-            say_compiling(True)
-            self._full = self._lowered.compile(compiler_options=known)
-            say_compiling(False)
-        return self._full
-
-    def _optimize(self) -> jax.stages.Compiled:
-        self._full = self._full or self._lowered.compile()
-        return self._full
-
-    def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
-        begin = time.perf_counter()
-        with in_turn(self._alone):
-            results = jax.block_until_ready(executable(leaves))
-        if executable is self._quick and self._thread is None:
-            with self._lock:
-                self._seconds += time.perf_counter() - begin
-                # (`ps1`, the prompt, exists in interactive sessions only.)
-                is_worth = hasattr(sys, "ps1") or self._seconds > _WORTH_OPTIMIZING
-                if is_worth and self._thread is None:
-                    self._thread = threading.Thread(target=self._optimize)
-                    self._thread.start()
-        return results
+    with _choosing:
+        if key not in _by_kind:
+            if len(_by_kind) >= _KEPT:
+                _by_kind.clear()
+                _by_text.clear()
+            with uncollected():
+                say_compiling(True)
+                lowered = jax.jit(run).lower(leaves)
+                say_compiling(False)
+            text = lowered.as_text()
+            digest = function, hashlib.sha256(text.encode()).digest()
+            new = _Lowered(lowered, "@lapack_" in text)
+            _by_kind[key] = _by_text.setdefault(digest, new)
+        return _by_kind[key], leaves
 
 
 def _is_simple() -> bool:

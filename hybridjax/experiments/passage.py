@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.compilation import OneTier
+from .._core.compilation import Program
 from ..engine import kernels
 from ..engine.itinerary.bodies import Watched, dips
 from ..engine.runge_kutta import looped_step
@@ -384,4 +384,4 @@ def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
 
 
 # (XLA's newer code generator compiles these programs for twice as long.)
-program = OneTier(follow_table, {"xla_cpu_use_fusion_emitters": False})
+program = Program(follow_table, loops=True)
