@@ -145,30 +145,29 @@ def _move(s, lanes, u, target, setout, result, settings, options: Options) -> Re
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     s, lanes, u, target, setout, result, settings, options = primals
-    closely = options.tangents or not options.glide
-    taped = options._replace(tape=True, glide=False, tangents=closely)
+    taped = options._replace(tape=True, tangents=True)
     still = fixed((s, lanes, u, target, setout))
     recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
-    primals = s, lanes, u, target, recorded, options.glide
-    ends = _follow_jvp(primals, (*tangents[:4], None, None))
+    primals = s, lanes, u, target, recorded
+    ends = _follow_jvp(primals, (*tangents[:4], None))
     return ends if options.tape else tuple(x._replace(tape=None) for x in ends)
 
 
 @eqx.filter_custom_jvp
-def follow(s, lanes, u, target, recorded: Recorded, unroll: bool) -> Recorded:
+def follow(s, lanes, u, target, recorded: Recorded) -> Recorded:
     """Recorded flow, with the derivatives of `move` from lanes that are close to its start."""
     return recorded
 
 
 def _follow_jvp(primals, tangents):
-    s, lanes, u, target, recorded, unroll = primals
+    s, lanes, u, target, recorded = primals
     target, levels = target.split()
 
     def repeat(by_lane, common):
         (t, q, u, time), (s, levels) = by_lane, common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
-        return replay(s, begin, u, end, recorded.tape, unroll)
+        return replay(s, begin, u, end, recorded.tape)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
     by_lane = (

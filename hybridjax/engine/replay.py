@@ -54,7 +54,6 @@ def replay(
     u: Inputs,
     target: Target,
     tape: Tape,
-    unroll: bool = False,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
     h, code, at_once = tape.h, tape.code, tape.at_once
@@ -75,7 +74,7 @@ def replay(
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            t, q = _advance(s, begin, code != IDLE, u, target, h1, which, unroll)
+            t, q = _advance(s, begin, code != IDLE, u, target, h1, which)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
@@ -111,7 +110,6 @@ def _advance(
     target: Target,
     h: Times,
     which: Index,
-    unroll: bool,
 ) -> tuple[Times, Padded]:
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
     t, q, chart = lanes.t, lanes.q, lanes.chart
@@ -130,7 +128,7 @@ def _advance(
         # (A branch of its own, lest XLA masks the states again in every stage.)
 
         def step():
-            end = take_step(method, flow.field, t0, q0, h0, unroll, still.field)
+            end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
 
         q1, f1 = jax.lax.cond(here.any(), step, lambda: (q0, q0))

@@ -228,7 +228,7 @@ class ReturnMap(eqx.Module):
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result, piece):
-            return follow(s, lanes, u, target, piece, False).moved, None
+            return follow(s, lanes, u, target, piece).moved, None
 
         return self.travel(
             q, Options(new_input=False) if record is None else flow, record

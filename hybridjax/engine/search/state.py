@@ -33,9 +33,6 @@ class Options(NamedTuple):
 
     tape: bool = False
     """Record a tape."""
-    glide: bool = False
-    """Try one step of all lanes first: if it ends at the target in all of them, the loop is
-    skipped."""
     new_input: bool = True
     """Arm the guards for the input u, which may have jumped; otherwise they stay as they are."""
     tangents: bool = False
