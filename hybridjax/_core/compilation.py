@@ -180,6 +180,23 @@ def one_program(function: Callable) -> Callable:
     return ft.wraps(function)(lambda *x: (program if is_hidden(x) else function)(*x))
 
 
+def on_the_host(
+    function: Callable, derived: Callable = lambda compiled: compiled
+) -> Callable:
+    """A function that runs on the host (see `executor.py`); inside of a transformation of JAX
+    `quick_jit`, or that `derived`, as by `by_columns`."""
+    transformed = derived(quick_jit(function))
+
+    @ft.wraps(function)
+    def call(*arguments):
+        if is_hidden(arguments):
+            return transformed(*arguments)
+        with on_the_cpu(), eval_context(), uncollected(), at_ease():
+            return from_host(function(*to_host(arguments)))
+
+    return call
+
+
 def host_first(
     function: Callable, derived: Callable = lambda compiled: compiled
 ) -> Callable:
@@ -188,16 +205,17 @@ def host_first(
     compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
     result up to rounding.
 
-    Inside of a transformation of JAX this is `quick_jit`, or that `derived`, as by `by_columns`.
+    Inside of a transformation of JAX this is `quick_jit`, or that `derived`.
     """
-    transformed = derived(compiled := quick_jit(function))
+    compiled: Any = quick_jit(function)
+    transformed, hosted = derived(compiled), on_the_host(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 
     def compile_(arguments):
         # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
         with on_the_cpu(), as_numpy():  # (under JAX's settings of this thread)
-            programs[kind(arguments)] = compiled.lower(*arguments).compile()  # type: ignore
+            programs[kind(arguments)] = compiled.lower(*arguments).compile()
 
     @ft.wraps(function)
     def call(*arguments):
@@ -212,13 +230,8 @@ def host_first(
         if key in programs:
             return programs[key](*arguments)
         try:
-            with (
-                eval_context(),
-                uncollected(),
-                at_ease(),
-                executor.at_most(WORTH_COMPILING),
-            ):
-                return from_host(function(*to_host(arguments)))
+            with executor.at_most(WORTH_COMPILING):
+                return hosted(*arguments)
         except executor.OutOfTimeError:
             programs[key] = compiled
             return compiled(*arguments)

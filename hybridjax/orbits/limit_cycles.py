@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
+from .._core.compilation import at_ease
 from .._core.execution import Execution
 from .._core.executor import from_host, to_host
 from .._core.meaning import current_of_many, first_of
@@ -260,12 +261,13 @@ def solved(
 def _search(map: ReturnMap) -> ReturnMap | None:
     """The return map of a cycle that is found from the state of a map's anchor; None if there is
     none. (Newton's method does not lead to a cycle that begins in another chart: turns do.)"""
-    for _ in range(_TURNS):
-        end = map.turn(map.anchor.q[:, 0]).end
-        if end.chart == map.anchor.chart:
-            break
-        anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
-        map = dataclasses.replace(map, anchor=anchor)
+    with at_ease():
+        for _ in range(_TURNS):
+            end = map.turn(map.anchor.q[:, 0]).end
+            if end.chart == map.anchor.chart:
+                break
+            anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
+            map = dataclasses.replace(map, anchor=anchor)
     solution = newton(map)
     if not solution.is_fixed_point or verdict(kept(map, solution)).refused:
         return None

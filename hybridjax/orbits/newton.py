@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import host_first
+from .._core.compilation import on_the_host
 from .._core.executor import Array, on_host
 from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
@@ -98,13 +98,13 @@ def _ends(map: ReturnMap) -> bool:
     return int(_first_turn(map).result) == Result.OK
 
 
-@host_first
+@on_the_host
 def _first_turn(map: ReturnMap) -> Return:
     return map.turn(map.anchor.q[:, 0])
 
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
-    q, turn, steps = root(map, False, MAX_STEPS, near)
+    q, turn, steps = root(map, MAX_STEPS, near)
     if once_more and not on_host(
         q
     ):  # (where the host's last turn begins, a step is rounding)
@@ -159,7 +159,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 
-@ft.partial(host_first, derived=ft.partial(by_columns, along=_solve_along))
+@ft.partial(on_the_host, derived=ft.partial(by_columns, along=_solve_along))
 def solve(
     map: ReturnMap, once_more: bool = False, factors: bool = True, near: Any = None
 ) -> Solution:
@@ -173,28 +173,24 @@ def solve(
     return _solve(map, once_more, factors, near)
 
 
-@host_first
+@on_the_host
 def _solve_damped(map: ReturnMap) -> Solution:
-    q, turn, steps = root(map, True, 2 * MAX_STEPS)
+    q, turn, steps = _damped(map, 2 * MAX_STEPS)
     return Solution(
         map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
     )
 
 
 def root(
-    map: ReturnMap, damped: bool, max_steps: int, near: Any = None
+    map: ReturnMap, max_steps: int, near: Any = None
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
     """The fixed point of the return map, the turn from it, and the number of steps.
 
     Differentiable once and twice; only the state has derivatives.
     """
-    if not on_host(map.expected):
-        return _root(map, damped, max_steps)
-    return (
-        _damped_on_host(map, max_steps)
-        if damped
-        else _root_on_host(map, max_steps, near)
-    )
+    if on_host(map.expected):
+        return _root_on_host(map, max_steps, near)
+    return _root(map, max_steps)
 
 
 def _root_on_host(
@@ -242,10 +238,8 @@ def _step_from(
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
-def _damped_on_host(
-    map: ReturnMap, max_steps: int
-) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Levenberg-Marquardt steps, with the constants of optimistix."""
+def _damped(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Levenberg-Marquardt steps on the host, with the constants of optimistix."""
     sizes, least, damping, best = map.sizes, np.inf, 1.0, None
     history: list[float] = []
     x, step = map.anchor.q[:, 0] / sizes, 0.0
@@ -273,13 +267,10 @@ def _damped_on_host(
 
 
 @eqx.filter_custom_jvp
-def _root(map, damped, max_steps):
+def _root(map, max_steps):
     import optimistix as optx  # (a fifth of a second, as lineax below)
 
-    if damped:
-        solver = optx.LevenbergMarquardt(rtol=RTOL, atol=ATOL)
-    else:
-        solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
+    solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
     solution = optx.root_find(
         _residual,
         solver,
