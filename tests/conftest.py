@@ -126,8 +126,6 @@ def unchecked_host():
 
 
 compilation.at_ease = unchecked_host
-# Results of one test come from one program.
-compilation._WORTH_OPTIMIZING = np.inf
 # The tests of a process find many cycles of one kind, of which few take longer on the host than
 # compiling would.
 compilation.WORTH_COMPILING = 15.0

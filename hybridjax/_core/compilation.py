@@ -2,8 +2,7 @@
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.
-- `TwoTiers` compiles experiments twice: a quick executable for the first answer, and the
-  fully optimized one in a thread beside it.
+- `Program` compiles experiments: with few optimizations, or for loops that run many times.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once.
 """
@@ -14,7 +13,6 @@ import functools as ft
 import gc
 import hashlib
 import os
-import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
@@ -34,10 +32,6 @@ from .progress import say_compiling
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
-# Seconds in a quick executable after which a script compiles the optimized one, in about as much
-# time. Less: it waits at its end for the compiling thread longer than it has computed. More:
-# repeated calls stay slow for longer.
-_WORTH_OPTIMIZING = 8.0
 # Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
 _KEPT = 1024
 
@@ -140,6 +134,23 @@ def one_program(function: Callable) -> Callable:
     return call
 
 
+def on_the_host(
+    function: Callable, derived: Callable = lambda compiled: compiled
+) -> Callable:
+    """A function that runs on the host (see `executor.py`); inside of a transformation of JAX
+    `quick_jit`, or that `derived`, as by `by_columns`."""
+    transformed = derived(quick_jit(function))
+
+    @ft.wraps(function)
+    def call(*arguments):
+        if is_hidden(arguments):
+            return transformed(*arguments)
+        with on_the_cpu(), jax_compat.outside(), uncollected(), at_ease():
+            return from_host(function(*to_host(arguments)))
+
+    return call
+
+
 def host_first(
     function: Callable, derived: Callable = lambda compiled: compiled
 ) -> Callable:
@@ -148,17 +159,17 @@ def host_first(
     compiling takes: in a thread, or at once if a single call has taken so long. Both give the same
     result up to rounding.
 
-    Inside of a transformation of JAX this is `quick_jit`, or that `derived`, as by `by_columns`.
+    Inside of a transformation of JAX this is `quick_jit`, or that `derived`.
     """
-    compiled = quick_jit(function)
-    transformed = derived(compiled)
+    compiled: Any = quick_jit(function)
+    transformed, hosted = derived(compiled), on_the_host(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 
     def compile_(arguments):
         # (It is not run: programs with factorizations may run in one thread only, see `in_turn`.)
         with on_the_cpu(), as_numpy():  # (under JAX's settings of this thread)
-            programs[kind(arguments)] = compiled.lower(*arguments).compile()  # type: ignore
+            programs[kind(arguments)] = compiled.lower(*arguments).compile()
 
     @ft.wraps(function)
     def call(*arguments):
@@ -174,13 +185,8 @@ def host_first(
         if key in programs:
             return programs[key](*arguments)
         try:
-            with (
-                jax_compat.outside(),
-                uncollected(),
-                at_ease(),
-                executor.at_most(WORTH_COMPILING),
-            ):
-                return from_host(function(*to_host(arguments)))
+            with executor.at_most(WORTH_COMPILING):
+                return hosted(*arguments)
         except executor.OutOfTimeError:
             programs[key] = compiled
             return compiled(*arguments)
@@ -206,59 +212,60 @@ def kind(arguments) -> tuple:
     return structure, *jax_compat.settings_of_programs(), *types
 
 
-class TwoTiers:
-    """`function(*arguments)` for one job, all of which is done by one executable.
+class Program:
+    """`function(*arguments)`, compiled once for all arguments of a kind.
 
-    A job that is `large` waits for the fully optimized executable, so its results do not depend on
-    time. Another job uses it if it is there, and else the one that compiles in a third of the time.
-    A thread compiles the optimized one for later jobs: in Jupyter and other interactive sessions
-    after the first use, in scripts after `_WORTH_OPTIMIZING` seconds of use.
+    **Arguments:** `loops`: whether it runs through loops many times, and is optimized for these.
+    Otherwise it compiles in 60 % of the time, and takes four times as long to run.
     """
 
-    def __init__(self, function: Callable, large: bool):
-        self._function = function
-        self.large = large
-        self._chosen: dict[tuple, tuple[_Program, jax.stages.Compiled]] = {}
+    def __init__(self, function: Callable, loops: bool):
+        self._function, self._loops = function, loops
+        self._plain = eqx.filter_jit(function)
 
     def __call__(self, *arguments: Any) -> Any:
         if not _is_simple() or is_hidden(arguments):
-            return one_tier(self._function, self.large)(*arguments)
-        key, leaves, program = _program_of(self._function, arguments)
-        if key not in self._chosen:
-            with _choosing:
-                if key not in self._chosen:  # by another thread in the meantime
-                    say_compiling(True)
-                    self._chosen[key] = program, program.choose(self.large)
-                    say_compiling(False)
-        program, executable = self._chosen[key]
-        return program.run(executable, leaves)
+            return self._plain(*arguments)
+        lowered, leaves = _lowered(self._function, arguments)
+        executable = lowered.executable(self._loops)
+        with in_turn(lowered.alone):
+            return jax.block_until_ready(executable(leaves))
 
 
-class OneTier:
-    """`function(*arguments)`, compiled once by options for loops.
+class _Lowered:
+    """A program that is lowered, and its executables, with and without optimized loops.
 
-    For functions that compile in about a second: of these a quick executable is no gain.
+    **Fields:** `alone`: whether it calls LAPACK (see `in_turn`).
     """
 
-    def __init__(self, function: Callable):
-        self._function = function
+    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
+        self._lowered, self.alone = lowered, alone
+        self._executables: dict[bool, jax.stages.Compiled] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
-        if not _is_simple() or is_hidden(arguments):
-            return one_tier(self._function, True)(*arguments)
-        _, leaves, program = _program_of(self._function, arguments)
+    def executable(self, loops: bool) -> jax.stages.Compiled:
         with _choosing:
-            executable = program.only()
-        return program.run(executable, leaves)
+            if loops not in self._executables:
+                options = jax_compat.quick_options()
+                if loops:
+                    options = jax_compat.loop_options()
+                say_compiling(True)
+                compiled = self._lowered.compile(compiler_options=options)
+                self._executables[loops] = compiled
+                say_compiling(False)
+            return self._executables[loops]
 
 
 _choosing = threading.Lock()
-_by_kind: dict[tuple, "_Program"] = {}
-_by_text: dict[Hashable, "_Program"] = {}
+_by_kind: dict[tuple, _Lowered] = {}
+_by_text: dict[Hashable, _Lowered] = {}
 
 
-def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Program"]:
-    """The kind of arguments, their arrays, and the program of a function for them."""
+def _lowered(function: Callable, arguments: tuple) -> tuple[_Lowered, list]:
+    """The program of a function for arguments of this kind, and their arrays.
+
+    Objects that hold the same functions written anew (an `Output` with a `lambda`) are of other
+    kinds, but have the same text and share executables.
+    """
     key = function, kind(arguments)
     arrays, static = eqx.partition(arguments, _is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
@@ -267,85 +274,22 @@ def _program_of(function: Callable, arguments: tuple) -> tuple[tuple, list, "_Pr
         arrays = jax.tree_util.tree_unflatten(structure, leaves)
         return function(*eqx.combine(arrays, static))
 
-    if key not in _by_kind:
-        with _choosing, uncollected():
-            say_compiling(True)
-            _lowered(key, run, leaves)
-            say_compiling(False)
-    return key, leaves, _lowered(key, run, leaves)
-
-
-def _lowered(key: tuple, run: Callable, leaves: list) -> "_Program":
-    """The program for arguments of this kind. Objects that hold the same functions written anew
-    (an `Output` with a `lambda`) are of other kinds, but have the same text and share executables.
-    """
-    if key not in _by_kind:
-        if len(_by_kind) >= _KEPT:
-            _by_kind.clear()
-            _by_text.clear()
-        traced = jax.jit(run).trace(leaves)
-        lowered = traced.lower()
-        text = hashlib.sha256(lowered.as_text().encode()).digest()
-        needed, _ = jax_compat.needed_part(traced.jaxpr.jaxpr)
-        program = _Program(lowered, alone=jax_compat.calls_lapack(needed))
-        _by_kind[key] = _by_text.setdefault((key[0], text), program)
-    return _by_kind[key]
-
-
-@ft.lru_cache(_KEPT)
-def one_tier(function: Callable, large: bool) -> Callable:
-    """Return `function` compiled: fully optimized if the job is `large`."""
-    return eqx.filter_jit(function) if large else quick_jit(function)
-
-
-class _Program:
-    """A program that is lowered, and its executables."""
-
-    def __init__(self, lowered: jax.stages.Lowered, alone: bool):
-        self._lowered = lowered
-        self._alone = alone
-        self._quick: jax.stages.Compiled | None = None
-        self._full: jax.stages.Compiled | None = None
-        self._seconds = 0.0
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-
-    def choose(self, large: bool) -> jax.stages.Compiled:
-        if large and self._thread is not None:
-            self._thread.join()
-        if large or self._full is not None:
-            return self._optimize()
-        if self._quick is None:
-            options = jax_compat.quick_options()
-            self._quick = self._lowered.compile(compiler_options=options)
-        return self._quick
-
-    def only(self) -> jax.stages.Compiled:
-        """The executable of a program of loops, which has no other."""
-        if self._full is None:
-            say_compiling(True)
-            options = jax_compat.loop_options()
-            self._full = self._lowered.compile(compiler_options=options)
-            say_compiling(False)
-        return self._full
-
-    def _optimize(self) -> jax.stages.Compiled:
-        self._full = self._full or self._lowered.compile()
-        return self._full
-
-    def run(self, executable: jax.stages.Compiled, leaves: list) -> Any:
-        begin = time.perf_counter()
-        with in_turn(self._alone):
-            results = jax.block_until_ready(executable(leaves))
-        if executable is self._quick and self._thread is None:
-            with self._lock:
-                self._seconds += time.perf_counter() - begin
-                # (`ps1`, the prompt, exists in interactive sessions only.)
-                is_worth = hasattr(sys, "ps1") or self._seconds > _WORTH_OPTIMIZING
-                if is_worth and self._thread is None:
-                    self._thread = threading.Thread(target=self._optimize)
-                    self._thread.start()
-        return results
+    with _choosing:
+        if key not in _by_kind:
+            if len(_by_kind) >= _KEPT:
+                _by_kind.clear()
+                _by_text.clear()
+            with uncollected():
+                say_compiling(True)
+                traced = jax.jit(run).trace(leaves)
+                lowered = traced.lower()
+                say_compiling(False)
+            needed, _ = jax_compat.needed_part(traced.jaxpr.jaxpr)
+            text = lowered.as_text()
+            digest = function, hashlib.sha256(text.encode()).digest()
+            new = _Lowered(lowered, jax_compat.calls_lapack(needed))
+            _by_kind[key] = _by_text.setdefault(digest, new)
+        return _by_kind[key], leaves
 
 
 def _is_simple() -> bool:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from .._core.compilation import whole
 from .._core.executor import namespace, on_host, scan
@@ -24,7 +24,6 @@ from .target import Target
 
 
 Jacobians = Float[Array, "L n m"]
-Wanted = Bool[Array, ""] | bool
 _PLAIN = Options()
 
 
@@ -91,7 +90,7 @@ def through(
         )
     static = (
         search,
-        options._replace(tangents=bool(options.tangents), at_once=False),
+        options._replace(at_once=False),
         *by,
     )
     make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
@@ -146,30 +145,29 @@ def _move(s, lanes, u, target, setout, result, settings, options: Options) -> Re
 @_move.def_jvp
 def _move_jvp(primals, tangents):
     s, lanes, u, target, setout, result, settings, options = primals
-    closely = options.tangents is not False or not options.glide
-    taped = options._replace(tape=True, glide=False, tangents=closely)
+    taped = options._replace(tape=True, tangents=True)
     still = fixed((s, lanes, u, target, setout))
     recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
-    primals = s, lanes, u, target, recorded, options.glide
-    ends = _follow_jvp(primals, (*tangents[:4], None, None))
+    primals = s, lanes, u, target, recorded
+    ends = _follow_jvp(primals, (*tangents[:4], None))
     return ends if options.tape else tuple(x._replace(tape=None) for x in ends)
 
 
 @eqx.filter_custom_jvp
-def follow(s, lanes, u, target, recorded: Recorded, unroll: bool) -> Recorded:
+def follow(s, lanes, u, target, recorded: Recorded) -> Recorded:
     """Recorded flow, with the derivatives of `move` from lanes that are close to its start."""
     return recorded
 
 
 def _follow_jvp(primals, tangents):
-    s, lanes, u, target, recorded, unroll = primals
+    s, lanes, u, target, recorded = primals
     target, levels = target.split()
 
     def repeat(by_lane, common):
         (t, q, u, time), (s, levels) = by_lane, common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
-        return replay(s, begin, u, end, recorded.tape, unroll)
+        return replay(s, begin, u, end, recorded.tape)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
     by_lane = (
@@ -195,10 +193,9 @@ def flow_jacobian(
     settings: Settings,
     h: Times,
     result: Index,
-    wanted: Wanted,
 ) -> tuple[Jacobians, Moved, Tape]:
     """Derivative of (t, q) at the targets with respect to q at the start, without input that may
-    have jumped, in JAX. If it is not `wanted`, zeros: only the flow is computed then.
+    have jumped, in JAX.
 
     Exact, through every event on the way, and differentiable once more. Each column is one
     forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearizing first
@@ -207,22 +204,13 @@ def flow_jacobian(
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
     still, start, goal = fixed((s, lanes, target))
-    u, options = (
-        jnp.zeros((s.nu, 1)),
-        Options(tape=True, new_input=False, tangents=wanted),
-    )
+    u = jnp.zeros((s.nu, 1))
+    options = Options(tape=True, new_input=False, tangents=True)
     moved, tape = move(still, start, u, goal, settings, h, result, options)
     assert tape is not None
-    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True, wanted=wanted)
-    if wanted is not True:
-        end = jnp.where(
-            wanted, end, jnp.concatenate([moved.lanes.t[None], moved.lanes.q])
-        )
-    return (
-        jacobian,
-        moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:])),
-        tape,
-    )
+    jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
+    ends = moved.lanes._replace(t=end[0], q=end[1:])
+    return jacobian, moved._replace(lanes=ends), tape
 
 
 def tape_jacobian(
@@ -231,17 +219,14 @@ def tape_jacobian(
     target: Target,
     tape: Tape,
     of_states: bool = False,
-    wanted: Wanted = True,
     across: Float[Array, "A d"] | None = None,
 ) -> tuple[Jacobians, Float[Array, "n L"]]:
     """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
-    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets; both are zeros if they
-    are not `wanted`. `across`: see `chain`; traced, it makes no difference."""
-    if on_host(lanes.t) and not wanted:
-        return np.zeros((len(lanes.t), 1 + s.d, s.d)), np.zeros((1 + s.d, len(lanes.t)))
+    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets. `across`: see `chain`;
+    traced, it makes no difference."""
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
-    columns, end = _push(s, lanes, target, tape, of_states, wanted)
+    columns, end = _push(s, lanes, target, tape, of_states)
     return columns.transpose(2, 1, 0), end
 
 
@@ -264,24 +249,15 @@ def _columns(s, lanes, target, tape, of_states):
 
 
 @eqx.filter_custom_jvp
-def _push(s, lanes, target, tape, of_states, wanted):
-    """`_columns` where they are wanted."""
+def _push(s, lanes, target, tape, of_states):
+    """`_columns`, with the axes that `jax.vmap` maps as more lanes."""
 
     def run(s, target, common, by_lane):
-        (wanted,), (lanes, tape) = common, by_lane
+        return _columns(s, by_lane[0], target, by_lane[1], of_states)
 
-        def columns():
-            return _columns(s, lanes, target, tape, of_states)
-
-        def zeros():
-            L, n = lanes.t.shape[0], 1 + s.d
-            return jnp.zeros((s.d if of_states else n + s.nu, n, L)), jnp.zeros((n, L))
-
-        return columns() if wanted is True else jax.lax.cond(wanted, columns, zeros)
-
-    return _over_lanes(run, s, target, (wanted,), (lanes, tape))
+    return _over_lanes(run, s, target, (), (lanes, tape))
 
 
 @_push.def_jvp
 def _push_jvp(primals, tangents):
-    return eqx.filter_jvp(_columns, primals[:-1], tangents[:-1])
+    return eqx.filter_jvp(_columns, primals, tangents)

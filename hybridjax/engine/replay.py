@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.executor import namespace
 from .._core.host_derivatives import NotOnHostError
@@ -54,7 +54,6 @@ def replay(
     u: Inputs,
     target: Target,
     tape: Tape,
-    unroll: bool = False,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
     h, code, at_once = tape.h, tape.code, tape.at_once
@@ -75,7 +74,7 @@ def replay(
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            t, q = _advance(s, begin, code != IDLE, u, target, h1, which, unroll)
+            t, q = _advance(s, begin, code != IDLE, u, target, h1, which)
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
@@ -111,7 +110,6 @@ def _advance(
     target: Target,
     h: Times,
     which: Index,
-    unroll: bool,
 ) -> tuple[Times, Padded]:
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
     t, q, chart = lanes.t, lanes.q, lanes.chart
@@ -130,7 +128,7 @@ def _advance(
         # (A branch of its own, lest XLA masks the states again in every stage.)
 
         def step():
-            end = take_step(method, flow.field, t0, q0, h0, unroll, still.field)
+            end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
 
         q1, f1 = jax.lax.cond(here.any(), step, lambda: (q0, q0))
@@ -341,117 +339,155 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
     )
 
 
+class _Ends(NamedTuple):
+    """Ends of M moves in a chart of n states, with derivatives by (t, q, u) at their starts."""
+
+    t: Inexact[np.ndarray, " M"]
+    q: Inexact[np.ndarray, "n M"]
+    field: Inexact[np.ndarray, "n M"]
+    dt: Inexact[np.ndarray, "M 1 m"]
+    dq: Inexact[np.ndarray, "M n m"]
+
+
 def _linear(
     s: Structure, a: int, moves: Moves, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moves that start in chart a."""
-    n, M, code = s.dims[a], len(moves.t), moves.code
+    """Moves that start in chart a: (t, q) after them, padded, and the derivatives."""
     u = kernels.unpushed(s, moves.lane)
-    by_clock, on_time = np.isin(code, s.schedules(a)), code == ARRIVE_TIME
-    index = np.broadcast_to(target.index, target.time.shape)[moves.lane]
+    ends = _after_steps(s, a, moves, target, u)
+    ends = _at_zeros(s, a, moves, target, u, ends)
+    return _after_resets(s, moves, u, ends)
+
+
+def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends:
+    """The ends of the steps."""
+    n, code = s.dims[a], moves.code
+    by_clock = np.isin(code, s.schedules(a))
+    on_time = code == ARRIVE_TIME
     goal = target.time[moves.lane]
     h = np.where(on_time, goal - moves.t, np.where(moves.at_once, 0.0, moves.h))
-    expanded = np.array(
-        np.moveaxis(_linear_step(s, a, moves.t, moves.q[:n], u, h), -1, 0)
-    )
-    q, dq, f = expanded[:, :, 0].T, expanded[:, :, 2:], expanded[:, :, 1].T
+    expanded = _linear_step(s, a, moves.t, moves.q[:n], u, h)
+    expanded = np.array(np.moveaxis(expanded, -1, 0))
+    q, field = expanded[:, :, 0].T, expanded[:, :, 1].T
+    by_start, by_length = expanded[:, :, 2:-1], expanded[:, :, -1:]
     t = np.where(on_time, goal, moves.t + h)
-    # By (t, q, u). A step to a known time shrinks with t, and lasts until a schedule has come.
-    dt = np.zeros((M, 1, dq.shape[2] - 1), dq.dtype)
-    dt[:, 0, 0] = -1.0 * (by_clock | on_time)
-    for g in map(
-        int, np.intersect1d(code, s.schedules(a) if isinstance(s, Varied) else [])
-    ):
+    # A step to a known time shrinks with t, and lasts until a schedule has come.
+    longer = np.zeros((len(t), 1, by_start.shape[2]), by_start.dtype)
+    longer[:, 0, 0] = -1.0 * (by_clock | on_time)
+    # (Only a varied parameter moves a schedule.)
+    varied = s.schedules(a) if isinstance(s, Varied) else []
+    for g in np.intersect1d(code, varied).astype(int).tolist():
         now = np.flatnonzero(code == g)
-        dt[now, 0, 1 + n :] = kernels.due(s, g, t[now], q[:, now], u[:, now])[
-            0, 2 + n :
-        ].T
-    dq = dq[:, :, :-1] + dq[:, :, -1:] * dt
+        due = kernels.due(s, g, t[now], q[:, now], u[:, now])[0]
+        longer[now, 0, 1 + n :] = due[2 + n :].T
+    dt = longer.copy()
     dt[:, 0, 0] += 1.0
+    return _Ends(t, q, field, dt, by_start + by_length * longer)
 
-    which = np.where(
-        code == ARRIVE_LEVEL,
-        len(s.transitions),
-        np.where(by_clock | moves.at_once, -1, code),
-    )
-    lands = np.flatnonzero(which >= 0)
-    if len(lands):
-        point, landing = (t[lands], q[:, lands], f[:, lands]), s.at(lands)
-        flow = ChartFlow(landing, a, u[:, lands], target.levels, index[lands])
-        zero = flow.locate(*point, which[lands])
-        t[lands] += zero.past
-        q[:, lands] = zero.q
-        at = t[lands], q[:, lands], u[:, lands]
-        by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
-        f, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
-        jac = kernels.watched(landing, a, target.levels, *at, index=index[lands])
-        row = np.argmax(np.array(flow.rows)[:, None] == which[lands], axis=0)
-        by_t, by_q, by_u = _split(jac[row, :, np.arange(len(lands))][:, None], n)
-        # (Over the time past: nothing but rounding errors, with derivatives.)
-        past, moved = zero.past[:, None, None], dq[lands]
-        moved = moved + past * (f_t @ dt[lands] + f_q @ moved)
-        moved[:, :, 1 + n :] += past * f_u
-        change = by_t @ dt[lands] + by_q @ moved
-        change[:, :, 1 + n :] += by_u
-        delay = -change / (by_t + by_q @ f)
-        dt[lands] += delay
-        dq[lands] = moved + f @ delay
 
-    end, by = (
-        np.zeros((M, 1 + s.d), dq.dtype),
-        np.zeros((M, 1 + s.d, 1 + s.d + s.nu), dq.dtype),
-    )
+def _at_zeros(
+    s: Structure, a: int, moves: Moves, target: Target, u, ends: _Ends
+) -> _Ends:
+    """The ends moved to the zeros of the functions that end their moves. The delay of a zero is
+    that of the saltation formula (see `saltation.py`), here by time and state."""
+    n, code = s.dims[a], moves.code
+    by_clock = np.isin(code, s.schedules(a))
+    crossed = np.where(by_clock | moves.at_once, -1, code)
+    crossed = np.where(code == ARRIVE_LEVEL, len(s.transitions), crossed)
+    lands = np.flatnonzero(crossed >= 0)
+    if not len(lands):
+        return ends
+    crossed = crossed[lands]
+    index = np.broadcast_to(target.index, target.time.shape)[moves.lane[lands]]
+    landing = s.at(lands)
+    flow = ChartFlow(landing, a, u[:, lands], target.levels, index)
+    zero = flow.locate(ends.t[lands], ends.q[:, lands], ends.field[:, lands], crossed)
+    t, q = ends.t.copy(), ends.q.copy()
+    t[lands] += zero.past
+    q[:, lands] = zero.q
+    at = t[lands], q[:, lands], u[:, lands]
+    by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
+    field, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
+    watched = kernels.watched(landing, a, target.levels, *at, index=index)
+    row = np.argmax(np.array(flow.rows)[:, None] == crossed, axis=0)
+    gradient = watched[row, :, np.arange(len(lands))][:, None]
+    by_t, by_q, by_u = _split(gradient, n)
+    # (Over the time past: nothing but rounding errors, with derivatives.)
+    past = zero.past[:, None, None]
+    before, dt = ends.dq[lands], ends.dt[lands]
+    moved = before + past * (f_t @ dt + f_q @ before)
+    moved[:, :, 1 + n :] += past * f_u
+    change = by_t @ dt + by_q @ moved
+    change[:, :, 1 + n :] += by_u
+    delay = -change / (by_t + by_q @ field)
+    all_dt, all_dq = ends.dt.copy(), ends.dq.copy()
+    all_dt[lands] = dt + delay
+    all_dq[lands] = moved + field @ delay
+    return _Ends(t, q, ends.field, all_dt, all_dq)
+
+
+def _after_resets(
+    s: Structure, moves: Moves, u, ends: _Ends
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ends after the events of moves, padded to the states of all charts."""
+    M, n = len(ends.t), len(ends.q)
+    end = np.zeros((M, 1 + s.d), ends.dq.dtype)
+    by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
+    end[:, 0] = ends.t
+    by[:, :1, columns] = ends.dt
+    event = np.maximum(moves.code, -1)
     for kind in [(-1,), *s.kinds]:
-        now = np.flatnonzero(np.isin(np.maximum(code, -1), kind))
-        new, dnew = q[:, now], dq[now]
-        if len(now) == 0:
+        now = np.flatnonzero(np.isin(event, kind))
+        if not len(now):
             continue
+        after, by_start = ends.q[:, now], ends.dq[now]
         if kind != (-1,):
-            place = np.argmax(np.array(kind)[:, None] == code[now], axis=0).astype(
-                np.int32
-            )
-            by_reset = kernels.reset(
-                s.at(now), Member(kind, place), t[now], new, u[:, now]
-            )
-            new = by_reset[:, 0]
-            by_t, by_q, by_u = _split(np.moveaxis(by_reset, -1, 0), n)
-            dnew = by_t @ dt[now] + by_q @ dnew
-            dnew[:, :, 1 + n :] += by_u
-        m = len(new)
-        end[now, 1 : 1 + m] = new.T
-        by[np.ix_(now, np.arange(1, 1 + m), columns)] = dnew
-    end[:, 0] = t
-    by[:, :1, columns] = dt
+            place = np.argmax(np.array(kind)[:, None] == event[now], axis=0)
+            member = Member(kind, place.astype(np.int32))
+            reset = kernels.reset(s.at(now), member, ends.t[now], after, u[:, now])
+            by_t, by_q, by_u = _split(np.moveaxis(reset, -1, 0), n)
+            after = reset[:, 0]
+            by_start = by_t @ ends.dt[now] + by_q @ by_start
+            by_start[:, :, 1 + n :] += by_u
+        m = len(after)
+        end[now, 1 : 1 + m] = after.T
+        by[np.ix_(now, np.arange(1, 1 + m), columns)] = by_start
     return end, by
 
 
 def _linear_step(s: Structure, a: int, t, q, u, h):
     """`kernels.linear_step`; of an explicit method, by derivatives of the field at its stages,
     which needs no program."""
-    (n, M), method = q.shape, s.method(a)
+    method = s.method(a)
     if method.implicit or s.by_system:
         return kernels.linear_step(s, a, t, q, u, h)
-    m = 2 + n + s.nu
-    stages = len(method.b) + 1
-    K, dK = np.zeros((stages, n, M), q.dtype), np.zeros((stages, M, n, m), q.dtype)
+    n, M = q.shape
+    m = 2 + n + s.nu  # by time, states, inputs and length of the step
+    stages = len(method.b) + 1  # the last one is at the end of the step
+    rates = np.zeros((stages, n, M), q.dtype)
+    by_rates = np.zeros((stages, M, n, m), q.dtype)
+    flat, by_flat = (x.reshape(stages, -1) for x in (rates, by_rates))  # (views)
     straight = np.zeros((M, n, m))
     straight[:, :, 1 : 1 + n] = np.eye(n)
-    rows = [*(row[:i] for i, row in enumerate(np.array(method.a))), np.array(method.b)]
-    for i, (row, c) in enumerate(zip(rows, [*method.c, 1.0], strict=True)):
-        slope = (row @ K.reshape(stages, -1)[:i]).reshape(n, M)
-        dslope = (row @ dK.reshape(stages, -1)[:i]).reshape(M, n, m)
-        state, dstate = q + h * slope, straight + h[:, None, None] * dslope
-        dstate[:, :, -1] += slope.T
-        expanded = kernels.field(s, a, t + c * h, state, u)
-        by_t, by_q, by_u = _split(np.moveaxis(expanded, -1, 0), n)
-        dK[i] = by_q @ dstate
-        dK[i, :, :, 0] += by_t[:, :, 0]
-        dK[i, :, :, 1 + n : -1] += by_u
-        dK[i, :, :, -1] += c * by_t[:, :, 0]
-        K[i] = expanded[:, 0]
-    values = np.stack([state.T, K[-1].T], axis=2)
-    return np.moveaxis(np.concatenate([values, dstate], axis=2), 0, -1)
+    weights = [row[:i] for i, row in enumerate(np.array(method.a))]
+    weights.append(np.array(method.b))
+    places = [*method.c, 1.0]
+    for i in range(stages):
+        slope = (weights[i] @ flat[:i]).reshape(n, M)
+        state = q + h * slope
+        by_slope = (weights[i] @ by_flat[:i]).reshape(M, n, m)
+        by_state = straight + h[:, None, None] * by_slope
+        by_state[:, :, -1] += slope.T
+        expanded = kernels.field(s, a, t + places[i] * h, state, u)
+        f_t, f_q, f_u = _split(np.moveaxis(expanded, -1, 0), n)
+        rates[i] = expanded[:, 0]
+        by_rates[i] = f_q @ by_state
+        by_rates[i, :, :, 0] += f_t[:, :, 0]
+        by_rates[i, :, :, 1 + n : -1] += f_u
+        by_rates[i, :, :, -1] += places[i] * f_t[:, :, 0]
+    values = np.stack([state.T, rates[-1].T], axis=2)
+    return np.moveaxis(np.concatenate([values, by_state], axis=2), 0, -1)
 
 
 def _split(expanded, n: int):

@@ -53,17 +53,16 @@ def take_step(
     t: AnyTimes,
     q: States,
     h: AnyTimes,
-    unroll: bool = False,
     still: LaneField | None = None,
 ) -> Step:
     """One step of a method from (t, q) over h.
 
-    With `unroll`, or for many lanes, the stages of an explicit method are unrolled: faster, and
-    slower to compile. For derivatives of an implicit step give `still`, the field without any.
+    For many lanes, the stages of an explicit method are unrolled: faster, and slower to compile.
+    For derivatives of an implicit step give `still`, the field without any.
     """
     if method.implicit:
         return _implicit_step(method, field, t, q, h, still)
-    unroll = unroll or q.shape[1] >= _UNROLLED_LANES
+    unroll = q.shape[1] >= _UNROLLED_LANES
     K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
     combined = _combine if unroll else lambda w, K: jnp.tensordot(np.array(w), K, 1)
     error = h * combined(np.array(method.error), K)

@@ -97,11 +97,11 @@ class ChartFlow(NamedTuple):
         """Rows of a `Watch` that have a meaning in the chart: guards, and the target's level."""
         return self.s.guards(self.a) + [len(self.s.transitions)] * self.has_level
 
-    def step(self, t: AnyTimes, q: States, h: AnyTimes, unroll: bool = False) -> Step:
+    def step(self, t: AnyTimes, q: States, h: AnyTimes) -> Step:
         """A step from (t, q) over h (see `take_step`)."""
         if on_host(q):
             return kernels.step(self.s, self.a, t, q, self.u, h, self.subset)
-        return take_step(self.method, self.field, t, q, h, unroll)
+        return take_step(self.method, self.field, t, q, h)
 
     def step_along(
         self, t: AnyTimes, q: States, h: AnyTimes, along: States

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core.compilation import OneTier
+from .._core.compilation import Program
 from ..engine import kernels
 from ..engine.itinerary.bodies import Watched, dips
 from ..engine.runge_kutta import looped_step
@@ -383,4 +383,5 @@ def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
     return jax.tree_util.tree_map(ft.partial(jnp.where, mask), yes, no)
 
 
-program = OneTier(follow_table)
+# (XLA's newer code generator compiles these programs for twice as long.)
+program = Program(follow_table, loops=True)

@@ -17,7 +17,7 @@ from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.text import folded, listed
 from ..engine.lanes import Lanes
-from ..engine.move import Options, move
+from ..engine.move import move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
 from ..linear.algebra import Matrices
@@ -139,9 +139,7 @@ def flow_batch(
         target = section_target(course.bound, course.lanes, period, *to)
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
-        moved = move(
-            s, lanes, u, target, settings, stride, result, Options(glide=True)
-        ).moved
+        moved = move(s, lanes, u, target, settings, stride, result).moved
         # An event may change places with a section, but none may be left out or come in addition.
         wrong = (
             jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn))

@@ -12,11 +12,11 @@ from .._core.arguments import names
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
-from .._core.compilation import TwoTiers
+from .._core.compilation import Program
 from .._core.execution import Execution, in_threads
 from .._core.executor import from_host, on_cpu, to_host
 from .._core.meaning import require_as_made
-from .._core.memo import Memory, remembered
+from .._core.memo import Memory
 from .._core.progress import counted, working
 from .._core.results import Result
 from .._core.signal import signals, unit_of
@@ -52,10 +52,10 @@ _SAMPLES = Reals("experiments samples inputs", missing=True, infinite=True)
 DesignLike = Design | Annotated[np.ndarray | jax.Array, _SAMPLES]
 """A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
 
-# From so many samples in all, a run waits for the optimized program: it takes 10 s longer to
-# compile and saves 2 microseconds per sample. Fewer: short runs wait in vain. More: runs of 20 s
+# From so many samples in all, a search for events is compiled with optimized loops: that takes 5 s
+# longer, and saves 3 microseconds per sample. Fewer: short runs wait in vain. More: runs of 10 s
 # take twice as long.
-_LARGE = 5_000_000
+_LARGE = 2_000_000
 # Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
 # them, more leave the cache. On accelerators: more need more memory.
 _BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
@@ -178,7 +178,7 @@ class Campaign:
     - `stepping`: tolerances and step schedule between sections.
     - `process_noise`: as in `run_experiments`.
     - `execution`: batch size and number of threads.
-    - `large`: whether to wait for the optimized program.
+    - `large`: whether searches for events have optimized loops.
     - `feedback`: a controller, or None.
     """
 
@@ -246,10 +246,6 @@ class Campaign:
             return _AtSections(z, course(self.placed, z.items), on_cycle, self.outputs)
 
         return _resolved.recall(self.placed, names, make)
-
-    @remembered
-    def _program(self) -> TwoTiers:
-        return TwoTiers(flow_batch, self.large)
 
     def _starts(
         self, u, first: int, execution: Execution
@@ -356,7 +352,8 @@ class Campaign:
     ) -> Iterator[tuple[slice, Any]]:
         """Yield rows and their `Response` with a search for events, batch after batch."""
         arguments = lambda rows: self._arguments(u, start, rows)  # noqa: E731
-        return in_batches(self._program, arguments, len(u), execution, name)
+        search = _LARGE_SEARCH if self.large else _SEARCH
+        return in_batches(search, arguments, len(u), execution, name)
 
     def _arguments(self, u, start, rows: slice | np.ndarray) -> tuple:
         """Arguments of a program for some experiments."""
@@ -386,12 +383,10 @@ def prepare(
     outputs: OutputNames,
     options: Options,
     chunk: int | None = None,
-    one_program: bool = False,
 ) -> Campaign:
     """Check the arguments of `run_experiments`, and do what is done once for all experiments.
 
-    **Arguments:** `chunk`: number of experiments that run together. Default: all. `one_program`:
-    whether all runs have to use the optimized program.
+    **Arguments:** `chunk`: number of experiments that run together. Default: all.
     """
     placed = as_placed(cycle, sections)
     items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
@@ -423,7 +418,7 @@ def prepare(
         stepping=plan_flow(placed, options.accuracy),
         process_noise=noise,
         execution=execution,
-        large=one_program or len(inputs) * inputs.cycles * N > _LARGE,
+        large=len(inputs) * inputs.cycles * N > _LARGE,
         feedback=feedback,
     )
 
@@ -505,6 +500,7 @@ class _AtSections(NamedTuple):
     """The outputs by whose `id` this is found: they must not be collected."""
 
 
+_SEARCH, _LARGE_SEARCH = Program(flow_batch, False), Program(flow_batch, True)
 _resolved = Memory()
 _tables = Memory()
 

@@ -144,8 +144,7 @@ def stream_experiments(
     Without a `store`, each chunk is run when the iterator gets to it. With a `store`, all chunks
     are run and kept. Experiments that are in the store already are not run again: after an
     interruption, repeat the call. The records are the same to the last bit for any number of
-    processes and interruptions, on machines of one kind. Therefore all experiments wait for the
-    optimized program (10 s, once).
+    processes and interruptions, on machines of one kind.
 
     **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
 
@@ -179,9 +178,7 @@ def stream_experiments(
     execution = dataclasses.replace(options.execution or Execution(), workers=1)
     options = dataclasses.replace(options, execution=execution)
     with working("stream_experiments"):
-        campaign = prepare(
-            cycle, sections, design, outputs, options, chunk, one_program=True
-        )
+        campaign = prepare(cycle, sections, design, outputs, options, chunk)
         S = len(campaign.inputs)
         fill(ExperimentJob(campaign, Blocks((S,), (min(chunk, S),))), store, client)
     return StoredExperiments(store)

@@ -176,7 +176,7 @@ def candidate_cycle(
     """
     map, last = guess.return_map.at_phase_of(system), None
     if is_inside_program():
-        q, turn, steps = root(map, False, NEWTON_STEPS)
+        q, turn, steps = root(map, NEWTON_STEPS)
         period, anchor = map.turn(q, turn.record).period, map.departure(q)
     else:
         anchor, turn, steps, _ = solve(map, True, False, last_turn(guess))

@@ -1,7 +1,6 @@
 """Cycles of systems side by side, each from a guess of its own, in lanes of the host."""
 
 import dataclasses
-import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -26,21 +25,14 @@ from ..systems.system import HybridSystem
 from .coincidence import together
 from .crossing import AtEvent, to_section
 from .guess import require_similar
-from .newton import FEW_STEPS, USUAL_STEPS
+from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn
-from .scale import ROUNDING
 from .shooting import excess, newton_steps, one_by_one
 
 
 # Periods for which a system is simulated before each further attempt of Newton's method. (0: for
 # unstable cycles.) Fewer: slow transients remain. More: each failure takes longer.
 _SETTLE = 8, 0, 40
-# Largest step, in sizes of the states, that is taken with a guessed Jacobian. Larger: steps lead
-# astray. Smaller: few are taken.
-_NEAR = 0.06
-# Largest number of parameters for which guesses from neighbors are quadratic: the number of terms
-# grows with its square. Larger: more neighbors are needed. Smaller: guesses are less accurate.
-_QUADRATIC = 4
 
 
 def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
@@ -48,10 +40,10 @@ def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
     return jax.tree_util.tree_map(one_by_one, lanes) if map.expected.ndim else lanes
 
 
-def _turn(map: ReturnMap, wanted):
-    """The anchor, the expected period, and one turn with its Jacobian if it is `wanted`, of a
-    system, or of systems side by side on the host."""
-    turn = map.turn_with_jacobian(map.each(map.anchor.q.T), wanted)
+def _turn(map: ReturnMap):
+    """The anchor, the expected period, and one turn with its Jacobian, of a system, or of systems
+    side by side on the host."""
+    turn = map.turn_with_jacobian(map.each(map.anchor.q.T))
     turn = turn._replace(record=None, tapes=None, end=_apart(map, turn.end))
     return _apart(map, map.anchor), map.expected, turn
 
@@ -99,14 +91,12 @@ class Rounds(NamedTuple):
 
 
 class Known(NamedTuple):
-    """Cycles of K other systems, from which guesses are taken."""
+    """Cycles of K systems, from which others begin."""
 
-    systems: HybridSystem | None
-    """Their arrays have a leading axis of K systems."""
+    numbers: Float[np.ndarray, "K p"] | None
+    """Those of the systems (see `numbers_of`)."""
     anchor: Lanes
     period: Float[np.ndarray, " K"]
-    jacobian: Float[np.ndarray, "K d d"]
-    """Jacobian of the return map less the identity, in each."""
     result: Int[np.ndarray, " K"]
 
 
@@ -124,69 +114,36 @@ class Tiles(NamedTuple):
     workers: int
     known: Known | None = None
 
-    @property
-    def parameters(self) -> Float[np.ndarray, "S p"]:
-        """The numbers in which the systems differ, each in units of its spread; below them those of
-        the known systems. (Numbers that are not finite are replaced by the mean.)"""
-        flat = _numbers(self.systems)
-        if self.known is not None:
-            flat = np.concatenate([flat, _numbers(self.known.systems)])
-        numbers = np.ma.masked_invalid(flat)
-        flat = (numbers - numbers.mean(axis=0)).filled(0.0)
-        spread = np.sqrt(np.mean(flat**2, axis=0))
-        return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]
-
     def solve(self, S: int) -> Rounds:
-        """Newton's method for all systems: first for a few, spread over all, from the known cycles
-        or the guess, then for as many again from the cycles of their neighbors, and so on. Systems
-        that fail begin again from the end of a simulation, which begins on the cycle of the nearest
-        system, then from that cycle."""
-        parameters, before = self.parameters[:S], self.parameters[S:]
+        """Newton's method for all systems, each from the nearest known cycle, or, if none is known,
+        from those of a few systems, spread over all, that begin from the guess. Systems that fail
+        begin again from the end of a simulation, which begins on the cycle of the nearest system,
+        then from that cycle."""
+        numbers = numbers_of(self.systems)
         order = np.random.default_rng(0).permutation(S)
-
-        def neighbors(rows, out: Rounds | None, moved: bool = True):
-            """Guesses for some systems from the known cycles and those of the rounds so far."""
-            sources = (
-                []
-                if self.known is None
-                else [(before, self.known._replace(systems=None))]
-            )
-            if out is not None:
-                cycles = Known(
-                    None, out.anchor, out.period, out.turn.jacobian, out.result
-                )
-                sources.insert(0, (parameters[order[: len(out.result)]], cycles))
-            near, cycles = _join(*sources)
-            return self._by_neighbors(near, cycles, parameters[rows], moved)
-
-        out: Rounds | None = None
-        with working("cycles", S) as call:
-            if self.known is None:
-                call.done, rows = 0, order[: min(self.size, WIDE)]
-                with uncollected():  # the programs are compiled during this call
-                    out = self._newton(rows, *self._given(rows), FEW_STEPS)
-                    if not (out.result == Result.OK).any():
-                        out = self._again(rows, out, self._given, _SETTLE)
-            while (done := 0 if out is None else len(out.result)) < S:
-                call.done = done
-                more = slice(done, max(4 * done, self.size))
-                rows = order[more]
-                rows = rows[
-                    _tree(parameters[rows]).indices
-                ]  # systems of one call are neighbors
-                order[more] = rows
-                anchor, period, jacobian = neighbors(rows, out)
-                anchor, period = self._first_step(rows, anchor, period, jacobian)
-                part = self._newton(rows, anchor, period, USUAL_STEPS)
-                part = part._replace(steps=part.steps + 1)
-                out = part if out is None else _join(out, part)
-        assert out is not None
-        near = self.known is not None or (out.result == Result.OK).any()
-        settle, nearest = (
-            _SETTLE if near else (),
-            ft.partial(neighbors, out=out, moved=False),
-        )
-        return _pick(self._again(order, out, nearest, settle), np.argsort(order))
+        known, rest = self.known, order
+        parts: list[Rounds] = []
+        with working("cycles", S) as call, uncollected():
+            call.done = 0
+            if known is None:
+                first, rest = np.split(order, [min(self.size, WIDE)])
+                out = self._newton(first, *self._given(first), FEW_STEPS)
+                if not (out.result == Result.OK).any():
+                    out = self._again(first, out, self._given, _SETTLE)
+                known = Known(numbers[first], out.anchor, out.period, out.result)
+                parts.append(out)
+            for k in range(0, len(rest), self.size):
+                call.done = S - len(rest) + k
+                rows = rest[k : k + self.size]
+                begin = self._nearest(numbers[rows], known)
+                parts.append(self._newton(rows, *begin, FEW_STEPS))
+        out = _join(*parts)
+        found = Known(numbers[order], out.anchor, out.period, out.result)
+        known = found if self.known is None else _join(found, known)
+        if (known.result == Result.OK).any():
+            nearest = lambda rows: self._nearest(numbers[rows], known)  # noqa: E731
+            out = self._again(order, out, nearest, _SETTLE)
+        return _pick(out, np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
         given = self.map.anchor, self.map.expected
@@ -203,7 +160,7 @@ class Tiles(NamedTuple):
             failed = np.flatnonzero(out.result != Result.OK)
             if not len(failed):
                 break
-            begin = guesses(rows[failed])[:2]
+            begin = guesses(rows[failed])
             if periods:
                 begin = self._in_tiles(
                     _settle, rows[failed], *begin, options=(periods,)
@@ -216,45 +173,17 @@ class Tiles(NamedTuple):
                 out = _replace(out, failed, part)
         return out
 
-    def _by_neighbors(self, parameters, cycles: Known, wanted, moved: bool):
-        """The cycle of the nearest system, `moved` as the cycles around it in the same chart
-        suggest, if so asked: its anchor, its period, and the Jacobian there (NaN if no cycle is
-        known)."""
-        ok = np.flatnonzero(cycles.result == Result.OK)
+    def _nearest(
+        self, numbers: Float[np.ndarray, "n p"], known: Known
+    ) -> tuple[Lanes, Float[np.ndarray, " n"]]:
+        """The anchors and periods of the cycles of the nearest systems; those of the guess if no
+        cycle is known."""
+        ok = np.flatnonzero(known.result == Result.OK)
         if not len(ok):
-            blank = np.full((len(wanted), *cycles.jacobian.shape[1:]), np.nan)
-            return *self._given(wanted), blank
-        parameters = parameters[ok]
-        terms = _powers(parameters[:1]).shape[1]
-        _, near = _tree(parameters).query(wanted, min(2 * terms + 3, len(ok)))
-        near = near.reshape(len(wanted), -1)
-        first = near[:, 0]
-        anchor, period, jacobian = _pick(
-            (cycles.anchor, cycles.period, cycles.jacobian), ok
-        )
-        if not moved:
-            return _pick((anchor, period, jacobian), first)
-        flat = jacobian.reshape(len(ok), -1)
-        values = np.concatenate([anchor.q[..., 0], period[:, None], flat], axis=1)
-        same = anchor.chart[near] == anchor.chart[first][:, None]
-        apart = _powers(parameters[near] - parameters[first][:, None]) * same
-        change = (values[near] - values[first][:, None]) * same
-        gram, moment = (np.swapaxes(apart, 1, 2) @ x for x in (apart, change))
-        slope = np.linalg.pinv(gram, rcond=ROUNDING, hermitian=True) @ moment
-        guess = (
-            values[first] + (_powers(wanted - parameters[first])[:, None] @ slope)[:, 0]
-        )
-        d = anchor.q.shape[1]
-        anchor = _pick(anchor, first)._replace(q=guess[:, :d, None])
-        return anchor, guess[:, d], guess[:, d + 1 :].reshape(-1, d, d)
-
-    def _first_step(self, rows, anchor: Lanes, period, jacobian):
-        """The first Newton step, with Jacobians that are guessed, for systems with a small one."""
-        anchor, period, turn, *_ = self._turn(rows, anchor, period, wanted=False)
-        sizes, step = self._step_from(anchor, turn.residual, jacobian)
-        small = (np.abs(step) <= _NEAR).all(axis=1, keepdims=True)
-        q = anchor.q[..., 0] + np.where(small, step * sizes, 0.0)
-        return anchor._replace(q=q[..., None]), period
+            return self._given(numbers)
+        assert known.numbers is not None
+        _, place = nearest(numbers, known.numbers[ok])
+        return _pick((known.anchor, known.period), ok[place])
 
     def _newton(self, rows, anchor: Lanes, period, steps: int) -> Rounds:
         """Newton's method; systems that have converged make room for others."""
@@ -275,7 +204,9 @@ class Tiles(NamedTuple):
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
         anchor, period, turn, codes, coincide = self._turn(rows, anchor, period)
-        sizes, step = self._step_from(anchor, turn.residual, turn.jacobian)
+        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
+        jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
+        step = newton_steps(jacobian, turn.residual / sizes)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)
         # A turn that closes but met its section too often was given too long a period.
@@ -291,13 +222,7 @@ class Tiles(NamedTuple):
         once = np.ones(len(rows), int)
         return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
 
-    def _step_from(self, anchor: Lanes, residual, jacobian):
-        """Sizes of the states (S, d) of some systems, and their Newton steps in these sizes."""
-        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
-        scaled = jacobian * sizes[:, None, :] / sizes[:, :, None]
-        return sizes, newton_steps(scaled, residual / sizes)
-
-    def _turn(self, rows, anchor: Lanes, period, wanted: bool = True):
+    def _turn(self, rows, anchor: Lanes, period):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
 
         def events(turned):
@@ -314,9 +239,7 @@ class Tiles(NamedTuple):
                 coincide,
             )
 
-        return self._in_tiles(
-            _turn, rows, anchor, period, options=(wanted,), then=events
-        )
+        return self._in_tiles(_turn, rows, anchor, period, then=events)
 
     def _in_tiles(
         self,
@@ -375,23 +298,24 @@ def tiles_of(
     return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
 
 
-def _numbers(systems: HybridSystem | None) -> Float[np.ndarray, "S p"]:
+def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
     """The numbers of systems, one row for each."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
     return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
 
 
-def _tree(points: Float[np.ndarray, "S p"]) -> Any:
+def nearest(
+    numbers: Float[np.ndarray, "n p"], known: Float[np.ndarray, "K p"]
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """The distances of systems to the nearest known ones, and the places of these. Each number
+    counts in units of its spread. (Those that are not finite are replaced by the mean.)"""
     from scipy.spatial import KDTree  # (a third of a second)
 
-    return KDTree(points)
-
-
-def _powers(x: Float[np.ndarray, "*S p"]) -> Float[np.ndarray, "*S r"]:
-    """x, and for few parameters the products of two of its columns."""
-    p = x.shape[-1]
-    i, j = np.triu_indices(p if p <= _QUADRATIC else 0)
-    return np.concatenate([x, x[..., i] * x[..., j]], axis=-1)
+    finite = np.ma.masked_invalid(np.concatenate([known, numbers]))
+    apart = (finite - finite.mean(axis=0)).filled(0.0)
+    spread = np.sqrt(np.mean(apart**2, axis=0))
+    points = apart / np.where(spread > 0, spread, 1.0)
+    return KDTree(points[: len(known)]).query(points[len(known) :])
 
 
 def _pick(tree, rows):

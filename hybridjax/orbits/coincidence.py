@@ -21,6 +21,7 @@ from .._core.executor import Array, namespace, stop_gradient, to_host
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Tape
+from ..engine.saltation import jump
 from ..engine.settings import ROUNDING
 from ..engine.target import until
 from ..engine.trajectory import Trajectory
@@ -242,34 +243,29 @@ def _orders(
     if not left:
         yield before
         return
-    a, q, u = before.chart, before.state[:, None], np.zeros((s.nu, 1))
-    time, n = np.array([t]), len(before.state)
-    field = kernels.field(s, a, time, q, u)[:, 0, 0]
+    a, q, u = before.chart, before.state[None], np.zeros((s.nu, 1))
+    time = np.array([t])
     happened = [s.clocks[g] for g in before.events]
-    events = [
-        (g, np.zeros(n), 0.0)
+    scheduled = [
+        g
         for g in s.schedules(a)
         if _scheduled_at(s, g, t, due) and s.clocks[g] not in happened
     ]
-    if guards := s.guards(a):
-        rows = kernels.watched(s, a, None, time, q, u, np.zeros(1, np.int32))[..., 0]
-        for g, row in zip(guards, rows, strict=True):
-            slope = row[2 : 2 + n]
-            rate = row[1] + slope @ field
-            if rate < 0 and abs(row[0]) <= -due * rate:
-                events.append((g, slope, rate))
-    for g, slope, rate in events:
-        if g in before.events or not kernels.enabled(s, s.member(g), time, q, u).all():
+    for g in [*scheduled, *s.guards(a)]:
+        if (
+            g in before.events
+            or not kernels.enabled(s, s.member(g), time, q.T, u).all()
+        ):
             continue
-        reset = kernels.reset(s, s.member(g), time, q, u)[..., 0]
+        event = jump(s, g, time, q, u)
+        saltation = event.saltation[0]
+        if g in scheduled:
+            saltation = event.by_state[0]
+        elif event.rate[0] >= 0 or abs(event.level[0]) > -due * event.rate[0]:
+            continue
         b = s.chart_index(s.transitions[g].target)
-        state, by_t, saltation = reset[:, 0], reset[:, 1], reset[:, 2 : 2 + n]
-        if rate < 0:
-            after = kernels.field(s, b, time, state[:, None], u)[:, 0, 0]
-            saltation = (
-                saltation + np.outer(after - saltation @ field - by_t, slope) / rate
-            )
-        order = _Order((*before.events, g), b, state, saltation @ before.derivative)
+        events = (*before.events, g)
+        order = _Order(events, b, event.after[0], saltation @ before.derivative)
         yield from _orders(s, t, order, left - 1, due)
 
 

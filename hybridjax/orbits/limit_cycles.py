@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
+from .._core.compilation import at_ease
 from .._core.execution import Execution
 from .._core.executor import from_host, to_host
 from .._core.meaning import current_of_many, first_of
@@ -23,7 +24,7 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
-from .batches import Known, Rounds, Tiles, tiles_of
+from .batches import Known, Rounds, Tiles, numbers_of, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes, together
 from .crossing import AtEvent, Crossing
@@ -260,12 +261,13 @@ def solved(
 def _search(map: ReturnMap) -> ReturnMap | None:
     """The return map of a cycle that is found from the state of a map's anchor; None if there is
     none. (Newton's method does not lead to a cycle that begins in another chart: turns do.)"""
-    for _ in range(_TURNS):
-        end = map.turn(map.anchor.q[:, 0]).end
-        if end.chart == map.anchor.chart:
-            break
-        anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
-        map = dataclasses.replace(map, anchor=anchor)
+    with at_ease():
+        for _ in range(_TURNS):
+            end = map.turn(map.anchor.q[:, 0]).end
+            if end.chart == map.anchor.chart:
+                break
+            anchor = map.departure(end.q[:, 0])._replace(chart=end.chart)
+            map = dataclasses.replace(map, anchor=anchor)
     solution = newton(map)
     if not solution.is_fixed_point or verdict(kept(map, solution)).refused:
         return None
@@ -349,9 +351,7 @@ def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
 
 def known_from(cycles: LimitCycles) -> Known:
     """Cycles as guesses for others."""
-    unit = np.eye(cycles.factors.shape[-1])
-    jacobian = turn_product(np.asarray(cycles.factors)) - unit
-    return Known(None, cycles.anchor, cycles.period, jacobian, cycles.result)
+    return Known(None, cycles.anchor, cycles.period, cycles.result)
 
 
 def _some_known(cycles: LimitCycles) -> Known | None:
@@ -360,9 +360,9 @@ def _some_known(cycles: LimitCycles) -> Known | None:
     if not len(rows):
         return None
     rows = rows[:: -(-len(rows) // _GUESSES)]
-    known = known_from(cycles)._replace(systems=None)
-    some = jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], known)
-    return some._replace(systems=_some(cycles.systems, rows))
+    numbers = numbers_of(cycles.systems)
+    known = known_from(cycles)._replace(numbers=numbers)
+    return jax.tree_util.tree_map(lambda x: np.asarray(x)[rows], known)
 
 
 def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:

@@ -32,11 +32,11 @@ from ..engine.lanes import (
     side_by_side,
 )
 from ..engine.replay import Variation, recorded_moves
+from ..engine.saltation import jump
 from ..engine.target import Target
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from ..systems.transition import Scheduled
 from ..systems.varied import Varied
 from .return_map import ReturnMap, Turn, with_derivatives
 from .scale import has_implicit
@@ -386,11 +386,8 @@ def _linear_flow(
 
     states, f = lay(states), lay(with_field[:, 0])
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(D), P))
-    ends = (
-        x.reshape(-1, d)
-        for x in (states[:, :, -1], f[:, :, -1], np.roll(f[:, :, 0], -1, 1))
-    )
-    jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, *ends)
+    last = states[:, :, -1].reshape(-1, d)
+    jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, last)
     jumps = Jumps(*(x.reshape(D, P, *x.shape[1:]) for x in jumps))
     arrays = LinearFlow(
         lay(time.ravel()),
@@ -463,38 +460,24 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
     return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
 
 
-def _jumps(s: Structure, code, t, u, q, f, after) -> Jumps:
-    """The events at the ends of pieces, with the fields f before and `after` them."""
-    P, d = f.shape
+def _jumps(s: Structure, code, t, u, q) -> Jumps:
+    """The events at the ends of pieces, where the states are q."""
+    P, d = q.shape
     shapes = (P, d, d), (P, d, s.nu), (P, d), (P, s.nu), (P, d), (P,)
-    out = Jumps(*(np.zeros(shape, f.dtype) for shape in shapes))
+    out = Jumps(*(np.zeros(shape, q.dtype) for shape in shapes))
     out.by_state[:] = np.eye(d)
-    for g in np.unique(code[code >= 0]):
-        now, tr = np.flatnonzero(code == g), s.transitions[g]
-        a = s.chart_index(tr.source)
-        n, point = s.dims[a], (t[now], q[now, : s.dims[a]].T, u[:, now])
-        by = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
-        m, by_t, by_q, by_u = (
-            by.shape[1],
-            by[:, :, 1],
-            by[:, :, 2 : 2 + n],
-            by[:, :, 2 + n :],
-        )
-        if isinstance(tr.guard, Scheduled):
-            guard = kernels.due(s, g, *point)[0].T
-        else:
-            row, index = s.guards(a).index(g), np.zeros(1, np.int32)
-            guard = kernels.watched(s, a, None, *point, index)[row].T
-        delay = -1 / (guard[:, 1] + np.sum(guard[:, 2 : 2 + n] * f[now, :n], axis=1))
-        out.delay_by_state[now, :n] = guard[:, 2 : 2 + n] * delay[:, None]
-        out.delay_by_input[now] = guard[:, 2 + n :] * delay[:, None]
-        slip = by_t + (by_q @ f[now, :n, None])[..., 0] - after[now, :m]
+    for g in np.unique(code[code >= 0]).tolist():
+        now = np.flatnonzero(code == g)
+        n = s.dims[s.chart_index(s.transitions[g].source)]
+        event = jump(s, g, t[now], q[now, :n], u[:, now])
+        m = event.after.shape[1]
         out.by_state[now] = 0.0
-        out.by_state[now, :m, :n] = (
-            by_q + slip[..., None] * out.delay_by_state[now, None, :n]
-        )
-        out.by_input[now, :m] = by_u + slip[..., None] * out.delay_by_input[now, None]
-        out.slip[now, :m], out.delay_by_level[now] = slip, delay
+        out.by_state[now, :m, :n] = event.saltation
+        out.by_input[now, :m] = event.input_saltation
+        out.delay_by_state[now, :n] = event.delay_by_state
+        out.delay_by_input[now] = event.delay_by_input
+        out.slip[now, :m] = event.slip
+        out.delay_by_level[now] = event.delay_by_level
     return out
 
 

@@ -21,6 +21,7 @@ from .._core.executor import on_the_cpu
 from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import LEGS, Form, Itinerary
 from ..engine.itinerary.turn import Passage
+from .batches import nearest
 from .repeat import (
     Corrected,
     Maps,
@@ -154,8 +155,9 @@ class Solver:
             while len(_routes) > _KEPT:
                 _routes.popitem(last=False)
         self.routes = _routes[key]
-        numbers = [np.isfinite(x.reshape(S, -1)).all(axis=1) for x in many.leaves]
-        self._finite = np.all([np.isfinite(many.expected), *numbers], axis=0)
+        flat = [x.reshape(S, -1).astype(float) for x in many.leaves]
+        self._numbers = np.concatenate([many.expected[:, None], *flat], axis=1)
+        self._finite = np.isfinite(self._numbers).all(axis=1)
         self.pending = np.flatnonzero(self._finite)
         self._ends: dict[int, np.ndarray] = {}
         blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
@@ -186,10 +188,7 @@ class Solver:
 
     def nearest(self, rows, known) -> tuple[np.ndarray, np.ndarray]:
         """Distances of systems to the nearest ones with known cycles, and the numbers of these."""
-        from scipy.spatial import KDTree  # (a third of a second)
-
-        numbers = _parameters(self.many.leaves)
-        distance, place = KDTree(numbers[known]).query(numbers[rows])
+        distance, place = nearest(self._numbers[rows], self._numbers[known])
         return distance, known[place]
 
     def _take(self, number: int) -> None:
@@ -265,12 +264,3 @@ def _key(map: ReturnMap, leaves: tuple[np.ndarray, ...]) -> tuple:
     for x in arrays:
         digest.update(np.ascontiguousarray(x).view(np.uint8))
     return identity(map), digest.digest()
-
-
-def _parameters(leaves: tuple[np.ndarray, ...]) -> Float[np.ndarray, "S p"]:
-    """The numbers in which systems differ, in units of their spread."""
-    flat = np.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
-    numbers = np.ma.masked_invalid(flat.astype(float))
-    flat = (numbers - numbers.mean(axis=0)).filled(0.0)
-    spread = np.sqrt(np.mean(flat**2, axis=0))
-    return flat[:, spread > 0] / spread[spread > 0] if spread.any() else flat[:, :1]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.compilation import host_first
+from .._core.compilation import on_the_host
 from .._core.executor import Array, on_host
 from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
@@ -23,7 +23,6 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
 from ..engine.replay import Moves, Variation
-from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, Return, ReturnMap, Turn, across
@@ -32,7 +31,6 @@ from .shooting import (
     RTOL,
     excess,
     fixed_point,
-    follow_moves,
     newton_steps,
     travel,
 )
@@ -100,13 +98,13 @@ def _ends(map: ReturnMap) -> bool:
     return int(_first_turn(map).result) == Result.OK
 
 
-@host_first
+@on_the_host
 def _first_turn(map: ReturnMap) -> Return:
     return map.turn(map.anchor.q[:, 0])
 
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
-    q, turn, steps = root(map, False, MAX_STEPS, near)
+    q, turn, steps = root(map, MAX_STEPS, near)
     if once_more and not on_host(
         q
     ):  # (where the host's last turn begins, a step is rounding)
@@ -161,7 +159,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 
-@ft.partial(host_first, derived=ft.partial(by_columns, along=_solve_along))
+@ft.partial(on_the_host, derived=ft.partial(by_columns, along=_solve_along))
 def solve(
     map: ReturnMap, once_more: bool = False, factors: bool = True, near: Any = None
 ) -> Solution:
@@ -175,73 +173,44 @@ def solve(
     return _solve(map, once_more, factors, near)
 
 
-@host_first
+@on_the_host
 def _solve_damped(map: ReturnMap) -> Solution:
-    q, turn, steps = root(map, True, 2 * MAX_STEPS)
+    q, turn, steps = _damped(map, 2 * MAX_STEPS)
     return Solution(
         map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
     )
 
 
 def root(
-    map: ReturnMap, damped: bool, max_steps: int, near: Any = None
+    map: ReturnMap, max_steps: int, near: Any = None
 ) -> tuple[Float[Array, " d"], Turn, Int[Array, ""]]:
     """The fixed point of the return map, the turn from it, and the number of steps.
 
     Differentiable once and twice; only the state has derivatives.
     """
-    if not on_host(map.expected):
-        return _root(map, damped, max_steps)
-    return (
-        _damped_on_host(map, max_steps)
-        if damped
-        else _root_on_host(map, max_steps, near)
-    )
+    if on_host(map.expected):
+        return _root_on_host(map, max_steps, near)
+    return _root(map, max_steps)
 
 
 def _root_on_host(
     map: ReturnMap, max_steps: int, near: Any
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method from the fixed point of the moves of a `near` turn, or from where rough turns
-    lead; if these lead nowhere, from the anchor's state."""
+    """Newton's method from the fixed point of the moves of a `near` turn, or from the anchor's
+    state."""
     begin = map.anchor.q[:, 0] / map.sizes
+    moves = None
     if near is not None:
-        return _newton(map, *fixed_point(map, near, begin), 0, max_steps)
-    end = _newton(map, *_by_rough_turns(map, begin), max_steps)
-    return end if np.isfinite(end[0]).all() else _newton(map, begin, None, 0, max_steps)
-
-
-def _by_rough_turns(
-    map: ReturnMap, x: np.ndarray
-) -> tuple[np.ndarray, Moves | None, int]:
-    """Newton's method on turns with errors of `TRANSIENT`, until the moves of one have a fixed
-    point: that of these moves, divided at full accuracy, the moves, and the number of steps."""
-    rough = Settings(
-        np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale
-    )
-    rough_map, moves = dataclasses.replace(map, settings=rough), None
-    for steps in range(1, FEW_STEPS + 1):  # noqa: B007
-        turn, step = _step_from(rough_map, x)
-        x = newton = x + step
-        if np.isfinite(x).all():
-            x, moves = fixed_point(
-                rough_map, (turn.legs, side_by_side(turn.tapes)), newton
-            )
-        if x is not newton or not np.isfinite(x).all():
-            break
-    pieces = moves and follow_moves(
-        map, map.departure(x * map.sizes), map.ends(), moves
-    )
-    x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
-    return x, moves, steps
+        begin, moves = fixed_point(map, near, begin)
+    return _newton(map, begin, moves, max_steps)
 
 
 def _newton(
-    map: ReturnMap, x: np.ndarray, moves: Moves | None, first: int, max_steps: int
+    map: ReturnMap, x: np.ndarray, moves: Moves | None, max_steps: int
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
-    turn makes the `moves` if they are right; `first` steps were taken before."""
-    for steps in itertools.count(first + 1):
+    turn makes the `moves` if they are right."""
+    for steps in itertools.count(1):
         travelled = None if moves is None else travel(map, x * map.sizes, moves)
         turn, step = _step_from(map, x, travelled)
         x = x + step
@@ -250,11 +219,7 @@ def _newton(
             np.asarray(map.settings.rtol) if travelled else 0.0
         )
         # (The first state need not be as accurate as a Newton step.)
-        done = (
-            excess(x[None], step[None])[0] < 1
-            and close
-            and (travelled or steps > first + 1)
-        )
+        done = excess(x[None], step[None])[0] < 1 and close and (travelled or steps > 1)
         if done or steps == max_steps or not np.isfinite(x).all():
             break
         moves = None
@@ -273,10 +238,8 @@ def _step_from(
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
-def _damped_on_host(
-    map: ReturnMap, max_steps: int
-) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Levenberg-Marquardt steps, with the constants of optimistix."""
+def _damped(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Levenberg-Marquardt steps on the host, with the constants of optimistix."""
     sizes, least, damping, best = map.sizes, np.inf, 1.0, None
     history: list[float] = []
     x, step = map.anchor.q[:, 0] / sizes, 0.0
@@ -304,13 +267,10 @@ def _damped_on_host(
 
 
 @eqx.filter_custom_jvp
-def _root(map, damped, max_steps):
+def _root(map, max_steps):
     import optimistix as optx  # (a fifth of a second, as lineax below)
 
-    if damped:
-        solver = optx.LevenbergMarquardt(rtol=RTOL, atol=ATOL)
-    else:
-        solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
+    solver = optx.Newton(rtol=RTOL, atol=ATOL, linear_solver=_linear_solver())
     solution = optx.root_find(
         _residual,
         solver,

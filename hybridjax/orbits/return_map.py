@@ -228,7 +228,7 @@ class ReturnMap(eqx.Module):
         s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result, piece):
-            return follow(s, lanes, u, target, piece, False).moved, None
+            return follow(s, lanes, u, target, piece).moved, None
 
         return self.travel(
             q, Options(new_input=False) if record is None else flow, record
@@ -237,24 +237,22 @@ class ReturnMap(eqx.Module):
     def turn_with_jacobian(
         self,
         q: Float[Array, " d"],
-        wanted: Bool[Array, ""] | bool = True,
         record: Recorded | None = None,
         varied: Varied | None = None,
         travelled: tuple[Return, Any, Any] | None = None,
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
-        **Arguments:** `wanted`: whether derivatives with respect to the state are computed;
-        otherwise they are meaningless. `record`: see `turn`. `varied`: the system with a parameter
-        by which there are derivatives, too, at the same phase of the clock (on the host).
-        `travelled`: the turn, as by `travel`, and the largest gap in it (on the host).
+        **Arguments:** `record`: see `turn`. `varied`: the system with a parameter by which there
+        are derivatives, too, at the same phase of the clock (on the host). `travelled`: the turn,
+        as by `travel`, and the largest gap in it (on the host).
         """
         s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
 
         def flow(lanes, target, h, result, piece):
             if piece is None:
                 jacobian, moved, tape = flow_jacobian(
-                    s, lanes, target, settings, h, result, wanted
+                    s, lanes, target, settings, h, result
                 )
             else:
                 moved, tape = piece
@@ -265,7 +263,7 @@ class ReturnMap(eqx.Module):
 
         if on_host(q):  # (all pieces are linearized together)
             options = Options(
-                True, new_input=False, tangents=wanted, at_once=varied is not None
+                True, new_input=False, tangents=True, at_once=varied is not None
             )
             travelled = travelled or (*self.travel(q, options), 0.0)
             end, (legs, _, tapes), gap = travelled
@@ -279,7 +277,7 @@ class ReturnMap(eqx.Module):
         lanes, tape, ends = side_by_side((legs, tapes, ends))
         if on_host(q):
             many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
-            by, at = tape_jacobian(many, lanes, ends, tape, varied is None, wanted)
+            by, at = tape_jacobian(many, lanes, ends, tape, varied is None)
             factors = (
                 by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
             )

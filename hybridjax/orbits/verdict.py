@@ -24,6 +24,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.events import SAME_TIME
 from ..engine.replay import recorded_moves
+from ..engine.saltation import jump
 from ..errors import DefinitionError
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
@@ -206,17 +207,15 @@ def _walk_along(cycle) -> _Path:
     delay = np.zeros(s.d)
     for k in np.flatnonzero(event >= 0):
         at = float(t[k + 1]), int(chart[k]), q[:, k]
-        if moves.at_once[k]:  # (The event before it has brought this one about.)
-            jump = _jump_at_once(s, int(event[k]), *at, scale)
-            by_state[k - 1] = jump.by_state @ by_state[k - 1]
-            by_state[k - 1] += np.outer(jump.slip, delay)
-        else:
-            jump = _jump(s, int(event[k]), *at, scale)
-            delay = jump.delay @ by_state[k]
-            by_state[k] = jump.by_state @ by_state[k]
-            by_state[k] += np.outer(jump.slip, delay)
-        findings += jump.findings
-        chart[k], q[:, k] = jump.chart, jump.q
+        event_k = _jump(s, int(event[k]), *at, scale, bool(moves.at_once[k]))
+        # (The event before one at once has brought this about, and has delayed it.)
+        before = k - 1 if moves.at_once[k] else k
+        if not moves.at_once[k]:
+            delay = event_k.delay @ by_state[k]
+        by_state[before] = event_k.by_state @ by_state[before]
+        by_state[before] += np.outer(event_k.slip, delay)
+        findings += event_k.findings
+        chart[k], q[:, k] = event_k.chart, event_k.q
     monodromy = np.eye(s.d)
     for of_move in by_state:
         monodromy = of_move @ monodromy
@@ -238,77 +237,46 @@ def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
 
 
 class _Jump(NamedTuple):
-    r"""An event.
-
-    A deviation $x$ before it, at a fixed time, becomes $R_q x + (R_q f^- + R_t - f^+)\,\delta$
-    with the delay $\delta = -h_q x / \dot h$ of the event: the saltation matrix (M. A. Aizerman and
-    F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11, 1958). Scheduled events
-    have no delay.
-    """
+    """An event on the way, padded. Scheduled events have no delay."""
 
     chart: int
     """After the event, as `q`."""
     q: Float[np.ndarray, " d"]
     by_state: Float[np.ndarray, "d d"]
-    """$R_q$."""
+    """Derivative of the reset."""
     slip: Float[np.ndarray, " d"]
-    """$R_q f^- + R_t - f^+$."""
+    """Change of the state after the event by the time of the event."""
     delay: Float[np.ndarray, " d"]
     """Derivative of the time of the event by the state before it."""
     findings: list[Finding]
 
 
-def _jump(s: Structure, g: int, t: float, a: int, q, scale) -> _Jump:
-    """Event g of a state of chart a, at its own time."""
+def _jump(
+    s: Structure, g: int, t: float, a: int, q, scale, at_once: bool = False
+) -> _Jump:
+    """Event g of a state of chart a, at its own time; or `at_once` after another event, which has
+    led to this state, where its guard is at zero, or beyond."""
     transition, n = s.transitions[g], s.dims[a]
-    jump = _reset(s, g, t, a, q)
-    time, state = np.array([t]), q[:n, None]
-    if isinstance(transition.guard, Scheduled):
-        late = t - float(transition.guard.nearest(time)[0])
-        return jump._replace(findings=_off_schedule(transition, t, late))
-    level, slope, rate = _guard(s, a, g, time, state)
-    findings = _off_guard(transition, t, level, rate, _noise(slope, scale[a, :n]))
-    delay = np.zeros(s.d)
-    delay[:n] = -slope / rate
-    return jump._replace(delay=delay, findings=findings)
-
-
-def _jump_at_once(s: Structure, g: int, t: float, a: int, q, scale) -> _Jump:
-    """Event g of a state of chart a, to which another event has just led: its guard is at zero, or
-    beyond."""
-    transition, n = s.transitions[g], s.dims[a]
-    jump = _reset(s, g, t, a, q)
-    if isinstance(transition.guard, Scheduled):
-        return jump
-    level, slope, _ = _guard(s, a, g, np.array([t]), q[:n, None])
-    if level <= 10 * _noise(slope, scale[a, :n]):
-        return jump
-    return jump._replace(findings=_off_guard(transition, t, level, -1.0, 0.0))
-
-
-def _reset(s: Structure, g: int, t: float, a: int, q) -> _Jump:
-    """The state after an event, without its delay."""
-    transition, n = s.transitions[g], s.dims[a]
-    b = s.chart_index(transition.target)
-    m = s.dims[b]
-    state, time, u = q[:n, None], np.array([t]), np.zeros((s.nu, 1))
-    reset = kernels.reset(s, s.member(g), time, state, u)[..., 0]
-    before = kernels.field(s, a, time, state, u)[:, 0, 0]
-    after = kernels.field(s, b, time, reset[:, :1], u)[:, 0, 0]
+    event = jump(s, g, np.array([t]), q[None, :n], np.zeros((s.nu, 1)))
+    level, rate = event.level[0], event.rate[0]
+    noise = _noise(event.gradient[0], scale[a, :n])
+    delay, findings = np.zeros(s.d), []
+    scheduled = isinstance(transition.guard, Scheduled)
+    if scheduled and not at_once:
+        late = t - float(transition.guard.nearest(np.array([t]))[0])
+        findings = _off_schedule(transition, t, late)
+    elif not scheduled and not at_once:
+        delay[:n] = event.delay_by_state[0]
+        findings = _off_guard(transition, t, level, rate, noise)
+    elif not scheduled and level > 10 * noise:
+        findings = _off_guard(transition, t, level, -1.0, 0.0)
+    m = event.after.shape[1]
     out, slip, by_state = np.zeros(s.d), np.zeros(s.d), np.zeros((s.d, s.d))
-    out[:m] = reset[:, 0]
-    by_state[:m, :n] = reset[:, 2 : 2 + n]
-    slip[:m] = reset[:, 2 : 2 + n] @ before + reset[:, 1] - after
-    return _Jump(b, out, by_state, slip, np.zeros(s.d), [])
-
-
-def _guard(s: Structure, a: int, g: int, time, state):
-    """Value, gradient and rate of a guard at one state; it falls through zero at its event."""
-    u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
-    row = kernels.watched(s, a, None, time, state, u, first)[s.guards(a).index(g), :, 0]
-    slope = row[2 : 2 + len(state)]
-    field = kernels.field(s, a, time, state, u)[:, 0, 0]
-    return row[0], slope, row[1] + slope @ field
+    out[:m] = event.after[0]
+    slip[:m] = event.slip[0]
+    by_state[:m, :n] = event.by_state[0]
+    b = s.chart_index(transition.target)
+    return _Jump(b, out, by_state, slip, delay, findings)
 
 
 def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):

@@ -20,7 +20,7 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from ..engine.settings import SWEEP, Settings
 from ..errors import ComputationError, DefinitionError
-from ..orbits.batches import Known
+from ..orbits.batches import Known, numbers_of
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..orbits.limit_cycles import (
@@ -213,7 +213,7 @@ class SweepJob:
             cycles = self.cycles or self.coarse()[1]
         else:
             coarse = self.family.systems(self.space.at(self.begun.index))
-            known = self.begun.coarse._replace(systems=coarse)
+            known = self.begun.coarse._replace(numbers=numbers_of(coarse))
             cycles = self._solved(self._points(k), workers, known)
         shape = [x.stop - x.start for x in self.blocks.slices(k)]
         values = self.wanted.values(cycles, self.variables)
@@ -256,11 +256,10 @@ class SweepJob:
         )
         index = self._points(0) if len(self.blocks) == 1 else index
         n = len(index[0])
-        d = map.anchor.q.shape[0]
         anchor = jax.tree_util.tree_map(
             lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor
         )
-        blank = Known(None, anchor, np.zeros(n), np.zeros((n, d, d)), np.zeros(n, int))
+        blank = Known(None, anchor, np.zeros(n), np.zeros(n, int))
         return Begun(map, index, blank)
 
     def _guess(self) -> LimitCycle:

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core import compilation
-from hybridjax._core.compilation import TwoTiers, in_turn, kernel, quick_jit
+from hybridjax._core.compilation import Program, in_turn, kernel, quick_jit
 from hybridjax._core.lanes import by_lane
 
 from ..sessions import run_python
@@ -43,14 +43,14 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("function", [double, TwoTiers(lambda x: 2 * x, False)])
+@pytest.mark.parametrize("function", [double, Program(lambda x: 2 * x, False)])
 @pytest.mark.parametrize("way", WAYS)
 def test_programs_work_wherever_they_are_called(way, function):
     assert_array_equal(WAYS[way](function), 2 * X)
 
 
 def test_errors_of_the_function_come_through():
-    for call in (wrong, jax.jit(wrong), TwoTiers(wrong, False)):
+    for call in (wrong, jax.jit(wrong), Program(wrong, False)):
         with pytest.raises(ValueError, match="not to blame"):
             call(X)
     assert gc.isenabled()
@@ -62,13 +62,13 @@ class Pair(NamedTuple):
 
 
 @pytest.fixture
-def tiers(monkeypatch):
+def compiled(monkeypatch):
     """The options of all programs that are compiled, which begin with none."""
     compiled = []
     compile = jax.stages.Lowered.compile
 
     def count(self, compiler_options=None):
-        compiled.append("quick" if compiler_options else "full")
+        compiled.append(compiler_options)
         return compile(self, compiler_options)
 
     monkeypatch.setattr(jax.stages.Lowered, "compile", count)
@@ -81,36 +81,27 @@ def total(x, make, k):
     return Pair(make(x).sum() + k, None)
 
 
-def test_later_jobs_take_the_optimized_program(tiers, monkeypatch):
-    monkeypatch.setattr(compilation, "_WORTH_OPTIMIZING", -1.0)
-    job = TwoTiers(total, large=False)
-    assert job(X, jnp.sin, 1) == Pair(jnp.sin(X).sum() + 1, None)
-    for program in compilation._by_kind.values():
-        program._thread.join()
-    assert tiers == ["quick", "full"]
-    job(X + 1, jnp.sin, 1)
-    (program,) = compilation._by_kind.values()
-    assert [x[1] for x in job._chosen.values()] == [
-        program._quick
-    ]  # one program for one job
-    later = TwoTiers(total, large=False)
-    assert_allclose(later(X, jnp.sin, 1).sum, job(X, jnp.sin, 1).sum)
-    assert [x[1] for x in later._chosen.values()] == [program._full]
-    assert len(tiers) == 2
-
-
-def test_functions_that_are_written_anew_share_a_program(tiers):
-    job = TwoTiers(total, large=False)
+def test_functions_that_are_written_anew_share_a_program(compiled):
+    job = Program(total, loops=False)
     for _ in range(3):
         job(X, lambda x: 2 * x, 1)
-    assert tiers == ["quick"]
+    assert len(compiled) == 1
     values = [
         job(X, lambda x: 3 * x, 1),
         job(X[:2], lambda x: 2 * x, 1),
         job(X, jnp.cos, 4),
     ]
     assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
-    assert len(tiers) == 4
+    assert len(compiled) == 4
+
+
+def test_a_large_job_does_not_wait_for_a_program_of_a_small_one(compiled):
+    """Both have a program of their own, and lower the function once."""
+    small, large = Program(total, loops=False), Program(total, loops=True)
+    results = [job(X, jnp.sin, 1).sum for job in (small, large, small, large)]
+    assert_allclose(results, jnp.sin(X).sum() + 1)
+    assert compiled == [jax_compat.quick_options(), jax_compat.loop_options()]
+    assert len(compilation._by_kind) == 1
 
 
 def point(power, tree, x, y):
@@ -140,9 +131,9 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
 
 def test_programs_that_call_lapack_take_turns():
     A = np.eye(2)
-    TwoTiers(jnp.linalg.eigvals, False)(A)
-    TwoTiers(jnp.linalg.matmul, False)(A, A)
-    alone = {key[0]: program._alone for key, program in compilation._by_kind.items()}
+    Program(jnp.linalg.eigvals, False)(A)
+    Program(jnp.linalg.matmul, False)(A, A)
+    alone = {key[0]: program.alone for key, program in compilation._by_kind.items()}
     assert alone[jnp.linalg.eigvals]
     assert not alone[jnp.linalg.matmul]
     inside = []

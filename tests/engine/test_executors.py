@@ -236,6 +236,6 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
             map, (turn.legs, side_by_side(turn.tapes)), q / map.sizes
         )
         for gap, steps in ((8e-13, 1), (1e-9, 2)):
-            end, _, taken = newton._newton(map, x + gap, moves, 0, 9)
+            end, _, taken = newton._newton(map, x + gap, moves, 9)
             assert taken == steps
             assert abs(end / map.sizes - x) < 1e-12

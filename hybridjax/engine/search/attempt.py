@@ -117,14 +117,8 @@ def land(
     )
 
 
-def attempt(
-    state: State, aim: Aim, task: Task, unroll=False, in_step: bool = False
-) -> Attempt:
-    """Let the active lanes step, and land those that come close to the zero they aim at.
-
-    With `in_step`, all lanes are assumed to go equally far from the same time, to no zero; then
-    terms that depend on time only are computed once.
-    """
+def attempt(state: State, aim: Aim, task: Task) -> Attempt:
+    """Let the active lanes step, and land those that come close to the zero they aim at."""
     s, lanes, L = task.s, state.lanes, state.lanes.t.shape[0]
     xp = namespace(lanes.t)
     zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
@@ -141,10 +135,8 @@ def attempt(
             only(here, lanes.q[:n]),
             xp.where(here, aim.step, 0.0),
         )
-        if in_step:
-            t, tau = t[:1], aim.step[xp.argmax(here)][None]
         before = None if out.along is None else only(here, out.along[:n])
-        step, along, change = _step(flow, present, t, q, tau, before, task, unroll)
+        step, along, change = _step(flow, present, t, q, tau, before, task)
         allowed, error = _errors(flow, t, q, tau, step, change, along, task)
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
@@ -153,23 +145,14 @@ def attempt(
         if rows:
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
-            if not in_step:
-                goal = aim._replace(which=which, step=tau)
-                end = cond(
-                    (which >= 0).any(),
-                    lambda: land(
-                        flow.only(which >= 0),
-                        before,
-                        q,
-                        step,
-                        allowed,
-                        t,
-                        goal,
-                        task.span,
-                    ),
-                    lambda: end,
-                )
-            moved = tau if in_step else tau + xp.where(end.lands, end.past, 0.0)
+            goal, plain = aim._replace(which=which, step=tau), end
+            landing = flow.only(which >= 0)
+            end = cond(
+                (which >= 0).any(),
+                lambda: land(landing, before, q, step, allowed, t, goal, task.span),
+                lambda: plain,
+            )
+            moved = tau + xp.where(end.lands, end.past, 0.0)
             after = cond(
                 present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
             )
@@ -207,7 +190,6 @@ def _step(
     tau: AnyTimes,
     along: States | None,
     task: Task,
-    unroll: bool,
 ) -> tuple[Step, States | None, States | None]:
     """A step; where derivatives matter, the deviation after it (of implicit methods), and the
     change of its error by a deviation.
@@ -217,20 +199,20 @@ def _step(
     died out since, as it does where a chart is stiff.
     """
     # (A branch, since XLA would mask the states again in every stage.)
-    plain = lambda: flow.step(t, q, tau, unroll)  # noqa: E731
+    plain = lambda: flow.step(t, q, tau)  # noqa: E731
     if along is not None and flow.method.implicit:
         return cond(
-            present & task.tangents,
+            present,
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
     step = cond(present, plain, lambda: Step(*[q] * len(Step._fields)))
-    if task.tangents is False:
+    if not task.tangents:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
     shifted = cond(
-        present & task.tangents,
-        lambda: flow.step(t, q + shift * _direction(len(q)), tau, unroll).estimate,
+        present,
+        lambda: flow.step(t, q + shift * _direction(len(q)), tau).estimate,
         lambda: step.estimate,
     )
     return step, None, shifted - step.estimate

@@ -7,11 +7,10 @@ its decisions are recorded in a `Tape`, which `replay` follows.
 import numpy as np
 
 from ..._core.executor import cond, namespace, on_host, put, while_loop
-from ..._core.lanes import shared
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ...systems.transition import SAME_TIME
-from ..arrays import Index, Inputs, Mask, Times
+from ..arrays import Index, Inputs, Times
 from ..events import arm, next_schedule, overdue
 from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
@@ -20,7 +19,7 @@ from ..watch import chart_field, watch
 from .accept import uneventful
 from .attempt import attempt, deviation
 from .outcome import level_counts, with_events, without_events
-from .state import Aim, Approach, Attempt, Moved, Options, Recorded, State, Stride, Task
+from .state import Aim, Approach, Moved, Options, Recorded, State, Stride, Task
 
 
 # A guard's zero is aimed at if Newton's guess places it within this part of the step. Nearer to 1:
@@ -56,36 +55,24 @@ def search(
     begin = _begin(lanes, result, task, options.new_input)
     tape = blank_tape(settings.max_steps, lanes) if options.tape else None
 
-    def all_the_way() -> Recorded:
-        going = lambda x: (x[0].i < settings.max_steps) & x[0].active.any()  # noqa: E731
+    def going(carry):
+        state, _ = carry
+        return (state.i < settings.max_steps) & state.active.any()
 
-        def iterate(carry):
-            state, tape = carry
-            aim = take_aim(state, task)
-            step = state, aim, attempt(state, aim, task), task
-            calm = uneventful(*step).all()
-            end, row = cond(
-                calm, lambda: without_events(*step), lambda: with_events(*step)
-            )
-            return end, None if tape is None else write_row(tape, state.i, row)
+    def iterate(carry):
+        state, tape = carry
+        aim = take_aim(state, task)
+        step = state, aim, attempt(state, aim, task), task
+        calm = uneventful(*step).all()
+        end, row = cond(calm, lambda: without_events(*step), lambda: with_events(*step))
+        return end, None if tape is None else write_row(tape, state.i, row)
 
-        end, written = while_loop(going, iterate, (begin, tape))
-        # (Copies of many empty rows take time. A single lane's tape has as many as XLA's.)
-        if written is not None and on_host(end.i) and s.by_system:
-            written = Tape(*(x[: end.i] for x in written))
-        result = update_result(end.result, end.active, Result.STEP_LIMIT)
-        return Recorded(Moved(end.lanes, end.h, end.error, result), written)
-
-    if not options.glide:
-        return all_the_way()
-    aim, new, arrives = _one_step(begin, task)
-
-    def in_one_step() -> Recorded:
-        end, row = without_events(begin, aim, new, task)
-        written = None if tape is None else write_row(tape, begin.i, row)
-        return Recorded(Moved(end.lanes, end.h, end.error, end.result), written)
-
-    return cond(arrives.all(), in_one_step, all_the_way)
+    end, written = while_loop(going, iterate, (begin, tape))
+    # (Copies of many empty rows take time. A single lane's tape has as many as XLA's.)
+    if written is not None and on_host(end.i) and s.by_system:
+        written = Tape(*(x[: end.i] for x in written))
+    result = update_result(end.result, end.active, Result.STEP_LIMIT)
+    return Recorded(Moved(end.lanes, end.h, end.error, result), written)
 
 
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
@@ -101,7 +88,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
     )
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows, along = implicit and task.tangents is not False, task.stride.along
+    follows, along = implicit and task.tangents, task.stride.along
     none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
     return State(
         arm(s, lanes, watched, task.span) if new_input else lanes,
@@ -115,24 +102,6 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         no,
         xp.zeros((), xp.int32),
     )
-
-
-def _one_step(begin: State, task: Task) -> tuple[Aim, Attempt, Mask]:
-    """One step of all lanes, and in which of them it ends at the target."""
-    s, levels = task.s, shared(task.target.levels)
-    clock = levels is None or not any(
-        levels.present(s, a) for a in range(len(s.charts))
-    )
-    aim = take_aim(begin, task)
-    new = attempt(begin, aim, task, unroll=True, in_step=clock)
-    arrives = uneventful(begin, aim, new, task) & (new.lands | aim.last)
-    if clock:
-        for x in (
-            begin.lanes.t,
-            aim.step,
-        ):  # the same in all active lanes, as `attempt` assumed
-            arrives = arrives & (x == x[namespace(x).argmax(begin.active)])
-    return aim, new, arrives | ~begin.active
 
 
 def take_aim(state: State, task: Task) -> Aim:

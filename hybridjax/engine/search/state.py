@@ -33,12 +33,9 @@ class Options(NamedTuple):
 
     tape: bool = False
     """Record a tape."""
-    glide: bool = False
-    """Try one step of all lanes first: if it ends at the target in all of them, the loop is
-    skipped."""
     new_input: bool = True
     """Arm the guards for the input u, which may have jumped; otherwise they stay as they are."""
-    tangents: Bool[Array, ""] | bool = False
+    tangents: bool = False
     """Make steps also short enough for the derivatives of a replay."""
     at_once: bool = False
     """On the host: one program for all pieces of a turn."""
@@ -75,7 +72,7 @@ class Task(NamedTuple):
     """Time from the start to the limit, relative to which rounding errors of times are judged."""
     stride: Stride
     settings: Settings
-    tangents: Bool[Array, ""] | bool
+    tangents: bool
     """Whether steps are also short enough for the derivatives of a replay."""
 
 
