@@ -20,6 +20,7 @@ from ..orbits.find import find_limit_cycle
 from ..orbits.guess import require_similar
 from ..systems.quotient import check_symmetry
 from ..systems.system import Guess, HybridSystem
+from .beside import Model
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
 from .problem import (
@@ -100,11 +101,14 @@ def fit_model(
     rng = np.random.default_rng(seed)
     around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
     starts = np.concatenate([x0[None], x0 + around])
+    model = Model(problem, near)
     ends: list[End] = []
     for start in counted(starts, "guesses", guesses):
         at_guess = not ends and near.system is system
-        cycle = near if at_guess else _cycle_at(problem, system, start, near)
-        ends.append(_descend(problem, start, cycle))
+        cycle = near
+        if not at_guess and not model.is_beside(start, near):
+            cycle = _cycle_at(problem, system, start, near)
+        ends.append(_descend(problem, start, cycle, model))
         if ends[-1].explains(problem.weighted):
             break
     best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
@@ -229,12 +233,15 @@ def _cycle_at(
 
 
 def _descend(
-    problem: FitProblem, start: Float[np.ndarray, " p"], cycle: LimitCycle
+    problem: FitProblem,
+    start: Float[np.ndarray, " p"],
+    cycle: LimitCycle,
+    model: Model,
 ) -> End:
     if int(cycle.result) != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
-    x, r, J, near, steps, converged = descend(problem, start, cycle)
+    x, r, J, near, steps, converged = descend(problem, start, cycle, model)
     result = Result.OK if converged else Result.NOT_CONVERGED
     return End(start, x, float(r @ r), r, J, near, steps, int(result))
 

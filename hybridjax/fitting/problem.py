@@ -1,7 +1,7 @@
 """Weighted residuals of data as a function of free parameters, and their minimization."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -278,12 +278,16 @@ def evaluate(
 
 
 def descend(
-    problem: FitProblem, x: Float[np.ndarray, " p"], guess: LimitCycle
+    problem: FitProblem,
+    x: Float[np.ndarray, " p"],
+    guess: LimitCycle,
+    evaluate: Callable = evaluate,
 ) -> tuple[
     Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle, int, bool
 ]:
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
-    Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
+    Jacobian, a guess for their cycle, number of evaluations, and whether it has converged. Other
+    ways to `evaluate` the model do as the function of that name.
 
     The damping is relative to the largest sensitivity, so that units of the residuals do not count.
     (`scipy.optimize.least_squares` takes 27 evaluations in place of 8 where the data identify only

@@ -215,7 +215,7 @@ def find_limit_cycle(
     if isinstance(guess, LimitCycle) and section is None and is_inside_program():
         route = route_near(guess)
         if route is not None:
-            return traced_cycle(route, map)
+            return traced_cycle(guess, route, map)
     if isinstance(guess, LimitCycle) and traced:
         solution = solve(map, True, True, near)
         # (Of events that coincide on the guess, too, its search has compared the orders.)

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._core.compilation import at_ease, identity, whole
 from .._core.executor import from_host, is_traced, is_tracer, on_the_cpu
@@ -27,6 +28,7 @@ from .cycle import LimitCycle
 from .linear_flow import hosted, last_turn
 from .repeat import (
     Corrected,
+    Derivatives,
     Plan,
     Route,
     agrees,
@@ -47,7 +49,7 @@ from .verdict import verdict
 # Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
 # not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3
-_routes = Memory()
+_routes, _beside = Memory(), Memory()
 _calls: collections.Counter = collections.Counter()
 
 
@@ -69,28 +71,60 @@ def route_near(guess: LimitCycle) -> Route | None:
 
 def _beginning(route: Route, map: ReturnMap) -> tuple:
     """The state and the ends of legs from which Newton's method begins."""
-    grown = map.expected / float(route.map.expected)
+    grown = map.expected / route.map.expected
     ends = map.anchor.t + route.first.ends * grown
     return jnp.asarray(route.map.anchor.q[:, 0]), ends
 
 
-def traced_cycle(route: Route, map: ReturnMap) -> LimitCycle:
-    """The cycle of a return map whose system is traced, with derivatives.
+def known_beside(cycle: LimitCycle) -> LimitCycle | None:
+    """The known cycle beside which a traced one was found on its route; None for others."""
+    return _beside.get(cycle, None)
+
+
+def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
+    """The cycle of a return map whose system is traced, with derivatives, on the route of a known
+    cycle.
 
     A cycle that leaves the route has a result code.
     """
+    begin = _beginning(route, map)
     traced = [x.size for x in leaves_of(map) if is_tracer(x)]
     few = sum(traced) <= JACOBIAN_COLUMNS
-    find = ft.partial(_found, route, not few)
-    found = (by_jacobian(find) if few else find)(map)
+    if few:
+        find = ft.partial(_found, route, "all", begin)
+        found = by_jacobian(find)(map)
+    else:
+        found = _found(route, "all", begin, map, reverse=True)
+    cycle = _cycle(route.finer, route, map, found, _result(route, map, found))
+    _beside.recall(cycle, None, lambda: known)
+    return cycle
+
+
+def first_order_cycle(
+    route: Route, map: ReturnMap, q: Float[Array, " d"]
+) -> LimitCycle:
+    """The cycle of a return map whose system is traced, from a state near it on the route of a
+    known cycle. The anchor and the period have first derivatives, in forward mode; the rest has
+    none.
+
+    A cycle that leaves the route has a result code.
+    """
+    begin = q, _beginning(route, map)[1]
+    found = _found(route, "first", begin, map)
     return _cycle(route.finer, route, map, found, _result(route, map, found))
 
 
-def _found(route: Route, reverse: bool, map: ReturnMap) -> Corrected:
+def _found(
+    route: Route,
+    derivatives: Derivatives,
+    begin: tuple,
+    map: ReturnMap,
+    reverse: bool = False,
+) -> Corrected:
     itinerary = route.finer  # (steps cannot be divided later)
-    plan = Plan(itinerary.rows, None, jnp.asarray(itinerary.last))
-    options: Any = dict(derivatives=True, reverse=reverse)
-    begin = _beginning(route, map)
+    count = None if reverse else jnp.asarray(itinerary.count)
+    plan = Plan(itinerary.rows, count, jnp.asarray(itinerary.last))
+    options: Any = dict(derivatives=derivatives)
     return correct(maps_of(map), itinerary.form, plan, *begin, **options)
 
 
@@ -109,24 +143,19 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
 
 def _coincide(route: Route, found: Corrected, expected):
     """Whether two events come together that do not on the known cycle."""
-    ends = found.passage.ends
-    pairs = [k for k in range(1, len(route.first.events)) if _apart(route, k)]
-    between = [ends[k] - ends[k - 1] for k in pairs]
-    if isinstance(route.map.base, AtEvent) and len(route.first.events) > 1:
-        between.append(ends[0] - found.passage.legs_t[0])
-    if not between:
-        return jnp.asarray(False)
-    return (jnp.stack(between) <= TOGETHER * expected).any()
-
-
-def _apart(route: Route, k: int) -> bool:
-    """Whether event k comes later than the one before on the known cycle. (Of two that are
-    scheduled, the order is known.)"""
     s, events = route.map.structure, route.first.events
-    if s.clocks[events[k]] >= 0 and s.clocks[events[k - 1]] >= 0:
-        return False
-    ends, period = route.first.ends, float(route.map.expected)
-    return bool(ends[k] - ends[k - 1] > TOGETHER * period)
+    ends, known = found.passage.ends, jnp.asarray(route.first.ends)
+    together = jnp.asarray(False)
+    for k in range(1, len(events)):
+        if s.clocks[events[k]] >= 0 and s.clocks[events[k - 1]] >= 0:
+            continue  # (Of two that are scheduled, the order is known.)
+        were_apart = known[k] - known[k - 1] > TOGETHER * route.map.expected
+        meet = ends[k] - ends[k - 1] <= TOGETHER * expected
+        together = together | (were_apart & meet)
+    if isinstance(route.map.base, AtEvent) and len(events) > 1:
+        since_begin = ends[0] - found.passage.legs_t[0]
+        together = together | (since_begin <= TOGETHER * expected)
+    return together
 
 
 def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:

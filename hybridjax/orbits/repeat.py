@@ -8,7 +8,7 @@ program for all systems of a class, and is differentiable.
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -49,7 +49,12 @@ _OTHER = 0.83
 _APART, _ROUGH = 1e-6, 1e3
 # Largest last correction of an event's time, as a part of the period. Larger: an event that the
 # corrections have not reached passes. Smaller: rounding errors of times do not.
-_LAST = 1e-10
+LAST_CORRECTION = 1e-10
+
+
+# Derivatives of a cycle: none; first ones, of the state at its beginning and of the period; all,
+# for which the last turn is repeated.
+Derivatives: TypeAlias = Literal["none", "first", "all"]
 
 
 class Plan(NamedTuple):
@@ -255,7 +260,7 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
     legs = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
-    passage = Passage(zeros(), q, ends, *legs, zeros(), zeros(), inside)
+    passage = Passage(zeros(), q, ends, *legs, zeros(d), zeros(), zeros(), inside)
     unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
     return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
 
@@ -265,27 +270,55 @@ def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def _root(maps: Maps, form: Form, plan: Plan, q, ends, reverse: bool) -> Corrected:
+def _root(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
     return _corrected(maps, form, plan, q, ends)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
     """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp; nothing else of the result has derivatives."""
-    maps, form, plan, *_, reverse = primals
+    maps, form, plan, *_ = primals
     found = _root(*primals)
     q, ends = found.q, found.passage.ends
-    fixed = jax.tree_util.tree_map(lambda _: None, maps.map.settings)
-    t_maps = eqx.tree_at(
-        lambda x: x.map.settings, tangents[0], fixed, is_leaf=lambda x: x is None
-    )
-    options: Any = dict(columns=False, reverse=reverse)
-    residual = lambda maps: turn(maps, form, plan, q, ends, **options)[1]  # noqa: E731
-    _, moved = eqx.filter_jvp(residual, (maps,), (t_maps,))
-    passage, _ = turn(maps, form, plan, q, ends, reverse=reverse)
+    _, moved = _at_fixed_state(maps, tangents[0], form, plan, q, ends)
+    passage, _ = turn(maps, form, plan, q, ends)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
     return found, nothing._replace(q=step)
+
+
+def _at_fixed_state(maps: Maps, by_maps: Any, form: Form, plan: Plan, q, ends):
+    """Derivatives of the time at the end of a turn from q, and of P(q) - q."""
+    fixed = jax.tree_util.tree_map(lambda _: None, maps.map.settings)
+    by_maps = eqx.tree_at(
+        lambda x: x.map.settings, by_maps, fixed, is_leaf=lambda x: x is None
+    )
+
+    def end(maps):
+        passage, residual = turn(maps, form, plan, q, ends, columns=False)
+        return passage.t, residual
+
+    return eqx.filter_jvp(end, (maps,), (by_maps,))[1]
+
+
+@eqx.filter_custom_jvp
+def _root_and_period(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+    return _corrected(maps, form, plan, q, ends)
+
+
+@_root_and_period.def_jvp
+def _root_and_period_jvp(primals, tangents):
+    """First derivatives of the state, and of the time at the end of the turn, from the Jacobian
+    that Newton's method has used."""
+    maps, form, plan, *_ = primals
+    found = _root_and_period(*primals)
+    q, passage = found.q, found.passage
+    late, moved = _at_fixed_state(maps, tangents[0], form, plan, q, passage.ends)
+    _, step, *_ = maps.each(_newton, passage.factors, moved, q)
+    before = monodromy(passage.factors[:-1])
+    late = late + passage.delay @ (before @ step)
+    nothing = jax.tree_util.tree_map(lambda _: None, found)
+    return found, nothing._replace(q=step, passage=nothing.passage._replace(t=late))
 
 
 def correct(
@@ -295,21 +328,20 @@ def correct(
     q,
     ends,
     *,
-    derivatives: bool = False,
-    reverse: bool = False,
+    derivatives: Derivatives = "none",
 ) -> Corrected:
     """Newton's method on an itinerary.
 
-    **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: whether
-    the result has those of the cycles, for which the last turn is repeated; in `reverse` mode, too.
+    **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: those of
+    the result. (Reverse mode needs a plan without a count of rows.)
     """
-    if not derivatives:
-        return _corrected(maps, form, plan, q, ends)
     still = jax.lax.stop_gradient
-    found = _root(maps, form, plan, still(q), still(ends), reverse)
-    passage, _ = turn(
-        maps, form, plan, found.q, still(found.passage.ends), reverse=reverse
-    )
+    if derivatives == "none":
+        return _corrected(maps, form, plan, q, ends)
+    if derivatives == "first":
+        return _root_and_period(maps, form, plan, still(q), still(ends))
+    found = _root(maps, form, plan, still(q), still(ends))
+    passage, _ = turn(maps, form, plan, found.q, still(found.passage.ends))
     return found._replace(passage=passage)
 
 
@@ -349,7 +381,7 @@ def judge(route: Route, found: Corrected, t, expected) -> tuple:
     # (Rounding makes legs that last no time negative.)
     forwards = durations >= -ROUNDING * expected[..., None]
     kept = ~passage.left & forwards.all(axis=-1)
-    kept = kept & (passage.last <= _LAST * expected)
+    kept = kept & (passage.last <= LAST_CORRECTION * expected)
     # (On a cycle that is not isolated, Newton's method ends anywhere.)
     sizes = route.map.sizes
     defect = found.jacobian * sizes / sizes[:, None]

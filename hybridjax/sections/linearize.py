@@ -28,6 +28,7 @@ from ..systems.transition import TOGETHER
 from .families import AbstractSections, BoundSections, ClockPhase, Orbit, as_family
 from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike
+from .walk import walk_beside, walked
 
 
 Delays = Annotated[Numbers, Reals("2", sign="nonnegative")]
@@ -79,10 +80,16 @@ def linearize(
         *(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist())
     )
     names, columns = s.inputs_among(inputs)
-    if of_family:
-        A, B, C, D, dims = _of_family(
-            cycle, as_family(placed), tuple(z.items), last_turn(cycle)
-        )
+    family = as_family(placed) if of_family else None
+    walk = None if family is None else walk_beside(cycle, family)
+    if family is not None and walk is not None:
+        on_walk, jacobians = walked(cycle, family, walk)
+        A, B = on_walk.between(jacobians)
+        C, D = _output_jacobians(on_walk, tuple(z.items))
+        dims = on_walk.dims
+    elif family is not None:
+        turn = last_turn(cycle)
+        A, B, C, D, dims = _of_family(cycle, family, tuple(z.items), turn)
     else:
         A, B, C, D, dims = _matrices_of(placed, tuple(z.items))
     if not traced:

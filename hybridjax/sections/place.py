@@ -7,7 +7,7 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import at_ease, host_first, quick_jit
@@ -173,16 +173,7 @@ def _locate(
         pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     first = before[1].result[0, 0]
     lanes, moved, tape = side_by_side(pieces)
-    normal = _normals(s, bound, lanes, xp.arange(N), u)
-    f = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
-    share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), f]))
-    flat = xp.max(share, axis=0) == 0
-    drop = xp.where(flat, -1, xp.argmax(share, axis=0))
-    dims = (
-        xp.asarray(s.dims)[lanes.chart]
-        + (xp.isinf(bound.time) & (map.base is None))
-        - ~flat
-    )
+    drop, dims, normal = coordinates_on(map, bound, lanes)
     duration, result = moved.lanes.t - lanes.t, moved.result
     # Rounding would decide on which side of an event a clock section lies. (Not of the clock's.)
     by_clock = xp.asarray(
@@ -198,6 +189,33 @@ def _locate(
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)
     return first, (bound, lanes, tape, duration, result, drop, dims, normal)
+
+
+def coordinates_on(
+    map: ReturnMap, bound: BoundSections, lanes: Lanes
+) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, "N n"]]:
+    """The fields `drop`, `dims` and `normal` of `PlacedSections`."""
+    s, N, xp = map.structure, len(lanes.t), namespace(lanes.t)
+    normal = _normals(s, bound, lanes, xp.arange(N), xp.zeros((s.nu, 1)))
+    field = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
+    share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), field]))
+    flat = xp.max(share, axis=0) == 0
+    drop = xp.where(flat, -1, xp.argmax(share, axis=0))
+    time_is_state = xp.isinf(bound.time) & (map.base is None)
+    dims = xp.asarray(s.dims)[lanes.chart] + time_is_state - ~flat
+    return drop, dims, normal
+
+
+def recorded_flows(placed: PlacedSections) -> tuple[Any, Any]:
+    """Starts and steps, side by side, of the flow from a cycle's beginning to the anchor of the
+    family (None if that is no `Crossing`), and from there to one section after the other."""
+    cycle, flows = placed.cycle, []
+    turn = None if has_implicit(cycle.structure) else last_turn(cycle)
+    map, family = to_host((_patient(cycle), placed.family))
+    _locate(map, family, turn, flows)
+    recorded = [side_by_side((lanes, tape)) for lanes, _, tape in flows]
+    lead = recorded[0] if isinstance(family.anchor, Crossing) else None
+    return lead, recorded[-1]
 
 
 def place_along(
@@ -301,15 +319,18 @@ def _bind(
         carry = anchor, stride((0.1 * period / M)[None]), xp.zeros(1, xp.int32)
         times = anchor.t + period * xp.arange(1, M + 1) / M
         lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
-    orbit = Orbit(period, lanes.t, lanes.chart, lanes.q.T)
-    bound = (
-        to_host(_bind_program(map, family, orbit))
-        if on_host(period)
-        else family.bind(s, orbit)
-    )
+    bound = bind_at(map, family, lanes)
     late = xp.ceil((t - bound.time[0]) / period)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)
     return dataclasses.replace(bound, time=bound.time + late * period)
+
+
+def bind_at(map: ReturnMap, family: AbstractSections, points: Lanes) -> BoundSections:
+    """The family evaluated on the cycle, from points at equal times."""
+    orbit = Orbit(map.expected, points.t, points.chart, points.q.T)
+    if on_host(map.expected):
+        return to_host(_bind_program(map, family, orbit))
+    return family.bind(map.structure, orbit)
 
 
 @quick_jit

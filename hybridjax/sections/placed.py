@@ -36,7 +36,8 @@ class PlacedSections(eqx.Module):
     - `bound`: the family evaluated on the cycle.
     - `lanes`: the cycle's state at each section (N lanes), in order, within one period from
         section 0.
-    - `tape`: the steps of the flow from each section to the next.
+    - `tape`: the steps of the flow from each section to the next; None where it was repeated from
+        a known cycle.
     - `duration` (N,): time from section i to the next.
     - `result` (N,): `Result` codes of the flow from section i to the next.
     - `drop` (N,): the coordinate of (t, states...) that is left out on section i, or -1.
@@ -48,7 +49,7 @@ class PlacedSections(eqx.Module):
     family: AbstractSections
     bound: BoundSections
     lanes: Lanes
-    tape: Tape
+    tape: Tape | None
     duration: Float[Array, " N"]
     result: Int[Array, " N"]
     drop: Int[Array, " N"]
@@ -158,18 +159,24 @@ class PlacedSections(eqx.Module):
     def flow_jacobians(self) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
         """A and B of the flow from each section to the next, padded; NaN if it failed."""
         placed = self if is_hidden(self) else to_host(self)
-        s, n, sizes = self.structure(), 1 + placed.lanes.q.shape[0], placed.across
-        following, _, target = placed.onwards()
+        s, sizes = self.structure(), placed.across
+        _, _, target = placed.onwards()
         with at_ease():
             jacobian, _ = tape_jacobian(
                 s, placed.lanes, target, placed.tape, across=sizes
             )
-        xp = namespace(jacobian)
-        jacobian = xp.where(
-            (placed.result == Result.OK)[:, None, None], jacobian, xp.nan
-        )
-        embed, select = placed.frames()
-        after = select[following]
+        return placed.between(jacobian)
+
+    def between(
+        self, jacobian: Float[Array, "N n m"]
+    ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
+        """A and B, padded, from derivatives of (t, q) on each next section by (t, q) and the inputs
+        on this one; NaN where the flow failed."""
+        xp, n = namespace(jacobian), self.normal.shape[1]
+        failed = self.result != Result.OK
+        jacobian = xp.where(failed[:, None, None], xp.nan, jacobian)
+        embed, select = self.frames()
+        after = xp.roll(select, -1, axis=0)
         return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
 
     @property

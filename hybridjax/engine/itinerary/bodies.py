@@ -1,10 +1,12 @@
-r"""What the rows of an itinerary do: steps in charts, jumps at events, the section at the end.
+r"""What the rows of an itinerary do: steps in charts, jumps at events, arrivals on sections.
 
 Beside the state $q$ run columns $v$, its derivatives in some directions at a fixed time. Between
-events they obey $\dot v = f_q v$. An event of the guard h takes place later by
-$\delta = -h_q v / \dot h$, and leaves $v^+ = R_q (v + f^- \delta) + R_t \delta - f^+ \delta$ with
-the reset R: the saltation formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and
-Applied Mathematics 11, 1958).
+events they obey $\dot v = f_q v + f_u w$, where w is the constant input of the direction. An event
+of the guard h takes place later by $\delta = -(h_q v + h_u w) / \dot h$, and leaves
+$v^+ = R_q (v + f^- \delta) + R_t \delta + R_u w - f^+ \delta$ with the reset R: the saltation
+formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11,
+1958). On a section the state has moved by $v + f \delta$ where the section is a level, and by v
+where it is a time.
 """
 
 import dataclasses
@@ -20,7 +22,7 @@ from ...systems.transition import SAME_TIME, Scheduled
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
-from .rows import JUMP, NOTHING, PIECE, SCHEDULE, SECTION, STEP, Body, Rows
+from .rows import JUMP, LEVEL, NOTHING, PIECE, SCHEDULE, STEP, TIME, Body, Rows
 
 
 # Times of a schedule are equal if they differ by less than this part of its period. Larger: an
@@ -40,7 +42,7 @@ class Course(NamedTuple):
     begin: Float[Array, ""]
     """Time at which the present leg began."""
     delay: Float[Array, " C"]
-    """Columns of the time of the last event."""
+    """Columns of the time of the last event, or of the arrival on a section."""
     ends: Float[Array, " E"]
     """Ends of legs: as guessed, and as found once they are past."""
     before: "Watched"
@@ -73,8 +75,9 @@ class Watched(NamedTuple):
 class Bodies:
     """Functions of a row and a course for every kind of row.
 
-    **Fields:** `levels`: of the section at the end, if there is one; `width`: largest number of
-    watched functions of a chart; `pairs`: a solver for each chart.
+    **Fields:** `levels`: of the sections, if there are any; `width`: largest number of watched
+    functions of a chart; `pairs`: a solver for each chart; `inputs`: those of each column, None for
+    columns without inputs.
     """
 
     s: Structure
@@ -82,6 +85,7 @@ class Bodies:
     settings: Settings
     width: int
     pairs: Callable[[int], steps.Solver]
+    inputs: Float[Array, "C nu"] | None = None
 
     def of(self, body: Body) -> Callable[[Rows, Course], Course]:
         """The function of rows with this body."""
@@ -91,18 +95,27 @@ class Bodies:
             SCHEDULE: self._schedule,
             STEP: self._step,
             JUMP: self._jump,
-            SECTION: self._section,
+            LEVEL: self._level,
+            TIME: self._time,
         }[body.does]
         return lambda row, course: work(body, row, course)
 
     def _piece(self, body: Body, row: Rows, course: Course) -> Course:
-        """A piece begins: columns begin anew. (`follow` keeps those of the last one.)"""
+        """A piece begins: columns begin anew. (`follow` keeps those of the last one.)
+
+        On a section, the first one is that of the time: who begins later is behind by the flow.
+        """
         n, d, C = self.s.dims[body.chart], course.y.shape[1], course.y.shape[0] - 1
-        unit = jnp.where(jnp.arange(d) < n, jnp.eye(C, d), 0.0)
         rate = self._field(body.chart, course.t, self._state(body.chart, course))
-        return course._replace(
-            y=course.y.at[1:].set(unit), rate=jnp.pad(rate, (0, d - n))
-        )
+        rate = jnp.pad(rate, (0, d - n))
+        delay = course.delay
+        if self.inputs is None:
+            unit = jnp.eye(C, d)
+        else:
+            unit = jnp.concatenate([-rate[None], jnp.eye(C - 1, d)])
+            delay = jnp.zeros(C).at[0].set(1.0)
+        unit = jnp.where(jnp.arange(d) < n, unit, 0.0)
+        return course._replace(y=course.y.at[1:].set(unit), rate=rate, delay=delay)
 
     def _schedule(self, body: Body, row: Rows, course: Course) -> Course:
         """A leg begins whose end is known: the tick nearest to the guess."""
@@ -116,7 +129,7 @@ class Bodies:
         a = body.chart
         q = self._state(a, course)
         field = self._field(a, course.t, q)
-        now = self._watched(a, course.t, q, field)
+        now = self._watched(a, row, course.t, q, field)
         h = row.fraction * (course.ends[row.leg] - course.begin)
         if self._functions(a):
             is_correction = row.target >= 0
@@ -139,24 +152,26 @@ class Bodies:
         b = s.chart_index(s.transitions[body.kind[0]].target)
         q, u = self._state(a, course), self._no_input
         field = self._field(a, course.t, q)
-        now = self._watched(a, course.t, q, field)
+        now = self._watched(a, row, course.t, q, field)
         delay, late = course.delay, jnp.zeros(())
         if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
             delay = jnp.zeros_like(delay)
         elif not body.at_once:
             late = _newton(now, row.target)
-            delay = self._delay(a, course, q, now, row.target)
+            delay = self._delay(a, row, course, q, now)
         left = course.left | self._has_left(a, row, course, now)
         t, q = course.t + late, q + field * late
         after = s.reset(member, t, q, u)
         onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
 
-        def column(v, delay):
-            along = delay, v + field * delay
-            reset = lambda t, q: s.reset(member, t, q, u)  # noqa: E731
-            return jax.jvp(reset, (t, q), along)[1] - onward * delay
+        def reset(t, q, u):
+            return s.reset(member, t, q, u)
 
-        columns = jax.vmap(column)(course.y[1:, : s.dims[a]], delay)
+        def column(v, delay, w=u):
+            along = delay, v + field * delay, w
+            return jax.jvp(reset, (t, q, u), along)[1] - onward * delay
+
+        columns = self._each(column, course.y[1:, : s.dims[a]], delay)
         moved = jnp.concatenate([after[None], columns])
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
         left = left | self._has_tick(a, course, t)
@@ -171,26 +186,47 @@ class Bodies:
             left=left | (t < course.begin),
         )
 
-    def _section(self, body: Body, row: Rows, course: Course) -> Course:
-        """The end, at a level of the section or at the time that is known."""
+    def _level(self, body: Body, row: Rows, course: Course) -> Course:
+        """The arrival on a level."""
         a = body.chart
         n, q = self.s.dims[a], self._state(a, course)
         field = self._field(a, course.t, q)
-        now = self._watched(a, course.t, q, field)
-        late, y = jnp.zeros(()), course.y
-        if self._has_level(a):
-            late = _newton(now, row.target)
-            delay = self._delay(a, course, q, now, row.target)
-            arrived = jnp.outer(jnp.append(late, delay), field)
-            y = y.at[:, :n].add(arrived)
-        t = course.t + late
+        now = self._watched(a, row, course.t, q, field)
+        late = _newton(now, row.target)
+        delay = self._delay(a, row, course, q, now)
+        arrived = jnp.outer(jnp.append(late, delay), field)
         left = course.left | self._has_left(a, row, course, now)
+        course = course._replace(y=course.y.at[:, :n].add(arrived), left=left)
+        return self._arrived(a, row, course, now, late, delay)
+
+    def _time(self, body: Body, row: Rows, course: Course) -> Course:
+        """The arrival at a time that is known."""
+        a, q = body.chart, self._state(body.chart, course)
+        now = self._watched(a, row, course.t, q, self._field(a, course.t, q))
+        left = course.left | self._has_left(a, row, course, now)
+        # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
+        misses = jnp.abs(course.ends[row.leg] - course.t)
+        course = course._replace(left=left, last=jnp.maximum(course.last, misses))
+        delay = jnp.zeros_like(course.delay)
+        return self._arrived(a, row, course, now, jnp.zeros(()), delay)
+
+    def _arrived(
+        self, a: int, row: Rows, course: Course, now: Watched, late, delay
+    ) -> Course:
+        """A course on a section, where the next leg begins."""
+        t = course.t + late
+        before = now
+        if self._has_level(a):  # (The next section has another one.)
+            level = len(self.s.guards(a))
+            before = now._replace(value=now.value.at[level].set(jnp.inf))
         return course._replace(
             t=t,
-            y=y,
+            begin=t,
+            delay=delay,
             ends=course.ends.at[row.leg].set(t),
+            before=before,
             last=jnp.maximum(course.last, jnp.abs(late)),
-            left=left | self._has_tick(a, course, t),
+            left=course.left | self._has_tick(a, course, t) | (t < course.begin),
         )
 
     # Functions of a chart.
@@ -208,7 +244,8 @@ class Bodies:
     def _advanced(self, a: int, course: Course, h):
         """The state and its columns after a step, and the error relative to what is allowed."""
         n = self.s.dims[a]
-        y, error = steps.step(self.s, a, self.pairs(a), course.t, course.y[:, :n], h)
+        solver, y = self.pairs(a), course.y[:, :n]
+        y, error = steps.step(self.s, a, solver, course.t, y, h, self.inputs)
         scale = self.settings.scale[a, :n]
         allowed = self.settings.rtol * jnp.maximum(
             jnp.abs(course.y[0, :n]), jnp.abs(y[0])
@@ -224,18 +261,20 @@ class Bodies:
         """Number of watched functions."""
         return len(self.s.guards(a)) + self._has_level(a)
 
-    def _values(self, a: int, t, q) -> Float[Array, " g"]:
+    def _values(self, a: int, row: Rows, t, q, u) -> Float[Array, " g"]:
         """The watched functions."""
         from ..kernels import watched_at
 
         kinds = self.s.guard_kinds(a)
-        index = jnp.zeros((), jnp.int32)
-        return watched_at(a, kinds, self.s, self.levels, t, q, self._no_input, index)
+        return watched_at(a, kinds, self.s, self.levels, t, q, u, row.section)
 
-    def _watched(self, a: int, t, q, field) -> Watched:
+    def _watched(self, a: int, row: Rows, t, q, field) -> Watched:
         if not self._functions(a):
             return Watched.unknown(t, self.width)
-        values = lambda t, q: self._values(a, t, q)  # noqa: E731
+
+        def values(t, q):
+            return self._values(a, row, t, q, self._no_input)
+
         value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
         more = self.width - len(value)
         # (Rates of what is not watched are 1: nothing divides by zero.)
@@ -248,31 +287,54 @@ class Bodies:
                 enabled = enabled.at[place].set(holds)
         return Watched(t, value, rate, enabled)
 
-    def _delay(self, a: int, course: Course, q, now: Watched, target):
+    def _delay(self, a: int, row: Rows, course: Course, q, now: Watched):
         """Columns of the time at which a watched function is zero."""
-        n = self.s.dims[a]
+        u = self._no_input
 
-        def along(v):
-            value = lambda q: self._values(a, course.t, q)  # noqa: E731
-            return jax.jvp(value, (q,), (v,))[1][target]
+        def values(q, u):
+            return self._values(a, row, course.t, q, u)
 
-        return -jax.vmap(along)(course.y[1:, :n]) / now.rate[target]
+        def along(v, w=u):
+            return jax.jvp(values, (q, u), (v, w))[1][row.target]
+
+        columns = course.y[1:, : self.s.dims[a]]
+        return -self._each(along, columns) / now.rate[row.target]
+
+    def _each(self, function: Callable, *columns: Array) -> Array:
+        """A function of each column, and of its inputs where there are any."""
+        inputs = () if self.inputs is None else (self.inputs,)
+        return jax.vmap(function)(*columns, *inputs)
 
     def _has_left(self, a: int, row: Rows, course: Course, now: Watched):
-        """Test whether a watched function has another sign than on the recorded trajectory (where
-        that is known), has passed zero and come back since the row before, or has led to an event
-        that was not enabled there; or whether the event of this row comes from the wrong side."""
+        """Test whether the itinerary is left between the row before and this one.
+
+        - Where a leg begins, watched functions must have the signs of the recorded trajectory.
+        - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or
+          later than recorded. (A fall is no event where its predicate does not hold.)
+        - The one at whose zero the leg ends must have been positive, and must fall.
+        """
         if not self._functions(a):
             return jnp.asarray(False)
         known, before = row.signs != 0, course.before
+        known = known & (jnp.arange(self.width) != row.target)
+        begins = jnp.isinf(before.value)
         # (Comparisons with NaN are false.)
-        other = known & ~(jnp.sign(now.value) * row.signs > 0)
-        returns = known & dips(before, now, row.signs)
-        positive = (before.value > 0) & jnp.isfinite(before.value)
-        falls = known & positive & (now.value <= 0)
+        other = begins & known & ~(jnp.sign(now.value) * row.signs > 0)
+        unknown = known & ~jnp.isfinite(now.value) & ~begins
+        returns = known & ~begins & dips(before, now, jnp.sign(now.value))
+        positive = (before.value > 0) & ~begins
+        falls = known & positive & ~(now.value > 0)
         enabled = falls & (before.enabled | now.enabled)
-        rises = (row.target >= 0) & ~(now.rate[row.target] < 0)
-        return (other | returns | enabled).any() | rises
+        return (other | unknown | returns | enabled).any() | self._misses(
+            row, before, now
+        )
+
+    def _misses(self, row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
+        """Test whether the function at whose zero a leg ends does not fall to it. (The row of its
+        first correction has its sign in the row before.)"""
+        was_positive = (before.value[row.target] > 0) | (row.signs[row.target] <= 0)
+        falls = now.rate[row.target] < 0
+        return (row.target >= 0) & ~(was_positive & falls)
 
     def _has_tick(self, a: int, course: Course, t) -> Bool[Array, ""]:
         """Test whether a scheduled event was due in a leg that ends at t, before its end."""

@@ -6,7 +6,7 @@ last one.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -37,7 +37,7 @@ _LEGS = 4
 _NEAR_ZERO = 1e-7
 
 # What a row does.
-NOTHING, PIECE, SCHEDULE, STEP, JUMP, SECTION = range(6)
+NOTHING, PIECE, SCHEDULE, STEP, JUMP, LEVEL, TIME = range(7)
 
 
 class Rows(NamedTuple):
@@ -54,12 +54,15 @@ class Rows(NamedTuple):
     place: Int[np.ndarray, " R"]
     """Of a jump: index of the transition among those of its kind."""
     piece: Int[np.ndarray, " R"]
-    """Number of the piece that begins; `LEGS` for none."""
+    """Number of the piece that begins; that of all pieces for none."""
     onward: Bool[np.ndarray, " R"]
-    """Of a jump: whether the trajectory goes on after it."""
+    """Of a jump: whether the trajectory goes on after it. Otherwise it ends on a section right
+    after the event."""
+    section: Int[np.ndarray, " R"]
+    """Index of the level that is watched."""
     signs: Int[np.ndarray, "R G"]
     """Signs of the watched functions of the chart where a row begins, on the recorded
-    trajectory; 0 where they may have either."""
+    trajectory; 0 where they may have either. (See `Bodies` for their use.)"""
 
 
 class Body(NamedTuple):
@@ -85,6 +88,13 @@ class Form(NamedTuple):
     bodies: tuple[Body, ...]
     watched: int
     """Largest number of watched functions of a chart."""
+    sections: int = 0
+    """Number of sections: a piece begins at each, with columns of the time, the state and the
+    inputs. 0 for a turn in `LEGS` pieces, with columns of the state."""
+
+    @property
+    def pieces(self) -> int:
+        return self.sections or LEGS
 
 
 class Itinerary(NamedTuple):
@@ -118,7 +128,8 @@ def levels_in(s: Structure, a: int, levels: AbstractLevels | None) -> bool:
 class _Table:
     """Rows that are written one after the other."""
 
-    def __init__(self):
+    def __init__(self, sections: int = 0):
+        self.sections = sections
         self.rows: list[tuple] = []
         self.bodies: list[Body] = [Body(NOTHING)]
 
@@ -135,13 +146,16 @@ class _Table:
         fraction: float = 0.0,
         target: int = -1,
         place: int = 0,
-        piece: int = LEGS,
+        piece: int | None = None,
         onward: bool = True,
+        section: int = 0,
     ) -> None:
         self.include([body])
         number = self.bodies.index(body)
+        if piece is None:
+            piece = self.sections or LEGS
         places = target, place, piece
-        self.rows.append((number, leg, fraction, *places, onward, signs))
+        self.rows.append((number, leg, fraction, *places, onward, section, signs))
 
 
 class _Leg(NamedTuple):
@@ -156,6 +170,10 @@ class _Leg(NamedTuple):
     code: int
     """With which it ends: of an event, of a level, or negative."""
     at_once: bool
+    lane: int = 0
+    """Number of the recorded piece."""
+    section: int = 0
+    """Index of the level that is watched."""
 
     def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
         """Beginnings of steps, and the end, with so many steps for each recorded one."""
@@ -170,9 +188,11 @@ class _Leg(NamedTuple):
         """Signs at a time; 0 for what changes its sign in the recorded move there."""
         move = int(np.searchsorted(self.times, t, side="right")) - 1
         move = min(move, len(self.begins) - 1)
+        begin, end = self.begins[move], self.ends[move]
         if t == self.times[move]:
-            return self.begins[move]
-        return np.where(self.begins[move] == self.ends[move], self.begins[move], 0)
+            return begin
+        # (One that rises may do so at any time.)
+        return np.where((begin == end) | (begin < 0), begin, 0)
 
 
 def recorded(
@@ -191,31 +211,88 @@ def recorded(
     while sum(len(x) - 1 for x in nodes) < LEGS:
         density *= 1.25
         nodes = [leg.nodes(density) for leg in legs]
-    pieces = _pieces(nodes)
-    table = _Table()
+    return _written(s, legs, nodes, _Table(), _pieces(nodes))
+
+
+def recorded_walk(
+    s: Structure,
+    walk: tuple[Lanes, Tape],
+    levels: AbstractLevels | None,
+    to: Int[np.ndarray, " L"],
+    begins_on_section: bool,
+    density: float = 1.0,
+) -> tuple[Itinerary, Int[np.ndarray, " L"]]:
+    """The itinerary of a trajectory from section to section, recorded side by side, and the numbers
+    of the legs that end on sections.
+
+    **Arguments:** `to`: the section to which each recorded piece leads. `begins_on_section`:
+    whether the first piece begins on one.
+    """
+    legs = _legs(s, levels, walk, to)
+    nodes = [leg.nodes(density) for leg in legs]
+    arrivals = np.flatnonzero(np.diff([leg.lane for leg in legs])) + 1
+    begins = {0, *arrivals.tolist()} if begins_on_section else {*arrivals.tolist()}
+    begins.discard(len(legs))
+    table = _Table(len(begins))
+    itinerary = _written(s, legs, nodes, table, {(k, -1) for k in begins})
+    return itinerary, np.append(arrivals, len(legs)) - 1
+
+
+def _written(
+    s: Structure, legs: list[_Leg], nodes: list, table: _Table, pieces: set
+) -> Itinerary:
+    """The itinerary of legs with these nodes.
+
+    **Arguments:** `pieces`: leg and number of the node at which each piece begins; node -1 for one
+    that begins with the leg, on a section.
+    """
     unknown = np.zeros(legs[0].begins.shape[1], int)
     charts: list[int] = []
+    befores: list[int] = []
     armed: list[np.ndarray] = []
+
+    def begin(k: int, leg: _Leg, t: float) -> None:
+        table.add(Body(PIECE, leg.chart), k, unknown, piece=len(charts))
+        charts.append(leg.chart)
+        befores.append(sum(before.code >= 0 for before in legs[:k]))
+        armed.append(_armed(s, leg.chart, t, leg.signs(t)))
+
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
         a = leg.chart
+        if (k, -1) in pieces:
+            begin(k, leg, times[0])
         if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
             table.add(Body(SCHEDULE, a, (leg.code,)), k, unknown)
         for j, (t, fraction) in enumerate(zip(times, _fractions(times), strict=False)):
             if (k, j) in pieces:
-                table.add(Body(PIECE, a), k, unknown, piece=len(charts))
-                charts.append(a)
-                armed.append(_armed(s, a, t, leg.signs(t)))
-            table.add(Body(STEP, a), k, leg.signs(t), fraction=fraction)
-        _end(s, table, k, leg, goes_on=k < len(legs) - 1)
+                begin(k, leg, t)
+            signs, section = leg.signs(t), leg.section
+            table.add(Body(STEP, a), k, signs, fraction=fraction, section=section)
+        # (A trajectory that ends with an event ends at a time that is free.)
+        ends = k == len(legs) - 1 or (k + 1, -1) in pieces
+        before = leg.signs(times[-2]) if len(times) > 1 else unknown
+        _end(s, table, k, leg, before, goes_on=not ends)
     events = tuple(leg.code for leg in legs if leg.code >= 0)
     certain = all(_is_certain(s, leg) for leg in legs)
     if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
-        table.include(Body(SECTION, leg.chart) for leg in legs)
+        table.include(Body(TIME, leg.chart) for leg in legs)
     table.include(Body(PIECE, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
-    begins = np.array(charts, np.int32), np.stack(armed, axis=1)
-    return _finished(table, ends, *begins, events)._replace(certain=certain)
+    form, rows, used = _finished(table)
+    last = len(ends) - 1
+    return Itinerary(
+        form,
+        rows,
+        used,
+        np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS)),
+        last,
+        np.array(charts, np.int32),
+        np.array(befores, np.int32),
+        np.array(armed).reshape(-1, len(s.transitions)).T,
+        events,
+        certain,
+    )
 
 
 def _is_certain(s: Structure, leg: _Leg) -> bool:
@@ -257,56 +334,70 @@ def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
     return {places[k] for k in chosen}
 
 
-def _end(s: Structure, table: _Table, k: int, leg: _Leg, goes_on: bool) -> None:
-    """Add the rows with which leg k ends."""
+def _end(
+    s: Structure, table: _Table, k: int, leg: _Leg, before: np.ndarray, goes_on: bool
+) -> None:
+    """Add the rows with which leg k ends. `before`: signs where its last step begins."""
     a, signs = leg.chart, leg.ends[-1]
-    step = Body(STEP, a)
     if leg.code == ARRIVE_LEVEL:
-        level = len(s.guards(a))
-        signs = _but(signs, level)
-        for _ in range(CORRECTIONS):
-            table.add(step, k, signs, target=level)
-        table.add(Body(SECTION, a), k, signs, target=level)
+        target = len(s.guards(a))
+        signs = _corrected(table, k, leg, before, target)
+        body = Body(LEVEL, a)
+        table.add(body, k, signs, target=target, section=leg.section)
     elif leg.code < 0:
-        table.add(Body(SECTION, a), k, signs)
+        table.add(Body(TIME, a), k, signs, section=leg.section)
     else:
         jump, place = _jump(s, leg.code, leg.at_once)
         target = -1
         if not (leg.at_once or _is_scheduled(s, leg.code)):
             target = s.guards(a).index(leg.code)
-            signs = _but(signs, target)
-            for _ in range(CORRECTIONS):
-                table.add(step, k, signs, target=target)
-        # (A turn that ends with an event ends at a time that is free.)
-        table.add(jump, k, signs, target=target, place=place, onward=goes_on)
+            signs = _corrected(table, k, leg, before, target)
+        where: Any = dict(target=target, section=leg.section)
+        table.add(jump, k, signs, place=place, onward=goes_on, **where)
 
 
-def _legs(s: Structure, levels, turn: tuple[Lanes, Tape]) -> list[_Leg]:
-    """The legs of a recorded turn."""
+def _corrected(
+    table: _Table, k: int, leg: _Leg, before: np.ndarray, target: int
+) -> Int[np.ndarray, " G"]:
+    """Add the corrections of leg k, and return the signs at its end.
+
+    The first correction has the sign of its function before it; the others none, as it is zero.
+    """
+    signs = leg.ends[-1].copy()
+    signs[target] = before[target]
+    for _ in range(CORRECTIONS):
+        where: Any = dict(target=target, section=leg.section)
+        table.add(Body(STEP, leg.chart), k, signs, **where)
+        signs = signs.copy()
+        signs[target] = 0
+    return signs
+
+
+def _legs(
+    s: Structure, levels, turn: tuple[Lanes, Tape], to: np.ndarray | None = None
+) -> list[_Leg]:
+    """The legs of a recorded turn, or of a walk to sections."""
     moves = recorded_moves(*turn)
+    index = np.zeros(len(moves.h), np.int32) if to is None else to[moves.lane]
     h = np.where(moves.at_once, 0.0, moves.h)
     before = _before_events(turn[1])
-    begins = _signs(s, levels, moves.t, moves.chart, moves.q)
-    ends = _signs(s, levels, moves.t + h, moves.chart, before)
-    last = np.flatnonzero(moves.code >= 0)
-    if not len(last) or last[-1] != len(h) - 1:
-        last = np.append(last, len(h) - 1)
+    begins = _signs(s, levels, moves.t, moves.chart, moves.q, index)
+    ends = _signs(s, levels, moves.t + h, moves.chart, before, index)
+    is_last = moves.code >= 0
+    is_last[-1] = True
+    if to is not None:
+        is_last[:-1] |= np.diff(moves.lane) != 0
+    last = np.flatnonzero(is_last)
     legs, first = [], 0
     for end in last:
         own = slice(first, end + 1)
         times = np.append(moves.t[own], moves.t[end] + h[end])
         code, at_once = int(moves.code[end]), bool(moves.at_once[end])
         a = int(moves.chart[first])
-        legs.append(_Leg(a, times, begins[own], ends[own], code, at_once))
+        where = int(moves.lane[end]), int(index[end])
+        legs.append(_Leg(a, times, begins[own], ends[own], code, at_once, *where))
         first = end + 1
     return legs
-
-
-def _but(signs: np.ndarray, target: int) -> np.ndarray:
-    """Signs without that of the function that is zero here."""
-    signs = signs.copy()
-    signs[target] = 0
-    return signs
 
 
 def _before_events(tape: Tape) -> Float[np.ndarray, "d M"]:
@@ -315,8 +406,11 @@ def _before_events(tape: Tape) -> Float[np.ndarray, "d M"]:
     return np.asarray(tape.before)[row, :, lane].T
 
 
-def _signs(s: Structure, levels, t, chart, q) -> Int[np.ndarray, "M G"]:
-    """Signs of the watched functions of charts at points; 0 where they are zero but for errors."""
+def _signs(s: Structure, levels, t, chart, q, index) -> Int[np.ndarray, "M G"]:
+    """Signs of the watched functions of charts at points; 0 where they are zero but for errors.
+
+    **Arguments:** `index` (M,): of the level that is watched.
+    """
     width = max(len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims)))
     signs = np.zeros((len(t), width), int)
     for a in np.unique(chart).tolist():
@@ -325,8 +419,7 @@ def _signs(s: Structure, levels, t, chart, q) -> Int[np.ndarray, "M G"]:
         count = len(s.guards(a)) + levels_in(s, a, levels)
         if not count:
             continue
-        index = np.zeros(1, np.int32)
-        value = kernels.watched(s, a, levels, *point, index)[:, 0]
+        value = kernels.watched(s, a, levels, *point, index[here])[:, 0]
         value = np.nan_to_num(value, posinf=np.inf, neginf=-np.inf)
         finite = np.where(np.isfinite(value), np.abs(value), 0.0)
         known = np.abs(value) > _NEAR_ZERO * finite.max(axis=1, keepdims=True)
@@ -345,22 +438,18 @@ def _jump(s: Structure, g: int, at_once: bool) -> tuple[Body, int]:
     return Body(JUMP, a, kind, at_once), kind.index(g)
 
 
-def _finished(table: _Table, ends, charts, armed, events: tuple[int, ...]) -> Itinerary:
-    """The itinerary of a table, filled up with empty rows."""
+def _finished(table: _Table) -> tuple[Form, Rows, int]:
+    """The form and the rows of a table, filled up with empty ones, and the number of the others."""
     used = len(table.rows)
     width = len(table.rows[0][-1])
     for _ in range(-used % _ROUND):
         table.add(Body(NOTHING), 0, np.zeros(width, int))
     columns = [np.array(x) for x in zip(*table.rows, strict=True)]
     number = np.int32
-    types = number, number, float, *[number] * 3, bool, number
+    types = number, number, float, *[number] * 3, bool, number, number
     rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))
     place = np.array([bodies.index(body) for body in table.bodies], number)
     rows = rows._replace(body=place[rows.body])
-    last = len(ends) - 1
-    ends = np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS))
-    before = rows.leg[rows.piece < LEGS]
-    form = Form(bodies, width)
-    return Itinerary(form, rows, used, ends, last, charts, before, armed, events, True)
+    return Form(bodies, width, table.sections), rows, used

@@ -56,35 +56,64 @@ def field(s: Structure, a: int, t, q) -> Float[Array, " n"]:
     return s.field(a, t, q, jnp.zeros(s.nu))
 
 
-def _rates(s: Structure, a: int, t, y: Float[Array, "1+C n"]) -> Float[Array, "1+C n"]:
+def _rates(
+    s: Structure, a: int, t, y: Float[Array, "1+C n"], inputs
+) -> Float[Array, "1+C n"]:
     """Rates of a state and of its columns."""
-    rate, linear = jax.linearize(lambda q: field(s, a, t, q), y[0])
     if len(y) == 1:
-        return rate[None]
-    return jnp.concatenate([rate[None], jax.vmap(linear)(y[1:])])
+        return field(s, a, t, y[0])[None]
+    if inputs is None:
+        rate, linear = jax.linearize(lambda q: field(s, a, t, q), y[0])
+        columns = jax.vmap(linear)(y[1:])
+    else:
+        at = y[0], jnp.zeros(s.nu)
+        rate, linear = jax.linearize(lambda q, u: s.field(a, t, q, u), *at)
+        columns = jax.vmap(linear)(y[1:], inputs)
+    return jnp.concatenate([rate[None], columns])
 
 
 def step(
-    s: Structure, a: int, solver: Solver, t, y: Float[Array, "1+C n"], h
+    s: Structure,
+    a: int,
+    solver: Solver,
+    t,
+    y: Float[Array, "1+C n"],
+    h,
+    inputs: Float[Array, "C nu"] | None = None,
 ) -> tuple[Float[Array, "1+C n"], Float[Array, " n"]]:
-    """A state and its columns after a step from t to t + h, and the state's estimated error."""
+    """A state and its columns after a step from t to t + h, and the state's estimated error.
+
+    **Arguments:** `inputs`: of each column; None if there are none.
+    """
     if isinstance(solver, Method):
-        return _implicit(s, a, solver, t, y, h)
+        return _implicit(s, a, solver, t, y, h, inputs)
     import diffrax
 
-    term = diffrax.ODETerm(lambda t, y, _: _rates(s, a, t, y))
+    term = diffrax.ODETerm(lambda t, y, _: _rates(s, a, t, y, inputs))
     begun = solver.init(term, t, t + h, y, None)
     end, error, _, _, _ = solver.step(term, t, t + h, y, None, begun, False)
     return end, error[0]
 
 
-def _implicit(s: Structure, a: int, method: Method, t, y, h):
+def _implicit(s: Structure, a: int, method: Method, t, y, h, inputs):
     """A step of an implicit method, and its columns as derivatives of the whole step."""
-    lanes = lambda t, q: jax.vmap(lambda q: field(s, a, t[0], q), -1, -1)(q)  # noqa: E731
 
-    def whole(q):
+    def whole(q, u):
+        def of_lane(t, q):
+            return s.field(a, t, q, u)
+
+        def lanes(t, q):
+            return jax.vmap(lambda q: of_lane(t[0], q), -1, -1)(q)
+
         end = take_step(method, lanes, t[None], q[:, None], h[None], still=lanes)
         return end.q[:, 0], end.error[:, 0]
 
-    end, linear, error = jax.linearize(whole, y[0], has_aux=True)
-    return jnp.concatenate([end[None], jax.vmap(linear)(y[1:])]), error
+    still = jnp.zeros(s.nu)
+    if inputs is None:
+        step = jax.linearize(lambda q: whole(q, still), y[0], has_aux=True)
+        end, linear, error = step
+        columns = jax.vmap(linear)(y[1:])
+    else:
+        end, linear, error = jax.linearize(whole, y[0], still, has_aux=True)
+        columns = jax.vmap(linear)(y[1:], inputs)
+    return jnp.concatenate([end[None], columns]), error

@@ -1,0 +1,184 @@
+"""Residuals and their Jacobian beside a known cycle, as one program that nothing is searched in.
+
+The cycle follows the route of the known one (`orbits/near.py`), and its sections the walk of the
+known ones (`sections/walk.py`). Cycles that leave either have a result code.
+"""
+
+import collections
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._core.compilation import identity, whole
+from .._core.executor import on_the_cpu
+from .._core.results import Result
+from ..orbits.cycle import LimitCycle
+from ..orbits.find import find_limit_cycle
+from ..orbits.near import first_order_cycle, route_near
+from ..orbits.repeat import Route, on_device
+from ..sections.families import AbstractSections
+from ..sections.walk import Walk, walk_of, walk_with
+from .observations import ObservedHTF, ObservedSeries
+from .problem import FitProblem, evaluate
+
+
+# Evaluations of problems of a class after which they are compiled. Fewer: a program is compiled
+# that few evaluations use. More: many fits, as of a bootstrap, stay slow for longer.
+WORTH_COMPILING = 100
+# Directions that forward mode takes. More: a model with more free parameters needs no search, but
+# the memory of programs grows with their number.
+_MOST_DIRECTIONS = 64
+
+_evaluations: collections.Counter = collections.Counter()
+
+
+class Beside(NamedTuple):
+    """A known cycle, and what cycles beside it repeat."""
+
+    known: LimitCycle
+    route: Route
+    walks: tuple[Walk, ...]
+    """To the sections of each family in the observations."""
+
+
+class Model:
+    """Residuals and their Jacobian, by a program beside known cycles.
+
+    Where the route of the known cycle is left, the search finds the cycle, which becomes the known
+    one; the program stays the same.
+    """
+
+    def __init__(self, problem: FitProblem, known: LimitCycle):
+        self._problem, self._known = problem, known
+        self._beside: Beside | None = None
+        self._is_new = True
+        self._class = identity((on_device(known.return_map), problem))
+
+    def __call__(
+        self, problem: FitProblem, x: np.ndarray, guess: LimitCycle
+    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle]:
+        """As `evaluate`."""
+        _evaluations[self._class] += 1
+        if _evaluations[self._class] <= WORTH_COMPILING:
+            return evaluate(problem, x, guess)
+        if self._is_new:
+            self._beside, self._is_new = _beside(problem, self._known), False
+        found = self._evaluated(x, guess)
+        if found is None and self._beside is not None:
+            cycle = self.cycle_at(x, guess)
+            if int(cycle.result) == Result.OK:
+                self._beside = _beside(problem, cycle)
+                found, guess = self._evaluated(x, cycle), cycle
+        if found is None:
+            return evaluate(problem, x, guess)
+        near = dataclasses.replace(guess, anchor=found.anchor, period=found.period)
+        return found.residuals, found.jacobian, near
+
+    def is_beside(self, x: np.ndarray, guess: LimitCycle) -> bool:
+        """Test whether the cycle with the parameters at x is found without a search."""
+        return self._evaluated(x, guess) is not None
+
+    def cycle_at(self, x: np.ndarray, guess: LimitCycle) -> LimitCycle:
+        """The cycle with the parameters at x, converged or not, by a search."""
+        parameters = self._problem.parameters
+        values = parameters.decode(jnp.asarray(x))
+        system = parameters.insert(guess.system, values)
+        return find_limit_cycle(system, guess, throw=False)
+
+    def _evaluated(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
+        if self._beside is None:
+            return None
+        q = np.asarray(guess.anchor.q)[:, 0]
+        found = _run(self._problem, np.asarray(x), q, self._beside)
+        well = int(found.result) == Result.OK and np.isfinite(found.residuals).all()
+        return found if well else None
+
+
+class Evaluated(NamedTuple):
+    """A model at one point of the parameters."""
+
+    residuals: Float[Array, " r"]
+    jacobian: Float[Array, "r p"]
+    anchor: Any
+    period: Float[Array, ""]
+    result: Int[Array, ""]
+
+
+def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
+    """What a fit repeats; None where its flags would not tell all, or for observations that need
+    the search."""
+    observations = problem.observations
+    is_search = [
+        isinstance(o, ObservedSeries)
+        or (isinstance(o, ObservedHTF) and o.delay is not None)
+        for o in observations
+    ]
+    if any(is_search) or len(problem.parameters.names) > _MOST_DIRECTIONS:
+        return None
+    route = route_near(known)
+    if route is None:
+        return None
+    walks = [walk_of(known, family) for family in _families(observations)]
+    if any(walk is None for walk in walks):
+        return None
+    walks = (dataclasses.replace(w, forwards=True) for w in walks if w is not None)
+    return Beside(known, _as_numbers(route), tuple(walks))
+
+
+def _families(observations: Any) -> list[AbstractSections]:
+    is_family = lambda x: isinstance(x, AbstractSections)  # noqa: E731
+    leaves = jax.tree_util.tree_leaves(observations, is_leaf=is_family)
+    return [x for x in leaves if is_family(x)]
+
+
+def _as_numbers(route: Route) -> Route:
+    """The route with counts of rows as arrays, for which nothing is compiled again."""
+    finer = route.finer._replace(count=np.asarray(route.finer.count))
+    return route._replace(first=finer, finer=finer, other=finer)
+
+
+def _run(
+    problem: FitProblem, x: np.ndarray, q: np.ndarray, beside: Beside
+) -> Evaluated:
+    """Residuals and Jacobian at coordinates x, from a state q near the cycle's beginning."""
+    problem, beside = on_device((problem, beside))
+    with on_the_cpu():
+        program = whole(_evaluated, (), (problem, beside), loops=True)
+        return program(x, q)
+
+
+def _evaluated(problem: FitProblem, beside: Beside, x: Array, q: Array) -> Evaluated:
+    def at(x):
+        cycle, observations = _model(problem, beside, x, q)
+        parts = [observation.residuals(cycle) for observation in observations]
+        r = jnp.concatenate(parts)
+        well = (cycle.result == Result.OK) & jnp.isfinite(r).all()
+        return jnp.where(well, r, jnp.inf), (cycle.anchor, cycle.period, cycle.result)
+
+    def push(direction):
+        return jax.jvp(at, (x,), (direction,), has_aux=True)
+
+    directions = jnp.eye(x.shape[0])
+    r, J, rest = jax.vmap(push, out_axes=(None, -1, None))(directions)
+    return Evaluated(r, J, *rest)
+
+
+def _model(problem: FitProblem, beside: Beside, x: Array, q: Array):
+    """The cycle with parameters at x, and the observations of it."""
+    known, route, walks = beside
+    values = problem.parameters.decode(x)
+    system = problem.parameters.insert(known.system, values)
+    cycle = first_order_cycle(route, known.return_map.at_phase_of(system), q)
+    cycle = dataclasses.replace(
+        cycle,
+        legs=cycle.legs._replace(q=jnp.full_like(cycle.legs.q, jnp.nan)),
+        factors=jnp.full_like(cycle.factors, jnp.nan),
+    )
+    observations = problem.parameters.observed(problem.observations, values)
+    for family, walk in zip(_families(observations), walks, strict=True):
+        walk_with(cycle, family, walk)
+    return cycle, observations

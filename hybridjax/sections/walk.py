@@ -1,0 +1,250 @@
+"""Sections on a cycle beside one that is known, by its itinerary.
+
+The trajectory from section to section of the known cycle is a table (`engine/itinerary`). Within a
+program of JAX, where nothing searches, a neighboring cycle follows it: one pass gives the times and
+states on the sections, and the derivatives of the flow from each to the next.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core.compilation import at_ease
+from .._core.executor import is_traced, on_the_cpu, to_host
+from .._core.jax_compat import is_tracer, outside
+from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
+from .._core.memo import Memory
+from .._core.results import Result, update_result
+from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded_walk
+from ..engine.itinerary.turn import Passage, Travelers, follow
+from ..engine.lanes import Lanes
+from ..engine.target import AbstractLevels
+from ..orbits.crossing import Crossing, ListLevels
+from ..orbits.cycle import LimitCycle
+from ..orbits.near import known_beside
+from ..orbits.repeat import LAST_CORRECTION, has_route, maps_of
+from ..orbits.return_map import ReturnMap
+from ..orbits.scale import ROUNDING
+from .families import AbstractSections, BoundSections
+from .place import bind_at, coordinates_on, place_sections, recorded_flows
+from .placed import PlacedSections
+
+
+# Steps of a walk for each recorded one, which a system beside the known one may not suit. Fewer:
+# neighbors leave the walk. More: it takes longer.
+_DENSITY = 2.0
+# Passes of a walk: the first finds the ends of legs, with which the steps of the last one lie as on
+# the known cycle. Fewer: neighbors leave the walk. More: it takes longer.
+_PASSES = 2
+
+
+class Path(eqx.Module):
+    """A recorded trajectory that begins on a cycle."""
+
+    form: Form = eqx.field(static=True)
+    rows: Rows
+    count: Int[Array, ""]
+    """Of rows that do something."""
+    ends: Float[Array, " E"]
+    """Ends of legs, from the beginning."""
+    last: Int[Array, ""]
+    """Number of the last leg."""
+
+    @classmethod
+    def of(cls, itinerary: Itinerary) -> "Path":
+        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
+        rows, ends = itinerary.rows, itinerary.ends
+        return cls(itinerary.form, rows, counts[0], ends, counts[1])
+
+
+class Walk(eqx.Module):
+    """From a cycle's beginning to each of its N sections, and to the first one again."""
+
+    lead: Path | None
+    """To the anchor of the family, if that is a `Crossing`."""
+    path: Path
+    """From there."""
+    period: Float[Array, ""]
+    """Of the known cycle."""
+    late: Float[Array, ""]
+    """Periods that the sections at times come later than the family says."""
+    chart_at_anchor: Int[Array, "1"]
+    arrivals: Int[Array, " K"]
+    """Legs that end on sections: on all N, and on the first one again."""
+    begins_on_section: bool = eqx.field(static=True)
+    """Whether the anchor is section 0: then it is no arrival."""
+    forwards: bool = eqx.field(static=True)
+    """Whether only forward mode differentiates the walk."""
+    chart: Int[Array, " N"]
+    armed: Bool[Array, "G N"]
+    events: Int[Array, " N"]
+    """Charts, transitions that are armed, and numbers of events before, on the sections."""
+
+
+_walks = Memory()
+
+
+def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
+    """The walk of a known cycle; None where flags cannot tell if a neighbor keeps it, or for
+    sections that more than one point of the cycle decides on.
+
+    **Raises:** as `place_sections`.
+    """
+    if family.points > 1 or not has_route(cycle.return_map):
+        return None
+    with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)
+        placed = to_host(place_sections(cycle, family))
+        lead, flow = recorded_flows(placed)
+        s, N = placed.cycle.structure, family.n_sections
+        begins_on_section = lead is not None and family.at_anchor
+        to = np.arange(int(begins_on_section), N + 1) % N
+        before = None
+        if lead is not None:
+            at_anchor = ListLevels((family.anchor,))
+            nowhere = np.zeros(len(lead[0].t), np.int32)
+            before, _ = recorded_walk(s, lead, at_anchor, nowhere, False, _DENSITY)
+            if not before.certain:
+                return None
+        path, arrivals = recorded_walk(
+            s, flow, placed.bound.levels, to, begins_on_section, _DENSITY
+        )
+        if not path.certain or len(arrivals) < len(to):
+            return None
+        begin = jax.tree_util.tree_map(lambda x: x[..., :1], flow[0])
+        raw = bind_at(placed.cycle.return_map, family, begin)
+    late = 0.0
+    if np.isfinite(raw.time[0]):
+        late = np.rint((placed.bound.time[0] - raw.time[0]) / placed.cycle.period)
+    return Walk(
+        None if before is None else Path.of(before),
+        Path.of(path),
+        np.asarray(placed.cycle.period),
+        np.asarray(late),
+        begin.chart,
+        arrivals,
+        begins_on_section,
+        False,
+        path.charts,
+        path.armed,
+        path.begins,
+    )
+
+
+def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
+    """The walk for a traced cycle that was found beside a known one; None if there is none."""
+    walk = _walks.get(cycle, id(family))
+    if walk is not None:
+        return walk
+    known = known_beside(cycle)
+    if known is None or is_traced(known, family):
+        return None
+    return walk_of(known, family)
+
+
+def walk_with(cycle: LimitCycle, family: AbstractSections, walk: Walk | None) -> None:
+    """Have a traced cycle follow a walk to the sections of a family."""
+    if walk is not None:
+        _walks.recall(cycle, id(family), lambda: walk)
+
+
+def walked(
+    cycle: LimitCycle, family: AbstractSections, walk: Walk
+) -> tuple[PlacedSections, Float[Array, "N n m"]]:
+    """The sections of a family on a cycle, and the derivatives of (t, q) on each next section by
+    (t, q) and the inputs on this one. The result of sections that leave the walk is a code."""
+    map = cycle.return_map
+    start = map.anchor.t[0], map.anchor.q[:, 0]
+    begin, code = start, jnp.zeros((), jnp.int32)
+    if walk.lead is not None:
+        assert isinstance(family.anchor, Crossing)
+        at_anchor = ListLevels((family.anchor,))
+        ends = start[0] + walk.lead.ends * (map.expected / walk.period)
+        free = jnp.full_like(ends, jnp.inf)
+        options = dict(columns=False, forwards=walk.forwards)
+        lead = _followed(map, walk.lead, at_anchor, start, ends, free, **options)
+        begin = lead.t, lead.q
+        code = _code(map, walk.lead, lead, start[0])
+    orbit = map.anchor._replace(
+        t=begin[0][None], q=begin[1][:, None], chart=walk.chart_at_anchor
+    )
+    bound = bind_at(map, family, orbit)
+    bound = dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
+    ends = begin[0] + walk.path.ends * (map.expected / walk.period)
+    known = _known_ends(map, walk, bound)
+    options = dict(columns=True, forwards=walk.forwards)
+    passage = _followed(map, walk.path, bound.levels, begin, ends, known, **options)
+    code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
+    N = family.n_sections
+    lanes = Lanes(
+        passage.legs_t,
+        jnp.asarray(walk.chart),
+        passage.legs_q.T,
+        jnp.asarray(walk.armed),
+        jnp.asarray(walk.events),
+        jnp.tile(jnp.array([[0.0], [jnp.inf], [0.0], [0.0]]), N),
+    )
+    duration = jnp.diff(passage.legs_t, append=passage.t[None])
+    fields = bound, lanes, None, duration, jnp.full(N, code)
+    placed = PlacedSections(cycle, family, *fields, *coordinates_on(map, bound, lanes))
+    return placed, passage.factors
+
+
+def _known_ends(map: ReturnMap, walk: Walk, bound: BoundSections) -> Float[Array, " E"]:
+    """Ends of legs on sections at known times; infinite for others."""
+    N = len(bound.time)
+    k = np.arange(int(walk.begins_on_section), N + 1)
+    times = bound.time[k % N] + (k // N) * map.expected
+    return jnp.full_like(walk.path.ends, jnp.inf).at[walk.arrivals].set(times)
+
+
+def _followed(
+    map: ReturnMap,
+    path: Path,
+    levels: AbstractLevels | None,
+    begin: tuple,
+    ends: Float[Array, " E"],
+    known: Float[Array, " E"],
+    columns: bool,
+    forwards: bool,
+) -> Passage:
+    """A trajectory of a system on a path, with derivatives.
+
+    **Arguments:** `ends`: guessed ends of legs; `known`: the same where they are known, otherwise
+    infinite.
+    """
+    everything = map, begin, known, levels
+    leaves = jax.tree_util.tree_leaves(everything)
+    few = forwards or sum(x.size for x in leaves if is_tracer(x)) <= JACOBIAN_COLUMNS
+
+    def passage(moving) -> Passage:
+        map, begin, known, levels = moving
+        maps = maps_of(map)
+        travelers = Travelers(
+            lambda numbers: maps.of(numbers).structure,
+            maps.numbers,
+            False,
+            map.structure.nu,
+        )
+        settings = jax.lax.stop_gradient(map.settings)
+        table = path.form, path.rows, path.count if few else None
+        options: Any = dict(columns=columns, known=known, passes=_PASSES)
+        return follow(travelers, levels, settings, *table, begin, ends, **options)
+
+    return (by_jacobian(passage) if few and not forwards else passage)(everything)
+
+
+def _code(map: ReturnMap, path: Path, passage: Passage, begin) -> Int[Array, ""]:
+    """The code of a trajectory: whether it has kept the path, with steps that are fine enough."""
+    passage, begin = jax.lax.stop_gradient((passage, begin))
+    period = jax.lax.stop_gradient(map.expected)
+    durations = jnp.diff(passage.ends, prepend=begin[None])
+    used = jnp.arange(len(durations)) <= path.last
+    kept = ~passage.left & (~used | (durations >= -ROUNDING * period)).all()
+    kept = kept & (passage.last <= LAST_CORRECTION * period)
+    code = update_result(jnp.zeros((), jnp.int32), ~kept, Result.EVENT_ORDER)
+    return update_result(code, ~(passage.error <= 1), Result.STEP_LIMIT)

@@ -1,0 +1,43 @@
+"""A loop whose derivatives run along agrees with JAX's own derivatives of the loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hybridjax._core.loops import loop, pushed
+
+
+def step(constants, k, carry):
+    x, steps = carry
+    return jnp.sin(constants["a"] * x) + k * x**2 / 10, steps + 1
+
+
+def step_along(constants, by_constants, k, carry, columns):
+    one = lambda constants, carry: step(constants, k, carry)  # noqa: E731
+    return pushed(one, constants, by_constants, carry, columns)
+
+
+def with_own_derivatives(a, x):
+    end, steps = loop(step, step_along, {"a": a}, (x, jnp.asarray(0)), 7)
+    return end
+
+
+def with_derivatives_of_jax(a, x):
+    run = lambda k, carry: step({"a": a}, k, carry)  # noqa: E731
+    return jax.lax.fori_loop(0, 7, run, (x, jnp.asarray(0)))[0]
+
+
+def test_first_and_second_derivatives_are_those_of_jax():
+    a, x = jnp.asarray(1.3), jnp.array([0.2, -0.4])
+    for order in (jax.jacfwd, lambda f, n: jax.jacfwd(jax.jacfwd(f, n), n)):
+        for argument in (0, 1):
+            found = jax.jit(order(with_own_derivatives, argument))(a, x)
+            expected = order(with_derivatives_of_jax, argument)(a, x)
+            np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_lanes_have_derivatives_of_their_own():
+    a, x = jnp.array([0.7, 1.3, 2.0]), jnp.array([0.2, -0.4])
+    slopes = jax.vmap(jax.jacfwd(with_own_derivatives), in_axes=(0, None))(a, x)
+    expected = [jax.jacfwd(with_derivatives_of_jax)(each, x) for each in a]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-13)
