@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
-from hybridjax._core import compilation
+from hybridjax._core import compilation, jax_compat
 from hybridjax._core.compilation import Program, in_turn, kernel, quick_jit
 from hybridjax._core.lanes import by_lane
 
