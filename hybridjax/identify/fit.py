@@ -1,7 +1,7 @@
 """`Fit`: what all fits to data share, whatever they fit."""
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -12,8 +12,6 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding, print_findings
 from .._core.html import card, text
 from .._core.results import Result
-from ..linear.ldtp import LDTP
-from ..systems.system import HybridSystem
 
 
 class Fit(eqx.Module):
@@ -43,7 +41,7 @@ class Fit(eqx.Module):
         @property
         def covariance_dof(self) -> float: ...
         @property
-        def model(self) -> LDTP | HybridSystem | None: ...
+        def model(self) -> Any: ...
         @property
         def noise(self) -> Float[np.ndarray, " ny"] | None: ...
         @property
