@@ -211,7 +211,7 @@ class FitProblem(eqx.Module):
         """True if all data have standard deviations."""
         return all(bool(observation.weighted) for observation in self.observations)
 
-    def unit(self, cost: float, freedom: int) -> float:
+    def unit(self, cost: float, freedom: float) -> float:
         """Return the factor of covariances for the cost of a fit, from the cost relative to its
         expected value: that of variances that are estimated, or this misfit where there are none
         (NaN if no residual is left to estimate it)."""

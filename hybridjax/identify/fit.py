@@ -1,7 +1,7 @@
 """`Fit`: what all fits to data share, whatever they fit."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -32,14 +32,24 @@ class Fit(eqx.Module):
     - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.
     """
 
-    multipliers: eqx.AbstractVar[Complex[np.ndarray, " d"]]
-    covariance: eqx.AbstractVar[Float[np.ndarray, "p p"]]
-    covariance_dof: eqx.AbstractVar[float]
-    model: eqx.AbstractVar[Any]
-    noise: eqx.AbstractVar[Float[np.ndarray, " ny"] | None]
-    dof: eqx.AbstractVar[float]
-    result: eqx.AbstractVar[int]
-    findings: eqx.AbstractVar[tuple[Finding, ...]]
+    if TYPE_CHECKING:
+        # (Fields of some fits, and properties of others: neither can be declared for all of them.)
+        @property
+        def multipliers(self) -> Complex[np.ndarray, " d"]: ...
+        @property
+        def covariance(self) -> Float[np.ndarray, "p p"]: ...
+        @property
+        def covariance_dof(self) -> float: ...
+        @property
+        def model(self) -> Any: ...
+        @property
+        def noise(self) -> Float[np.ndarray, " ny"] | None: ...
+        @property
+        def dof(self) -> float: ...
+        @property
+        def result(self) -> int: ...
+        @property
+        def findings(self) -> tuple[Finding, ...]: ...
 
     @property
     def modulus(self) -> Float[np.ndarray, " d"]:

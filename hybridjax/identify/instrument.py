@@ -229,11 +229,65 @@ def solve(
     """
     N = sums.setup.n_sections
     P = sums.setup.periods
-    repeats, kind = how
     y, u, r = map(sums.rows, (outputs, inputs, references))
     sizes = np.tile(sums.unit, N)
     unit = sizes[y][:, None] / sizes[u]
     classes = excited_classes(sums, r, threshold)
+    estimates = _solve_classes(sums, classes, (y, u, r), how)
+    every = (classes[:, None] + P * np.arange(N)) / P
+    nearest = np.abs((every + N / 2) % N - N / 2)
+    f = np.unique(np.round(P * nearest).astype(int)) / P
+    lines = Lines.of(f, N)
+
+    def entries(x):
+        return None if x is None else lines.entries(x * unit**2).real
+
+    scatter = None
+    if estimates.variance is not None:
+        freedom = np.zeros(len(f))
+        freedom[lines.row] = estimates.freedom[:, None]
+        scatter = Scatter(freedom, shared=True)
+    return HTF(
+        f,
+        lines.entries(estimates.H * unit),
+        check_harmonics(None, N),
+        N,
+        inputs,
+        outputs,
+        "estimate",
+        variance=entries(estimates.variance),
+        noise_variance=entries(estimates.noise),
+        scatter=scatter,
+    )
+
+
+class _ClassEstimates(NamedTuple):
+    """Harmonic matrices of a plant in K classes, and variances of their entries."""
+
+    H: Complex[np.ndarray, "K y u"]
+    variance: Float[np.ndarray, "K y u"] | None
+    """From the scatter of experiments, or else that of windows."""
+    noise: Float[np.ndarray, "K y u"] | None
+    """From windows, if both are known."""
+    freedom: Float[np.ndarray, " K"]
+    """Complex degrees of freedom of the variance."""
+
+
+def _solve_classes(
+    sums: Sums,
+    classes: Int[np.ndarray, " K"],
+    rows: tuple[Int[np.ndarray, " _"], ...],
+    how: tuple[int, str],
+) -> _ClassEstimates:
+    """Solve the equations of each class, with the references as instruments.
+
+    **Arguments:** `rows`: those of the outputs, the inputs and the references.
+
+    **Raises:** `DefinitionError` if inputs do not answer the references, or without a scatter that
+    is asked for.
+    """
+    y, u, r = rows
+    repeats, kind = how
     G = sums.total[classes]
 
     def block(rows, columns, G=G):
@@ -241,7 +295,7 @@ def solve(
 
     to_r = np.linalg.solve(block(r, r), block(r, u))  # (R R*)^-1 R U*
     power = block(u, r) @ to_r
-    _require_answers(power, block(r, r), classes / P)
+    _require_answers(power, block(r, r), classes / sums.setup.periods)
     along = _adjoint(to_r) @ block(r, y)
     H = _adjoint(np.linalg.solve(power, along))
     spread = np.linalg.inv(power)
@@ -255,56 +309,27 @@ def solve(
         mean = np.maximum(_diagonal(square), 0)[:, :, None] / rows
         return mean * by_input[:, None]
 
-    freedom = np.full(len(classes), float(sums.experiments - len(u)))
-    total = None
     noise = None
-    if kind != "noise" and freedom[0] > 0:
-        # The error of P multiplies all of U in E, of which the references explain only a part. The
-        # other part adds errors of entries of P to E: of one at the edge of its disc, where they
-        # count three times, and of all others, whose scatter takes degrees of freedom.
-        left = spread @ block(u, u) - np.eye(len(u))
-        edge = _diagonal(left @ spread) / by_input
-        rows = freedom + _diagonal(left).sum(axis=1)
-        total = variance(G, rows[:, None, None] + 2 * edge[:, None])
-        taken = _diagonal(left @ left).sum(axis=1) / rows**2
-        freedom = 1 / (1 / freedom + taken)
     if repeats > 1:
         noise = variance(sums.between[classes], sums.experiments)
-    if kind == "total" and total is None:
+    freedom = np.full(len(classes), float(sums.experiments - len(u)))
+    if kind == "total" and freedom[0] <= 0:
         raise DefinitionError(
             f"{sums.experiments} experiments with {len(u)} unknowns each leave no scatter: apply "
             "several realizations (`Design.realizations`), or pass variance='noise'."
         )
-    if total is None:
-        total = noise
-        noise = None
+    if kind == "noise" or freedom[0] <= 0:
         freedom[:] = sums.experiments * (repeats - 1)
-
-    every = (classes[:, None] + P * np.arange(N)) / P
-    nearest = np.abs((every + N / 2) % N - N / 2)
-    f = np.unique(np.round(P * nearest).astype(int)) / P
-    lines = Lines.of(f, N)
-
-    def entries(x):
-        return None if x is None else lines.entries(x * unit**2).real
-
-    scatter = None
-    if total is not None:
-        by_line = np.zeros(len(f))
-        by_line[lines.row] = freedom[:, None]
-        scatter = Scatter(by_line, shared=True)
-    return HTF(
-        f,
-        lines.entries(H * unit),
-        check_harmonics(None, N),
-        N,
-        inputs,
-        outputs,
-        "estimate",
-        variance=entries(total),
-        noise_variance=entries(noise),
-        scatter=scatter,
-    )
+        return _ClassEstimates(H, noise, None, freedom)
+    # The error of P multiplies all of U in E, of which the references explain only a part. The
+    # other part adds errors of entries of P to E: of one at the edge of its disc, where they
+    # count three times, and of all others, whose scatter takes degrees of freedom.
+    left = spread @ block(u, u) - np.eye(len(u))
+    edge = _diagonal(left @ spread) / by_input
+    counted = freedom + _diagonal(left).sum(axis=1)
+    total = variance(G, counted[:, None, None] + 2 * edge[:, None])
+    taken = _diagonal(left @ left).sum(axis=1) / counted**2
+    return _ClassEstimates(H, total, noise, 1 / (1 / freedom + taken))
 
 
 def _require_answers(

@@ -1,5 +1,7 @@
 """Plant, controller, loop and sensitivity from experiments with a loop at work."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 
@@ -13,7 +15,7 @@ from ..linear.htf import HTF
 from .instrument import Roles, Sums, require_loop, solve, spectral_products
 
 
-Names = tuple[str, ...]
+Names = Sequence[str]
 
 
 class Loop(eqx.Module):
@@ -89,7 +91,8 @@ def loop(
     def estimate(outputs: Names, inputs: Names, reference: Names) -> HTF:
         others = [name for name in (*r, *d) if name not in reference]
         sums = _without(products, products.rows(others))
-        return solve(sums, outputs, inputs, reference, (repeats, "auto"))
+        names = tuple(outputs), tuple(inputs)
+        return solve(sums, *names, reference, (repeats, "auto"))
 
     plant = None
     controller = None

@@ -187,7 +187,7 @@ def _condensed(z: Float[np.ndarray, "rows _"]) -> Float[np.ndarray, "rows _"]:
     """Return a matrix with no more columns than rows, and the same residuals of regressions."""
     if z.shape[1] <= len(z):
         return z
-    return np.linalg.qr(z.T, mode="r").T
+    return np.asarray(np.linalg.qr(z.T, mode="r")).T
 
 
 def _decay(c: Coefficients, cycles: int) -> Float[np.ndarray, "cycles d"]:

@@ -229,7 +229,9 @@ def validate(
     prepared = PreparedRecords(compared)
     grid = prepared.whole()
     lags = _lags(prepared, grid)
-    roots = [] if isinstance(tested, LDTP) else list(model.spread(grid))
+    roots = []
+    if not isinstance(tested, LDTP) and not isinstance(model, LDTP):
+        roots = list(model.spread(grid))
     if isinstance(tested, LDTP):
         # Outputs in units of their size, so that none is neglected.
         S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))

@@ -62,16 +62,17 @@ def error_weights(
         return np.broadcast_to(weight, htf.H.shape)
     variance = np.asarray(htf.variance)
     if htf.scatter is not None and variance.all():
-        variance = _separated(htf, variance)
+        variance = _separated(htf.harmonics, variance, np.asarray(htf.scatter.freedom))
     return weights_of(variance, rms)
 
 
 def _separated(
-    htf: HTF, variance: Float[np.ndarray, "M F ny nu"]
+    harmonics: tuple[int, ...],
+    variance: Float[np.ndarray, "M F ny nu"],
+    freedom: Float[np.ndarray, " F"],
 ) -> Float[np.ndarray, "M F ny nu"]:
     """Return the nearest product of a factor for each frequency and one for each harmonic."""
-    _, same = np.unique(np.abs(htf.harmonics), return_inverse=True)
-    freedom = np.asarray(htf.scatter.freedom)
+    _, same = np.unique(np.abs(harmonics), return_inverse=True)
     size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
     for _ in range(20):  # more sweeps change nothing in 6 digits
         by_line = (variance / size[same]).mean(axis=0)

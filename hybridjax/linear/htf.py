@@ -485,7 +485,7 @@ def _combined(
     )
 
 
-def _variances(terms: list[HTF], name: str) -> list[Array] | None:
+def _variances(terms: list[HTF], name: str) -> list[Any] | None:
     """Return the variances of terms, zero for exact ones; None if all are exact, or one is not and
     has none."""
     given = to_host([getattr(term, name) for term in terms])

@@ -185,6 +185,7 @@ def estimates(t):
     yield t.structured.distance, dict(true=true)
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
+    yield t.structured.interval, dict(level=0.9)
     yield hj.select_order, dict(htf=t.estimate, overhang=6)
     yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)

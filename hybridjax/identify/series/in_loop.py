@@ -256,7 +256,8 @@ class LoopEquations:
         cycles = self.records.cycles
         correlated = denominator.correlated_cycles(multipliers_of(c), cycles) + 1
         blocks = max(1, cycles // max(correlated, _BLOCK))
-        score = sum(self._scores(x, c, scale, blocks) for x in self.sections)
+        scores = [self._scores(x, c, scale, blocks) for x in self.sections]
+        score = np.sum(scores, axis=0)
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)
         share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))

@@ -137,7 +137,7 @@ class PreparedRecords:
         self.sampled = sum(grid.sampled.sum(axis=(0, 1)) for grid in self.grids)
         u = np.concatenate([record.u for record in self.records])
         y = np.concatenate([record.y for record in self.records])
-        _require_signals(self.inputs, u.any(axis=0), "zero")
+        _require_signals(self.inputs, np.any(u != 0, axis=0), "zero")
         varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
         _require_signals(self.outputs, varies, "constant")
         require_deviations(self.records)

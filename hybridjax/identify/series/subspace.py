@@ -154,7 +154,7 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
             out[:, :, n] = regression.reduced(z).reshape(z.shape)
         return out
 
-    y = left(grid.y, grid.sampled.all(axis=3))
+    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
     return grid._replace(u=left(grid.u, grid.inside), y=y, drift=no_columns)
 
 
