@@ -50,12 +50,14 @@ class Pictures:
         """The pictures at times of the trajectory."""
         drawings = drawn(self.trajectory.structure, t, *self.trajectory.at(t))
         k = np.searchsorted(self._t, t, side="right") - 1
-        origin = self._origin[k] + self._velocity[k] * (t - self._t[k])[:, None]
+        since = t - self._t[k]
+        origin = self._origin[k] + self._velocity[k] * since[:, None]
         return self._seen(t, origin, drawings)
 
     def camera(self, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
         """The places of the camera over the ground."""
-        return (t - self._t[0])[:, None] / self.period * self.stride
+        part = (t - self._t[0]) / self.period
+        return part[:, None] * self.stride
 
     def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
         ways = np.pad(origin - self.camera(t), ((0, 0), (0, 1)))  # (a radius stays)
@@ -87,15 +89,20 @@ def drawn(
     code = code_of(s.system)
     for a in np.unique(chart).tolist():
         rows = np.flatnonzero(chart == a)
-        leaves, form = jax.tree_util.tree_flatten(drawing_of(s, a))
         program = s.kernel(_flat, by_lane, a, code, lanes=4)
         values = program(t[rows], q[rows, : s.dims[a]].T)
-        ends = np.cumsum([x.size for x in leaves])
         for row, numbers in zip(rows, values.T, strict=True):
-            parts = np.split(numbers, ends[:-1])
-            shapes = [x.reshape(y.shape) for x, y in zip(parts, leaves, strict=True)]
-            drawings[row] = jax.tree_util.tree_unflatten(form, shapes)
+            drawings[row] = _drawing(drawing_of(s, a), numbers)
     return drawings
+
+
+def _drawing(form: Any, numbers: Float[np.ndarray, " n"]) -> Any:
+    """The drawing of this form with these numbers, which `_flat` has put one after the other."""
+    leaves, structure = jax.tree_util.tree_flatten(form)
+    ends = np.cumsum([x.size for x in leaves])
+    parts = np.split(numbers, ends[:-1])
+    arrays = [part.reshape(x.shape) for part, x in zip(parts, leaves, strict=True)]
+    return jax.tree_util.tree_unflatten(structure, arrays)
 
 
 def drawing_of(s: Structure, a: int) -> Any:
