@@ -113,7 +113,7 @@ def wrong_calls():
             yield command, options, message
 
 
-@pytest.mark.parametrize(("command", "options", "message"), wrong_calls())
+@pytest.mark.parametrize(("command", "options", "message"), list(wrong_calls()))
 def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message):
     """Said before anything is imported, read or written, with the usage and exit status 2."""
     monkeypatch.chdir(tmp_path)
