@@ -107,10 +107,13 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(
-    ("command", "options", "message"),
-    [(command, *row) for command, rows in WRONG.items() for row in rows.items()],
-)
+def wrong_calls():
+    for command, rows in WRONG.items():
+        for options, message in rows.items():
+            yield command, options, message
+
+
+@pytest.mark.parametrize(("command", "options", "message"), list(wrong_calls()))
 def test_wrong_options(tmp_path, monkeypatch, capsys, command, options, message):
     """Said before anything is imported, read or written, with the usage and exit status 2."""
     monkeypatch.chdir(tmp_path)

@@ -78,10 +78,10 @@ def test_folders(folder):
     modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
     stub = folder / "__init__.pyi"
     if stub.exists():
-        imports = [
-            n for n in ast.parse(stub.read_text()).body if isinstance(n, ast.ImportFrom)
-        ]
-        names = {x.asname for n in imports if n.module is not None for x in n.names}
+        names = set()
+        for statement in ast.parse(stub.read_text()).body:
+            if isinstance(statement, ast.ImportFrom) and statement.module is not None:
+                names |= {alias.asname for alias in statement.names}
         assert not names & modules
 
 

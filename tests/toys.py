@@ -89,7 +89,8 @@ class Toys(hj.HybridSystem):
         return self.make(*self.numbers)[1]
 
     def period(self):
-        return (*self.make(*self.numbers), None)[2]
+        made = self.make(*self.numbers)
+        return made[2] if len(made) > 2 else None
 
 
 class Switched(hj.HybridSystem):

@@ -152,7 +152,8 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])
 def test_a_computer_that_fails_is_no_damaged_file(tmp_path, monkeypatch, error):
-    saved(path := tmp_path / "good.npz", {})
+    path = tmp_path / "good.npz"
+    saved(path, {})
     monkeypatch.setattr(archive, "_array", Mock(side_effect=error))
     with pytest.raises(type(error)):
         archive.read_arrays(path)

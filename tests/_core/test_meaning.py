@@ -167,7 +167,10 @@ def test_a_change_is_noticed(way, named, monkeypatch):
     before, change = WAYS[way]
     other = types.ModuleType("users_other")
     inner = types.ModuleType("users_inner")
-    other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
+    inner.K = 1
+    other.K = 1
+    other.h = lambda x: x
+    other.inner = inner
     space = {**named, "other": other}
     exec(before, space)
     digest = meaning(space["f"])

@@ -534,7 +534,10 @@ def test_a_change_of_what_code_reads_is_seen_by_systems(way, monkeypatch):
     before, change = WAYS[way]
     other = types.ModuleType("users_other")
     inner = types.ModuleType("users_inner")
-    other.K, other.h, other.inner, inner.K = 1, lambda x: x, inner, 1
+    inner.K = 1
+    other.K = 1
+    other.h = lambda x: x
+    other.inner = inner
     space = made("")
     space["other"] = other
     exec(before, space)

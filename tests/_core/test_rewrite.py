@@ -66,8 +66,10 @@ def test_types_are_kept():
         ours = jax.eval_shape(vectorized(function), x, 3)
         truth = jax.eval_shape(function, x, 3)
         assert ours == truth
-        weak = [[v.weak_type for v in jax.tree.leaves(tree)] for tree in (ours, truth)]
-        assert weak[0] == weak[1]
+        for found, expected in zip(
+            jax.tree.leaves(ours), jax.tree.leaves(truth), strict=True
+        ):
+            assert found.weak_type == expected.weak_type
     assert all(
         isinstance(v, jax.Array) for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5)
     )

@@ -43,7 +43,8 @@ def test_harmonic_transfer_functions_compile_nothing():
     ports = {"inputs": ("a", "b"), "outputs": ("a", "b")}
     f = np.arange((SECTIONS + 1) // 2)
     rng = np.random.default_rng(0)
-    model = hj.LDTP(*0.1 * rng.normal(size=(4, SECTIONS, 2, 2)), **ports)
+    A, B, C, D = 0.1 * rng.normal(size=(4, SECTIONS, 2, 2))
+    model = hj.LDTP(A, B, C, D, **ports)
     with compiled() as names:
         exact = model.htf(f)
         loop = model.feedback(np.eye(2)).inverse()

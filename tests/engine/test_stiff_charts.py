@@ -64,7 +64,8 @@ def by_differences(order):
     d = 0.02
     at = np.arange(-2, 3)
     values = [exact(slow=5.0 + d * k)[0] for k in at]
-    weights = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}[order]
+    of_order = {1: [1, -8, 0, 8, -1], 2: [-1, 16, -30, 16, -1]}
+    weights = of_order[order]
     return np.dot(weights, values) / 12 / d**order
 
 

@@ -78,9 +78,13 @@ class Random(hj.HybridSystem):
     inputs = ("left", "right")
 
     def charts(self):
-        names = [tuple(f"q{i}" for i in range(n)) for n in self.plan.dims]
-        pairs = zip(names, self.charts_x, strict=True)
-        return {f"chart {a}": Piece(n, x) for a, (n, x) in enumerate(pairs)}
+        charts = {}
+        for a, (dim, numbers) in enumerate(
+            zip(self.plan.dims, self.charts_x, strict=True)
+        ):
+            states = tuple(f"q{i}" for i in range(dim))
+            charts[f"chart {a}"] = Piece(states, numbers)
+        return charts
 
     def transitions(self):
         return [self._transition(g, *pair) for g, pair in enumerate(self._pairs())]

@@ -114,7 +114,9 @@ class Turning:
 
 def plant(t):
     plant = Turning()
-    plant.inputs, plant.period, plant.dt = ("u",), 1.0, 0.25
+    plant.inputs = ("u",)
+    plant.period = 1.0
+    plant.dt = 0.25
     return plant
 
 

@@ -195,7 +195,7 @@ QUICK = {"wheel, 8 spokes", "compass gait", "buck, 20 V"}
 
 
 def marks(name):
-    return [pytest.mark.slow] * (name not in QUICK)
+    return [] if name in QUICK else [pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=marks(x)) for x in CASES])

@@ -40,11 +40,12 @@ def test_a_small_multiplier_of_an_autonomous_cycle():
 
 def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
     """x' = cos - x / 2 and y' = x - y, with y = 0 after each tick."""
-    small, large = 1e-9, 1e9
-    field = lambda t, q, u: (  # noqa: E731
-        small * jnp.cos(2 * jnp.pi * t) - q[0] / 2,
-        q[0] / small * large - q[1],
-    )
+    small = 1e-9
+    large = 1e9
+
+    def field(t, q, u):
+        x, y = q
+        return small * jnp.cos(2 * jnp.pi * t) - x / 2, x / small * large - y
 
     def reset(t, q, u):
         return (q[0], 0.0)
@@ -52,10 +53,7 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
     tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0, 0.5), reset=reset)
     system = toy({"a": Field(("x", "y"), field)}, [tick], period=1.0)
     guess = hj.Guess("a", (small, large))
-    cycle = hj.find_limit_cycle(
-        system,
-        guess,
-    )
+    cycle = hj.find_limit_cycle(system, guess)
     assert_allclose(cycle.multipliers, [np.exp(-0.5)], rtol=1e-12)
 
 

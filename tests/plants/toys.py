@@ -16,7 +16,8 @@ class Circle:
     rate = 0.2
 
     def reset(self, seed):
-        self.seed, self.steps = seed, 0
+        self.seed = seed
+        self.steps = 0
         return self.set_state((0.5, 0.0))
 
     def get_state(self):

@@ -21,15 +21,19 @@ def plan():
 def test_the_spectrum_of_a_design(plan):
     above, below = hj.plot.spectrum(plan, MODEL).axes[:, 0]
     f = np.unique(plan.frequencies)
-    H = np.abs(np.asarray(MODEL.htf(f, 0).H)[0, :, 0, 0])
-    assert_allclose(above.get_lines()[0].get_ydata(), H / H.max())
+    htf = MODEL.htf(f, 0)
+    modulus = np.abs(np.asarray(htf.H)[0, :, 0, 0])
+    (drawn,) = above.get_lines()
+    assert_allclose(drawn.get_ydata(), modulus / modulus.max())
+
     usual, optimal = below.get_lines()
-    measured = np.sum(np.square(optimal.get_ydata()) / 2)
-    assert_allclose(measured, plan.power.sum())
+    power = np.square(optimal.get_ydata()) / 2
+    assert_allclose(power.sum(), plan.power.sum())
     assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
-    legend = [x.get_text() for x in below.get_legend().get_texts()]
-    assert legend == [plan.usual_name, "optimal"] == ["equal amplitudes", "optimal"]
+    assert plan.usual_name == "equal amplitudes"
+    legend = [text.get_text() for text in below.get_legend().get_texts()]
+    assert legend == ["equal amplitudes", "optimal"]
     with pytest.raises(
         hj.DefinitionError, match="not the one that the plan was made for"
     ):
@@ -39,17 +43,19 @@ def test_the_spectrum_of_a_design(plan):
 def test_what_strides_buy(plan):
     study = hj.designs.Study(USUAL, 1, 1e-9, goal=GOAL)
     data = hj.experiments.simulate_experiments(MODEL, USUAL, start="periodic")
-    studied = study.add(hj.experiments.add_noise(data, std=1e-3))
-    # (More of them than there are colors.)
-    others = {f"there {k}": studied for k in range(8)}
-    ax = hj.plot.strides(plan, {"here": [studied, studied]} | others).ax
+    noisy = hj.experiments.add_noise(data, std=1e-3)
+    studied = study.add(noisy)
+    more_than_colors = {f"there {k}": studied for k in range(8)}
+    studies = {"here": [studied, studied], **more_than_colors}
+    ax = hj.plot.strides(plan, studies).ax
     lines = {line.get_label(): line for line in ax.get_lines()}
     assert lines["here"].get_xdata() == studied.strides
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
-    equal = lines["equal amplitudes"]
-    at = np.interp(
-        np.log(USUAL.cycles(0)), np.log(equal.get_xdata()), np.log(equal.get_ydata())
-    )
-    assert np.exp(at) == pytest.approx(np.linalg.norm(plan.usual_standard_errors))
+
+    strides, errors = lines["equal amplitudes"].get_data()
+    of_usual = np.log(USUAL.cycles(0))
+    log_error = np.interp(of_usual, np.log(strides), np.log(errors))
+    expected = np.linalg.norm(plan.usual_standard_errors)
+    assert np.exp(log_error) == pytest.approx(expected)
     with pytest.raises(hj.DefinitionError, match="without a block"):
         hj.plot.strides(plan, {"here": study})

@@ -25,10 +25,8 @@ class Stands(hj.Chart):
     drag: float = 0.0
 
     def field(self, t, q, u):
-        a, b, w, v, rate = (
-            *self.walker.charts()["step"].field(t, seen(q, self.leg), u),
-            0.0,
-        )
+        step = self.walker.charts()["step"]
+        a, b, w, v = step.field(t, seen(q, self.leg), u)
         rate = jnp.cos(q[self.leg]) * q[2 + self.leg] - self.drag * q[4]
         return told(self.leg, a, b, w, v, rate)
 
