@@ -187,7 +187,7 @@ class LDTPFit(MultiplierEstimate):
         return bool(np.isfinite(self._spread.variance(slopes)).all())
 
     def _about(self) -> str:
-        about = f"misfit {self.cost:.6g}, expected {self.freedom}"
+        about = f"chi-square {self.cost:.6g} with {self.freedom} degrees of freedom"
         if self.cost > 2 * self.freedom or weights.are_alike(
             self.correlation or 0.0, self.freedom
         ):
