@@ -65,6 +65,12 @@ def test_every_public_name_that_a_user_writes_is_in_an_example():
     assert not {name for name in written if not re.search(rf"\b{name}\b", code)}
 
 
+def test_citations_have_the_version_of_the_package():
+    bibtex, cff = ((ROOT / x).read_text() for x in ("docs/cite.md", "CITATION.cff"))
+    assert f"version = {{{hj.__version__}}}" in bibtex
+    assert f"version: {hj.__version__}" in cff
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     pytest.importorskip(
@@ -140,6 +146,15 @@ def test_links_lead_somewhere(site):
             target = target / "index.html" if target.is_dir() else target
             assert target.exists(), (page, link)
             assert anchor in known.get(target, {anchor}) | {""}, (page, link)
+
+
+@pytest.mark.slow
+def test_footers_have_version_license_and_citation(site):
+    for page in site.rglob("*.html"):
+        footer = page.read_text().partition('class="md-copyright"')[2]
+        assert page.stem == "404" or all(
+            text in footer for text in (hj.__version__, "Apache-2.0", "@software{")
+        ), page
 
 
 @pytest.mark.slow

@@ -324,7 +324,7 @@ class OrderSelection(eqx.Module):
         return self.by_rank if self.variances else self.by_mdl
 
     def __repr__(self) -> str:
-        rows = ["order  left/noise  deviations (1 %)   cost/expected          MDL"]
+        rows = ["order  left/noise  deviations (1 %)  chi-square/dof          MDL"]
         for k, d in enumerate(self.orders):
             rows.append(
                 f"{d:5d}  {self.strength[k]:10.4g}  {self.deviation[k]:10.3g} "

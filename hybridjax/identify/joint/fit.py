@@ -203,7 +203,7 @@ class LDTPFit(MultiplierFit):
         return bool(np.isfinite(self._spread.variance(slopes)).all())
 
     def _about(self) -> str:
-        about = f"misfit {self.cost:.6g}, expected {self.dof:.0f}"
+        about = f"chi-square {self.cost:.6g} with {self.dof:.0f} degrees of freedom"
         if self.noise is not None:
             about = f"errors one step ahead {signal_values(self.outputs, self.noise)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
