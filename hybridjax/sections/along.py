@@ -4,11 +4,11 @@ The moves of the turn are cut where a section lies within them, without another 
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..engine import kernels, lanes
 from ..engine.events import Entry, arm, rearm
@@ -32,120 +32,190 @@ def flow_along(
     """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
     known times or all at states: what `through` returns. None if a target is not reached once in a
     turn, and for implicit methods, whose steps have errors that decay before the turn ends."""
-    s, begin, period, late = (
-        map.structure,
-        carry[0],
-        map.expected,
-        TOGETHER * map.expected,
-    )
+    s, begin = map.structure, carry[0]
     if has_implicit(s):
         return None
-    moves, M = recorded_moves(*turn), np.sum(turn[1].code != IDLE)
-    before = turn[1].before.transpose(2, 0, 1)[turn[1].code.T != IDLE].T
-    # (Targets lie in the first two turns, and what follows them at most at the begin of a third.)
-    moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in moves))
-    later = period * np.repeat([0, 1, 2], M)
-    moves = moves._replace(
-        t=moves.t + later, code=np.where(moves.code < 0, MOVE, moves.code)
-    )
-    if (places := _places_on(map, moves, before, begin, targets)) is None:
+    moves, before = _three_turns(map, turn)
+    places = _places_on(map, moves, before, begin, targets)
+    if places is None:
         return None
-    # Moves start at the beginning, where recorded moves do, and at targets, which take the place of
-    # a recorded start at the same time.
-    first, key, time, state = places
-    replaced = time - moves.t[key] <= late
-    between = np.setdiff1d(np.arange(first[0] + 1, key[-1] + 1), key[replaced])
-    keys = np.concatenate([first, between, key])
-    times = np.concatenate([begin.t, moves.t[between], time])
-    order = np.lexsort((times, keys))
-    keys, times, is_target = keys[order], times[order], order > len(between)
-    q = np.concatenate([begin.q, moves.q[:, between], state], axis=1)[:, order]
-    piece, event = np.cumsum(is_target)[:-1], np.broadcast_to(targets.event, key.shape)
-    h, ends_in, new = np.diff(times), moves.code[keys[:-1]], np.diff(keys) > 0
-    arrives = is_target[1:] & (event[np.minimum(piece, len(key) - 1)] < 0)
-    code = np.where(
-        arrives, ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL, ends_in
-    )
+    walk = _walk(map, moves, begin, places)
+    event = np.broadcast_to(targets.event, len(places.key))
+    arrives = walk.at_target[1:] & (event[np.minimum(walk.piece, len(event) - 1)] < 0)
+    arrival = ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL
+    ends_in = moves.code[walk.key[:-1]]
+    h, code = np.diff(walk.t), np.where(arrives, arrival, ends_in)
     # (Where events and sections coincide, a search decides which comes first.)
-    if (arrives & new & (ends_in >= 0) | (code >= 0) & (h == 0) | (h < 0)).any():
+    at_event = arrives & (np.diff(walk.key) > 0) & (ends_in >= 0)
+    if (at_event | (code >= 0) & (h == 0) | (h < 0)).any():
         return None
-    at, chart, none = (
-        np.flatnonzero(is_target),
-        moves.chart[keys],
-        np.zeros(len(key), np.int32),
-    )
-    fired, count = (
-        np.maximum(code[at - 1], -1),
-        begin.events + np.cumsum(code >= 0, dtype=np.int32),
-    )
-    ends = lanes.start_lanes(s, times[at], chart[at], q[:, at])._replace(
-        events=count[at - 1]
-    )
-    watched, u = map.watch(ends, until(ends.t)), np.zeros((s.nu, 1))
-    ends = rearm(
-        s,
-        arm(s, ends, watched, period),
-        watched,
-        fired,
-        none > 0,
-        period,
-        u,
-        none,
-        Entry(ends.armed, ends.armed),
-    )
+    chart = moves.chart[walk.key]
+    ends = _ends_at_targets(map, walk, chart, code, begin.events)
     legs = Lanes(
         *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
     )
-    before = np.where(code >= 0, before[:, keys[:-1] % M], q[:, 1:])
-    rows = h, code, times[1:], before, q[:, 1:], chart[1:], np.zeros(len(h), bool)
-    tape = Tape(*(x[None] for x in rows))
-    flow = legs, Moved(ends, none, none, none), lanes.regrouped(tape, piece, legs)
+    M = before.shape[1]
+    states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
+    at_once = np.zeros(len(h), bool)
+    rows = h, code, walk.t[1:], states, walk.q[:, 1:], chart[1:], at_once
+    tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, legs)
+    none = np.zeros(len(event), np.int32)
+    flow = legs, Moved(ends, none, none, none), tape
     last = Lanes(*(x[..., -1:] for x in ends))
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)
 
 
-def _places_on(map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: Target):
-    """The numbers of the moves in which `begin` lies, and that start at targets, or in which these
-    lie, and the times and states (d, K) of the targets, which follow each other. `ends` are those
-    of one turn."""
-    s, period, late = map.structure, map.expected, TOGETHER * map.expected
-    M, K, clock = ends.shape[1], len(targets.time), np.isfinite(targets.time[0])
+def _three_turns(
+    map: ReturnMap, turn: tuple[Lanes, Tape]
+) -> tuple[Moves, Float[np.ndarray, "d M"]]:
+    """The moves of a turn three times, one turn after the other, and the states before the events
+    of one. (Targets lie in the first two turns, and what follows them at most at the beginning of a
+    third.)"""
+    is_move = turn[1].code.T != IDLE
+    before = turn[1].before.transpose(2, 0, 1)[is_move].T
+    moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in recorded_moves(*turn)))
+    later = map.expected * np.repeat([0, 1, 2], before.shape[1])
+    code = np.where(moves.code < 0, MOVE, moves.code)
+    return moves._replace(t=moves.t + later, code=code), before
+
+
+class _Places(NamedTuple):
+    """Where K targets lie on the recorded moves."""
+
+    first: Int[np.ndarray, "1"]
+    """Number of the move in which the flow begins."""
+    key: Int[np.ndarray, " K"]
+    """Numbers of the moves that start at the targets, or in which these lie."""
+    t: Float[np.ndarray, " K"]
+    q: Float[np.ndarray, "d K"]
+
+
+class _Walk(NamedTuple):
+    """Starts of moves: at the beginning, where recorded moves start, and at targets, which take the
+    place of a recorded start at the same time."""
+
+    key: Int[np.ndarray, " W"]
+    """Numbers of the recorded moves."""
+    t: Float[np.ndarray, " W"]
+    q: Float[np.ndarray, "d W"]
+    at_target: Bool[np.ndarray, " W"]
+
+    @property
+    def piece(self) -> Int[np.ndarray, " W-1"]:
+        """Number of the target to which each move leads."""
+        return np.cumsum(self.at_target)[:-1]
+
+
+def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
+    late = TOGETHER * map.expected
+    is_replaced = places.t - moves.t[places.key] <= late
+    passed = np.arange(places.first[0] + 1, places.key[-1] + 1)
+    between = np.setdiff1d(passed, places.key[is_replaced])
+    keys = np.concatenate([places.first, between, places.key])
+    times = np.concatenate([begin.t, moves.t[between], places.t])
+    states = np.concatenate([begin.q, moves.q[:, between], places.q], axis=1)
+    order = np.lexsort((times, keys))
+    return _Walk(keys[order], times[order], states[:, order], order > len(between))
+
+
+def _ends_at_targets(
+    map: ReturnMap, walk: _Walk, chart, code, events_before: Int[np.ndarray, "1"]
+) -> Lanes:
+    """Lanes at the targets, with the transitions that are armed there."""
+    s, period = map.structure, map.expected
+    at = np.flatnonzero(walk.at_target)
+    fired = np.maximum(code[at - 1], -1)
+    count = events_before + np.cumsum(code >= 0, dtype=np.int32)
+    ends = lanes.start_lanes(s, walk.t[at], chart[at], walk.q[:, at])
+    ends = ends._replace(events=count[at - 1])
+    watched = map.watch(ends, until(ends.t))
+    armed = arm(s, ends, watched, period)
+    none = np.zeros(len(at), np.int32)
+    u = np.zeros((s.nu, 1))
+    entry = Entry(ends.armed, ends.armed)
+    return rearm(s, armed, watched, fired, none > 0, period, u, none, entry)
+
+
+def _places_on(
+    map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: Target
+) -> _Places | None:
+    """Where the targets, which follow each other, lie on moves whose `ends` are those of one turn;
+    None if one is not met once."""
+    s, period = map.structure, map.expected
+    late = TOGETHER * period
+    M, K = ends.shape[1], len(targets.time)
+    by_clock = np.isfinite(targets.time[0])
     event = np.broadcast_to(targets.event, K)
-    place = lambda time: np.searchsorted(moves.t, time + late, side="right") - 1  # noqa: E731
-    if clock:
-        move = place(targets.time)
+
+    def move_at(time):
+        return np.searchsorted(moves.t, time + late, side="right") - 1
+
+    if by_clock:
+        move = move_at(targets.time)
         h = targets.time - moves.t[move]
     else:
-        level = _levels_on(s, Moves(*(x[..., :M] for x in moves)), ends, targets)
-        falls = (level[0] > 0) & (level[1] <= 0)
-        reached = np.where(event[:, None] < 0, falls, moves.code[:M] == event[:, None])
-        if (reached.sum(axis=1) != 1).any():
+        once = Moves(*(x[..., :M] for x in moves))
+        guessed = _levels_met(s, once, ends, targets, event, np.diff(moves.t))
+        if guessed is None:
             return None
-        move = np.argmax(reached, axis=1)
-        start, end = level[:, np.arange(K), move]
-        part = np.where(event < 0, start / (start - end), 1.0)
-        h = part * np.diff(moves.t)[move]
-    cut, change = np.flatnonzero(event < 0), period
-    start = Moves(*(x[..., move[cut]] for x in moves))
-    start = start._replace(
-        code=np.full(len(cut), ARRIVE_TIME if clock else ARRIVE_LEVEL), lane=cut
-    )
-    while change > late:  # (Newton's method finds levels.)
+        move, h = guessed
+    is_inside = np.flatnonzero(event < 0)
+    end = _until_settled(s, moves, targets, move, h, is_inside, by_clock, period)
+    if end is None:
+        return None
+    time, turns = moves.t[move] + h, 0
+    if not by_clock:
+        turns = np.ceil((begin.t[0] + late - time[0]) / period)
+        is_next = np.append(False, time[1:] <= time[:-1] + late)
+        turns = turns + np.cumsum(is_next)
+    time = time + turns * period
+    key = np.where(event < 0, move_at(time), turns * M + move + 1).astype(int)
+    state = moves.q[:, key]
+    state[:, is_inside] = end[:, 1:].T
+    return _Places(move_at(begin.t), key, time, state)
+
+
+def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):
+    """The move of one turn in which each target lies, and the time from its start, to first order;
+    None if one is not met once."""
+    K, M = len(targets.time), ends.shape[1]
+    level = _levels_on(s, once, ends, targets)
+    falls = (level[0] > 0) & (level[1] <= 0)
+    is_reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])
+    if (is_reached.sum(axis=1) != 1).any():
+        return None
+    move = np.argmax(is_reached, axis=1)
+    start, end = level[:, np.arange(K), move]
+    part = np.where(event < 0, start / (start - end), 1.0)
+    return move, part * lengths[:M][move]
+
+
+def _until_settled(
+    s: Structure,
+    moves: Moves,
+    targets: Target,
+    move: Int[np.ndarray, " K"],
+    h: Float[np.ndarray, " K"],
+    inside: Int[np.ndarray, " C"],
+    by_clock: bool,
+    period: float,
+) -> Float[np.ndarray, "C n"] | None:
+    """(t, q) at the targets within moves, by Newton's method for levels, which changes the lengths
+    `h` of the moves until there; None if it does not converge."""
+    start = Moves(*(x[..., move[inside]] for x in moves))
+    arrival = ARRIVE_TIME if by_clock else ARRIVE_LEVEL
+    start = start._replace(code=np.full(len(inside), arrival), lane=inside)
+    change = period
+    while True:
         goal = dataclasses.replace(targets, time=moves.t[move] + h)
-        end, _ = linear_moves(s, start._replace(h=h[cut]), goal)
-        last, change = change, np.abs(end[:, 0] - start.t - h[cut]).max(initial=0.0)
+        end, _ = linear_moves(s, start._replace(h=h[inside]), goal)
+        last = change
+        change = np.abs(end[:, 0] - start.t - h[inside]).max(initial=0.0)
         if not change <= last:
             return None
-        h[cut] = end[:, 0] - start.t
-    time, turns = moves.t[move] + h, 0
-    if not clock:
-        turns = np.ceil((begin.t[0] + late - time[0]) / period)
-        turns = turns + np.cumsum(np.append(False, time[1:] <= time[:-1] + late))
-    time = time + turns * period
-    key = np.where(event < 0, place(time), turns * M + move + 1).astype(int)
-    state = moves.q[:, key]
-    state[:, cut] = end[:, 1:].T
-    return place(begin.t), key, time, state
+        h[inside] = end[:, 0] - start.t
+        if change <= TOGETHER * period:
+            return end
 
 
 def _levels_on(

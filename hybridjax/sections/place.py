@@ -2,7 +2,7 @@
 
 import collections
 import dataclasses
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -73,13 +73,13 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     family = as_family(sections)
     require_x64(cycle, family)
     cycle.require_found()
-    for placed in () if is_traced((cycle, family)) else list(_recent):
-        if placed.cycle is cycle and eqx.tree_equal(
-            *jax.device_get((placed.family, family))
-        ):
+    traced = is_traced((cycle, family))
+    if not traced:
+        placed = _placed_before(cycle, family)
+        if placed is not None:
             return placed
     family.check(cycle.structure)
-    if traced := is_traced((cycle, family)):
+    if traced:
         require_program()
     # (Programs of `_place` are for one number of moves: none are given where they do not help.)
     turn = None if traced or has_implicit(cycle.structure) else last_turn(cycle)
@@ -89,6 +89,17 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
         _check(placed, int(first))
         _recent.append(placed)
     return placed
+
+
+def _placed_before(
+    cycle: LimitCycle, family: AbstractSections
+) -> PlacedSections | None:
+    """The sections of this family on this cycle, if they were among the last that were placed."""
+    for placed in list(_recent):
+        families_of_both = jax.device_get((placed.family, family))
+        if placed.cycle is cycle and eqx.tree_equal(*families_of_both):
+            return placed
+    return None
 
 
 def _patient(cycle: LimitCycle) -> ReturnMap:
@@ -135,75 +146,96 @@ def _locate(
     map: ReturnMap, family: AbstractSections, turn: Any, flows: list
 ) -> tuple[Any, Any]:
     """Do as `_place`; on the host `flows` gets the start, target and tape of every flow."""
-    s, N = Structure(map.system), family.n_sections
-    period, begin, xp = map.expected, map.anchor, namespace(map.expected)
-    u = xp.zeros((s.nu, 1))
+    s = Structure(map.system)
+    N = family.n_sections
+    period = map.expected
+    xp = namespace(period)
 
     def go(carry, targets, patience=np.inf):
-        options = Options(tape=True, tangents=True)
-        beside = (
-            turn is not None
-            and on_host(period)
-            and flow_along(map, turn, carry, targets)
-        )
-        carry, flow = beside or through(
-            s, carry, u, targets, map.settings, options, patience
-        )
+        found = None
+        if turn is not None and on_host(period):
+            found = flow_along(map, turn, carry, targets)
+        if found is None:
+            options = Options(tape=True, tangents=True)
+            u = xp.zeros((s.nu, 1))
+            found = through(s, carry, u, targets, map.settings, options, patience)
+        carry, flow = found
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
-    carry, before = (
-        (begin, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)),
-        None,
-    )
+    carry = map.anchor, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
+    before = None
     if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, begin.t + 1.5 * period)
+        target = toward(xp.full(1, np.inf), -1, map.anchor.t + 1.5 * period)
         carry, before = go(carry, to_section(target, family.anchor))
-        before = before if family.at_anchor else None
+        if not family.at_anchor:
+            before = None
     bound = _bind(s, map, family, carry[0], go)
-    k = xp.arange(int(before is not None), N + 1)
-    i = k % N
-    time, never = bound.time[i] + (k // N) * period, xp.full(k.shape, np.inf)
-    targets = Target(
-        time, i, bound.event[i], never, None, bound.levels, Result.SECTION_MISSED
-    )
+    targets = _all_sections(bound, period, begins_on_section=before is not None)
     _, pieces = go(carry, targets, 1.5 * period)
     if before is None:
         before = pieces
         pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     first = before[1].result[0, 0]
     lanes, moved, tape = side_by_side(pieces)
-    drop, dims, normal = coordinates_on(map, bound, lanes)
-    duration, result = moved.lanes.t - lanes.t, moved.result
-    # Rounding would decide on which side of an event a clock section lies. (Not of the clock's.)
-    by_clock = xp.asarray(
-        [*(isinstance(x.guard, Scheduled) for x in s.transitions), True]
-    )
-    when = xp.where(by_clock[xp.maximum(tape.code, -1)], xp.nan, tape.t)
-    near = [
-        (abs(when - x.t) <= TOGETHER * period).any(axis=0) for x in (lanes, moved.lanes)
-    ]
-    near = xp.isfinite(bound.time) & (near[0] | xp.roll(near[1], 1))
-    result = update_result(result, near, Result.COINCIDENCE)
+    duration = moved.lanes.t - lanes.t
+    near = _near_events(map, bound, lanes, moved.lanes, tape)
+    result = update_result(moved.result, near, Result.COINCIDENCE)
     if not on_host(period):  # (on the host `_check` says more)
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)
-    return first, (bound, lanes, tape, duration, result, drop, dims, normal)
+    coordinates = coordinates_on(map, bound, lanes)
+    return first, (bound, lanes, tape, duration, result, *coordinates)
+
+
+def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) -> Target:
+    """The targets on one section after the other, until section 0 is met again."""
+    N, xp = len(bound.time), namespace(bound.time)
+    k = xp.arange(int(begins_on_section), N + 1)
+    index = k % N
+    return Target(
+        time=bound.time[index] + (k // N) * period,
+        index=index,
+        event=bound.event[index],
+        limit=xp.full(k.shape, np.inf),
+        event_sequence=None,
+        levels=bound.levels,
+        missed=Result.SECTION_MISSED,
+    )
+
+
+def _near_events(
+    map: ReturnMap, bound: BoundSections, starts: Lanes, ends: Lanes, tape: Any
+) -> Array:
+    """Test at which of N clock sections an event happens, but for those of the clock: rounding
+    would decide on which side of it they lie."""
+    xp, s = namespace(bound.time), map.structure
+    is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
+    ignored = xp.asarray(
+        [*is_scheduled, True]
+    )  # (the last one is for moves without an event)
+    when = xp.where(ignored[xp.maximum(tape.code, -1)], xp.nan, tape.t)
+    late = TOGETHER * map.expected
+    at_start = (xp.abs(when - starts.t) <= late).any(axis=0)
+    at_end = (xp.abs(when - ends.t) <= late).any(axis=0)
+    return xp.isfinite(bound.time) & (at_start | xp.roll(at_end, 1))
 
 
 def coordinates_on(
     map: ReturnMap, bound: BoundSections, lanes: Lanes
 ) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, "N n"]]:
     """The fields `drop`, `dims` and `normal` of `PlacedSections`."""
-    s, N, xp = map.structure, len(lanes.t), namespace(lanes.t)
+    s, xp = map.structure, namespace(lanes.t)
+    N = len(lanes.t)
     normal = _normals(s, bound, lanes, xp.arange(N), xp.zeros((s.nu, 1)))
     field = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
-    share = xp.abs(normal.T * xp.concatenate([xp.ones((1, N)), field]))
-    flat = xp.max(share, axis=0) == 0
-    drop = xp.where(flat, -1, xp.argmax(share, axis=0))
+    flow = xp.concatenate([xp.ones((1, N)), field])
+    share = xp.abs(normal.T * flow)
+    is_flat = xp.max(share, axis=0) == 0
+    drop = xp.where(is_flat, -1, xp.argmax(share, axis=0))
     time_is_state = xp.isinf(bound.time) & (map.base is None)
-    dims = xp.asarray(s.dims)[lanes.chart] + time_is_state - ~flat
-    return drop, dims, normal
+    states = xp.asarray(s.dims)[lanes.chart]
+    return drop, states + time_is_state - ~is_flat, normal
 
 
 def recorded_flows(placed: PlacedSections) -> tuple[Any, Any]:
@@ -228,7 +260,7 @@ def place_along(
     """Sections placed on the host in P directions, as complex numbers of N P sections (see
     `kernels.Tangents`), the structure, and the Jacobians (N, P, n, m) of the flow."""
     flows: list[Any] = []
-    map, N, M = _patient(cycle), family.n_sections, family.points
+    map, N = _patient(cycle), family.n_sections
     placed = PlacedSections(cycle, family, *_locate(map, family, turn, flows)[1])
     if np.any(placed.result):
         raise NotOnHostError
@@ -237,39 +269,46 @@ def place_along(
     x, longer = beginning(by_cycle, s.d, P)
 
     def follow(flow, by_levels, times, twice=False):
-        lanes, tape = side_by_side((flow[0], flow[2]))
-        target, levels = flow[1], flow[1].levels
-        along = kernels.Tangents(s, by_cycle.structure, levels, by_levels, P)
-        flow = Variation(along, lanes, target, tape, times, twice)
-        return flow, flow.tangents(x), along
+        starts, target, tapes = flow
+        lanes, tape = side_by_side((starts, tapes))
+        along = kernels.Tangents(s, by_cycle.structure, target.levels, by_levels, P)
+        variation = Variation(along, lanes, target, tape, times, twice)
+        return variation, variation.tangents(x), along
 
     if isinstance(family.anchor, Crossing):
         levels = ListLevels((cast(Crossing, by_family.anchor),))
-        x = follow(flows.pop(0), levels, np.zeros((P, 1)))[1][-1]
-    lanes, points = side_by_side(flows[0][0]), x[None]
-    orbit = Orbit(cycle.period, lanes.t[:M], lanes.chart[:M], lanes.q.T[:M])
+        _, tangents, _ = follow(flows.pop(0), levels, np.zeros((P, 1)))
+        x = tangents[-1]
+    # The points of the orbit on which the family depends.
+    M = family.points
+    points, moved_points = side_by_side(flows[0][0]), x[None]
+    orbit = Orbit(cycle.period, points.t[:M], points.chart[:M], points.q.T[:M])
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
-        flow, points, _ = follow(flows.pop(0), None, times)
-        points = points[flow.first]
-    moving = longer, np.moveaxis(points[:, 0], 1, 0), np.moveaxis(points[:, 1:], 2, 0)
-    raw, by_bound = to_host(
-        _bind_along(s, family, orbit, (by_cycle.structure, by_family, moving))
-    )
-    clock = np.isfinite(bound.time)
-    late = np.rint((bound.time[0] - raw.time[0]) / cycle.period) if clock[0] else 0.0
+        variation, tangents, _ = follow(flows.pop(0), None, times)
+        moved_points = tangents[variation.first]
+    by_time = np.moveaxis(moved_points[:, 0], 1, 0)
+    by_state = np.moveaxis(moved_points[:, 1:], 2, 0)
+    directions = by_cycle.structure, by_family, (longer, by_time, by_state)
+    raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
+    # The flow from section to section, with the times of the sections.
+    is_clock = np.isfinite(bound.time)
+    late = 0.0
+    if is_clock[0]:
+        late = np.rint((bound.time[0] - raw.time[0]) / cycle.period)
     k = np.arange(N + 1)[-len(flows[0][1].time) :]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
-    times = clock[k % N] * (by_time[:, k % N] + (late + k // N) * longer[:, None])
-    flow, tangents, along = follow(flows[0], by_bound.levels, times, True)
-    t, chart, q, u = flow.points(tangents, flow.first[-N:])
+    later = (late + k // N) * longer[:, None]
+    times = is_clock[k % N] * (by_time[:, k % N] + later)
+    variation, tangents, along = follow(flows[0], by_bound.levels, times, True)
+    t, chart, q, u = variation.points(tangents, variation.first[-N:])
     many = lambda y: np.repeat(y, P)  # noqa: E731
     lanes = placed.lanes._replace(t=t, chart=chart, q=q)
     bound = dataclasses.replace(bound, time=many(bound.time), event=many(bound.event))
     normal = _normals(along, bound, lanes, many(np.arange(N)), u)
     rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
     moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
-    return moved, along, flow.jacobians(tangents, placed.across)[-N:]
+    return moved, along, variation.jacobians(tangents, placed.across)[-N:]
 
 
 def _observed(
@@ -358,32 +397,17 @@ def _normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Arra
     return for_each_chart(s, lanes.chart, state_based, work, out).T
 
 
+_AGAIN = "is crossed more than once in one period"
+
+
 def _check(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
     crossed twice, or by the clock at the time of an event."""
-    N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
-    again = "is crossed more than once in one period"
-    results = [first, *np.asarray(placed.result).tolist()]
-    if isinstance(placed.family, families.KinematicPhase) and any(results):
-        _check_center(placed.family, placed.cycle)
-    place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
-    for i, code in enumerate(results):
-        if code == Result.COINCIDENCE:
-            raise ComputationError(
-                f"{name(i - 1)} coincides with an event: move the sections, or use `AtEvent`."
-            )
-        if code != Result.OK:
-            text = f"{name(i % N)} is not reached from section {i - 1} on the cycle"
-            text = text if i else f"the cycle does not reach {name(0)}{place}"
-            hint = _remedy(placed, i % N) if code == Result.SECTION_MISSED else "."
-            if code == Result.STEP_LIMIT:
-                hint = (
-                    ". Give them to the search for the cycle, or place more sections."
-                )
-            raise ComputationError(f"{text}: {Result(code).message}{hint}")
-    if isinstance(anchor, Crossing) and len(_met(placed, 0)[2]) > 1:
+    _require_reached(placed, [first, *np.asarray(placed.result).tolist()])
+    name, anchor = placed.family.describe, placed.family.anchor
+    if isinstance(anchor, Crossing) and len(_met(placed, 0).places) > 1:
         raise ComputationError(
-            f"{name(0)} lies at {anchor}, which {again}{_remedy(placed, 0)}"
+            f"{name(0)} lies at {anchor}, which {_AGAIN}{_remedy(placed, 0)}"
         )
     moving = np.flatnonzero(np.asarray(placed.normal)[:, 0])
     if not placed.cycle.clocked and len(moving):
@@ -391,24 +415,11 @@ def _check(placed: PlacedSections, first: int) -> None:
             f"{name(int(moving[0]))} depends on time, which has no meaning on the cycle of an "
             "autonomous system: use a function of the state, or ClockPhase."
         )
-    period, duration = float(placed.cycle.period), np.asarray(placed.duration)
-    rounds = float(duration.sum()) / period
-    if rounds < 1 - SAME:
-        raise ComputationError(f"{name(0)} {again}{_remedy(placed, 0)}")
-    apart = np.abs(duration - period * np.rint(duration / period))
-    i, j = sorted((k := int(np.argmin(apart)), (k + 1) % N))
-    if i < j and apart[k] <= TOGETHER * period:
-        raise ComputationError(
-            f"{name(j)} coincides with section {i} on the cycle: leave one out."
-        )
-    if rounds > 1 + SAME:
-        late = int(np.argmax(duration))
-        raise ComputationError(
-            f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
-            f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
-        )
+    _require_order(placed)
+    assert placed.tape is not None
+    events = np.sum(np.asarray(placed.tape.code) >= 0)
     # (By rounding, a round may hold the event at which it begins and ends twice, or not at all.)
-    if np.sum(np.asarray(placed.tape.code) >= 0) != len(placed.cycle.event_sequence):
+    if events != len(placed.cycle.event_sequence):
         raise ComputationError(
             "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
             "steps (find the cycle with `settings=Settings(max_steps=...)`)."
@@ -420,46 +431,108 @@ def _check(placed: PlacedSections, first: int) -> None:
                 f"{steepness:.1g} of its fastest rate. Choose another level."
             )
         if count > 1:
-            raise ComputationError(f"{name(i)} {again}{_remedy(placed, i)}")
+            raise ComputationError(f"{name(i)} {_AGAIN}{_remedy(placed, i)}")
 
 
-def _met(placed: PlacedSections, i: int) -> tuple[Any, np.ndarray, np.ndarray, str]:
-    """Section i as a `Crossing`, if it is one; the ends (2, n) of parts of the cycle in which its
-    level falls; and which of these cross it, and where."""
-    cycle, N, levels = placed.cycle, placed.n_sections, placed.bound.levels
+def _require_reached(placed: PlacedSections, results: list[int]) -> None:
+    """**Raises:** `ComputationError` for the first result that is not OK: of the flow to section 0,
+    and from each section to the next."""
+    N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
+    if isinstance(placed.family, families.KinematicPhase) and any(results):
+        _check_center(placed.family, placed.cycle)
+    for i, code in enumerate(results):
+        if code == Result.OK:
+            continue
+        if code == Result.COINCIDENCE:
+            raise ComputationError(
+                f"{name(i - 1)} coincides with an event: move the sections, or use `AtEvent`."
+            )
+        if i:
+            what = f"{name(i % N)} is not reached from section {i - 1} on the cycle"
+        else:
+            place = f" at its anchor, {anchor}" if isinstance(anchor, Crossing) else ""
+            what = f"the cycle does not reach {name(0)}{place}"
+        hint = "."
+        if code == Result.SECTION_MISSED:
+            hint = _remedy(placed, i % N)
+        if code == Result.STEP_LIMIT:
+            hint = ". Give them to the search for the cycle, or place more sections."
+        raise ComputationError(f"{what}: {Result(code).message}{hint}")
+
+
+def _require_order(placed: PlacedSections) -> None:
+    """**Raises:** `ComputationError` for sections that are met twice in a round, at the same time,
+    or in another order."""
+    N, name = placed.n_sections, placed.family.describe
+    period, duration = float(placed.cycle.period), np.asarray(placed.duration)
+    rounds = float(duration.sum()) / period
+    if rounds < 1 - SAME:
+        raise ComputationError(f"{name(0)} {_AGAIN}{_remedy(placed, 0)}")
+    apart = np.abs(duration - period * np.rint(duration / period))
+    nearest = int(np.argmin(apart))
+    i, j = sorted((nearest, (nearest + 1) % N))
+    if i < j and apart[nearest] <= TOGETHER * period:
+        raise ComputationError(
+            f"{name(j)} coincides with section {i} on the cycle: leave one out."
+        )
+    if rounds > 1 + SAME:
+        late = int(np.argmax(duration))
+        raise ComputationError(
+            f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
+            f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
+        )
+
+
+class _Met(NamedTuple):
+    """Where the level of a section falls on its cycle, in parts of the steps."""
+
+    section: Crossing | None
+    """The section, if it is a `Crossing`."""
+    high: Float[np.ndarray, " n"]
+    low: Float[np.ndarray, " n"]
+    """The level at the beginning and the end of each part."""
+    places: list[str]
+    """Times and charts of the parts in which the section is crossed."""
+
+
+def _met(placed: PlacedSections, i: int) -> _Met:
+    """Where the level of section i falls."""
+    cycle = placed.cycle
+    N, levels = placed.n_sections, placed.bound.levels
     items = getattr(placed.family, "items", (placed.family.anchor,))
-    section = items[i] if i < len(items) and isinstance(items[i], Crossing) else None
-    if section is not None:
+    section = None
+    if i < len(items) and isinstance(items[i], Crossing):
+        section = items[i]
         i, N, levels = 0, 1, ListLevels((section,))
-    s, (t, chart, q) = cycle.structure, cycle.trajectory().dense()
+    s = cycle.structure
+    t, chart, q = cycle.trajectory().dense()
     level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = np.flatnonzero((np.diff(level) < 0) & (np.diff(t) > 0))
-    high, low = ends = np.stack([level[falls], level[falls + 1]])
+    high, low = level[falls], level[falls + 1]
     crossed = falls[(high > 0) & (low <= 0)]
-    points = " and ".join(f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed)
-    return section, ends, crossed, points
+    places = [f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed]
+    return _Met(section, high, low, places)
 
 
 def _remedy(placed: PlacedSections, i: int) -> str:
     """Where the cycle crosses section i, the values through which the function of a `Crossing`
     goes in its direction, and what to change."""
-    section, ends, _, points = _met(placed, i)
-    hint = f", at {points}" * bool(points)
+    section, high, low, places = _met(placed, i)
+    hint = f", at {' and '.join(places)}" if places else ""
     if section is None:
         return (
             f"{hint}. Choose a phase that rises through each section once in a period."
         )
-    sign, span = 1 if section.direction == "falling" else -1, "nowhere"
-    if ends.size:
-        ends = ends[0].max(), ends[1].min()
-        span = "from {:.4g} to {:.4g}".format(
-            *(float(section.value) + sign * x for x in ends)
-        )
-    change = (
-        "choose another function, `value`, `direction` or `charts`, not at an event"
+    span = "nowhere"
+    if len(high):
+        sign = 1 if section.direction == "falling" else -1
+        first, last = (float(section.value) + sign * x for x in (high.max(), low.min()))
+        span = f"from {first:.4g} to {last:.4g}"
+    return (
+        f"{hint}. Values of {section} on the cycle: {span}; choose another function, `value`, "
+        "`direction` or `charts`, not at an event."
     )
-    return f"{hint}. Values of {section} on the cycle: {span}; {change}."
 
 
 def _check_center(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
@@ -497,27 +570,31 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
 def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     """The number of crossings of each section (N,) by the cycle's steps, besides its own, the
     fastest rate of its level (N,), and the rate on the section (N,)."""
-    s, N, tape, lanes = placed.structure(), placed.n_sections, placed.tape, placed.lanes
+    s, N = placed.structure(), placed.n_sections
+    lanes, tape = placed.lanes, placed.tape
+    assert tape is not None
     still = np.zeros((s.nu, 1))
-    # The steps of one period, and the section at their start or -1.
-    t, chart, q, h, _, lane, order, _ = recorded_moves(lanes, tape)
-    section, after = np.where(order == 0, lane, -1), tape.before.transpose(2, 0, 1)
-    after = after[tape.code.T != IDLE].T
-    f0, f1 = slopes(s, t, chart, q, still), slopes(s, t + h, chart, after, still)
+    moves = recorded_moves(lanes, tape)
+    is_move = tape.code.T != IDLE
+    end = tape.before.transpose(2, 0, 1)[is_move].T
+    # The flow at several points of every step, by its cubic interpolant.
+    slope_at_start = slopes(s, moves.t, moves.chart, moves.q, still)
+    slope_at_end = slopes(s, moves.t + moves.h, moves.chart, end, still)
     x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
-    q = interpolate(x, h, q[:, None], after[:, None], f0[:, None], f1[:, None])
-    t, chart, q = (t + h * x).ravel(), np.tile(chart, len(x)), q.reshape(s.d, -1)
-    value, rate = levels_at(s, levels, N, t, chart, q)
+    both = moves.q[:, None], end[:, None]
+    rates = slope_at_start[:, None], slope_at_end[:, None]
+    states = interpolate(x, moves.h, *both, *rates).reshape(s.d, -1)
+    times = (moves.t + moves.h * x).ravel()
+    value, rate = levels_at(s, levels, N, times, np.tile(moves.chart, len(x)), states)
     level = value.reshape(N, len(x), -1)
-    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (h > 0)
+    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (moves.h > 0)
     # Around the section itself, rounding decides the signs.
-    itself = np.arange(N)[:, None] == section
-    falls[:, 0] &= ~itself
-    falls[:, -1] &= ~np.roll(itself, -1, axis=1)
-    f = slopes(s, lanes.t, lanes.chart, lanes.q, still)
-    on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * f.T, axis=1)
-    return (
-        np.sum(falls, axis=(1, 2)),
-        np.max(np.nan_to_num(np.abs(rate)), axis=1),
-        on_section,
-    )
+    begins_at = np.where(moves.order == 0, moves.lane, -1)
+    is_itself = np.arange(N)[:, None] == begins_at
+    falls[:, 0] &= ~is_itself
+    falls[:, -1] &= ~np.roll(is_itself, -1, axis=1)
+    field = slopes(s, lanes.t, lanes.chart, lanes.q, still)
+    on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * field.T, axis=1)
+    count = np.sum(falls, axis=(1, 2))
+    fastest = np.max(np.nan_to_num(np.abs(rate)), axis=1)
+    return count, fastest, on_section

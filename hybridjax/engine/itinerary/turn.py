@@ -1,5 +1,6 @@
 """A trajectory that follows an itinerary."""
 
+import dataclasses
 import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -87,94 +88,139 @@ def follow(
     `known`: ends of legs where they are known, otherwise infinite. `passes`: number of times the
     itinerary is followed, each with the ends that the one before has found.
     """
-    d, reverse = begin[1].shape[-1], count is None
+    d = begin[1].shape[-1]
     inputs = _inputs_of_columns(travelers, form, d) if columns else None
-    C = d if inputs is None else len(inputs)
-    if not columns:
-        C = 0
-    along = jax.vmap if travelers.many else lambda function: function
+    steps = _Steps(
+        travelers,
+        form,
+        inputs=inputs,
+        columns=_number_of_columns(columns, inputs, d),
+        solver=solver,
+        reverse=count is None,
+        passes=passes,
+    )
+    rows = jax.tree_util.tree_map(jnp.asarray, rows)
+    numbers = travelers.numbers
+    constants = _Constants(numbers, levels, settings, rows, count, begin, known)
+    state = steps.depart(constants, ends)
+    if count is not None:
+        every = passes * count
+        state = loop(steps.take, steps.take_along, constants, state, every)
+    else:
+        one = lambda state, row: (steps.row(constants, row, state), None)  # noqa: E731
+        for _ in range(passes):
+            state = steps.depart(constants, state.course.ends)
+            state, _ = jax.lax.scan(one, state, rows)
+    return _passage(state, form, columns, travelers.many)
 
-    def depart(constants, ends) -> _State:
-        begin, known = constants.begin, constants.known
+
+def _number_of_columns(columns: bool, inputs: Array | None, d: int) -> int:
+    if not columns:
+        return 0
+    return d if inputs is None else len(inputs)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Steps:
+    """The steps of the loop over the rows, of all lanes; see `follow`."""
+
+    travelers: Travelers
+    form: Form
+    inputs: Float[Array, "C nu"] | None
+    columns: int
+    solver: Solver | None
+    reverse: bool
+    passes: int
+
+    def depart(self, constants: "_Constants", ends) -> "_State":
+        """The beginning, with guessed ends of legs."""
+        known = constants.known
         ends = jax.lax.stop_gradient(ends)
         if known is not None:
             ends = jnp.where(jnp.isfinite(known), known, ends)
-        course = along(lambda t, q, ends: _departed(t, q, ends, C, form))(*begin, ends)
+
+        def of_lane(t, q, ends):
+            return _departed(t, q, ends, self.columns, self.form)
+
+        course = self.travelers.each(of_lane)(*constants.begin, ends)
         # (Rows at which no piece begins write into one more place.)
-        kept = lambda x: jnp.zeros((form.pieces + 1, *x.shape))  # noqa: E731
+        kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
         begun = _Begun(*map(kept, (course.t, course.y, course.delay, course.rate)))
         return _State(course, begun)
 
-    def branch(body: Body) -> Callable[..., Course]:
-        def of_lane(constants, numbers, course, row):
-            s = travelers.of(numbers)
+    def take(self, constants: "_Constants", k, state: "_State") -> "_State":
+        """Step k, which may be the first of another pass."""
+        if self.passes > 1:
+            again = self._restart(constants, state)
+            state = _chosen(_is_new(constants, k), again, state)
+        return self.row(constants, _row(constants, k), state)
 
-            def pairs(a):
-                return solver_of(s.method(a), reverse) if solver is None else solver
+    def take_along(
+        self, constants, by_constants, k, state: "_State", columns: "_State"
+    ):
+        """The same, with derivatives in directions on the first axis."""
+        if self.passes > 1:
+            again = pushed(self._restart, constants, by_constants, state, columns)
+            state, columns = _chosen(_is_new(constants, k), again, (state, columns))
+        row = _row(constants, k)
 
-            levels, settings = constants.levels, constants.settings
-            bodies = Bodies(s, levels, settings, form.watched, pairs, inputs)
-            return bodies.of(body)(row, course)
-
-        def of_all(constants, row, course):
-            lane = lambda *lane: of_lane(constants, *lane, row)  # noqa: E731
-            return along(lane)(constants.numbers, course)
-
-        return of_all
-
-    branches = [branch(body) for body in form.bodies]
-
-    def take(constants, row: Rows, state: _State) -> _State:
-        begun = state.begun.ended(row, state.course)
-        # (Constants are no arguments: sections also hold names.)
-        bound = [ft.partial(function, constants) for function in branches]
-        course = jax.lax.switch(row.body, bound, row, state.course)
-        return _State(course, begun.begun(row, course))
-
-    def take_along(constants, by_constants, row: Rows, state: _State, columns: _State):
         # (Derivatives of the bodies, not of the choice among them: that takes many times as long.)
-        def body(function):
+        def along(body):
             def of(row, course, by_course):
-                one = lambda constants, course: function(constants, row, course)  # noqa: E731
+                one = ft.partial(self._body, body, row)
                 return pushed(one, constants, by_constants, course, by_course)
 
             return of
 
+        branches = [along(body) for body in self.form.bodies]
+        ended = state.begun.ended(row, state.course)
+        by_ended = columns.begun.ended(row, columns.course, 1)
         both = state.course, columns.course
-        begun = state.begun.ended(row, both[0]), columns.begun.ended(row, both[1], 1)
-        both = jax.lax.switch(row.body, [*map(body, branches)], row, *both)
-        begun = begun[0].begun(row, both[0]), begun[1].begun(row, both[1], 1)
-        return _State(both[0], begun[0]), _State(both[1], begun[1])
+        course, by_course = jax.lax.switch(row.body, branches, row, *both)
+        begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
+        return _State(course, begun), _State(by_course, by_begun)
 
-    def restart(constants, state: _State) -> _State:
-        return depart(constants, state.course.ends)
+    def row(self, constants: "_Constants", row: Rows, state: "_State") -> "_State":
+        """What a row does."""
 
-    def numbered(constants, k, state: _State) -> _State:
-        if passes > 1:
-            is_new = (k > 0) & (k % constants.count == 0)
-            state = _chosen(is_new, restart(constants, state), state)
-        return take(constants, _row(constants, k), state)
+        # (Constants are no arguments: sections also hold names.)
+        def branch(body):
+            return lambda row, course: self._body(body, row, constants, course)
 
-    def numbered_along(constants, by_constants, k, state: _State, columns: _State):
-        if passes > 1:
-            is_new = (k > 0) & (k % constants.count == 0)
-            again = pushed(restart, constants, by_constants, state, columns)
-            state, columns = _chosen(is_new, again, (state, columns))
-        return take_along(constants, by_constants, _row(constants, k), state, columns)
+        branches = [branch(body) for body in self.form.bodies]
+        ended = state.begun.ended(row, state.course)
+        course = jax.lax.switch(row.body, branches, row, state.course)
+        return _State(course, ended.begun(row, course))
 
-    rows = jax.tree_util.tree_map(jnp.asarray, rows)
-    constants = _Constants(
-        travelers.numbers, levels, settings, rows, count, begin, known
-    )
-    state = depart(constants, ends)
-    if count is None:
-        one = lambda state, row: (take(constants, row, state), None)  # noqa: E731
-        for _ in range(passes):
-            state = depart(constants, state.course.ends)
-            state, _ = jax.lax.scan(one, state, rows)
-    else:
-        state = loop(numbered, numbered_along, constants, state, passes * count)
-    return _passage(state, form, columns, travelers.many)
+    def _restart(self, constants: "_Constants", state: "_State") -> "_State":
+        return self.depart(constants, state.course.ends)
+
+    def _body(self, body: Body, row: Rows, constants: "_Constants", course: Course):
+        """What rows with a body do, in all lanes."""
+
+        def of_lane(numbers, course):
+            s = self.travelers.of(numbers)
+            bodies = Bodies(
+                s,
+                constants.levels,
+                constants.settings,
+                self.form.watched,
+                lambda a: self._solver(s, a),
+                self.inputs,
+            )
+            return bodies.of(body)(row, course)
+
+        return self.travelers.each(of_lane)(constants.numbers, course)
+
+    def _solver(self, s: Structure, a: int) -> Solver:
+        if self.solver is not None:
+            return self.solver
+        return solver_of(s.method(a), self.reverse)
+
+
+def _is_new(constants: "_Constants", k: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether step k is the first of a later pass."""
+    return (k > 0) & (k % constants.count == 0)
 
 
 def _chosen(mask: Bool[Array, ""], yes: Any, no: Any) -> Any:
