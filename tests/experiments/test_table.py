@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.compilation import Program
 from hybridjax.experiments.passage import program
+from hybridjax.experiments.response import flow_batch
 from hybridjax.experiments.rows import tables
 from hybridjax.experiments.run import Options, prepare
 
@@ -38,7 +40,7 @@ def responses(campaign):
         program(*arguments, table.form, table.rows, np.int32(table.count))
         for table in (made.near, made.far)
     ]
-    return campaign._program(*arguments), *along
+    return Program(flow_batch, loops=False)(*arguments), *along
 
 
 def test_lanes_that_leave_the_table_say_so(campaign, responses):
