@@ -117,24 +117,29 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     """True if event k + 1 of a path follows event k in all neighbors, at once: both are scheduled,
     or the reset of event k puts the guard of the next one beyond zero, or at zero in each neighbor.
     """
-    s, (g, later) = path.structure, path.event[k : k + 2].tolist()
-    first, second = (isinstance(s.transitions[x].guard, Scheduled) for x in (g, later))
-    if second or later < 0:
-        return first and second
-    a, b = (int(x) for x in path.chart[k - 1 : k + 1])
-    n, m, time, u = s.dims[a], s.dims[b], path.t[[k]], np.zeros((s.nu, 1))
+    s = path.structure
+    g, later = path.event[k : k + 2].tolist()
+    scheduled = [isinstance(s.transitions[x].guard, Scheduled) for x in (g, later)]
+    if scheduled[1] or later < 0:
+        return all(scheduled)
+    a, b = int(path.chart[k - 1]), int(path.chart[k])
+    n, m = s.dims[a], s.dims[b]
+    time, u = path.t[[k]], np.zeros((s.nu, 1))
     before, after = path.before[k, :n, None], path.after[k, :m, None]
-    index = np.zeros(1, np.int32)
-    row = kernels.watched(s, b, None, time, after, u, index)[s.guards(b).index(later)]
-    value, by_t, by_q, by_u = row[0, 0], row[1, 0], row[2 : 2 + m, 0], row[2 + m :, 0]
+    watched = kernels.watched(s, b, None, time, after, u, np.zeros(1, np.int32))
+    guard = watched[s.guards(b).index(later), :, 0]
+    value, by_t, by_q, by_u = guard[0], guard[1], guard[2 : 2 + m], guard[2 + m :]
     rate = by_t + by_q @ kernels.field(s, b, time, after, u)[:, 0, 0]
     if value < -TOGETHER * period * abs(rate):
         return True
+    # The guard after the reset, by the time, the state before it and the inputs: zero up to
+    # rounding, if it is zero in each neighbor.
     by_reset = kernels.reset(s, s.member(g), time, before, u)[:, 1:, 0]
-    change = np.concatenate([[by_t], np.zeros(n), by_u]) + by_q @ by_reset
-    size = np.concatenate([[abs(by_t)], np.zeros(n), abs(by_u)])
-    size = size + np.abs(by_q) @ np.abs(by_reset)
-    if first:  # (its time is the same in all neighbors)
+    still = np.zeros(n)
+    direct = np.concatenate([[by_t], still, by_u])
+    change = direct + by_q @ by_reset
+    size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
+    if scheduled[0]:  # (its time is the same in all neighbors)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
 

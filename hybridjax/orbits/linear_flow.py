@@ -31,7 +31,7 @@ from ..engine.lanes import (
     for_each_chart,
     side_by_side,
 )
-from ..engine.replay import Variation, recorded_moves
+from ..engine.replay import Moves, Variation, recorded_moves
 from ..engine.saltation import jump
 from ..engine.target import Target
 from ..linear.time_response import monodromy
@@ -214,29 +214,33 @@ class LinearFlow(eqx.Module):
         **Returns:** those where pieces begin (P, d, nu + d, f), the delays of the events at their
         ends (P, nu + d, f), and those at the end of the turn (d, nu + d, f).
         """
-        (xp, jumps), (P, K, d) = (namespace(self.q), self.jumps), self.q.shape
-        shape, last = (P, d, -1, waves.shape[2]), waves[:, -1, None]
-        wide = lambda x: xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])  # noqa: E731
-        arrived = self.pushed[:, -1].reshape(P, -1, K) @ waves
-        kick = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(shape)
-        kick = wide(kick + jumps.by_input[..., None] * last[:, None])
+        xp, jumps = namespace(self.q), self.jumps
+        P, K, d = self.q.shape
+        nu, f = self.by_input.shape[3], waves.shape[2]
+
+        def wide(x):
+            """With columns of zeros for the deviations at the beginning of the turn."""
+            return xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])
+
+        # Deviations at the ends of pieces, before and after their events.
+        last = waves[:, -1, None]
+        arrived = (self.pushed[:, -1].reshape(P, -1, K) @ waves).reshape(P, d, nu, f)
+        jumped = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(P, d, nu, f)
+        kick = wide(jumped + jumps.by_input[..., None] * last[:, None])
 
         def advance(x, piece):
             through, kick, back = piece
-            return ((through @ x.reshape(d, -1)).reshape(x.shape) + kick) * back, x
+            after = (through @ x.reshape(d, -1)).reshape(x.shape) + kick
+            return after * back, x
 
-        begin = (
-            xp.pad(xp.eye(d), [(0, 0), (self.by_input.shape[3], 0)])[..., None]
-            + 0 * kick[0]
-        )
-        through, back = xp.asarray(self.through, dtype=waves.dtype), 1 / last[:, 0]
-        end, x = scan(advance, begin, (through, kick, back))
+        begin = xp.pad(xp.eye(d), [(0, 0), (nu, 0)])[..., None] + 0 * kick[0]
+        through = xp.asarray(self.through, dtype=waves.dtype)
+        end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
         by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
-        by_input = xp.einsum(
-            "pa,pauf->puf", jumps.delay_by_state, arrived.reshape(shape)
-        )
+        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
         by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
-        return x, (xp.einsum("pa,pacf->pcf", by_begin, x) + by_input) / last, end
+        delays = xp.einsum("pa,pacf->pcf", by_begin, x) + by_input
+        return x, delays / last, end
 
     @remembered
     def through(self) -> Float[Array, "P d d"]:
@@ -334,6 +338,46 @@ def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
 _STEPS = 4
 
 
+class _Pieces(NamedTuple):
+    """P pieces of one turn, in D directions: parts of several recorded moves between events."""
+
+    first: Int[np.ndarray, " P"]
+    last: Int[np.ndarray, " P"]
+    """Moves with which they begin and end."""
+    time: Inexact[np.ndarray, "P K D"]
+    """Times of the nodes."""
+    length: Inexact[np.ndarray, "P D"]
+    event: Int[np.ndarray, " P"]
+    """Index of the transition at the end, negative for none."""
+
+
+def _pieces(
+    moves: Moves, t: Inexact[np.ndarray, "1+M D"], most: int, longest: float
+) -> _Pieces:
+    """Pieces of at most so many moves, none longer than this time.
+
+    **Arguments:** `t`: times at which moves begin, and the end of the turn.
+    """
+    k = np.arange(len(moves.t))
+    after_event = np.roll(moves.code, 1) >= 0
+    begins = np.maximum.accumulate(np.where(after_event, k, 0))
+    first = np.flatnonzero((k - begins) % most == 0)
+    last = np.append(first[1:], len(k)) - 1
+    length, event = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
+    # (Rounding divides no piece.)
+    count = np.ceil(np.real(length[:, 0]) / longest - 1e-9)
+    count = np.maximum(count, 1).astype(int)
+    whole = np.repeat(np.arange(len(first)), count)
+    part = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
+    first, last, length = first[whole], last[whole], length[whole]
+    count, event = count[whole], event[whole]
+    share = (part[:, None] + rule().nodes) / count[:, None]
+    time = t[first][:, None] + share[..., None] * length[:, None]
+    is_last = part == count - 1
+    event = np.where(is_last, event, -1)
+    return _Pieces(first, last, time, length / count[:, None], event)
+
+
 def _linear_flow(
     cycle: Any, longest: float, parameter: str | None, by: Any = None
 ) -> LinearFlow:
@@ -344,67 +388,65 @@ def _linear_flow(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
         )
-    map, nodes, K = cycle.return_map, rule().nodes, NODES
+    map, K, directions = cycle.return_map, NODES, 1
     s, of = map.structure, with_inputs(map.system, parameter)
-    d, period, D, tiny = s.d, float(map.expected), 1, 1j * kernels.TINY
+    d, period = s.d, float(map.expected)
     lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
-    t, q = np.append(moves.t, map.anchor.t[0] + period)[:, None], moves.q.T[..., None]
+    t = np.append(moves.t, map.anchor.t[0] + period)[:, None]
+    q = moves.q.T[..., None]
     if by is not None:
-        D = len(jax.tree_util.tree_leaves(by)[0])
-        pairs = (s, by.structure), (of, with_inputs(by.system, parameter))
-        s, of = (kernels.Tangents(x, y, None, None, D) for x, y in pairs)
-        tangents = _along(s, map, lanes, tape, by)
-        t, q = t + tiny * tangents[:, 0], q + tiny * tangents[:-1, 1:]
-    # Pieces of several steps between events, because a step of an explicit method is short for the
-    # polynomials of a piece; each divided into some parts.
-    k, most = np.arange(len(moves.t)), 1 if has_implicit(s) else _STEPS
-    begins = np.maximum.accumulate(np.where(np.roll(moves.code, 1) >= 0, k, 0))
-    first = np.flatnonzero((k - begins) % most == 0)
-    last = np.append(first[1:], len(k)) - 1
-    h, code = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
-    parts = np.maximum(np.ceil(np.real(h[:, 0]) / (longest * period) - 1e-9), 1).astype(
-        int
-    )
-    whole = np.repeat(np.arange(len(first)), parts)
-    part = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
-    first, last, h, parts = first[whole], last[whole], h[whole], parts[whole, None]
-    P, code = len(whole), np.where(part == parts[:, 0] - 1, code[whole], -1)
-    time = t[first][:, None] + ((part[:, None] + nodes) / parts)[..., None] * h[:, None]
-    step = np.searchsorted(np.real(t[:-1, 0]), time.real[..., 0], "right") - 1
-    step = np.clip(step, first[:, None], last[:, None])
-    # Directions are lanes of their own, and come last.
-    each = 1 + d + np.arange(P * K * D) % D
-    charts, u = np.repeat(moves.chart[first], K * D), kernels.unpushed(s, each)
-    begin = t[step].ravel(), charts, np.moveaxis(q[step], 2, 0).reshape(d, -1)
-    states = _ahead(s, *begin, u, (time - t[step]).ravel())
-    at = charts, time.ravel(), states, d, kernels.unpushed(of, each)
-    with_field = with_derivatives(of, ft.partial(kernels.field, of), *at)
+        directions = len(jax.tree_util.tree_leaves(by)[0])
+        of_by = with_inputs(by.system, parameter)
+        of = kernels.Tangents(of, of_by, None, None, directions)
+        s = kernels.Tangents(s, by.structure, None, None, directions)
+        tangents = 1j * kernels.TINY * _along(s, map, lanes, tape, by)
+        t, q = t + tangents[:, 0], q + tangents[:-1, 1:]
+    # (A step of an explicit method is short for the polynomials of a piece.)
+    most = 1 if has_implicit(s) else _STEPS
+    pieces = _pieces(moves, t, most, longest * period)
+    chart, P = moves.chart[pieces.first], len(pieces.first)
+
+    # Lanes: by piece, node and direction. (Directions are lanes of their own, and come last.)
+    each = 1 + d + np.arange(P * K * directions) % directions
+    charts, times = np.repeat(chart, K * directions), pieces.time.ravel()
+    step = np.searchsorted(np.real(t[:-1, 0]), pieces.time.real[..., 0], "right") - 1
+    step = np.clip(step, pieces.first[:, None], pieces.last[:, None])
+    begin, start = t[step].ravel(), np.moveaxis(q[step], 2, 0).reshape(d, -1)
+    u = kernels.unpushed(s, each)
+    states = _ahead(s, begin, charts, start, u, times - begin)
+    field = ft.partial(kernels.field, of)
+    u = kernels.unpushed(of, each)
+    by_field = with_derivatives(of, field, charts, times, states, d, u)
 
     def lay(x):
-        return np.moveaxis(x.reshape(*x.shape[:-1], P, K, D), (-1, -3, -2), (0, 1, 2))
+        """Directions, pieces and nodes first."""
+        x = x.reshape(*x.shape[:-1], P, K, directions)
+        return np.moveaxis(x, (-1, -3, -2), (0, 1, 2))
 
-    states, f = lay(states), lay(with_field[:, 0])
-    u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(D), P))
-    last = states[:, :, -1].reshape(-1, d)
-    jumps = _jumps(of, np.tile(code, D), time[:, -1].T.ravel(), u, last)
-    jumps = Jumps(*(x.reshape(D, P, *x.shape[1:]) for x in jumps))
-    arrays = LinearFlow(
-        lay(time.ravel()),
-        (h / parts).T,
+    states = lay(states)
+    # Ends of pieces: by direction and piece.
+    u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(directions), P))
+    events, times_of_ends = np.tile(pieces.event, directions), pieces.time[:, -1].T
+    ends = times_of_ends.ravel(), u, states[:, :, -1].reshape(-1, d)
+    jumps = _jumps(of, events, *ends)
+    jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
+    flow = LinearFlow(
+        lay(times),
+        pieces.length.T,
         None,
         None,
         states,
-        f,
-        lay(with_field[:, 2 : 2 + d]),
-        lay(with_field[:, 2 + d :]),
+        lay(by_field[:, 0]),
+        lay(by_field[:, 2 : 2 + d]),
+        lay(by_field[:, 2 + d :]),
         jumps,
-        np.broadcast_to(map.scale[moves.chart[first]], (D, P, d)),
+        np.broadcast_to(map.scale[chart], (directions, P, d)),
     )
     if by is not None:
-        return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, arrays)
-    arrays = jax.tree_util.tree_map(lambda x: x[0], arrays)
-    return dataclasses.replace(arrays, chart=moves.chart[first], event=code)
+        return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, flow)
+    flow = jax.tree_util.tree_map(lambda x: x[0], flow)
+    return dataclasses.replace(flow, chart=chart, event=pieces.event)
 
 
 def _along(

@@ -342,41 +342,51 @@ class ReturnMap(eqx.Module):
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
-        sizes, valid, xp = self.sizes, self.valid, namespace(q)
-        unit, held = valid[..., None] * np.eye(self.structure.d), self.held(q)[1]
-        defect = monodromy(xp.moveaxis(turn.factors, -3, 0)) - unit - held
-        singular = svdvals(defect * sizes[..., None, :] / sizes[..., None])
-        counts = np.arange(self.structure.d) < valid.sum(axis=-1)[..., None]
-        smallest = xp.min(xp.where(counts, singular, np.inf), axis=-1)
+        sizes, xp = self.sizes, namespace(q)
+        defect = self._defect(q, turn)
+        existing = self.valid.sum(axis=-1)[..., None]
+        counts = np.arange(self.structure.d) < existing
+        smallest = xp.min(xp.where(counts, svdvals(defect), np.inf), axis=-1)
         # (Where derivatives are large, rounding errors of the start are, too, at the end.)
-        grown = xp.max(
-            xp.abs(defect * sizes[..., None, :] / sizes[..., None]), axis=(-2, -1)
-        )
+        grown = xp.max(xp.abs(defect), axis=(-2, -1))
         accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
         closed_enough = turn.closed & (turn.distance <= accuracy)
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
         code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
-            same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
-            apart = xp.max(
-                xp.abs(turn.legs.q - q[..., None]) / sizes[..., None], axis=-2
-            )
-            farthest = xp.max(xp.where(same, apart, np.inf), axis=-1)
-            still = farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
             if self.event >= 0 and not self.expected.ndim:  # (not in sweeps)
                 ends_at_once = turn.closed & self._follows(turn.end)
                 code = xp.where(ends_at_once, Result.COINCIDENCE, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
-            code = xp.where(turn.closed & still, Result.EQUILIBRIUM, code)
+            at_rest = turn.closed & self._rests(q, turn)
+            code = xp.where(at_rest, Result.EQUILIBRIUM, code)
         code = xp.where(turn.closed & self._beyond(turn), Result.GUARD_BEYOND, code)
-        for d in (d for d in range(1, self.multiplicity) if self.multiplicity % d == 0):
+        for d in range(1, self.multiplicity):
+            if self.multiplicity % d:
+                continue
             sooner = self.expected * (d / self.multiplicity)
             part = dataclasses.replace(self, multiplicity=d, expected=sooner).turn(q)
             early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
             code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
+
+    def _defect(self, q: Float[Array, " d"], turn: Turn) -> Float[Array, "d d"]:
+        """The derivative of P(q) - q, in sizes of the states."""
+        sizes = self.sizes
+        unit = self.valid[..., None] * np.eye(self.structure.d)
+        returned = monodromy(namespace(q).moveaxis(turn.factors, -3, 0))
+        defect = returned - unit - self.held(q)[1]
+        return defect * sizes[..., None, :] / sizes[..., None]
+
+    def _rests(self, q: Float[Array, " d"], turn: Turn) -> Bool[Array, ""]:
+        """Test whether a turn stays where it begins, as at an equilibrium."""
+        xp = namespace(q)
+        same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
+        apart = xp.abs(turn.legs.q - q[..., None]) / self.sizes[..., None]
+        farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
+        return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
         """True if a guard has the sign that it has after its event at the beginnings of all pieces

@@ -60,34 +60,57 @@ def fixed_point(
 
     Guards are not watched here: `travel` tests whether the moves are still right.
     """
-    s, sizes, target, n = map.structure, map.sizes, map.ends(), 1 + map.structure.d
-    moves, last, unit = recorded_moves(*turn), np.inf, np.eye(n - 1)
+    sizes, target = map.sizes, map.ends()
+    moves, last = recorded_moves(*turn), np.inf
     x = moves.q[:, 0] / sizes
     while True:
-        end, by = linear_moves(s, moves, target)
+        end, by = linear_moves(map.structure, moves, target)
+        by = by[:, :, : 1 + len(x)]  # by (t, q)
         starts = np.concatenate([moves.t[None], moves.q]).T
         gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
-        # Changes of later starts by the state at the first one, and in the last column by the gaps.
-        changes = [np.eye(n, k=-1)]
-        changes[0][0, -1] = map.anchor.t[0] - starts[0, 0]
-        for of_move, gap in zip(by[:, :, :n], gaps, strict=True):
-            changes.append(of_move @ changes[-1])
-            changes[-1][:, -1] += gap
-        off, held = map.held(x * sizes)
-        residual = np.where(map.valid, changes[-1][1:, -1], 0.0) - x * sizes - off
-        jacobian = np.where(map.valid[:, None], changes[-1][1:, :-1], 0.0) - unit - held
-        jacobian = jacobian * sizes / sizes[:, None]
-        (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
-        shift = np.stack(changes[:-1]) @ np.append(step * sizes, 1.0)
-        h = (end + (by[:, :, :n] @ shift[:, :, None])[:, :, 0] - starts - shift)[:, 0]
+        changes = _changes(by, gaps, map.anchor.t[0] - starts[0, 0])
+        step = _step_of(map, x, changes[-1, 1:])
+        shift = changes[:-1] @ np.append(step * sizes, 1.0)
+        ends_moved = end + (by @ shift[:, :, None])[:, :, 0]
+        h = (ends_moved - starts - shift)[:, 0]
         length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
-        if not (length <= 0.5 * last and (moves.order == 0).sum() == LEGS):
+        whole = (moves.order == 0).sum() == LEGS
+        if not (length <= 0.5 * last and whole):
             return otherwise, None
         x, last, starts = x + step, length, starts + shift
         moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
         # (The error after a step is about its square.)
         if length <= np.maximum(CLOSED, np.asarray(map.settings.rtol)):
             return x, _forwards(moves)
+
+
+def _changes(
+    by: Float[np.ndarray, "M n n"], gaps: Float[np.ndarray, "M n"], late: float
+) -> Float[np.ndarray, "1+M n n"]:
+    """Changes of (t, q) where moves start, and at the last end, by the state at the first start,
+    and in the last column by the gaps between moves. The first one is `late`."""
+    n = by.shape[1]
+    changes = [np.eye(n, k=-1)]
+    changes[0][0, -1] = late
+    for of_move, gap in zip(by, gaps, strict=True):
+        change = of_move @ changes[-1]
+        change[:, -1] += gap
+        changes.append(change)
+    return np.stack(changes)
+
+
+def _step_of(
+    map: ReturnMap, x: Float[np.ndarray, " d"], end: Float[np.ndarray, "d n"]
+) -> Float[np.ndarray, " d"]:
+    """The Newton step, in sizes of the states, by the changes of the state at the end of a turn
+    (see `_changes`)."""
+    sizes = map.sizes
+    off, held = map.held(x * sizes)
+    residual = np.where(map.valid, end[:, -1], 0.0) - x * sizes - off
+    returned = np.where(map.valid[:, None], end[:, :-1], 0.0)
+    jacobian = (returned - np.eye(len(x)) - held) * sizes / sizes[:, None]
+    (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
+    return step
 
 
 def _forwards(moves: Moves) -> Moves | None:

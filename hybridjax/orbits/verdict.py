@@ -207,15 +207,15 @@ def _walk_along(cycle) -> _Path:
     delay = np.zeros(s.d)
     for k in np.flatnonzero(event >= 0):
         at = float(t[k + 1]), int(chart[k]), q[:, k]
-        event_k = _jump(s, int(event[k]), *at, scale, bool(moves.at_once[k]))
+        jumped = _jump(s, int(event[k]), *at, scale, bool(moves.at_once[k]))
         # (The event before one at once has brought this about, and has delayed it.)
         before = k - 1 if moves.at_once[k] else k
         if not moves.at_once[k]:
-            delay = event_k.delay @ by_state[k]
-        by_state[before] = event_k.by_state @ by_state[before]
-        by_state[before] += np.outer(event_k.slip, delay)
-        findings += event_k.findings
-        chart[k], q[:, k] = event_k.chart, event_k.q
+            delay = jumped.delay @ by_state[k]
+        by_state[before] = jumped.by_state @ by_state[before]
+        by_state[before] += np.outer(jumped.slip, delay)
+        findings += jumped.findings
+        chart[k], q[:, k] = jumped.chart, jumped.q
     monodromy = np.eye(s.d)
     for of_move in by_state:
         monodromy = of_move @ monodromy

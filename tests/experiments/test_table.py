@@ -6,7 +6,9 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import hybridjax as hj
+from hybridjax._core.compilation import Program
 from hybridjax.experiments.passage import program
+from hybridjax.experiments.response import flow_batch
 from hybridjax.experiments.rows import tables
 from hybridjax.experiments.run import Options, prepare
 
@@ -40,7 +42,7 @@ def responses(campaign):
         program(*arguments, table.form, table.rows, np.int32(table.count))
         for table in (made.near, made.far)
     ]
-    return campaign._program(*arguments), *along
+    return Program(flow_batch, loops=False)(*arguments), *along
 
 
 def test_lanes_that_leave_the_table_say_so(campaign, responses):
