@@ -15,7 +15,7 @@ from ..._core.arguments import require_apart
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import OptionalNames, SignalNames
 from ..._core.findings import Finding, listed, warn_of
-from ..data import SectionData
+from ..data import SectionData, whole_cycles
 from ..findings import CLEAR, NAME_REFERENCE, Inspection, place, places
 from ..phase import Phase
 from ..recording import Recording, Trial
@@ -353,12 +353,11 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     """Yield the parts of a record, inputs in their rms, outputs in robust standard deviations."""
     record = data.records[r]
     N = data.n_sections
-    first = -record.first_section % N
-    cycles = (len(record.u) - first) // N
+    whole = whole_cycles(record)
+    cycles = (whole.stop - whole.start) // N
     number = min(_PARTS, cycles // _SHORTEST)
-    if not number:
+    if number < 1:
         return
-    whole = slice(first, first + cycles * N)
     u = (record.u[whole] / data.rms()[0]).reshape(cycles, N, -1)
     y = (record.y[whole] / _robust_size(data)).reshape(cycles, N, -1)
     sections = min(N, sections)
@@ -414,10 +413,8 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     whole = 0.0
     left = 0.0
     for record in data.records:
-        first = -record.first_section % N
-        cycles = (len(record.y) - first) // N
-        y = (record.y / size)[first : first + cycles * N]
-        y = y.reshape(cycles, N * len(size))[:, : len(slope)]
+        y = record.y[whole_cycles(record)] / size
+        y = y.reshape(-1, N * len(size))[:, : len(slope)]
         y = y[np.isfinite(y).all(axis=1)]
         late = y @ slope / max(slope @ slope, tiny)
         times.append(late)
