@@ -86,12 +86,12 @@ def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Ser
     after = h[1:]
     shape = (len(values), len(before))
     Q = diags_array(
-        (1 / before, -1 / before - 1 / after, 1 / after),
-        offsets=(0, -1, -2),
+        [1 / before, -1 / before - 1 / after, 1 / after],
+        offsets=[0, -1, -2],
         shape=shape,
     )
     coupling = after[:-1] / 6
-    R = diags_array((coupling, (before + after) / 3, coupling), offsets=(-1, 0, 1))
+    R = diags_array([coupling, (before + after) / 3, coupling], offsets=[-1, 0, 1])
     matrix = R + weight * (Q.T @ Q)
     band = [np.pad(matrix.diagonal(k), (0, k)) for k in range(3)]
     curvature = solveh_banded(band, Q.T @ values, lower=True, check_finite=False)
@@ -181,8 +181,8 @@ def spike_heights(values: Series) -> Series:
 def _candidates(x: Series) -> Series:
     """Return the signed height of each sample above or below its neighbors: the distance from their
     median, but not more than an opening or closing removes."""
-    above = ndimage.white_tophat(x, _LONGEST + 1)
-    below = ndimage.black_tophat(x, _LONGEST + 1)
+    above = np.asarray(ndimage.white_tophat(x, _LONGEST + 1))
+    below = np.asarray(ndimage.black_tophat(x, _LONGEST + 1))
     distance = x - ndimage.median_filter(x, _NEIGHBORHOOD)
     removed = np.where(distance > 0, above, below)
     return np.sign(distance) * np.minimum(np.abs(distance), removed)

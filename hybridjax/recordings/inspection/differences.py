@@ -201,7 +201,7 @@ def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
     """Find trials with another period."""
     periods = np.array([np.median(x) if len(x) else np.nan for x in phase.periods])
     tolerance = max(_OTHER_PERIOD, CLEAR * phase.jitter)
-    for s in np.flatnonzero(np.isfinite(periods)):
+    for s in np.flatnonzero(np.isfinite(periods)).tolist():
         others = np.delete(periods, s)
         others = others[np.isfinite(others)]
         if not len(others):
@@ -242,8 +242,8 @@ def _difference(
         return (x * usual).sum(axis=1) / np.maximum(size, np.finfo(float).tiny)
 
     alike = correlations(mean)
-    unlike = np.flatnonzero(alike <= _CORRELATED)
-    if not len(unlike):
+    unlike = np.flatnonzero(alike <= _CORRELATED).tolist()
+    if not unlike:
         return
     if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
         yield Finding(
