@@ -164,6 +164,14 @@ class SectionData(eqx.Module):
         return folded(summary + ")")
 
 
+def whole_cycles(record: Record) -> slice:
+    """Return the samples of the whole cycles of a record, from section 0 on."""
+    N = record.n_sections
+    first = -record.first_section % N
+    cycles = (len(record.u) - first) // N
+    return slice(first, first + cycles * N)
+
+
 def input_spectrum(
     data: SectionData,
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F nu"]]:

@@ -168,7 +168,7 @@ def undamped(data: SectionData, fit: SeriesFit) -> Iterator[Finding]:
 
 def _upper(multipliers: Multipliers) -> Multipliers:
     """Return one multiplier of each pair."""
-    return multipliers[multipliers.imag >= 0]
+    return multipliers[np.imag(multipliers) >= 0]
 
 
 def _few_strides(sampled: int, unknowns: int) -> Iterator[Finding]:
@@ -224,7 +224,7 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
     y = np.where(grid.sampled, grid.y, np.nan).reshape(-1, N, ny)
     for i, j in combinations(range(ny), 2):
         pair = y[..., [i, j]]
-        known = np.isfinite(pair).all(axis=2)
+        known = np.asarray(np.isfinite(pair).all(axis=2))
         # Of an output that is constant at a section.
         with np.errstate(invalid="ignore"):
             correlations = [np.corrcoef(pair[known[:, n], n].T)[0, 1] for n in range(N)]

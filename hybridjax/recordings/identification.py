@@ -193,18 +193,16 @@ def _phase_without_drift(
     The phase of the drifting signals tells where cycles begin; where a definition is given, the
     phase is estimated again from signals without drift.
     """
-    definition = None if isinstance(phase, Phase) else phase
-    if definition is not None:
-        phase = estimate_phase(recording, definition)
-    if drift is None:
+    if isinstance(phase, Phase):
+        if drift is not None:
+            recording = without_drift(recording, phase, sorted(set(outputs)), drift)
         return recording, phase
-    drifting = set(outputs)
-    if definition is not None:
-        drifting |= signals_of(definition)
-    recording = without_drift(recording, phase, sorted(drifting), drift)
-    if definition is not None:
-        phase = estimate_phase(recording, definition)
-    return recording, phase
+    rough = estimate_phase(recording, phase)
+    if drift is None:
+        return recording, rough
+    drifting = set(outputs) | signals_of(phase)
+    recording = without_drift(recording, rough, sorted(drifting), drift)
+    return recording, estimate_phase(recording, phase)
 
 
 def _order(

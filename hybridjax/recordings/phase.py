@@ -11,6 +11,7 @@ from .._core.memo import remembered
 from .._core.text import folded
 from ..errors import DefinitionError
 from .recording import Recording, Trial
+from .smoothing import Series
 
 
 # Longest gap, in cycles, across which cycles are counted. Longer: half a turn of an angle passes
@@ -104,6 +105,16 @@ class Phase(eqx.Module):
             len(recording.trials),
         )
         return list(zip(recording.trials, self.stretches, strict=True))
+
+    def samples(
+        self, recording: Recording, name: str
+    ) -> list[tuple[Trial, Series, tuple[Winding, ...]]]:
+        """Return each trial with the samples of a signal and its stretches.
+
+        **Raises:** `DefinitionError` as `by_trial`, and for an unknown signal.
+        """
+        k = recording.column(name)
+        return [(t, t.values[:, k], parts) for t, parts in self.by_trial(recording)]
 
     @property
     def cycles(self) -> int:

@@ -98,11 +98,9 @@ def section_data(
     _require_signals(recording, (*inputs, *outputs))
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
-    if n_sections is not None and phase.n_sections is not None:
-        require_equal(
-            "`n_sections` and phase", "n_sections", n_sections, phase.n_sections
-        )
-    N = n_sections or phase.n_sections or HARMONICS
+    N = _number_of_sections(n_sections, phase)
+    if not outputs and timing is None:
+        timing = "duration"
     if bandwidth is None:
         bandwidth = N / phase.period
     require_passing(bandwidth, 1 / phase.period)
@@ -113,7 +111,7 @@ def section_data(
         period=phase.period,
         bandwidth=float(bandwidth),
         sampled=sampled,
-        timing=timing if outputs or timing else "duration",
+        timing=timing,
     )
     parts, spikes = _sample_trials(recording, phase, plan)
     if not parts:
@@ -123,7 +121,7 @@ def section_data(
     lengths = [len(part.k) for part in parts]
     cycle = np.average([part.cycle for part in parts], axis=0, weights=lengths)
     _require_changes(parts, cycle, plan)
-    if plan.timing is not None:
+    if timing is not None:
         longest = parts[int(np.argmax(lengths))]
         time = recording.trials[longest.trial].time
         _require_times(longest, N, float(np.median(np.diff(time))))
@@ -180,6 +178,14 @@ class _Sections(NamedTuple):
     """Mean squares of changes of the outputs, if every second sample is left out."""
     cycle: Signals
     """Average values of the trial at each section, which are subtracted."""
+
+
+def _number_of_sections(n_sections: int | None, phase: Phase) -> int:
+    if n_sections is not None and phase.n_sections is not None:
+        require_equal(
+            "`n_sections` and phase", "n_sections", n_sections, phase.n_sections
+        )
+    return n_sections or phase.n_sections or HARMONICS
 
 
 def _require_signals(recording: Recording, names: Sequence[str]) -> None:
@@ -359,7 +365,6 @@ def _sample(
     N = plan.n_sections
     nu = len(plan.inputs)
     of_output = [_Output.through(time, x, plan) for x in signals.T[nu:]]
-    of_input = [_Input(time, x, plan) for x in signals.T[:nu]]
     sections = []
     for stretch in stretches:
         k = _crossed(stretch, N)
@@ -371,11 +376,12 @@ def _sample(
         observed = ~inside(stretch.gaps[long_gaps], start, start)
         values = np.zeros((len(start), signals.shape[1]))
         change = np.zeros((len(start), len(of_output)))
-        for i, x in enumerate(of_input):
-            values[:, i] = x.between(t)
-        for i, x in enumerate(of_output):
-            values[:, nu + i] = np.where(observed, x.at(start), np.nan)
-            change[:, i] = x.change(start)
+        for i, x in enumerate(signals.T[:nu]):
+            known = np.isfinite(x)
+            values[:, i] = _held(time[known], x[known], t, plan)
+        for i, output in enumerate(of_output):
+            values[:, nu + i] = np.where(observed, output.at(start), np.nan)
+            change[:, i] = output.change(start)
         none = np.zeros((0, 0))
         sections.append(_Sections(trial, k[:-1], start, observed, values, change, none))
     return sections
@@ -422,26 +428,17 @@ class _Output(NamedTuple):
         return np.mean([(half(time) - whole) ** 2 for half in self.halves], axis=0)
 
 
-class _Input:
-    """An input that is held, or averaged, from section to section."""
-
-    def __init__(self, time: Series, values: Series, plan: _Plan):
-        finite = np.isfinite(values)
-        self.time = time[finite]
-        self.values = values[finite]
-        self.gaps = _long_gaps(self.time, plan)
-        self.sampled = plan.sampled
-
-    def between(self, edges: Series) -> Series:
-        """Return one value between each two successive times; NaN if it touches a long gap."""
-        start = edges[:-1]
-        end = edges[1:]
-        if self.sampled == "mean":
-            values = means(self.time, self.values, edges)
-        else:
-            halfway = (self.time[:-1] + self.time[1:]) / 2
-            values = self.values[np.searchsorted(halfway, (start + end) / 2)]
-        return np.where(inside(self.gaps, start, end), np.nan, values)
+def _held(time: Series, values: Series, edges: Series, plan: _Plan) -> Series:
+    """Return the value of an input between each two successive times, as a mean or from the sample
+    in the middle; NaN if the interval touches a long gap."""
+    start = edges[:-1]
+    end = edges[1:]
+    if plan.sampled == "mean":
+        held = means(time, values, edges)
+    else:
+        halfway = (time[:-1] + time[1:]) / 2
+        held = values[np.searchsorted(halfway, (start + end) / 2)]
+    return np.where(inside(_long_gaps(time, plan), start, end), np.nan, held)
 
 
 def _with_times(parts: list[_Sections], plan: _Plan) -> list[_Sections]:

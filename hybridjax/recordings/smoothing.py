@@ -1,6 +1,6 @@
 """Splines through samples with a stated bandwidth, gaps between samples, and isolated spikes."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -74,8 +74,9 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
 def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Series:
     r"""Return a smoothing spline at its samples.
 
-    With $R c$ and $Q^T f$ as second derivatives c of the spline and second divided differences of
-    its samples f, $(R + \gamma Q^T Q) c = Q^T y$ and $f = y - \gamma Q c$.
+    The samples f of a natural spline determine its second derivatives c: $R c = Q^T f$, where the
+    columns of Q are second divided differences. The minimizer is $f = y - \gamma Q c$, with
+    $(R + \gamma Q^T Q) c = Q^T y$.
 
     `make_smoothing_spline` of scipy takes ten times as long, and is off by several percent at the
     bandwidths of slow drift.
@@ -85,13 +86,13 @@ def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Ser
     before = h[:-1]
     after = h[1:]
     shape = (len(values), len(before))
-    Q = diags_array(
-        (1 / before, -1 / before - 1 / after, 1 / after),
-        offsets=(0, -1, -2),
-        shape=shape,
-    )
+    # (`Any`, since checkers of types infer one number from the default.)
+    downwards: Any = [0, -1, -2]
+    around: Any = [-1, 0, 1]
+    differences = [1 / before, -1 / before - 1 / after, 1 / after]
+    Q = diags_array(differences, offsets=downwards, shape=shape)
     coupling = after[:-1] / 6
-    R = diags_array((coupling, (before + after) / 3, coupling), offsets=(-1, 0, 1))
+    R = diags_array([coupling, (before + after) / 3, coupling], offsets=around)
     matrix = R + weight * (Q.T @ Q)
     band = [np.pad(matrix.diagonal(k), (0, k)) for k in range(3)]
     curvature = solveh_banded(band, Q.T @ values, lower=True, check_finite=False)
@@ -181,8 +182,8 @@ def spike_heights(values: Series) -> Series:
 def _candidates(x: Series) -> Series:
     """Return the signed height of each sample above or below its neighbors: the distance from their
     median, but not more than an opening or closing removes."""
-    above = ndimage.white_tophat(x, _LONGEST + 1)
-    below = ndimage.black_tophat(x, _LONGEST + 1)
+    above = np.asarray(ndimage.white_tophat(x, _LONGEST + 1))
+    below = np.asarray(ndimage.black_tophat(x, _LONGEST + 1))
     distance = x - ndimage.median_filter(x, _NEIGHBORHOOD)
     removed = np.where(distance > 0, above, below)
     return np.sign(distance) * np.minimum(np.abs(distance), removed)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.recordings.inspection.inspect import feedback
+from hybridjax.recordings.inspection.answers import feedback
 
 
 N = 8

@@ -70,14 +70,12 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
     """
-    stretches = phase.by_trial(recording)
-    for _, parts in stretches:
+    trials: list[Intervals] = []
+    for trial, x, parts in phase.samples(recording, name):
         if not all(part.linear for part in parts):
             raise DefinitionError(
                 "`phase` must be of events or a Crossing, not a KinematicPhase."
             )
-    trials: list[Intervals] = []
-    for (trial, x), (_, parts) in zip(recording.samples(name), stretches, strict=True):
         known = np.isfinite(x)
         if known.sum() < 2:
             raise DefinitionError(

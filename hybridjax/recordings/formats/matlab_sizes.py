@@ -42,8 +42,10 @@ class _Inflated:
     """The content of a compressed element, piece by piece."""
 
     def __init__(self, file: BinaryIO, size: int):
-        self.file, self.left = file, size
-        self.stream, self.ready = zlib.decompressobj(), b""
+        self.file = file
+        self.left = size
+        self.stream = zlib.decompressobj()
+        self.ready = b""
 
     def read(self, size: int) -> bytes:
         while len(self.ready) < size and not self.stream.eof:
@@ -54,7 +56,8 @@ class _Inflated:
             if not packed:
                 break
             self.ready += self.stream.decompress(packed, _PIECE)
-        content, self.ready = self.ready[:size], self.ready[size:]
+        content = self.ready[:size]
+        self.ready = self.ready[size:]
         return content
 
 
@@ -66,7 +69,9 @@ class _Reader:
     """Tags and data in the next bytes of a source, with the byte order of the file."""
 
     def __init__(self, source: _Source, order: str, size: int):
-        self.source, self.order, self.left = source, order, size
+        self.source = source
+        self.order = order
+        self.left = size
 
     def read(self, size: int, /) -> bytes:
         content = self.source.read(min(size, self.left))
@@ -80,7 +85,8 @@ class _Reader:
             size -= len(self.read(min(size, _PIECE)))
 
     def tag(self) -> _Tag:
-        first, second = self.read(4), self.read(4)
+        first = self.read(4)
+        second = self.read(4)
         (word,) = struct.unpack(f"{self.order}I", first)
         if word >> 16:  # the number of bytes and the type in one word, then the data
             return _Tag(word & 0xFFFF, word >> 16, second[: word >> 16])
@@ -150,7 +156,8 @@ def _array(path: Path, source: _Reader, size: int, depth: int) -> Iterator[int]:
         return
     body = _Reader(source, source.order, size)
     flags = body.integers()[0]
-    kind, is_complex = flags & 0xFF, bool(flags >> 11 & 1)
+    kind = flags & 0xFF
+    is_complex = bool(flags >> 11 & 1)
     of_members = kind in (_CELL, _STRUCT, _OBJECT)
     if not (of_members or kind in _TEXT_AND_NUMBERS):  # sparse arrays, functions
         yield size

@@ -201,7 +201,7 @@ def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
     """Find trials with another period."""
     periods = np.array([np.median(x) if len(x) else np.nan for x in phase.periods])
     tolerance = max(_OTHER_PERIOD, CLEAR * phase.jitter)
-    for s in np.flatnonzero(np.isfinite(periods)):
+    for s in np.flatnonzero(np.isfinite(periods)).tolist():
         others = np.delete(periods, s)
         others = others[np.isfinite(others)]
         if not len(others):
@@ -217,8 +217,7 @@ def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Cycles:
     """Return the mean of a signal at each phase, without the mean of all, for each trial."""
     cycles = []
-    trials = phase.by_trial(recording)
-    for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
+    for trial, x, parts in phase.samples(recording, name):
         at = np.full(len(x), np.nan)
         for part in parts:
             at = np.fmax(at, part.at(trial.time))
@@ -243,8 +242,8 @@ def _difference(
         return (x * usual).sum(axis=1) / np.maximum(size, np.finfo(float).tiny)
 
     alike = correlations(mean)
-    unlike = np.flatnonzero(alike <= _CORRELATED)
-    if not len(unlike):
+    unlike = np.flatnonzero(alike <= _CORRELATED).tolist()
+    if not unlike:
         return
     if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
         yield Finding(
@@ -280,8 +279,7 @@ def slow_changes(
     than some cycles have been `removed`."""
     for name in outputs:
         power = np.zeros(_COSINES)
-        trials = phase.by_trial(recording)
-        for (_, x), (trial, parts) in zip(recording.samples(name), trials, strict=True):
+        for trial, x, parts in phase.samples(recording, name):
             for part in parts:
                 _, level = cycle_means(trial, x, [part], phase.period)
                 if len(level) >= 2 * _COSINES:
