@@ -289,7 +289,7 @@ def _written(
         last,
         np.array(charts, np.int32),
         np.array(befores, np.int32),
-        np.array(armed).reshape(-1, len(s.transitions)).T,
+        np.array(armed).reshape(len(charts), len(s.transitions)).T,
         events,
         certain,
     )
