@@ -126,8 +126,8 @@ def _odd(
     for cause, parts in causes.items():
         if parts.any():
             text = _TEXTS[cause].format(name, listed(list(compress(where, parts))))
-            action = "refused" if cause == "another sign" else "warned"
-            yield Finding(cause, text, action)
+            # The sign is a slip that spoils every estimate; the others may be few strides.
+            yield Finding(cause, text, "refused" if parts is turned else "warned")
 
 
 def _answers(parts: Sequence[_Part], i: int) -> list[_Answer]:
