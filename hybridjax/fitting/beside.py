@@ -28,7 +28,7 @@ from .problem import FitProblem, evaluate
 
 # Evaluations of problems of a class after which they are compiled. Fewer: a program is compiled
 # that few evaluations use. More: many fits, as of a bootstrap, stay slow for longer.
-WORTH_COMPILING = 100
+WORTH_COMPILING = 200
 # Directions that forward mode takes. More: a model with more free parameters needs no search, but
 # the memory of programs grows with their number.
 _MOST_DIRECTIONS = 64
