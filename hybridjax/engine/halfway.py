@@ -51,7 +51,8 @@ class Halfway(NamedTuple):
 def halfway(method: Method) -> Halfway | None:
     """The weights of a method; `None` if it has no order of 3, and is no more accurate than the
     cubic."""
-    a, every = np.array(method.a), np.ones(len(method.b), bool)
+    a = np.array(method.a)
+    every = np.ones(len(method.b), bool)
     if method.implicit:
         # (An explicit stage of a stiff chart may be large where a fast mode has been excited.)
         every = np.diag(a) != 0

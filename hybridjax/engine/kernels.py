@@ -253,11 +253,20 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
     """A vector function of some trees and (t, q, u), and its derivatives, as columns."""
 
     def expand(*x):
-        bound, (t, q, u, *further) = x[:trees], x[trees:]
-        n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
-        at = lambda t, q, u: function(*bound, t, q, u, *further)  # noqa: E731
-        split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
-        push = lambda dx: jax.jvp(at, (t, q, u), split(dx))  # noqa: E731
+        bound = x[:trees]
+        t, q, u, *further = x[trees:]
+        n = q.shape[0]
+        m = 1 + q.shape[0] + u.shape[0]
+
+        def at(t, q, u):
+            return function(*bound, t, q, u, *further)
+
+        def split(x):
+            return (x[0], x[1 : 1 + n], x[1 + n :])
+
+        def push(dx):
+            return jax.jvp(at, (t, q, u), split(dx))
+
         value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
         return jnp.concatenate([value[:, None], columns], axis=1)
 
@@ -276,8 +285,11 @@ class Tangents(Structure):
         self, s: Structure, along: Structure, levels, by_levels, directions: int
     ):
         super().__init__(s.source)
-        self.directions, self._levels, self._plain = directions, levels, s
-        self._along, self.nu = from_host((along, by_levels)), s.nu
+        self.directions = directions
+        self._levels = levels
+        self._plain = s
+        self._along = from_host((along, by_levels))
+        self.nu = s.nu
         leaves = map(np.asarray, jax.tree_util.tree_leaves((along, by_levels)))
         self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
@@ -290,9 +302,12 @@ class Tangents(Structure):
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
 
         def make():
-            still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+            def still(tree):
+                return jax.tree_util.tree_map(lambda _: None, tree)
+
             along = [self._along[1] if x is self._levels else still(x) for x in trees]
-            every, along = (self._plain, *trees), (self._along[0], *along)
+            every = (self._plain, *trees)
+            along = (self._along[0], *along)
             return kernel(
                 function, _Tangent(form, moving), static, (every, along), WIDE
             )
@@ -301,7 +316,8 @@ class Tangents(Structure):
 
         def call(*point, some=None):
             tangents = [point[k].imag / TINY for k in moving]
-            (u, x), further = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
+            u, x = np.split(point[2], [self.nu])
+            further = [y.real for y in point[3:]]
             both = of_lanes(point[0].real, point[1].real, u, *further, *tangents, x)
             return both[0] + 1j * TINY * both[1]
 
@@ -315,7 +331,10 @@ class Systems(Structure):
 
     def __init__(self, source: PerLane):
         super().__init__(source)
-        first = lambda x: np.asarray(x)[..., 0] if eqx.is_array(x) else x  # noqa: E731
+
+        def first(x):
+            return np.asarray(x)[..., 0] if eqx.is_array(x) else x
+
         arrays = map(
             np.asarray, jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array))
         )
@@ -324,12 +343,16 @@ class Systems(Structure):
 
     def at(self, lane):
         other = copy.copy(self)
-        other._made, other._numbers = {}, self._numbers[:, lane]
+        other._made = {}
+        other._numbers = self._numbers[:, lane]
         return other
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
         every = self._single, *trees
-        make = lambda: kernel(function, _BySystem(form), static, every, WIDE)  # noqa: E731
+
+        def make():
+            return kernel(function, _BySystem(form), static, every, WIDE)
+
         return ft.partial(
             self.once((function, form, static), trees, make), self._numbers
         )
@@ -372,7 +395,10 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
 
 def parted(tree: Any) -> tuple[Any, Any]:
     """Complex arrays (N, P, ...) as values (N, ...) and derivatives (P, N, ...)."""
-    by = lambda x: np.swapaxes(x.imag, 0, 1) / TINY  # noqa: E731
+
+    def by(x):
+        return np.swapaxes(x.imag, 0, 1) / TINY
+
     return jax.tree_util.tree_map(lambda x: x.real[:, 0], tree), jax.tree_util.tree_map(
         by, tree
     )
@@ -387,7 +413,10 @@ class _Tangent(NamedTuple):
     def __call__(self, function: Callable, trees: tuple, along: tuple) -> Callable:
         def moved(trees, along, *point):
             *point, x = point
-            step = lambda y, dy: y if dy is None else y + jnp.tensordot(x, dy, 1)  # noqa: E731
+
+            def step(y, dy):
+                return y if dy is None else y + jnp.tensordot(x, dy, 1)
+
             return function(*jax.tree_util.tree_map(step, trees, along), *point)
 
         lanes = self.form(moved, trees, along)
@@ -420,7 +449,9 @@ class _ByMethod(NamedTuple):
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
-    at = lambda t, q: field(t, q, u, h, *x)  # noqa: E731
+    def at(t, q):
+        return field(t, q, u, h, *x)
+
     # (With directions x it is differentiated.)
     return jnp.stack(take_step(method, at, t, q, h, still=at if x else None))
 
@@ -438,7 +469,10 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
 
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
-        still = lambda t, q: field(t, q, *fixed, *x)  # noqa: E731
+
+        def still(t, q):
+            return field(t, q, *fixed, *x)
+
         step = take_step(
             method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still
         )

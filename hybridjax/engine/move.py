@@ -79,10 +79,8 @@ def through(
 
     **Returns:** the same at the end; by target (rows) the lanes before, their ends, and the tape.
     """
-    ends, levels = (
-        (targets.time, targets.index, targets.event, targets.limit),
-        targets.levels,
-    )
+    ends = (targets.time, targets.index, targets.event, targets.limit)
+    levels = targets.levels
     by = targets.missed, targets.event_sequence
     if not options.at_once:
         return _pieces(
@@ -93,7 +91,10 @@ def through(
         options._replace(at_once=False),
         *by,
     )
-    make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
+
+    def make():
+        return whole(_pieces, (static,), (s, levels, settings))
+
     arguments = ends, begin, u, np.float64(patience)
     return s.once(("through", static), (levels, settings), make)(*arguments)
 
@@ -118,7 +119,8 @@ def _search(
     s, lanes, u, target, setout, result, settings, options: Options
 ) -> Recorded:
     def run(s, target, common, by_lane):
-        (settings, options), (lanes, u, setout, result) = common, by_lane
+        settings, options = common
+        lanes, u, setout, result = by_lane
         return search(s, lanes, u, target, shared(settings), setout, result, options)
 
     return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
@@ -130,7 +132,8 @@ def _over_lanes(
     """`run(s, target, common, by_lane)`, with the axes that `jax.vmap` maps as more lanes."""
 
     def whole(common, by_lane):
-        (source, levels, *common), (target, *by_lane) = common, by_lane
+        source, levels, *common = common
+        target, *by_lane = by_lane
         return run(Structure(source), target.with_levels(levels), common, by_lane)
 
     target, levels = target.split()
@@ -164,7 +167,8 @@ def _follow_jvp(primals, tangents):
     target, levels = target.split()
 
     def repeat(by_lane, common):
-        (t, q, u, time), (s, levels) = by_lane, common
+        t, q, u, time = by_lane
+        s, levels = common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
         return replay(s, begin, u, end, recorded.tape)
@@ -177,7 +181,10 @@ def _follow_jvp(primals, tangents):
     (t, q), (t_t, t_q) = lane_jvp(
         repeat, by_lane, ((s, levels), (t_s, t_target.levels))
     )
-    ends = lambda x: (x.moved.lanes.t, x.moved.lanes.q)  # noqa: E731
+
+    def ends(x):
+        return (x.moved.lanes.t, x.moved.lanes.q)
+
     out = eqx.tree_at(ends, recorded, (t, q))
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, eqx.tree_at(ends, none, (t_t, t_q), is_leaf=lambda x: x is None)
@@ -232,7 +239,8 @@ def tape_jacobian(
 
 def _columns(s, lanes, target, tape, of_states):
     """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
-    L, d = lanes.t.shape[0], s.d
+    L = lanes.t.shape[0]
+    d = s.d
     n = 1 + d + s.nu
 
     def flow(x):

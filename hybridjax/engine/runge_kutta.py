@@ -96,8 +96,12 @@ def looped_step(
 ) -> tuple[States, States]:
     """The end of a step of an explicit method, and its estimated error; stages are not unrolled."""
     apart = jax.lax.optimization_barrier
-    stages, a, c = len(method.c), jnp.asarray(method.a), jnp.asarray(method.c)
-    weighted = lambda w, K: jnp.sum(w[:, None, None] * K, axis=0)  # noqa: E731
+    stages = len(method.c)
+    a = jnp.asarray(method.a)
+    c = jnp.asarray(method.c)
+
+    def weighted(w, K):
+        return jnp.sum(w[:, None, None] * K, axis=0)
 
     def stage(k, K):
         # (States and rates apart: XLA would compute one of them again in each row of the other.)
@@ -185,7 +189,9 @@ def _decoupled(method: Method) -> _Decoupled:
         return _Decoupled(np.eye(len(A)), A, np.eye(len(A)))
     values, T = np.linalg.eig(A)
     kept = np.imag(values) >= 0  # one of each conjugate pair, twice
-    values, left, right = values[kept], T[:, kept], np.linalg.inv(T)[kept]
+    values = values[kept]
+    left = T[:, kept]
+    right = np.linalg.inv(T)[kept]
     return _Decoupled(
         left * np.where(np.imag(values) > 0, 2, 1), np.diag(values), right
     )
@@ -208,16 +214,20 @@ def _implicit_step(
     change, plain, rough = (jnp.tensordot(np.array(x), w, 1) for x in weights)
     shift = _shifted(J, method.filter * start[2])
     estimate = _apply(inverse(shift), plain) if method.filter else plain
+
     # The method has a higher order than the estimate where it is smooth: the ratio of two estimates
     # takes the place of the step. It has not where a fast mode was excited, by however little, and
     # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
-    divide = lambda x: jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))  # noqa: E731
+    def divide(x):
+        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
+
     ratio = jnp.where(rough == 0, 1.0, jnp.maximum(divide(rough), 1 - divide(plain)))
     powers = round(method.order - method.order / method.gain)
     local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
     estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     end = q + change
-    f0, f1 = field(t, q), field(t + h, end)
+    f0 = field(t, q)
+    f1 = field(t + h, end)
     halves = halfway(method)
     if halves is None:
         middle = halfway_cubic(q, end, f0, f1, h)
@@ -232,7 +242,10 @@ def step_along(
 ) -> tuple[Step, States, States]:
     """A step of an implicit method, and the derivatives of its end and of its estimate along a
     direction of states."""
-    step = lambda q: take_step(method, field, t, q, h, still=field)  # noqa: E731
+
+    def step(q):
+        return take_step(method, field, t, q, h, still=field)
+
     value, tangent = jax.jvp(step, (q,), (along,))
     return value, tangent.q, tangent.estimate
 
@@ -240,7 +253,8 @@ def step_along(
 def _increments(method, field, t, q, h):
     """Increments (s, n, L) by Newton's method, their last change (n, L), and the Jacobian (n, n, L)
     at the start."""
-    J, c = _jacobian(field, t, q), np.array(method.c)[:, None]
+    J = _jacobian(field, t, q)
+    c = np.array(method.c)[:, None]
     left, R, right = _decoupled(method)
     solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
     evaluate = jax.vmap(field)
@@ -264,7 +278,8 @@ def _increments(method, field, t, q, h):
     def iterate(carry):
         w, last, _, i = carry
         change = correction(w)
-        w, now = w + change, jnp.max(jnp.abs(change), axis=0)
+        w = w + change
+        now = jnp.max(jnp.abs(change), axis=0)
         size = jnp.abs(q) + jnp.max(jnp.abs(w), axis=0)
         # A component goes on while it moves by more than rounding errors, and converges.
         going = (now > small * size) & ((now < 0.5 * last) | (i < 2))
@@ -272,8 +287,11 @@ def _increments(method, field, t, q, h):
 
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
+
     # A step that needs more iterations is rejected for its error.
-    unsettled = lambda carry: carry[2] & (carry[3] < 12)  # noqa: E731
+    def unsettled(carry):
+        return carry[2] & (carry[3] < 12)
+
     w, last, *_ = jax.lax.while_loop(unsettled, iterate, begin)
     return w, last, J
 
@@ -281,8 +299,10 @@ def _increments(method, field, t, q, h):
 def _with_derivatives(method, field, still, start, w):
     """The increments w, as functions of the field and of the `start` (t, q, h) of the step."""
     t, q, h = start
-    A, c = np.array(method.a), np.array(method.c)[:, None]
-    (s, n, L), at = w.shape, jax.lax.stop_gradient
+    A = np.array(method.a)
+    c = np.array(method.c)[:, None]
+    s, n, L = w.shape
+    at = jax.lax.stop_gradient
     stages = at(q + jnp.tensordot(A, w, 1))
     J = jax.vmap(lambda t, q: _jacobian(still, t, q))(at(t + c * h), stages)
     coupled = jnp.einsum("ij,iabL->iajbL", A, J).reshape(s * n, s * n, L)

@@ -104,7 +104,8 @@ class Trajectory(eqx.Module):
     def events(self) -> list[Event]:
         """The events in order of time."""
         require_as_made(self.system, "this trajectory was computed")
-        events, s = [], self.structure
+        events = []
+        s = self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
             before, after = (
@@ -124,8 +125,10 @@ class Trajectory(eqx.Module):
         """
         h = np.diff(self.t)[:, None]
         x = np.linspace(0.0, 1.0, per_step + 1)[None, :]
-        q0, q1 = self.after[:-1, None], self.before[1:, None]
-        d0, d1 = self.slope_after[:-1, None], self.slope_before[1:, None]
+        q0 = self.after[:-1, None]
+        q1 = self.before[1:, None]
+        d0 = self.slope_after[:-1, None]
+        d1 = self.slope_before[1:, None]
         q = interpolate(x[..., None], h[..., None], q0, q1, d0, d1)
         t = self.t[:-1, None] + h * x
         chart = np.broadcast_to(self.chart[:-1, None], t.shape)
@@ -134,10 +137,8 @@ class Trajectory(eqx.Module):
             self.event[1:-1] >= 0
         )  # a step's start repeats the last end, but for resets
         last = np.flatnonzero(self.event[-1:] >= 0) - 1
-        t, chart = (
-            np.append(t[keep], self.t[last]),
-            np.append(chart[keep], self.chart[last]),
-        )
+        t = np.append(t[keep], self.t[last])
+        chart = np.append(chart[keep], self.chart[last])
         return t, chart, np.vstack([q[keep], self.after[last]])
 
     def at(
@@ -172,7 +173,8 @@ class Trajectory(eqx.Module):
         return (point[0], *observed(self.structure, names, *point))
 
     def __repr__(self):
-        s, system = self.structure, self.system
+        s = self.structure
+        system = self.system
         counts = (
             (np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions)
         )
@@ -203,7 +205,8 @@ def observed(
     items = tuple(s.resolve_outputs(names).items)
     values = np.full((len(names), len(t)), np.nan)
     for a in np.unique(chart):
-        at, states = chart == a, s.charts[a].states
+        at = chart == a
+        states = s.charts[a].states
         if all(item in states for item in items):  # (without compiling a function)
             values[:, at] = q[at].T[[states.index(item) for item in items]]
             continue
@@ -254,16 +257,19 @@ def simulate(
     check_schedules(s)
     start = Guess(chart, state, time)
     lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
-    settings, u, end = (
-        settings.filled(SIMULATION),
-        constant[:, None],
-        lanes.t + float(duration),
-    )
-    tapes, steps, h, result = [], 0, None, Result.STEP_LIMIT
+    settings = settings.filled(SIMULATION)
+    u = constant[:, None]
+    end = lanes.t + float(duration)
+    tapes = []
+    steps = 0
+    h = None
+    result = Result.STEP_LIMIT
     while result == Result.STEP_LIMIT and steps < max_steps:
         moved, tape = _piece(s, lanes, u, end, settings, h)
         tapes.append(tape)
-        lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
+        lanes = moved.lanes
+        h = moved.h
+        steps = steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
@@ -294,22 +300,23 @@ def recorded(
     t, before, after, chart, event = (
         np.concatenate(x) for x in zip(*rows, strict=True)
     )
-    source, until = np.append(chart[:1], chart[:-1]), u
+    source = np.append(chart[:1], chart[:-1])
+    until = u
     if u.shape[1] > 1:
         u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
-        until, u = np.hstack([u[:, :1], u]), np.hstack([u, u[:, -1:]])
+        until = np.hstack([u[:, :1], u])
+        u = np.hstack([u, u[:, -1:]])
     with at_ease():
-        left, right = (
-            slopes(s, t, source, before.T, until).T,
-            slopes(s, t, chart, after.T, u).T,
-        )
+        left = slopes(s, t, source, before.T, until).T
+        right = slopes(s, t, chart, after.T, u).T
     return Trajectory(s, t, chart, before, after, left, right, event, result)
 
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
     names = system.inputs
-    nu, value = len(names), np.asarray(0.0)
+    nu = len(names)
+    value = np.asarray(0.0)
     if callable(input):
         with evaluating("input, a function of t alone,"):
             shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
@@ -327,10 +334,12 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
 def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
     """Guards that have, at the start, the sign that they have after their event."""
     a = int(begin.chart[0])
-    guards, n = s.guards(a), s.dims[a]
+    guards = s.guards(a)
+    n = s.dims[a]
     if not guards:
         return
-    q, first = begin.q[:n], np.zeros(1, np.int32)
+    q = begin.q[:n]
+    first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, begin.t, q, u, first)[..., 0]
     point = np.append(begin.t, q)
     for g, row in zip(guards, rows, strict=True):
@@ -351,22 +360,20 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
     """The first event whose reset ends on a guard through which the state then goes, though it
     cannot count. (It may go through one that it was crossing.)"""
     passed: list[int] = []
-    events, first = np.flatnonzero(event[:-1] >= 0), np.zeros(1, np.int32)
+    events = np.flatnonzero(event[:-1] >= 0)
+    first = np.zeros(1, np.int32)
     for a in (a for a in np.unique(charts[events]) if s.guards(int(a))):
-        k, n = events[charts[events] == a], s.dims[a]
+        k = events[charts[events] == a]
+        n = s.dims[a]
 
         def guards(k, q, a=int(a), n=n):
             return kernels.watched(s, a, None, t[k], q[k, :n].T, u, first)
 
-        now, was, later = (
-            guards(k, after),
-            guards(k, before)[:, 0],
-            guards(k + 1, before)[:, 0],
-        )
-        slope, f = (
-            now[:, 2 : 2 + n],
-            kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0],
-        )
+        now = guards(k, after)
+        was = guards(k, before)[:, 0]
+        later = guards(k + 1, before)[:, 0]
+        slope = now[:, 2 : 2 + n]
+        f = kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0]
         zero = _SAME * np.einsum(
             "gnk,n->gk", np.abs(slope), np.abs(after[:, :n]).max(axis=0)
         )

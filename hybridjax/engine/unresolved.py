@@ -25,11 +25,13 @@ from .settings import ROUNDING, Settings
 _POLES = frozenset(["pole"])
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
-_PIECES, _FEW = 64, 8
+_PIECES = 64
+_FEW = 8
 # In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
 # so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
 # integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
-_SAME, _SAME_GAIN = 1e3, 1e-5
+_SAME = 1e3
+_SAME_GAIN = 1e-5
 # A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
 # is taken to fall. Larger: such falls between steps are missed.
 _NEAR = 1e-5
@@ -42,7 +44,8 @@ _KINKS = frozenset(["decision", "kink"])
 # in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
 # errors of multipliers are as large. Farther points: steep functions are refused that steps
 # resolve. Closer: beside those that they do not resolve, multipliers are wrong.
-_JUMP, _STEEP = 1e-8, 1e7
+_JUMP = 1e-8
+_STEEP = 1e7
 # How often the quarter of an interval is taken in which the field changes most unlike in the
 # others. Fewer: jumps are missed behind other changes. More: time.
 _QUARTERS = 20
@@ -99,7 +102,8 @@ def passed_over(
 
     **Arguments:** `linear`: whether the path is linearized, so that steps must resolve jumps, too.
     """
-    s, passed = path.structure, []
+    s = path.structure
+    passed = []
     for a in np.unique(path.chart[:-1]).tolist():
         rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
         if len(rows) and may_have_pulses(s, a):
@@ -115,16 +119,18 @@ def _passing(
 ) -> np.ndarray:
     """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
     gain and guard: over what a polynomial through eight of its values in the step lacks."""
-    s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
-    m, only_poles = n * (1 + s.nu), may_have_pulses(s, a) <= _POLES
+    s = path.structure
+    n = path.structure.dims[a]
+    legendre = np.polynomial.legendre
+    m = n * (1 + s.nu)
+    only_poles = may_have_pulses(s, a) <= _POLES
     pieces = _FEW if only_poles else 4 * _PIECES if linear else _PIECES
-    (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
+    x, _ = legendre.leggauss(8)
+    y, w = legendre.leggauss(4)
     fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
     polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
-    weights, nodes = (
-        np.tile(w / 2 / pieces, pieces),
-        (np.append(x, fine)[:, None] + 1) / 2,
-    )
+    weights = np.tile(w / 2 / pieces, pieces)
+    nodes = (np.append(x, fine)[:, None] + 1) / 2
     probes = _probes(s.method(a), (fine + 1) / 2, weights)
     ends = (
         path.after[:-1],
@@ -141,19 +147,15 @@ def _passing(
             s, a, points.reshape(-1, 1 + n), u, bool(may_be_sudden(s, a, _guards))
         )
         values = values.reshape(*points.shape[:2], -1)
-        rates, (guards, enabled) = (
-            values[:, 8:, :m],
-            np.split(values[:, 8:, m:], 2, axis=2),
-        )
+        rates = values[:, 8:, :m]
+        guards, enabled = np.split(values[:, 8:, m:], 2, axis=2)
         beside = rates - polynomial @ values[:, :8, :m]
         low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
         falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(
             axis=1
         )
-        moved, passed = (
-            h[:, 0] * (weights @ np.abs(rates)),
-            h[:, 0] * np.abs(weights @ beside),
-        )
+        moved = h[:, 0] * (weights @ np.abs(rates))
+        passed = h[:, 0] * np.abs(weights @ beside)
         if linear and len(k) > 1 and not only_poles:
             pairs = np.concatenate([rates[:-1, :, n:], rates[1:, :, n:]], axis=1)
             off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(
@@ -167,7 +169,8 @@ def _passing(
     moved, passed, missed, largest, falls = map(
         np.concatenate, zip(*parts, strict=True)
     )
-    size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
+    size = moved.sum(axis=0)
+    accuracy = np.max(np.asarray(settings.rtol))
     usual = (
         np.abs(path.after[rows]).max(axis=0)
         if settings.scale is None
@@ -187,12 +190,11 @@ def _passing(
 def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Errors of a method's integrals over parts of two steps, as weights of samples in these steps:
     experiments and linearizations have other steps than the cycle, up to half as long again."""
-    t, rows = np.concatenate([within, 1 + within]), []
+    t = np.concatenate([within, 1 + within])
+    rows = []
     for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):
-        stages, inside = (
-            begin + length * np.array(method.c),
-            (t > begin) & (t < begin + length),
-        )
+        stages = begin + length * np.array(method.c)
+        inside = (t > begin) & (t < begin + length)
         left = np.clip(np.searchsorted(t, stages) - 1, 0, len(t) - 2)
         part = (
             length * np.array(method.b) * (stages - t[left]) / (t[left + 1] - t[left])
@@ -206,7 +208,8 @@ def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarr
 
 def column_name(s: Structure, a: int, j: int) -> str:
     """The name of a column of `values_at`."""
-    n, states = s.dims[a], s.charts[a].states
+    n = s.dims[a]
+    states = s.charts[a].states
     if j < n:
         return f"rate of '{states[j]}'"
     row, column = divmod(j - n, max(s.nu, 1))
@@ -224,11 +227,13 @@ def values_at(
     lanes = kernels.POINTS if may_have_pulses(s, a) <= _POLES else kernels.WIDE
 
     def at(x):
-        point, n = (x[:, 0], x[:, 1:].T, u[:, None]), s.dims[a]
+        point = (x[:, 0], x[:, 1:].T, u[:, None])
+        n = s.dims[a]
         by = kernels.field(s, a, *point, lanes=lanes)
         rows = [by[:, 0], by[:, 2 + n :].reshape(-1, len(x))]
         if guards:
-            members, first = map(s.member, s.guards(a)), np.zeros(1, int)
+            members = map(s.member, s.guards(a))
+            first = np.zeros(1, int)
             rows += [kernels.watched(s, a, None, *point, first, lanes=lanes)[:, 0]]
             rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
         return np.concatenate(rows).T
@@ -257,9 +262,15 @@ def jumps(
 ):
     """Yield times at which the field or a gain jumps within intervals of an orbit, the column of
     `values_at` that jumps, and the jump."""
-    n, m, parts = s.dims[a], s.dims[a] * (1 + s.nu), np.arange(1, 4)[:, None, None] / 4
-    at = lambda points: values_at(s, a, points, np.zeros(s.nu))[:, :m]  # noqa: E731
-    first, last = at(low), at(high)
+    n = s.dims[a]
+    m = s.dims[a] * (1 + s.nu)
+    parts = np.arange(1, 4)[:, None, None] / 4
+
+    def at(points):
+        return values_at(s, a, points, np.zeros(s.nu))[:, :m]
+
+    first = at(low)
+    last = at(high)
     shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
     rounding = np.nanquantile(
         np.abs(at(shifted) - first), 0.9, axis=0
@@ -278,9 +289,12 @@ def jumps(
             np.abs(np.diff(values, axis=0) - np.diff(values, axis=0).mean(axis=0))
             / limit
         )
-        worst, here = uneven.max(axis=2).argmax(axis=0), np.arange(len(low))
-        low, high = points[worst, here], points[worst + 1, here]
-        first, last = values[worst, here], values[worst + 1, here]
+        worst = uneven.max(axis=2).argmax(axis=0)
+        here = np.arange(len(low))
+        low = points[worst, here]
+        high = points[worst + 1, here]
+        first = values[worst, here]
+        last = values[worst + 1, here]
         for i, j in np.argwhere(
             ((change > _JUMP) & (change > _STEEP * near))[worst, here]
         ):

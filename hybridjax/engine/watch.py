@@ -87,7 +87,9 @@ class ChartFlow(NamedTuple):
 
     @property
     def has_level(self) -> bool:
-        s, a, levels = self.s, self.a, self.levels
+        s = self.s
+        a = self.a
+        levels = self.levels
         if levels is None:
             return False
         return s.once(("level", a), (levels,), lambda: shared(levels).present(s, a))
@@ -115,7 +117,9 @@ class ChartFlow(NamedTuple):
 
     def watch(self, t: AnyTimes, q: States, f: States) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, levels, index = self.a, self.levels, self.index
+        a = self.a
+        levels = self.levels
+        index = self.index
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
             return Watch(
@@ -124,7 +128,9 @@ class ChartFlow(NamedTuple):
         kinds = self.s.guard_kinds(a)
 
         def watch(s, levels, t, q, u, i, f):
-            functions = lambda t, q: kernels.watched_at(a, kinds, s, levels, t, q, u, i)  # noqa: E731
+            def functions(t, q):
+                return kernels.watched_at(a, kinds, s, levels, t, q, u, i)
+
             return jax.jvp(functions, (t, q), (jnp.ones_like(t), f))
 
         return Watch(
@@ -145,7 +151,8 @@ class ChartFlow(NamedTuple):
         step. At the crossing itself (up to rounding) they change nothing, but carry the derivatives
         of its time and state exactly, to second order: this is the saltation formula.
         """
-        field, rows = self.field, self.rows
+        field = self.field
+        rows = self.rows
 
         def newton(t, q, f):
             value, rate = (pick(x, rows, which) for x in self.watch(t, q, f))
@@ -202,7 +209,8 @@ def watch(
 
 def no_events(s: Structure, t: Times) -> Watch:
     """A `Watch` of lanes at times t whose rows have no meaning."""
-    xp, shape = namespace(t), (len(s.transitions) + 1, len(t))
+    xp = namespace(t)
+    shape = (len(s.transitions) + 1, len(t))
     return Watch(xp.ones(shape), xp.zeros(shape))
 
 

@@ -97,7 +97,8 @@ class ExperimentData(eqx.Module):
         a whole number of periods or is shorter than the window, and for NaN in an experiment whose
         `result` is OK.
         """
-        self.u, self.y = np.array(u), np.array(y)
+        self.u = np.array(u)
+        self.y = np.array(y)
         shapes = self.u.shape, self.y.shape
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
             text = "the same experiments and samples (their first two axes)"
@@ -113,10 +114,12 @@ class ExperimentData(eqx.Module):
             )
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
-        self.n_sections, self.periods = n_sections, periods
+        self.n_sections = n_sections
+        self.periods = periods
         sizes = self.u.shape[2], self.y.shape[2]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
-        (S, n, ny), N = self.y.shape, self.n_sections
+        S, n, ny = self.y.shape
+        N = self.n_sections
         if n % N:
             raise DefinitionError(
                 f"records must hold whole periods of N = {N} samples, not {n}."
@@ -197,7 +200,8 @@ class ExperimentData(eqx.Module):
 
         **Raises:** `DefinitionError` if the record is too short.
         """
-        n, length = self.u.shape[1], self.n_sections * self.periods
+        n = self.u.shape[1]
+        length = self.n_sections * self.periods
         if repeats * length > n:
             text = f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods}"
             raise DefinitionError(
@@ -232,7 +236,8 @@ class ExperimentData(eqx.Module):
 
         **Raises:** `DefinitionError` for experiments that are no such pairs.
         """
-        plus, minus = self.u[::2], self.u[1::2]
+        plus = self.u[::2]
+        minus = self.u[1::2]
         if len(self.u) % 2:
             raise DefinitionError(
                 f"{len(self.u)} experiments are not pairs: leave one out."
@@ -246,7 +251,8 @@ class ExperimentData(eqx.Module):
             k = 2 * int(np.argmax(apart))
             text = "their inputs are not opposite (`Design.with_negatives` makes pairs)"
             raise DefinitionError(f"experiments {k} and {k + 1} are no pair: {text}.")
-        first, second = self.result[::2], self.result[1::2]
+        first = self.result[::2]
+        second = self.result[1::2]
         broken = first != Result.OK
         failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])
         error = np.maximum(self.error[::2], self.error[1::2])

@@ -166,7 +166,9 @@ def add_noise(
     if snr is not None:
         data.require_ok()
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
-    std, N, ny = np.asarray(std), data.n_sections, data.y.shape[2]
+    std = np.asarray(std)
+    N = data.n_sections
+    ny = data.y.shape[2]
     require_axes("`std`", std, {}, {"outputs": ny}, {"sections": N, "outputs": ny})
     white = np.random.default_rng(seed).normal(size=data.y.shape)
     each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])

@@ -101,7 +101,10 @@ class Plan(eqx.Module):
 
     def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
         """Return the first step and its limits at section k, for so many lanes."""
-        fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
+
+        def fill(x):
+            return jnp.full(lanes, x[k])
+
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
 
 
@@ -122,7 +125,8 @@ def make_plan(
     *_, target = placed.onwards()
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
-    J, by_input = J[:, :, : scale.shape[1]], J[:, :, scale.shape[1] :]
+    by_input = J[:, :, scale.shape[1] :]
+    J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
     ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
     error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
@@ -161,7 +165,8 @@ def make_plan(
         own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
         least = impact[best, section].sum() + np.abs(own).max()
     large = slice(1 + placed.structure().nu)
-    impact, estimate = impacts[best, large, section].T, estimate[best, large, section].T
+    impact = impacts[best, large, section].T
+    estimate = estimate[best, large, section].T
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
     together = (
         _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
@@ -169,7 +174,8 @@ def make_plan(
     weight = (impact / estimate).max(axis=0) * np.maximum(
         together, 1 / _MOST_CANCELLATION
     )
-    impact, estimate = impact[0], estimate[0]
+    impact = impact[0]
+    estimate = estimate[0]
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
     share = np.minimum(accuracy * estimate / impact, 1.0) / N
     slack = ways.slack[best]
@@ -193,7 +199,8 @@ class _Ways(NamedTuple):
 def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]:
     """Return inputs that cause deviations: none, and where methods are implicit, of each size by
     each input."""
-    s, nu = placed.structure(), by_input.shape[2]
+    s = placed.structure()
+    nu = by_input.shape[2]
     if not has_implicit(s):
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
@@ -208,10 +215,14 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
 def _try_ways(
     placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]
 ) -> _Ways:
-    s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
-    M, implicit = len(kicks), has_implicit(s)
+    s = placed.structure()
+    xp = namespace(placed.lanes.t)
+    N = placed.n_sections
+    M = len(kicks)
+    implicit = has_implicit(s)
     equal = () if implicit else _EQUAL_STEPS
-    K, most = len(equal) + len(_TOLERANCES), _EQUAL_STEPS[-1]
+    K = len(equal) + len(_TOLERANCES)
+    most = _EQUAL_STEPS[-1]
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
@@ -227,8 +238,12 @@ def _try_ways(
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 
-    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W * M), tree)  # noqa: E731
-    each = lambda x: xp.repeat(xp.asarray(x), M * N)  # noqa: E731
+    def all_ways(tree):
+        return jax.tree_util.tree_map(lambda x: xp.tile(x, W * M), tree)
+
+    def each(x):
+        return xp.repeat(xp.asarray(x), M * N)
+
     lanes = all_ways(placed.lanes)
     per_lane = ("time", "index", "event", "limit")
     target = dataclasses.replace(
@@ -257,12 +272,15 @@ def _try_ways(
 
 def _lead(placed: PlacedSections, target):
     """Return the time to the next level as a multiple of Newton's guess; 1 if the guess is bad."""
-    s, lanes = placed.structure(), placed.lanes
-    N, xp = placed.n_sections, namespace(lanes.t)
+    s = placed.structure()
+    lanes = placed.lanes
+    N = placed.n_sections
+    xp = namespace(lanes.t)
     watched = watch(
         s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, xp.ones(N, bool)
     )
-    value, rate = watched.value[-1], watched.rate[-1]
+    value = watched.value[-1]
+    rate = watched.rate[-1]
     falls = (value > 0) & (rate < 0)
     lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
     return xp.where((lead > 1 / _WORST_GUESS) & (lead < _WORST_GUESS), lead, 1.0)
@@ -271,11 +289,13 @@ def _lead(placed: PlacedSections, target):
 def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     """Return the largest later errors that errors of the interval after section k (*K, N, n) cause,
     relative to the scales."""
-    N, after = len(scale), np.roll(scale, -1, axis=0)
+    N = len(scale)
+    after = np.roll(scale, -1, axis=0)
     # (All errors of a section side by side: one product of matrices for each.)
     x = (error / after).reshape(-1, *scale.shape).transpose(1, 2, 0)
     J = J * scale[:, None] / after[:, :, None]
-    section, worst = np.arange(N), np.zeros((_PERIODS, N, x.shape[2]))
+    section = np.arange(N)
+    worst = np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
         np.maximum(worst[m // N], np.abs(x).max(axis=1), out=worst[m // N])
         x = J[(section + 1 + m) % N] @ x
@@ -288,7 +308,8 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
 def _accumulated(J, error, scale) -> float:
     """Return the largest error, relative to the scales, if all sections add `error` (N, n)."""
     N = len(scale)
-    total, largest = np.zeros(scale.shape[1]), 0.0
+    total = np.zeros(scale.shape[1])
+    largest = 0.0
     for m in range(_PERIODS * N):
         total = J[m % N] @ total + error[m % N]
         largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))

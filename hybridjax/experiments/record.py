@@ -62,14 +62,17 @@ class Record(eqx.Module):
         drift: Drift | None = None,
     ):
         """**Raises:** `DefinitionError` for shapes that do not fit together."""
-        self.u, self.y = np.array(u), np.array(y)
+        self.u = np.array(u)
+        self.y = np.array(y)
         if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
             text = (
                 f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
             )
             raise DefinitionError(f"{text} (their first axes), one or more.")
         require_index("section", first_section, n_sections)
-        self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
+        self.n_sections = n_sections
+        self.first_section = first_section
+        self.lead = lead
         self.drift = drift
         sizes = self.u.shape[1], self.y.shape[1]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
@@ -85,7 +88,8 @@ class Record(eqx.Module):
         **Raises:** `DefinitionError` if there are none.
         """
         section = (self.first_section + first) % self.n_sections
-        u, y = self.u[first:stop], self.y[first:stop]
+        u = self.u[first:stop]
+        y = self.y[first:stop]
         return dataclasses.replace(self, u=u, y=y, first_section=section)
 
     def __repr__(self) -> str:
@@ -155,7 +159,8 @@ def average_cycle(
 def require_deviations(records: Sequence[Record]) -> None:
     """**Raises:** `DefinitionError` if an output is nearly the same in all cycles, though no drift
     was declared and inputs change: it holds the limit cycle itself."""
-    N, nu = records[0].n_sections, len(records[0].inputs)
+    N = records[0].n_sections
+    nu = len(records[0].inputs)
     x = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in records])
     section = (
         np.concatenate([r.first_section + np.arange(len(r.u)) for r in records]) % N

@@ -112,9 +112,12 @@ def flow_batch(
     `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse mode
     stores the states at the sections and recomputes the flow between them.
     """
-    s, period, sequence = Structure(course.system), course.period, course.event_sequence
+    s = Structure(course.system)
+    period = course.period
+    sequence = course.event_sequence
     z = s.resolve_outputs(course.outputs)
-    N, (S, n, _) = len(course.bound.time), u.shape
+    N = len(course.bound.time)
+    S, n, _ = u.shape
     one_turn = len(sequence)
     first = jax.tree_util.tree_map(lambda x: x[..., :1], course.lanes)
     lanes = jax.tree_util.tree_map(
@@ -126,13 +129,15 @@ def flow_batch(
     def section(carry, xs):
         lanes, result, state = carry
         k, u = xs
-        i, j = k % N, (k + 1) % N
+        i = k % N
+        j = (k + 1) % N
         answer = None
         if feedback is not None:  # of outputs before the input acts
             A, B, C, D, _ = (x[i] for x in feedback.matrices)
             deviation = observe(s, z, lanes, u) - feedback.on_cycle[i][:, None]
             answer = -(C @ state + D @ deviation)
-            state, u = A @ state + B @ deviation, u + answer
+            state = A @ state + B @ deviation
+            u = u + answer
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
         to = j[None], lanes.t, turns[None]
@@ -212,13 +217,17 @@ class ResponseFunction(eqx.Module):
         system has changed.
         """
         require_x64(system)
-        u, placed = jnp.asarray(u, float), self.placed
+        u = jnp.asarray(u, float)
+        placed = self.placed
         require_shape(u.shape, placed.n_sections, placed.cycle.structure.nu)
         if system is None:
             placed.require_current()
             require_as_made(self.outputs, "this response function was made")
         else:
-            both = lambda x: (x.cycle.system, x.cycle.numbers)  # noqa: E731
+
+            def both(x):
+                return (x.cycle.system, x.cycle.numbers)
+
             placed = eqx.tree_at(both, placed, (system, arrays_of(system)))
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
@@ -262,7 +271,8 @@ def response_function(
     range.
     """
     placed = as_placed(cycle, sections)
-    z, stepping = check_outputs(cycle, outputs), plan_flow(placed, accuracy)
+    z = check_outputs(cycle, outputs)
+    stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)
     stepping = dataclasses.replace(stepping, settings=settings)

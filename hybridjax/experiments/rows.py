@@ -164,7 +164,10 @@ def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
 def _of_length(table: Table, other: Table) -> Table:
     """A table with at least as many rows as another has, repetitions of its last one."""
     more = max(len(other.rows.body) - len(table.rows.body), 0)
-    repeat = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])  # noqa: E731
+
+    def repeat(x):
+        return np.concatenate([x, np.repeat(x[-1:], more, axis=0)])
+
     return dataclasses.replace(table, rows=Rows(*map(repeat, table.rows)))
 
 
@@ -172,11 +175,14 @@ class _Writer:
     """Writes the rows of a table, one after the other."""
 
     def __init__(self, placed: PlacedSections, plan: Plan, spare: bool, density: int):
-        self.placed, self.plan = placed, plan
-        self.spare, self.density = spare, density
+        self.placed = placed
+        self.plan = plan
+        self.spare = spare
+        self.density = density
         self.s = placed.structure()
         self.N = placed.n_sections
-        self.t, self.chart = placed.lanes.t, placed.lanes.chart
+        self.t = placed.lanes.t
+        self.chart = placed.lanes.chart
         self.ends = self.t + placed.duration
         self.events = _events(placed)
         self.levels = placed.bound.levels
@@ -223,7 +229,8 @@ class _Writer:
 
     def _interval(self, k: int) -> None:
         """Write the rows from section k to the next."""
-        events, passed = self._happening(k), self._passed(k)
+        events = self._happening(k)
+        passed = self._passed(k)
         for e in events:
             self._to_event(k, e, is_first=e == passed)
         for count in sorted(self._arriving(k)):
@@ -288,10 +295,12 @@ class _Writer:
         turn = e // len(self.events) * float(self.placed.cycle.period)
         duration = event.t + turn - begin
         if is_first or (before is not None and is_own):
-            newton, signs = points.newton[at, target], points.signs[at].copy()
+            newton = points.newton[at, target]
+            signs = points.signs[at].copy()
             signs[target] = max(signs[target], 0)
         else:
-            newton, duration = None, 0.0
+            newton = None
+            duration = 0.0
             signs = np.zeros(self.width, int)
             signs[target] = 1
         arrives = event.at_section and is_own
@@ -341,7 +350,8 @@ class _Writer:
         duration = self.ends[k] - begin
         by_time = np.isfinite(self.placed.bound.time[(k + 1) % self.N])
         target = -1 if by_time else len(self.s.guards(a))
-        signs, newton = np.zeros(self.width, int), None
+        signs = np.zeros(self.width, int)
+        newton = None
         if is_own:
             signs = points.signs[at]
             newton = None if by_time else points.newton[at, target]
@@ -374,7 +384,8 @@ class _Writer:
         """
         steps = max(1, int(np.ceil(duration / self.plan.h[k] - 1e-6)))
         steps *= self.density
-        part, fixed = 1 / steps, 0.0
+        part = 1 / steps
+        fixed = 0.0
         if newton is not None:
             if duration / _WORST_GUESS < newton < duration * _WORST_GUESS:
                 part = duration / newton / steps
@@ -425,7 +436,8 @@ class _Writer:
     def _place(self, section: int, passed: int) -> int:
         """The number of a place by section and events passed since section 0."""
         if section == self.N:
-            section, passed = 0, passed - len(self.events)
+            section = 0
+            passed = passed - len(self.events)
         return self.places.setdefault((section, passed), len(self.places))
 
     def _event_kind(self, g: int) -> tuple[int, Kind, int]:
@@ -439,16 +451,19 @@ class _Writer:
 
     def _points(self, section, t, chart, q) -> _Points:
         """Watched functions at points after these sections."""
-        s, chart = self.s, np.asarray(chart, int)
+        s = self.s
+        chart = np.asarray(chart, int)
         charts = range(len(s.dims))
         width = max(len(s.guards(a)) + self._has_level(a) for a in charts)
-        newton, signs = np.zeros((len(t), width)), np.zeros((len(t), width), int)
+        newton = np.zeros((len(t), width))
+        signs = np.zeros((len(t), width), int)
         for a in np.unique(chart).tolist():
             count = len(s.guards(a)) + self._has_level(a)
             here = np.flatnonzero(chart == a)
             if not count:
                 continue
-            n, index = s.dims[a], (section[here] + 1) % self.N
+            n = s.dims[a]
+            index = (section[here] + 1) % self.N
             point = np.asarray(t)[here], q[:n, here], np.zeros((s.nu, 1))
             columns = kernels.watched(s, a, self.levels, *point, index)
             field = kernels.field(s, a, *point)[:, 0]
@@ -467,7 +482,8 @@ _EVENT = "section", "t", "before", "after"
 
 def _events(placed: PlacedSections) -> list[_Event]:
     """The events of one turn, in order."""
-    tape, found = placed.tape, []
+    tape = placed.tape
+    found = []
     for k in range(placed.n_sections):
         rows = np.flatnonzero(tape.code[:, k] >= 0)
         moves = np.flatnonzero(tape.code[:, k] != IDLE)

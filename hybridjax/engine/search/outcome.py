@@ -40,9 +40,11 @@ def without_events(
 ) -> tuple[State, Tape]:
     """The state after steps that are accepted in all active lanes, without events, and the row of
     the tape. Lanes may arrive."""
-    lanes, active = state.lanes, state.active
+    lanes = state.lanes
+    active = state.active
     xp = namespace(lanes.t)
-    level, on_time = active & new.lands, aim.last
+    level = active & new.lands
+    on_time = aim.last
     moved = aim.step + xp.where(level, new.past, 0.0)
     t = xp.where(on_time, aim.due, lanes.t + moved)
     arrived = level | on_time
@@ -69,11 +71,17 @@ def without_events(
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
     """The state after steps that may be rejected or end in events, and the row of the tape."""
-    s, lanes, active, target = task.s, state.lanes, state.active, task.target
-    xp, G, moved = namespace(lanes.t), len(s.transitions), step_length(aim, new)
+    s = task.s
+    lanes = state.lanes
+    active = state.active
+    target = task.target
+    xp = namespace(lanes.t)
+    G = len(s.transitions)
+    moved = step_length(aim, new)
     t = xp.where(aim.last, aim.due, xp.where(active, lanes.t + moved, lanes.t))
     verdict = accept(state, aim, new, t, task)
-    accepted, lands = verdict.accepted, verdict.lands
+    accepted = verdict.accepted
+    lands = verdict.lands
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
     by_clock = verdict.plain & (aim.schedule >= 0)
@@ -90,7 +98,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     change, size = (xp.max(xp.abs(x), axis=0) for x in (new.q - lanes.q, lanes.q))
     still = (change <= 1e-3 * size) | ((size == 0) & xp.isfinite(change))
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
-    result, unknown = state.result, xp.isnan(sum(new.watched)).any(axis=0)
+    result = state.result
+    unknown = xp.isnan(sum(new.watched)).any(axis=0)
     for failed, code in (
         (stuck & unknown, Result.FIELD_NOT_FINITE),
         (grazes, Result.GRAZING),
@@ -140,7 +149,10 @@ def _after(
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
     """Lanes after their steps and events, the watched functions there, whether the target's level
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
-    lanes, end, accepted, xp = state.lanes, new.watched, verdict.accepted, namespace(t)
+    lanes = state.lanes
+    end = new.watched
+    accepted = verdict.accepted
+    xp = namespace(t)
     zero = width(t, task.span, end.rate)
     stays = verdict.lands | aim.at_once
     ready = (state.ready & ((end.value > 0) | stays)) | (end.value > zero)
@@ -179,7 +191,9 @@ def _reset(
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
-    s, xp, fires = task.s, namespace(fired), fired >= 0
+    s = task.s
+    xp = namespace(fired)
+    fires = fired >= 0
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
@@ -199,14 +213,17 @@ def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
 
     (Charts of other numbers of states have no guards in common.)
     """
-    s, xp = task.s, namespace(lanes.t)
-    dims, same = xp.asarray(np.array(s.dims)), lanes.chart == new.chart
+    s = task.s
+    xp = namespace(lanes.t)
+    dims = xp.asarray(np.array(s.dims))
+    same = lanes.chart == new.chart
     alike = ~same & (dims[lanes.chart] == dims[new.chart])
 
     def compare():
         before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
         noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
-        value, rate = before.value[:-1], before.rate[:-1]
+        value = before.value[:-1]
+        rate = before.rate[:-1]
         zero = SAME_TIME * task.span * xp.abs(rate) + noise
         apart = xp.abs(value[:, None] - watched.value[None, :-1])
         equal = (apart <= zero[:, None]) & belongs(s, lanes.chart)[None, :-1]
@@ -235,7 +252,9 @@ def _share_guards(s: Structure) -> bool:
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
     """The crossing that each lane approaches next: one met in this step, or the same from nearer
     by."""
-    approach, crosses, which = state.approach, verdict.crosses, verdict.which
+    approach = state.approach
+    crosses = verdict.crosses
+    which = verdict.which
     xp = namespace(moved)
     fastest = xp.maximum(*(xp.abs(of_row(x.watched.rate, which)) for x in (state, new)))
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
@@ -253,13 +272,16 @@ def _next_step(
     state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
     """The next step, and lanes that are stuck: the step is too short to be taken."""
-    xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)
+    xp = namespace(fired)
+    plain = verdict.plain
+    too_long = verdict.too_long
     adapted = next_step(state.h, aim, new.error, state.lanes, task)
     h = xp.where(plain | too_long, adapted, state.h)
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
-    instant, t = INSTANT * task.span, state.lanes.t
+    instant = INSTANT * task.span
+    t = state.lanes.t
     # (A fast state needs steps that are shorter than an instant, as far as times resolve them.)
     shortest = xp.minimum(instant, ROUNDING * xp.abs(t) + _SHORTEST * task.span)
     stuck = (too_long & (h < shortest)) | (

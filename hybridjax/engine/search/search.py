@@ -77,7 +77,10 @@ def search(
 
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     """The state of the iteration at its start."""
-    s, xp, L, u = task.s, namespace(lanes.t), lanes.t.shape[0], task.u
+    s = task.s
+    xp = namespace(lanes.t)
+    L = lanes.t.shape[0]
+    u = task.u
     finite = (
         xp.isfinite(lanes.t)
         & xp.isfinite(lanes.q).all(axis=0)
@@ -88,8 +91,11 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
         s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
     )
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows, along = implicit and task.tangents, task.stride.along
-    none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
+    follows = implicit and task.tangents
+    along = task.stride.along
+    none = xp.zeros(L, xp.int32)
+    zero = xp.zeros(L)
+    no = xp.zeros(L, bool)
     return State(
         arm(s, lanes, watched, task.span) if new_input else lanes,
         watched,
@@ -106,7 +112,10 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
 
 def take_aim(state: State, task: Task) -> Aim:
     """The steps of active lanes; steps of length 0 of all others."""
-    s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
+    s = task.s
+    lanes = state.lanes
+    approach = state.approach
+    target = task.target
     xp = namespace(lanes.t)
     # Known times: the step is cut so that it ends on them exactly, in equal pieces.
     scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
@@ -165,7 +174,8 @@ def initial_step(
         return xp.where(here, first, out)
 
     assert settings.rtol is not None
-    xp, rtol = namespace(lanes.t), settings.rtol
+    xp = namespace(lanes.t)
+    rtol = settings.rtol
     return for_each_chart(
         s, lanes.chart, xp.ones(lanes.t.shape[0], bool), work, _FIRST_STEP * span
     )

@@ -97,10 +97,12 @@ def multisine(
     # A frequency that needs two phases is listed twice; `second` marks the repetition.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, n_sections)]]))
     second = np.concatenate([[False], j[1:] == j[:-1]])
-    nu, rng = len(names), np.random.default_rng(seed)
+    nu = len(names)
+    rng = np.random.default_rng(seed)
     total = _number(j, periods, nu, experiments)
     shares = [total // nu + (i < total % nu) for i in range(nu)]
-    sets, phases = [], []
+    sets = []
+    phases = []
     for i in range(nu):
         sets.append(assign(j, periods, shares[i], rng))
         if division == "sum-free":
@@ -109,11 +111,9 @@ def multisine(
         phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
         phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
     experiment = np.concatenate([sum(shares[:i]) + x for i, x in enumerate(sets)])
-    line, channel, phase = (
-        np.tile(j, nu),
-        np.repeat(np.arange(nu), len(j)),
-        np.concatenate(phases),
-    )
+    line = np.tile(j, nu)
+    channel = np.repeat(np.arange(nu), len(j))
+    phase = np.concatenate(phases)
     if division == "disjoint" and nu > 1:
         experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
@@ -168,10 +168,8 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
         raise DefinitionError(
             f"`band` {band} must increase in [0, N/2 = {n_sections / 2}]."
         )
-    low, high = (
-        int(np.ceil(f_min * periods - OFF_LINE)),
-        int(np.floor(f_max * periods + OFF_LINE)),
-    )
+    low = int(np.ceil(f_min * periods - OFF_LINE))
+    high = int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~partition.is_half_integer(j, periods)]
@@ -237,7 +235,8 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
     **Raises:** `DefinitionError` if there is no phase to choose.
     """
-    nu, length = len(design.input_names), design.n_sections * design.periods
+    nu = len(design.input_names)
+    length = design.n_sections * design.periods
     _, pair, count = np.unique(
         design.line * nu + design.channel, return_inverse=True, return_counts=True
     )
@@ -264,7 +263,9 @@ def _lower(phase, free, line, size, length: int):
     """Return the free phases of one signal that minimize its peak."""
     from scipy.optimize import minimize  # (a third of a second, needed by few designs)
 
-    spectrum, best, least = np.zeros(length // 2 + 1, complex), phase[free], np.inf
+    spectrum = np.zeros(length // 2 + 1, complex)
+    best = phase[free]
+    least = np.inf
 
     def signal(x):
         value = size * np.exp(1j * np.where(free, 0.0, phase))
@@ -286,5 +287,6 @@ def _lower(phase, free, line, size, length: int):
     for p in _POWERS:
         x = minimize(norm, x, p, "L-BFGS-B", jac=True, options={"maxiter": _STEPS}).x
         if (peak := np.abs(signal(x)).max()) < least:
-            best, least = x, peak
+            best = x
+            least = peak
     return best

@@ -82,7 +82,8 @@ def assign(
     at that moment (ties at random), so sizes differ by at most one. Needs
     `experiments >= fewest_experiments(line, periods)`, and then never fails.
     """
-    classes, load = line_class(line, periods), np.zeros(experiments, int)
+    classes = line_class(line, periods)
+    load = np.zeros(experiments, int)
     experiment = np.empty(len(line), int)
     for c in rng.permutation(np.unique(classes)):
         members = rng.permutation(np.flatnonzero(classes == c))
@@ -106,7 +107,8 @@ def avoid_second_order(
 
     **Raises:** `DefinitionError` if no such partition was found.
     """
-    classes, products = line_class(line, periods).tolist(), _products(periods)
+    classes = line_class(line, periods).tolist()
+    products = _products(periods)
     members = [
         np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)
     ]
@@ -121,22 +123,31 @@ def avoid_second_order(
         if not bad:
             break
         x = next(draws)
-        e, f = bad[int(x[0] * len(bad))], int(x[1] * len(members))
+        e = bad[int(x[0] * len(bad))]
+        f = int(x[1] * len(members))
         if hits[e] == 0:
             bad = [e for e, n in enumerate(hits) if n]
             continue
-        i, j = int(x[2] * len(members[e])), int(x[3] * len(members[f]))
-        a, b = held[e][i], held[f][j]
+        i = int(x[2] * len(members[e]))
+        j = int(x[3] * len(members[f]))
+        a = held[e][i]
+        b = held[f][j]
         if e == f or b in held[e] or a in held[f]:
             continue
-        new_e, new_f = held[e].copy(), held[f].copy()
-        new_e[i], new_f[j] = b, a
-        hits_e, hits_f = _hits(new_e, products), _hits(new_f, products)
+        new_e = held[e].copy()
+        new_f = held[f].copy()
+        new_e[i] = b
+        new_f[j] = a
+        hits_e = _hits(new_e, products)
+        hits_f = _hits(new_f, products)
         worse = hits_e + hits_f - hits[e] - hits[f]
         heat = 0.5 * max(1 - 2 * k / rounds, 0.0) + 1e-3  # cold in the second half
         if worse <= 0 or x[4] < np.exp(-worse / heat):
             members[e][i], members[f][j] = members[f][j], members[e][i]
-            held[e], held[f], hits[e], hits[f] = new_e, new_f, hits_e, hits_f
+            held[e] = new_e
+            held[f] = new_f
+            hits[e] = hits_e
+            hits[f] = hits_f
             if hits_f and f not in bad:
                 bad.append(f)
     if any(hits):
@@ -184,11 +195,15 @@ def check_sharing(
     """
     classes = line_class(line, periods)
     order = np.lexsort((line, classes, experiment))
-    e, c, j = experiment[order], classes[order], line[order]
+    e = experiment[order]
+    c = classes[order]
+    j = line[order]
     clash = (e[1:] == e[:-1]) & (c[1:] == c[:-1])
     if clash.any():
         k = int(np.argmax(clash))
-        low, high, number = int(j[k]), int(j[k + 1]), int(e[k + 1])
+        low = int(j[k])
+        high = int(j[k + 1])
+        number = int(e[k + 1])
         f = f"f = {low / periods:.10g}"
         reason = f"{f} is excited twice"
         if low < high:
