@@ -101,9 +101,9 @@ class ExperimentData(eqx.Module):
         self.y = np.array(y)
         shapes = self.u.shape, self.y.shape
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
-            text = "the same experiments and samples (their first two axes)"
             raise DefinitionError(
-                f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}."
+                f"`u` {shapes[0]} and `y` {shapes[1]} must have the same experiments and samples "
+                "(their first two axes)."
             )
         self.result = (
             np.zeros(len(self.u), int) if result is None else np.asarray(result, int)
@@ -138,9 +138,9 @@ class ExperimentData(eqx.Module):
             bad = ~finite.all(axis=2) & self.ok[:, None]
             if bad.any():
                 s, i = (int(x) for x in np.argwhere(bad)[0])
-                text = "repair the record, or mark the experiment as failed in `result`"
                 raise DefinitionError(
-                    f"experiment {s}: {name} is not finite at sample {i}: {text}."
+                    f"experiment {s}: {name} is not finite at sample {i}: repair the record, or "
+                    "mark the experiment as failed in `result`."
                 )
 
     @property
@@ -203,9 +203,9 @@ class ExperimentData(eqx.Module):
         n = self.u.shape[1]
         length = self.n_sections * self.periods
         if repeats * length > n:
-            text = f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods}"
             raise DefinitionError(
-                f"{text} periods: record more, or lower `periods` or repeats."
+                f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods} "
+                "periods: record more, or lower `periods` or repeats."
             )
         first = n - repeats * length
         return [
@@ -220,9 +220,11 @@ class ExperimentData(eqx.Module):
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
-        label = f"{self.label}, " if self.label else ""
+        state = self.summary()
+        if self.label:
+            state = f"{self.label}, {state}"
         return folded(
-            f"ExperimentData({label}{self.summary()}; {n // self.n_sections} cycles of "
+            f"ExperimentData({state}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
@@ -242,15 +244,17 @@ class ExperimentData(eqx.Module):
             raise DefinitionError(
                 f"{len(self.u)} experiments are not pairs: leave one out."
             )
-        unit = np.maximum(
-            np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0), np.finfo(float).tiny
-        )
-        total, size = (np.abs(x / unit).max(axis=(1, 2)) for x in (plus + minus, plus))
+        largest = np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0)
+        unit = np.maximum(largest, np.finfo(float).tiny)
+        total = np.abs((plus + minus) / unit).max(axis=(1, 2))
+        size = np.abs(plus / unit).max(axis=(1, 2))
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():
             k = 2 * int(np.argmax(apart))
-            text = "their inputs are not opposite (`Design.with_negatives` makes pairs)"
-            raise DefinitionError(f"experiments {k} and {k + 1} are no pair: {text}.")
+            raise DefinitionError(
+                f"experiments {k} and {k + 1} are no pair: their inputs are not opposite "
+                "(`Design.with_negatives` makes pairs)."
+            )
         first = self.result[::2]
         second = self.result[1::2]
         broken = first != Result.OK
@@ -277,10 +281,10 @@ def summary(
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:
         cycle, section = divmod(int(failed_at[s]), n_sections)
-        where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
-        text.append(
-            f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}"
-        )
+        cause = causes[s] if causes else Result(int(result[s])).message
+        if failed_at[s] >= 0:
+            cause = f"section {section}, cycle {cycle}: {cause}"
+        text.append(f"#{s}: {cause}")
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return folded("; ".join(text))

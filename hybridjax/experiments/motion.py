@@ -51,16 +51,17 @@ def perturbed_trajectory(
     begin = lanes
     for k, u in enumerate(held[..., None]):
         j = (k + 1) % N
-        turns = int((k + 1) % N == 0)
+        turns = int(j == 0)
         target = placed.target(np.array([j]), lanes.t, np.array([turns]))
         with at_ease():
             moved, tape = move(
                 s, lanes, u, target, settings, options=Options(tape=True)
             )
         assert tape is not None
-        if (code := Result(int(moved.result[0]))) != Result.OK:
+        result = Result(int(moved.result[0]))
+        if result != Result.OK:
             raise ComputationError(
-                f"the motion stops after sample {k}: {code.message}."
+                f"the motion stops after sample {k}: {result.message}."
             )
         tapes.append(tape._replace(t=tape.t + shift))
         shift += turns * period

@@ -184,7 +184,8 @@ class _Moves:
     def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
         zero = jnp.zeros(S)
         value, rate = self._unknown(S)
-        answer = controller = None
+        answer = None
+        controller = None
         if self.feedback is not None:
             answer = jnp.zeros((self.s.nu, S))
             controller = jnp.zeros((self.feedback.matrices.A.shape[1], S))

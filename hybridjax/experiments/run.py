@@ -277,9 +277,9 @@ class Campaign:
         )
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
-            text = f"was found (Newton's last step: {change[s]:.1e}): lower the input, or discard"
             raise ComputationError(
-                f"experiment {first + s}: no periodic response {text} cycles."
+                f"experiment {first + s}: no periodic response was found (Newton's last step: "
+                f"{change[s]:.1e}): lower the input, or discard cycles."
             )
         start = np.where(np.isnan(change), predicted, start)
         return start, parts if still and window.shape == u.shape else None
@@ -410,11 +410,9 @@ def prepare(
     noise = options.process_noise
     feedback = None if options.feedback is None else _controller(placed, items, options)
     _require_return(cycle, placed, feedback is not None)
-    discard = (
-        (DISCARD if start == "cycle" else 0)
-        if options.discard is None
-        else options.discard
-    )
+    discard = options.discard
+    if discard is None:
+        discard = DISCARD if start == "cycle" else 0
     N = placed.n_sections
     inputs = check_inputs(design, discard, N, cycle.structure.inputs)
     if noise is not None:
@@ -452,9 +450,9 @@ def _controller(
     F = options.feedback
     loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
     if len(loop.multipliers) and abs(loop.multipliers[0]) >= 1:
-        text = f"its largest multiplier is {abs(loop.multipliers[0]):.4g} in modulus"
         raise ComputationError(
-            f"with this feedback the limit cycle is not stable: {text}."
+            "with this feedback the limit cycle is not stable: its largest multiplier is "
+            f"{abs(loop.multipliers[0]):.4g} in modulus."
         )
     if isinstance(F, LDTP):
         return to_host(F.matrices)

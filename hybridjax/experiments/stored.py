@@ -94,12 +94,11 @@ class StoredExperiments:
     def __iter__(self) -> Iterator[ExperimentData]:
         """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
         `FileFormatError` if one is damaged."""
-        if missing := self.missing():
-            text = (
-                f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
-            )
+        missing = len(self.missing())
+        if missing:
             raise DefinitionError(
-                f"{text}: make the call that began it again to run them."
+                f"{missing} of {len(self)} chunks in '{self.address}' are missing: make the call "
+                "that began it again to run them."
             )
         for k in range(len(self)):
             yield self[k]

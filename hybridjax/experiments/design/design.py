@@ -228,8 +228,10 @@ class Design(eqx.Module):
         cycles = self.periods if cycles is None else cycles
         first, last, step = (experiments or slice(None)).indices(self.experiments)
         if step != 1 or last <= first:
-            text = f"consecutive experiments, such as slice(0, 10), not {experiments}"
-            raise DefinitionError(f"`experiments` must be a slice of {text}.")
+            raise DefinitionError(
+                "`experiments` must be a slice of consecutive experiments, such as slice(0, 10), "
+                f"not {experiments}."
+            )
         k = slice(*np.searchsorted(self.experiment, (first, last)))
         experiment = self.experiment[k]
         line = self.line[k]
@@ -389,8 +391,10 @@ def require_inputs(
 def check_window(n_sections: int, periods: int) -> None:
     """**Raises:** `DefinitionError` for windows that no memory holds."""
     if n_sections * periods > limits.WINDOW:
-        text = f"more samples than an experiment may have ({limits.WINDOW}): take fewer"
-        raise DefinitionError(f"{n_sections} sections in {periods} periods are {text}.")
+        raise DefinitionError(
+            f"{n_sections} sections in {periods} periods are more samples than an experiment may "
+            f"have ({limits.WINDOW}): take fewer."
+        )
 
 
 def to_lines(

@@ -176,9 +176,8 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:
-        text = "take more periods or a wider band"
         raise DefinitionError(
-            f"lines='{lines}' excites nothing in `band` {band}: {text}."
+            f"lines='{lines}' excites nothing in `band` {band}: take more periods or a wider band."
         )
     return j
 
@@ -286,7 +285,8 @@ def _lower(phase, free, line, size, length: int):
     x = phase[free]
     for p in _POWERS:
         x = minimize(norm, x, p, "L-BFGS-B", jac=True, options={"maxiter": _STEPS}).x
-        if (peak := np.abs(signal(x)).max()) < least:
+        peak = np.abs(signal(x)).max()
+        if peak < least:
             best = x
             least = peak
     return best
