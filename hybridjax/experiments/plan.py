@@ -120,7 +120,6 @@ def make_plan(
 
     **Raises:** `ComputationError` if no candidate reaches the next section.
     """
-    N = placed.n_sections
     placed = to_host(placed)
     *_, target = placed.onwards()
     with at_ease():
@@ -132,55 +131,75 @@ def make_plan(
     error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
-    impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
-    missed = (
-        np.isnan(ways.ends[0, -1]) & (np.arange(len(ways.ends[0, -1])) > 0)[:, None]
-    )
-    impacts = np.where(missed, 0.0, np.where(np.isnan(impact), np.inf, impact))
-    impact = impacts.max(axis=1)
-    lost = ~np.isfinite(impact).any(axis=0)
-    if lost.any():
-        k = int(np.argmax(lost))
-        text = "place more sections, or find the cycle with `settings=Settings(max_steps=...)`"
-        raise ComputationError(f"too many steps from section {k} to the next: {text}.")
-    estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 
-    # The largest share of the accuracy for each section that keeps their sum.
-    section = np.arange(N)
-    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
-        # The first candidate of each section with so small an impact, or the best.
-        enough = impact <= share
-        best = np.where(
-            enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0)
-        )
-        total = impact[best, section].sum()
-        if total <= accuracy:
-            break
-    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
+    impacts = _impacts(ways, J, error, scale)
+    largest = impacts.max(axis=1)
+    _require_ways(largest)
+    best, total = _cheapest(largest, accuracy)
+    section = np.arange(placed.n_sections)
     # Small deviations, whose errors may be hidden by those on the cycle, have at most the least; it
     # holds the cycle's own, whose stiff states are less accurate than its others.
     least = np.zeros(())
     if ways.estimate.shape[1] > 1:
-        after = (section + 1) % N
+        after = np.roll(section, -1)
         own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
-        least = impact[best, section].sum() + np.abs(own).max()
+        least = largest[best, section].sum() + np.abs(own).max()
+
+    # The cycle itself comes first, and then the larger deviations.
     large = slice(1 + placed.structure().nu)
     impact = impacts[best, large, section].T
-    estimate = estimate[best, large, section].T
+    estimate = np.maximum(ways.estimate, _LEAST_SHARE)[best, large, section].T
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
-    together = (
-        _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
-    )
-    weight = (impact / estimate).max(axis=0) * np.maximum(
-        together, 1 / _MOST_CANCELLATION
-    )
-    impact = impact[0]
-    estimate = estimate[0]
+    accumulated = _accumulated(J, error[best, 0, section], scale)
+    together = _CAUTION * accumulated / impact[0].sum()
+    weight = (impact / estimate).max(axis=0)
+    weight = weight * np.maximum(together, 1 / _MOST_CANCELLATION)
+
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
-    share = np.minimum(accuracy * estimate / impact, 1.0) / N
+    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0) / len(section)
+    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
+    of_equal_steps = np.maximum(spare * estimate[0], share)
     slack = ways.slack[best]
-    slack = np.where(np.isinf(slack), np.maximum(spare * estimate, share), slack)
+    slack = np.where(np.isinf(slack), of_equal_steps, slack)
     return from_host(Plan(ways.first[best, section], ways.lead, slack, weight, least))
+
+
+def _impacts(ways: "_Ways", J, error, scale) -> Float[np.ndarray, "K M N"]:
+    """Return the largest later errors that each candidate causes from each start: infinite where it
+    does not arrive, and 0 for a deviation from which the reference does not arrive, either."""
+    impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
+    impact = np.where(np.isnan(impact), np.inf, impact)
+    reference = ways.ends[0, -1]
+    deviates = np.arange(len(reference))[:, None] > 0
+    return np.where(np.isnan(reference) & deviates, 0.0, impact)
+
+
+def _require_ways(impact: Float[np.ndarray, "K N"]) -> None:
+    """**Raises:** `ComputationError` if no candidate reaches the next section."""
+    lost = ~np.isfinite(impact).any(axis=0)
+    if lost.any():
+        raise ComputationError(
+            f"too many steps from section {int(np.argmax(lost))} to the next: place more sections, "
+            "or find the cycle with `settings=Settings(max_steps=...)`."
+        )
+
+
+def _cheapest(
+    impact: Float[np.ndarray, "K N"], accuracy: float
+) -> tuple[Int[np.ndarray, " N"], float]:
+    """Return the candidate of each section, and the sum of their impacts: the cheapest ones for the
+    largest share of the accuracy that keeps this sum."""
+    N = impact.shape[1]
+    section = np.arange(N)
+    most_accurate = np.argmin(impact, axis=0)
+    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
+        enough = impact <= share
+        first = np.argmax(enough, axis=0)
+        best = np.where(enough.any(axis=0), first, most_accurate)
+        total = impact[best, section].sum()
+        if total <= accuracy:
+            break
+    return best, total
 
 
 class _Ways(NamedTuple):
@@ -204,11 +223,11 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
     if not has_implicit(s):
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
-    largest = np.abs(by_input / np.roll(scale, -1, axis=0)[:, :, None])[:, time:].max(
-        axis=(0, 1)
-    )
-    one = np.diag(np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu)))
-    return np.concatenate([np.zeros((1, nu)), *(size * one for size in _KICKS)])
+    after = np.roll(scale, -1, axis=0)[:, :, None]
+    largest = np.abs(by_input / after)[:, time:].max(axis=(0, 1))
+    unit = np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu))
+    kicks = [size * np.diag(unit) for size in _KICKS]
+    return np.concatenate([np.zeros((1, nu)), *kicks])
 
 
 @host_first
@@ -226,15 +245,14 @@ def _try_ways(
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
-    by_level = xp.isinf(placed.bound.time[following]) & (
-        placed.bound.event[following] < 0
-    )
+    by_level = xp.isinf(placed.bound.time[following])
+    by_level = by_level & (placed.bound.event[following] < 0)
     longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
     # A lane for every section in each of K candidates and the reference.
     W = K + 1
-    divide = np.array([*equal, *[most] * len(_TOLERANCES), 2])
-    slack = np.array([*[np.inf] * len(equal), *_TOLERANCES, 1.0])
+    divide = np.array([*equal, *(most for _ in _TOLERANCES), 2])
+    slack = np.array([*(np.inf for _ in equal), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 
@@ -246,9 +264,8 @@ def _try_ways(
 
     lanes = all_ways(placed.lanes)
     per_lane = ("time", "index", "event", "limit")
-    target = dataclasses.replace(
-        target, **{x: all_ways(getattr(target, x)) for x in per_lane}
-    )
+    ends_of_lanes = {name: all_ways(getattr(target, name)) for name in per_lane}
+    target = dataclasses.replace(target, **ends_of_lanes)
     start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
     accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
     tolerance = Settings(1.0, 1.0, patience, settings.scale)
@@ -259,12 +276,12 @@ def _try_ways(
     )
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
     ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
-    estimate = moved.error.reshape(W, M, N)[:K] * (rtol[:K, None, None] / settings.rtol)
+    tolerances = rtol[:K, None, None] / settings.rtol
+    estimate = moved.error.reshape(W, M, N)[:K] * tolerances
     first = longest / divide[:K, None]
     if tape is not None:  # the first step that is accepted, or all the way
-        taken = xp.take_along_axis(
-            tape.h, xp.argmax(tape.code != IDLE, axis=0)[None], axis=0
-        )
+        accepted = xp.argmax(tape.code != IDLE, axis=0)[None]
+        taken = xp.take_along_axis(tape.h, accepted, axis=0)
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
@@ -282,7 +299,8 @@ def _lead(placed: PlacedSections, target):
     value = watched.value[-1]
     rate = watched.rate[-1]
     falls = (value > 0) & (rate < 0)
-    lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    inverse_guess = xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    lead = placed.duration * inverse_guess
     return xp.where((lead > 1 / _WORST_GUESS) & (lead < _WORST_GUESS), lead, 1.0)
 
 
@@ -297,12 +315,13 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     section = np.arange(N)
     worst = np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
-        np.maximum(worst[m // N], np.abs(x).max(axis=1), out=worst[m // N])
+        period = worst[m // N]
+        np.maximum(period, np.abs(x).max(axis=1), out=period)
         x = J[(section + 1 + m) % N] @ x
-    ratio = np.clip(worst[-1] / np.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
-    return (worst.sum(axis=0) + worst[-1] * ratio / (1 - ratio)).T.reshape(
-        error.shape[:-1]
-    )
+    *_, before, last = worst
+    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    later = last * ratio / (1 - ratio)
+    return (worst.sum(axis=0) + later).T.reshape(error.shape[:-1])
 
 
 def _accumulated(J, error, scale) -> float:
@@ -345,9 +364,8 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         time = np.full((placed.n_sections, 1), float(cycle.period))
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
-        return Stepping(
-            make_plan(placed, settings, accuracy, scales), settings, scales, accuracy
-        )
+        plan = make_plan(placed, settings, accuracy, scales)
+        return Stepping(plan, settings, scales, accuracy)
 
     # A plan is no part of the program that JAX traces.
     inside = is_inside_program() and not is_traced(placed)
