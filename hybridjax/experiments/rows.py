@@ -10,7 +10,7 @@ turns out to lie beyond the next section is undone.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -122,22 +122,26 @@ class _Points(NamedTuple):
     """Newton's guesses of the times to their zeros."""
     signs: Int[np.ndarray, "P G"]
 
+    def part(self, points: slice) -> "_Points":
+        """The functions at some of the points."""
+        return _Points(self.newton[points], self.signs[points])
+
 
 def applies(s: Structure, placed: PlacedSections) -> bool:
     """Test whether experiments can follow a table: with explicit methods, and events at the zeros
     of guards that are always enabled."""
-    charts = np.unique(np.asarray(placed.lanes.chart)).tolist()
-    codes = np.unique(np.asarray(placed.tape.code))
-    taken = [s.transitions[g] for g in codes[codes >= 0].tolist()]
-    used = {*charts, *(s.chart_index(x.target) for x in taken)}
-    plain = all(
-        x.enabled is None and not isinstance(x.guard, Scheduled)
-        for x in s.transitions
-        if s.chart_index(x.source) in used
-    )
-    explicit = not any(s.method(a).implicit for a in used)
-    at_once = np.asarray(placed.tape.at_once)[np.asarray(placed.tape.code) >= 0].any()
-    return plain and explicit and not at_once
+    codes = np.asarray(placed.tape.code)
+    is_event = codes >= 0
+    if np.asarray(placed.tape.at_once)[is_event].any():
+        return False
+    charts = set(np.asarray(placed.lanes.chart).tolist())
+    for g in np.unique(codes[is_event]).tolist():
+        charts.add(s.chart_index(s.transitions[g].target))
+    if any(s.method(a).implicit for a in charts):
+        return False
+    possible = [x for x in s.transitions if s.chart_index(x.source) in charts]
+    scheduled = any(isinstance(x.guard, Scheduled) for x in possible)
+    return not scheduled and all(x.enabled is None for x in possible)
 
 
 class Tables(NamedTuple):
@@ -186,44 +190,54 @@ class _Writer:
         self.ends = self.t + placed.duration
         self.events = _events(placed)
         self.levels = placed.bound.levels
-        # (One scale of each guard for all points: at an event alone it would be rounding.)
-        at = [np.array([getattr(x, name) for x in self.events]) for name in _EVENT]
-        section, times, before, after = at
-        numbers = range(len(self.events))
-        places = [
-            (np.arange(self.N), self.t, self.chart, placed.lanes.q),
-            (section, times, [self._chart(e) for e in numbers], before.T),
-            (section, times, [self._chart(e + 1) for e in numbers], after.T),
-        ]
-        places = [x for x in places if len(x[0])]
-        joined = [np.concatenate(x, axis=-1) for x in zip(*places, strict=True)]
-        points = self._points(*joined)
-        cuts = np.cumsum([len(x[0]) for x in places])[:-1]
-        parts = [np.split(x, cuts) for x in points]
-        each = [_Points(*x) for x in zip(*parts, strict=True)]
-        self.at_sections = each[0]
-        if self.events:
-            _, self.before, self.after = each
+        self._watch_points()
         self.width = self.at_sections.signs.shape[1]
-        self.rows: list[tuple] = []
+        self.rows: list[dict[str, Any]] = []
         self.places: dict[tuple[int, int], int] = {(0, 0): BEGIN}
         self.bodies: list[Body] = []
+
+    def _watch_points(self) -> None:
+        """Evaluate the watched functions at sections, and before and after events.
+
+        (All at once, for one scale of each guard: at an event alone it would be rounding.)
+        """
+        N = self.N
+        events = self.events
+        E = len(events)
+        on_section = [np.arange(N), self.t, self.chart, self.placed.lanes.q]
+        if not events:
+            self.at_sections = self._points(*on_section)
+            return
+        section = [event.section for event in events]
+        t = [event.t for event in events]
+        chart_before = [self._chart(e) for e in range(E)]
+        chart_after = [self._chart(e + 1) for e in range(E)]
+        before = np.array([event.before for event in events]).T
+        after = np.array([event.after for event in events]).T
+        points = self._points(
+            np.concatenate([np.arange(N), section, section]),
+            np.concatenate([self.t, t, t]),
+            np.concatenate([self.chart, chart_before, chart_after]),
+            np.concatenate([self.placed.lanes.q, before, after], axis=1),
+        )
+        self.at_sections = points.part(slice(N))
+        self.before = points.part(slice(N, N + E))
+        self.after = points.part(slice(N + E, None))
 
     def written(self) -> Table:
         for k in range(self.N):
             self._interval(k)
         used = len(self.rows)
         self.rows += self.rows[-1:] * (-used % _ROUND)
-        number = np.int32
-        types: list[type] = [number, number, number, number, bool, bool, bool]
-        types += [number, float, float, number, bool, number]
-        columns = [
-            np.array(x).astype(d)
-            for x, d in zip(zip(*self.rows, strict=True), types, strict=True)
-        ]
+        columns = {}
+        for name in Rows._fields:
+            column = np.array([row[name] for row in self.rows])
+            if np.issubdtype(column.dtype, np.integer):
+                column = column.astype(np.int32)
+            columns[name] = column
         bodies = tuple(sorted(self.bodies))
-        place = np.array([bodies.index(body) for body in self.bodies], number)
-        rows = Rows(*columns)
+        place = np.array([bodies.index(body) for body in self.bodies], np.int32)
+        rows = Rows(**columns)
         rows = rows._replace(body=place[rows.body])
         return Table(Form(bodies, self.width), rows, used)
 
@@ -425,12 +439,23 @@ class _Writer:
             self.bodies.append(body)
         number = self.bodies.index(body)
         at = self._place(section, passed)
-        after = passed + bool(body.kind)
-        then = (
-            self._place(section + 1, after) if arrives else self._place(section, after)
+        is_event = bool(body.kind)
+        then = self._place(section + int(arrives), passed + int(is_event))
+        row = dict(
+            body=number,
+            section=section,
+            at=at,
+            then=then,
+            begins=begins,
+            corrects=corrects,
+            arrives=arrives,
+            target=target,
+            part=part,
+            fixed=fixed,
+            place=place,
+            may_wait=may_wait,
+            signs=signs,
         )
-        row = number, section, at, then, begins, corrects, arrives
-        row += target, part, fixed, place, may_wait, signs
         self.rows.append(row)
 
     def _place(self, section: int, passed: int) -> int:
@@ -452,32 +477,28 @@ class _Writer:
     def _points(self, section, t, chart, q) -> _Points:
         """Watched functions at points after these sections."""
         s = self.s
-        chart = np.asarray(chart, int)
-        charts = range(len(s.dims))
-        width = max(len(s.guards(a)) + self._has_level(a) for a in charts)
-        newton = np.zeros((len(t), width))
-        signs = np.zeros((len(t), width), int)
+        counts = [len(s.guards(a)) + self._has_level(a) for a in range(len(s.dims))]
+        newton = np.zeros((len(t), max(counts)))
+        signs = np.zeros((len(t), max(counts)), int)
         for a in np.unique(chart).tolist():
-            count = len(s.guards(a)) + self._has_level(a)
-            here = np.flatnonzero(chart == a)
+            count = counts[a]
             if not count:
                 continue
             n = s.dims[a]
+            here = np.flatnonzero(chart == a)
             index = (section[here] + 1) % self.N
-            point = np.asarray(t)[here], q[:n, here], np.zeros((s.nu, 1))
+            point = t[here], q[:n, here], np.zeros((s.nu, 1))
             columns = kernels.watched(s, a, self.levels, *point, index)
             field = kernels.field(s, a, *point)[:, 0]
             value = columns[:, 0]
-            rate = columns[:, 1] + np.sum(columns[:, 2 : 2 + n] * field, axis=1)
+            gradient = columns[:, 2 : 2 + n]
+            rate = columns[:, 1] + np.sum(gradient * field, axis=1)
             with np.errstate(all="ignore"):
                 newton[here, :count] = np.nan_to_num(-value / rate).T
             largest = np.abs(value).max(axis=1, keepdims=True)
             known = np.abs(value) > _NEAR_ZERO * largest
             signs[here, :count] = np.where(known, np.sign(value), 0).T
         return _Points(newton, signs)
-
-
-_EVENT = "section", "t", "before", "after"
 
 
 def _events(placed: PlacedSections) -> list[_Event]:
