@@ -70,7 +70,8 @@ def first_crossing(
     pivot = -(b + xp.where(b < 0, -1.0, 1.0) * xp.sqrt(xp.maximum(disc, 0.0)))
     r1 = _divide(pivot, 3 * c)
     r2 = _divide(d0, pivot)
-    r1, r2 = (xp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
+    r1 = xp.where((disc > 0) & (r1 > 0) & (r1 < 1), r1, 1.0)
+    r2 = xp.where((disc > 0) & (r2 > 0) & (r2 < 1), r2, 1.0)
     sa = xp.minimum(r1, r2)
     sb = xp.maximum(r1, r2)
     va = xp.where(sa < 1, cubic(sa), v1)
@@ -94,7 +95,8 @@ def first_crossing(
     position = xp.where(crosses, s, xp.inf)
     scale = xp.maximum(xp.abs(v0), xp.abs(v1))
     small = TOUCH * scale
-    touch = near = xp.zeros_like(armed)
+    touch = xp.zeros_like(armed)
+    near = xp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
         sure = _beside(node, margin) <= small

@@ -69,7 +69,9 @@ def _weights(
     a: Float[np.ndarray, "s s"], usable: Bool[np.ndarray, " s"], order: int
 ) -> Float[np.ndarray, "2 s"] | None:
     """The smallest weights of usable stages for an order; `None` if there are none."""
-    trees = [tree for k in range(1, order + 1) for tree in _trees(k)]
+    trees: list[Tree] = []
+    for size in range(1, order + 1):
+        trees.extend(_trees(size))
     sums = np.array([_sums(tree, a) for tree in trees])[:, usable]
     sizes = np.array([_size(tree) for tree in trees])
     state = 0.5**sizes / np.array([_density(tree) for tree in trees])
@@ -96,12 +98,11 @@ def _forests(size: int) -> list[Tree]:
     """Rooted trees that have so many nodes together, in any order."""
     if size == 0:
         return [()]
-    return [
-        (tree, *others)
-        for first in range(1, size + 1)
-        for tree in _trees(first)
-        for others in _forests(size - first)
-    ]
+    found: list[Tree] = []
+    for first in range(1, size + 1):
+        for tree, others in product(_trees(first), _forests(size - first)):
+            found.append((tree, *others))
+    return found
 
 
 def _size(tree: Tree) -> int:

@@ -216,7 +216,7 @@ def _step(
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
-    step = cond(present, plain, lambda: Step(*[q] * len(Step._fields)))
+    step = cond(present, plain, lambda: Step(*(q for _ in Step._fields)))
     if not task.tangents:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
@@ -239,9 +239,8 @@ def _errors(
     assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        rounding = rounding_error(
-            flow.field, t, q, step.f0
-        )  # (a bad step may end anywhere)
+        # (At the start: a bad step may end anywhere.)
+        rounding = rounding_error(flow.field, t, q, step.f0)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     motion = step.error if change is None else step.estimate
     error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)

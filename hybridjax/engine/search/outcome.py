@@ -95,7 +95,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
     # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
-    change, size = (xp.max(xp.abs(x), axis=0) for x in (new.q - lanes.q, lanes.q))
+    change = xp.max(xp.abs(new.q - lanes.q), axis=0)
+    size = xp.max(xp.abs(lanes.q), axis=0)
     still = (change <= 1e-3 * size) | ((size == 0) & xp.isfinite(change))
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
     result = state.result
@@ -111,11 +112,12 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         (active & ~arrived & (after.t >= target.limit), target.missed),
     ):
         result = update_result(result, failed, code)
-    if (along := new.along) is not None:
+    along = new.along
+    if along is not None:
         fresh = cond(
             (fired >= 0).any(),
             lambda: deviation(task.s, after, task.settings),
-            lambda: along,
+            lambda: new.along,
         )
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
@@ -130,10 +132,10 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         state.arrived | arrived,
         state.i + 1,
     )
-    code = xp.where(on_time, ARRIVE_TIME, xp.where(accepted, MOVE, IDLE))
-    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(
-        xp.int32
-    )
+    code = xp.where(accepted, MOVE, IDLE)
+    code = xp.where(on_time, ARRIVE_TIME, code)
+    code = xp.where(fired >= 0, fired, code)
+    code = xp.where(level, ARRIVE_LEVEL, code).astype(xp.int32)
     at_once = aim.at_once & (fired >= 0)
     return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once)
 
@@ -220,33 +222,36 @@ def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
     alike = ~same & (dims[lanes.chart] == dims[new.chart])
 
     def compare():
+        """Guards of the new chart (rows) with the value that one of the old chart (columns) has at
+        the state before."""
         before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
         noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
         value = before.value[:-1]
         rate = before.rate[:-1]
         zero = SAME_TIME * task.span * xp.abs(rate) + noise
         apart = xp.abs(value[:, None] - watched.value[None, :-1])
-        equal = (apart <= zero[:, None]) & belongs(s, lanes.chart)[None, :-1]
-        return equal.any(axis=1) & alike, (equal & lanes.armed).any(axis=1) & alike
+        has_guard = belongs(s, lanes.chart)[None, :-1]
+        equal = (apart <= zero[:, None]) & has_guard
+        known = equal.any(axis=1) & alike
+        armed = (equal & lanes.armed).any(axis=1) & alike
+        return known, armed
 
     no = xp.zeros_like(lanes.armed)
-    if not _share_guards(s):
-        return Entry(no | same, xp.where(same, lanes.armed, no))
-    known, armed = cond(alike.any(), compare, lambda: (no, no))
+    known = no
+    armed = no
+    if _share_guards(s):
+        known, armed = cond(alike.any(), compare, lambda: (no, no))
     return Entry(known | same, xp.where(same, lanes.armed, armed))
 
 
 def _share_guards(s: Structure) -> bool:
     """Test whether any transition leads to another chart that may have guards of the first one."""
-    ends = (
-        (s.chart_index(x.source), s.chart_index(x.target))
-        for x in s.transitions
-        if x.source != x.target
-    )
-    return any(
-        s.dims[a] == s.dims[b] and bool(s.guards(a)) and bool(s.guards(b))
-        for a, b in ends
-    )
+    for transition in s.transitions:
+        a = s.chart_index(transition.source)
+        b = s.chart_index(transition.target)
+        if a != b and s.dims[a] == s.dims[b] and s.guards(a) and s.guards(b):
+            return True
+    return False
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
@@ -256,7 +261,9 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
     crosses = verdict.crosses
     which = verdict.which
     xp = namespace(moved)
-    fastest = xp.maximum(*(xp.abs(of_row(x.watched.rate, which)) for x in (state, new)))
+    rate_before = xp.abs(of_row(state.watched.rate, which))
+    rate_after = xp.abs(of_row(new.watched.rate, which))
+    fastest = xp.maximum(rate_before, rate_after)
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
     return Approach(
         crosses | verdict.closer,
@@ -284,9 +291,8 @@ def _next_step(
     t = state.lanes.t
     # (A fast state needs steps that are shorter than an instant, as far as times resolve them.)
     shortest = xp.minimum(instant, ROUNDING * xp.abs(t) + _SHORTEST * task.span)
-    stuck = (too_long & (h < shortest)) | (
-        (verdict.refine | verdict.lost) & (h < instant)
-    )
+    misses = verdict.refine | verdict.lost
+    stuck = (too_long & (h < shortest)) | (misses & (h < instant))
     return h, stuck
 
 
