@@ -81,16 +81,11 @@ def through(
     """
     ends = (targets.time, targets.index, targets.event, targets.limit)
     levels = targets.levels
-    by = targets.missed, targets.event_sequence
+    failures = targets.missed, targets.event_sequence
     if not options.at_once:
-        return _pieces(
-            (move, options, *by), s, levels, settings, ends, begin, u, patience
-        )
-    static = (
-        search,
-        options._replace(at_once=False),
-        *by,
-    )
+        static = (move, options, *failures)
+        return _pieces(static, s, levels, settings, ends, begin, u, patience)
+    static = (search, options._replace(at_once=False), *failures)
 
     def make():
         return whole(_pieces, (static,), (s, levels, settings))
@@ -174,13 +169,10 @@ def _follow_jvp(primals, tangents):
         return replay(s, begin, u, end, recorded.tape)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
-    by_lane = (
-        (lanes.t, lanes.q, u, target.time),
-        (t_lanes.t, t_lanes.q, t_u, t_target.time),
-    )
-    (t, q), (t_t, t_q) = lane_jvp(
-        repeat, by_lane, ((s, levels), (t_s, t_target.levels))
-    )
+    point = lanes.t, lanes.q, u, target.time
+    t_point = t_lanes.t, t_lanes.q, t_u, t_target.time
+    common = (s, levels), (t_s, t_target.levels)
+    (t, q), (t_t, t_q) = lane_jvp(repeat, (point, t_point), common)
 
     def ends(x):
         return (x.moved.lanes.t, x.moved.lanes.q)
@@ -240,19 +232,24 @@ def tape_jacobian(
 def _columns(s, lanes, target, tape, of_states):
     """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
     L = lanes.t.shape[0]
-    d = s.d
-    n = 1 + d + s.nu
+    states = slice(1, 1 + s.d)
+    inputs = slice(1 + s.d, None)
 
-    def flow(x):
-        start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
-        t, q = replay(s, start, x[1 + d :], target, tape)
+    def flow(point):
+        begin = point[0], point[states]
+        start = eqx.tree_at(lambda x: (x.t, x.q), lanes, begin)
+        t, q = replay(s, start, point[inputs], target, tape)
         return jnp.concatenate([t[None], q])
 
-    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
-    directions = jnp.eye(n)[1 : 1 + d] if of_states else jnp.eye(n)
+    def push(tangent):
+        return jax.jvp(flow, (point,), (tangent,))
+
+    point = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
+    directions = jnp.eye(len(point))
+    if of_states:
+        directions = directions[states]
     tangents = jnp.broadcast_to(directions[:, :, None], (*directions.shape, L))
-    push = jax.vmap(lambda tangent: jax.jvp(flow, (x,), (tangent,)), out_axes=(None, 0))
-    end, columns = push(tangents)
+    end, columns = jax.vmap(push, out_axes=(None, 0))(tangents)
     return columns, end
 
 

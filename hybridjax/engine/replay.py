@@ -56,12 +56,8 @@ def replay(
     tape: Tape,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
-    h = tape.h
-    code = tape.code
-    at_once = tape.at_once
-    scheduled = jnp.array(
-        [isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False]
-    )
+    is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
+    scheduled = jnp.array([*is_scheduled, False])
 
     def row(carry, row):
         h, code, at_once = row
@@ -70,9 +66,8 @@ def replay(
             t, q, chart = carry
             by_clock = (code >= 0) & scheduled[code]
             due = scheduled_time(s, code, t + h)
-            h1 = jnp.where(
-                code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h)
-            )
+            h1 = jnp.where(by_clock, due - t, h)
+            h1 = jnp.where(code == ARRIVE_TIME, target.time - t, h1)
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
@@ -80,29 +75,27 @@ def replay(
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
-        return jax.lax.cond(
-            (code != IDLE).any(), move, lambda carry: carry, carry
-        ), None
+        moves = (code != IDLE).any()
+        return jax.lax.cond(moves, move, lambda carry: carry, carry), None
 
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry, rows):
         def follow(carry):
             return jax.lax.scan(row, carry, rows)[0]
 
-        return jax.lax.cond(
-            (rows[1] != IDLE).any(), follow, lambda carry: carry, carry
-        ), None
+        _, code, _ = rows
+        moves = (code != IDLE).any()
+        return jax.lax.cond(moves, follow, lambda carry: carry, carry), None
 
     # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
     # mode keeps no more of a block than where it starts.
-    rows, L = h.shape
+    rows, L = tape.h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
-    h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
-    at_once = jnp.pad(at_once, fill).reshape(-1, _BLOCK, L)
-    code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
-    (t, q, _), _ = jax.lax.scan(
-        block, (lanes.t, lanes.q, lanes.chart), (h, code, at_once)
-    )
+    h = jnp.pad(tape.h, fill).reshape(-1, _BLOCK, L)
+    at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
+    code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    begin = lanes.t, lanes.q, lanes.chart
+    (t, q, _), _ = jax.lax.scan(block, begin, (h, code, at_once))
     return t, q
 
 
@@ -131,8 +124,8 @@ def _advance(
         # (The charts, which may hold traced values, are made here, and not within a branch.)
         method = flow.method
         crossing = jnp.where(here, which, -1)
-        # (A branch of its own, lest XLA masks the states again in every stage.)
 
+        # (A branch of its own, lest XLA masks the states again in every stage.)
         def step():
             end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
@@ -146,9 +139,9 @@ def _advance(
 
         if flow.rows:
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
-        return jnp.where(here, t1, t_out), q_out.at[:n].set(
-            jnp.where(here, q1, q_out[:n])
-        )
+        t_out = jnp.where(here, t1, t_out)
+        q_out = q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+        return t_out, q_out
 
     return for_each_chart(s, chart, moving, work, (t, q))
 
@@ -286,29 +279,29 @@ class Variation:
         M, n, m = self._by.shape
         P = tangents.shape[2]
         along = np.concatenate([tangents[:-1], np.tile(self._unit, (M, 1, 1))], axis=1)
-        change = np.moveaxis(along, 1, 2) @ self._change.reshape(
-            *along.shape[:2], n * m
-        )
+        by_direction = self._change.reshape(*along.shape[:2], n * m)
+        change = np.moveaxis(along, 1, 2) @ by_direction
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
         if sizes is not None:
-            f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(
-                M, P, n - 1
-            )
+            f = slopes(self._s, *self.points(tangents, np.arange(M)))
+            f = f.T.reshape(M, P, n - 1)
             flows = ~moves.at_once
             project = projections(f[flows], sizes[moves.chart[flows]][:, None])
             by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
-        lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
-        moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
-        return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(
-            -1, P, n, m
-        )
+        lane = np.repeat(moves.lane, P) * P + np.arange(M * P) % P
+        each = moves._replace(lane=lane, order=np.repeat(moves.order, P))
+        columns = _products(each, by.reshape(-1, n, m), len(self.first) * P)
+        return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
         """Times, charts, states and inputs where some moves start, in each direction."""
         n, P = tangents.shape[1:]
         aside = 1j * kernels.TINY * np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
-        t, chart, q, *_ = (np.repeat(x[..., move], P, axis=-1) for x in self._moves)
-        return t + aside[0], chart, q + aside[1:], self._s.pushed(np.arange(len(t)) % P)
+        t = np.repeat(self._moves.t[move], P)
+        chart = np.repeat(self._moves.chart[move], P)
+        q = np.repeat(self._moves.q[:, move], P, axis=-1)
+        inputs = self._s.pushed(np.arange(len(t)) % P)
+        return t + aside[0], chart, q + aside[1:], inputs
 
 
 def linear_moves(
@@ -317,13 +310,12 @@ def linear_moves(
     """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n = 1 + s.d
     M = len(moves.t)
-    end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
-    for a in np.unique(moves.chart):
-        in_chart = np.flatnonzero(moves.chart == a)
-        of_chart = Moves(*(x[..., in_chart] for x in moves))
-        end[in_chart], by[in_chart] = _linear(
-            s.at(of_chart.lane), int(a), of_chart, target
-        )
+    end = np.zeros((M, n), target.time.dtype)
+    by = np.zeros((M, n, n + s.nu), target.time.dtype)
+    for a in np.unique(moves.chart).tolist():
+        here = np.flatnonzero(moves.chart == a)
+        of_chart = Moves(*(x[..., here] for x in moves))
+        end[here], by[here] = _linear(s.at(of_chart.lane), a, of_chart, target)
     return end, by
 
 
@@ -384,14 +376,15 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     by_clock = np.isin(code, s.schedules(a))
     on_time = code == ARRIVE_TIME
     goal = target.time[moves.lane]
-    h = np.where(on_time, goal - moves.t, np.where(moves.at_once, 0.0, moves.h))
+    h = np.where(moves.at_once, 0.0, moves.h)
+    h = np.where(on_time, goal - moves.t, h)
+    t = np.where(on_time, goal, moves.t + h)
     expanded = _linear_step(s, a, moves.t, moves.q[:n], u, h)
     expanded = np.array(np.moveaxis(expanded, -1, 0))
     q = expanded[:, :, 0].T
     field = expanded[:, :, 1].T
     by_start = expanded[:, :, 2:-1]
     by_length = expanded[:, :, -1:]
-    t = np.where(on_time, goal, moves.t + h)
     # A step to a known time shrinks with t, and lasts until a schedule has come.
     longer = np.zeros((len(t), 1, by_start.shape[2]), by_start.dtype)
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
