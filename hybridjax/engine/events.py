@@ -168,11 +168,11 @@ def guard_noise(
         t = only(here, lanes.t)
         q = only(here, lanes.q[: s.dims[a]])
         first = xp.asarray(np.zeros(1, np.int32))
-        slopes = kernels.watched(s, a, None, t, q, only(here, u), first)[
-            :, 1 : 2 + len(q)
-        ]
-        by_size = xp.sum(xp.abs(slopes * xp.concatenate([t[None], q])), axis=1)
-        return put_rows(out, rows, here, ROUNDING * by_size)
+        watched = kernels.watched(s, a, None, t, q, only(here, u), first)
+        slopes = watched[:, 1 : 2 + len(q)]
+        terms = slopes * xp.concatenate([t[None], q])
+        size = xp.sum(xp.abs(terms), axis=1)
+        return put_rows(out, rows, here, ROUNDING * size)
 
     xp = namespace(lanes.t)
     nothing = xp.zeros((len(s.transitions), lanes.t.shape[0]))
@@ -240,21 +240,22 @@ def next_schedule(
     which = xp.full_like(chart, -1)
     first = xp.full_like(t, xp.inf)
     for g, transition in enumerate(s.transitions):
-        if isinstance(transition.guard, Scheduled):
-            offset, period = transition.guard.numbers(t)
-            k = xp.floor((t - offset) / period + SAME_TIME)
-            past = offset + k * period
-            later = offset + (k + 1) * period
-            now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
-            time = xp.where(now, xp.maximum(past, t), later)
-            time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
-            # (Of several that are due now, the one of an earlier period is first.)
-            rank = xp.where(now, k, xp.inf)
-            sooner = (time < best) | ((time == best) & (rank < first))
-            sooner = sooner & (chart == s.chart_index(transition.source))
-            best = xp.where(sooner, time, best)
-            which = xp.where(sooner, g, which)
-            first = xp.where(sooner, rank, first)
+        if not isinstance(transition.guard, Scheduled):
+            continue
+        offset, period = transition.guard.numbers(t)
+        k = xp.floor((t - offset) / period + SAME_TIME)
+        past = offset + k * period
+        later = offset + (k + 1) * period
+        now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
+        time = xp.where(now, xp.maximum(past, t), later)
+        time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
+        # (Of several that are due now, the one of an earlier period is first.)
+        rank = xp.where(now, k, xp.inf)
+        sooner = (time < best) | ((time == best) & (rank < first))
+        sooner = sooner & (chart == s.chart_index(transition.source))
+        best = xp.where(sooner, time, best)
+        which = xp.where(sooner, g, which)
+        first = xp.where(sooner, rank, first)
     return best, which
 
 
@@ -283,14 +284,12 @@ def keep_pace(
     # (Events at one time, which take each other's place, are apart by rounding.)
     since = xp.where(event & (since <= INSTANT * span), 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)
-    shrinks = (since < gap) | (
-        since == 0
-    )  # (not the first interval after events at one time)
+    # (Not the first interval after events at one time.)
+    shrinks = (since < gap) | (since == 0)
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
-    to_come = xp.where(
-        shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf
-    )
+    series = since * ratio / xp.where(shrinks, 1 - ratio, 1.0)
+    to_come = xp.where(shrinks, series, xp.inf)
     zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap = xp.where(event, since, gap)
