@@ -131,17 +131,21 @@ class ExperimentData(eqx.Module):
             require_axes(
                 "`cycle_outputs`", self.cycle_outputs, {"sections": N, "outputs": ny}
             )
-        for name, values in (("u", self.u), ("y", self.y)):
-            finite = np.isfinite(values)
-            if finite.all():  # (along the last, short axis it takes ten times as long)
-                continue
-            bad = ~finite.all(axis=2) & self.ok[:, None]
-            if bad.any():
-                s, i = (int(x) for x in np.argwhere(bad)[0])
-                raise DefinitionError(
-                    f"experiment {s}: {name} is not finite at sample {i}: repair the record, or "
-                    "mark the experiment as failed in `result`."
-                )
+        self._require_finite("u", self.u)
+        self._require_finite("y", self.y)
+
+    def _require_finite(self, name: str, values: np.ndarray) -> None:
+        """**Raises:** `DefinitionError` for NaN in an experiment whose `result` is OK."""
+        finite = np.isfinite(values)
+        if finite.all():  # (along the last, short axis it takes ten times as long)
+            return
+        bad = ~finite.all(axis=2) & self.ok[:, None]
+        if bad.any():
+            s, i = np.argwhere(bad)[0].tolist()
+            raise DefinitionError(
+                f"experiment {s}: {name} is not finite at sample {i}: repair the record, or mark "
+                "the experiment as failed in `result`."
+            )
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:

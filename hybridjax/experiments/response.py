@@ -119,10 +119,11 @@ def flow_batch(
     N = len(course.bound.time)
     S, n, _ = u.shape
     one_turn = len(sequence)
-    first = jax.tree_util.tree_map(lambda x: x[..., :1], course.lanes)
-    lanes = jax.tree_util.tree_map(
-        lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first
-    )
+
+    def many(x):
+        return jnp.broadcast_to(x[..., :1], (*x.shape[:-1], S))
+
+    lanes = jax.tree_util.tree_map(many, course.lanes)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
     @jax.checkpoint
@@ -146,17 +147,13 @@ def flow_batch(
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result).moved
         # An event may change places with a section, but none may be left out or come in addition.
-        wrong = (
-            jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn))
-            > 1
-        )
+        expected = course.lanes.events[j] + turns * one_turn
+        wrong = jnp.abs(moved.lanes.events - expected) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
         # Times and events are counted within one turn, so that every turn is computed alike.
-        lanes = eqx.tree_at(
-            lambda x: (x.t, x.events),
-            moved.lanes,
-            (moved.lanes.t - turns * period, moved.lanes.events - turns * one_turn),
-        )
+        t = moved.lanes.t - turns * period
+        events = moved.lanes.events - turns * one_turn
+        lanes = moved.lanes._replace(t=t, events=events)
         ok = result == Result.OK
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
         return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
@@ -168,9 +165,8 @@ def flow_batch(
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
-    end = jnp.where(
-        result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan
-    )
+    end = jnp.concatenate([lanes.t[None], lanes.q])
+    end = jnp.where(result == Result.OK, end, jnp.nan)
     answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
 

@@ -118,24 +118,29 @@ def multisine(
         experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
         experiment, line, channel, phase = _orthogonal(sets[0], j, np.array(phases))
-    size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
-    if size.dtype.kind not in "fiu":
-        raise DefinitionError(
-            f"`amplitude` must return real numbers, not {size.dtype}."
-        )
-    if size.shape not in ((), line.shape):
-        raise DefinitionError(
-            f"`amplitude` must return a number for each of {len(line)} frequencies, not an array "
-            f"of the shape {size.shape}."
-        )
-    cosines = (
-        experiment,
-        line,
-        channel,
-        np.full(line.shape, size, float),
-        phase % (2 * np.pi),
-    )
+    sizes = _amplitudes(amplitude, line / periods)
+    cosines = experiment, line, channel, sizes, phase % (2 * np.pi)
     return ordered(cosines, n_sections, periods, int(experiment.max()) + 1, names)
+
+
+def _amplitudes(
+    amplitude: float | Callable[[np.ndarray], np.ndarray], frequencies: np.ndarray
+) -> np.ndarray:
+    """Return the amplitude of each cosine.
+
+    **Raises:** `DefinitionError` if the function returns something else than real numbers.
+    """
+    sizes = np.asarray(amplitude(frequencies) if callable(amplitude) else amplitude)
+    if sizes.dtype.kind not in "fiu":
+        raise DefinitionError(
+            f"`amplitude` must return real numbers, not {sizes.dtype}."
+        )
+    if sizes.shape not in ((), frequencies.shape):
+        raise DefinitionError(
+            f"`amplitude` must return a number for each of {len(frequencies)} frequencies, not an "
+            f"array of the shape {sizes.shape}."
+        )
+    return np.full(frequencies.shape, sizes, float)
 
 
 def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> int:
