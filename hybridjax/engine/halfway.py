@@ -74,12 +74,15 @@ def _weights(
         trees.extend(_trees(size))
     sums = np.array([_sums(tree, a) for tree in trees])[:, usable]
     sizes = np.array([_size(tree) for tree in trees])
-    state = 0.5**sizes / np.array([_density(tree) for tree in trees])
-    wanted = np.stack([state, sizes * state / 0.5], axis=1)
-    first = np.where(sizes < order, _FIRST, 1.0)[:, None]
-    weights = np.linalg.lstsq(first * sums, first * wanted, rcond=1e-12)[0]
+    densities = np.array([_density(tree) for tree in trees])
+    state = 0.5**sizes / densities
+    rate = sizes * state / 0.5
+    wanted = np.stack([state, rate], axis=1)
+    is_lower = sizes < order
+    first = np.where(is_lower, _FIRST, 1.0)[:, None]
+    weights, *_ = np.linalg.lstsq(first * sums, first * wanted, rcond=1e-12)
     violated = np.abs(sums @ weights - wanted).max(axis=1)
-    if np.any(violated > np.where(sizes < order, _ROUNDING, _VIOLATED)):
+    if np.any(violated > np.where(is_lower, _ROUNDING, _VIOLATED)):
         return None
     if np.abs(weights[:, 0]).max() > _LARGEST:
         return None

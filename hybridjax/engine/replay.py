@@ -278,7 +278,8 @@ class Variation:
         moves = self._moves
         M, n, m = self._by.shape
         P = tangents.shape[2]
-        along = np.concatenate([tangents[:-1], np.tile(self._unit, (M, 1, 1))], axis=1)
+        unit = np.tile(self._unit, (M, 1, 1))
+        along = np.concatenate([tangents[:-1], unit], axis=1)
         by_direction = self._change.reshape(*along.shape[:2], n * m)
         change = np.moveaxis(along, 1, 2) @ by_direction
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)

@@ -296,22 +296,24 @@ def recorded(
     under another one in each piece (nu, pieces)."""
     rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
     for tape in tapes:
-        tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
-        columns = tape.t, tape.before, tape.after, tape.chart, tape.code
-        rows.append(tuple(x[tape.code != IDLE] for x in columns))
-    t, before, after, chart, event = (
-        np.concatenate(x) for x in zip(*rows, strict=True)
-    )
+        lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
+        columns = lane.t, lane.before, lane.after, lane.chart, lane.code
+        rows.append(tuple(x[lane.code != IDLE] for x in columns))
+    joined = [np.concatenate(x) for x in zip(*rows, strict=True)]
+    t, before, after, chart, event = joined
     source = np.append(chart[:1], chart[:-1])
-    until = u
+    u_before = u
+    u_after = u
     if u.shape[1] > 1:
-        u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
-        until = np.hstack([u[:, :1], u])
-        u = np.hstack([u, u[:, -1:]])
+        of_step = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        u_before = np.hstack([of_step[:, :1], of_step])
+        u_after = np.hstack([of_step, of_step[:, -1:]])
     with at_ease():
-        left = slopes(s, t, source, before.T, until).T
-        right = slopes(s, t, chart, after.T, u).T
-    return Trajectory(s, t, chart, before, after, left, right, event, result)
+        slope_before = slopes(s, t, source, before.T, u_before).T
+        slope_after = slopes(s, t, chart, after.T, u_after).T
+    return Trajectory(
+        s, t, chart, before, after, slope_before, slope_after, event, result
+    )
 
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:

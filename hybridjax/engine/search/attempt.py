@@ -141,8 +141,8 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
         t = only(here, lanes.t)
         q = only(here, lanes.q[:n])
         tau = xp.where(here, aim.step, 0.0)
-        before = None if out.along is None else only(here, out.along[:n])
-        step, along, change = _step(flow, present, t, q, tau, before, task)
+        old_along = None if out.along is None else only(here, out.along[:n])
+        step, along, change = _step(flow, present, t, q, tau, old_along, task)
         allowed, error = _errors(flow, t, q, tau, step, change, along, task)
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
@@ -160,17 +160,18 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
                 lambda: plain,
             )
             moved = tau + xp.where(end.lands, end.past, 0.0)
-            after = cond(
-                present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
-            )
+
+            def watch_end():
+                return flow.watch(t + moved, end.q, end.f)
+
+            after = cond(present, watch_end, lambda: before)
             margin = _margin(flow, before, after, end, t, moved, task.span)
             bent = _bent(before, after, margin)
             chosen = (np.array(rows)[:, None] == which) & end.lands
             # (Where events coincide, the step to the second is rounding, and tells no speed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
-            far, slow = _clearance(
-                before, after, margin, moved, take_rows(state.ready, rows), judged
-            )
+            ready = take_rows(state.ready, rows)
+            far, slow = _clearance(before, after, margin, moved, ready, judged)
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),

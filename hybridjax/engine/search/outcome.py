@@ -121,16 +121,16 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         )
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
-        after,
-        watched,
-        aimed,
-        _approach(state, new, verdict, moved),
-        h,
-        along,
-        state.error + xp.where(accepted, new.error, 0.0),
-        result,
-        state.arrived | arrived,
-        state.i + 1,
+        lanes=after,
+        watched=watched,
+        aimed=aimed,
+        approach=_approach(state, new, verdict, moved),
+        h=h,
+        along=along,
+        error=state.error + xp.where(accepted, new.error, 0.0),
+        result=result,
+        arrived=state.arrived | arrived,
+        i=state.i + 1,
     )
     code = xp.where(accepted, MOVE, IDLE)
     code = xp.where(on_time, ARRIVE_TIME, code)
@@ -266,12 +266,12 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
     fastest = xp.maximum(rate_before, rate_after)
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
     return Approach(
-        crosses | verdict.closer,
-        xp.where(crosses, which, approach.which),
-        xp.where(crosses, verdict.position * moved, tau),
-        xp.where(crosses, moved, approach.reach),
-        xp.where(crosses, fastest, approach.rate),
-        xp.where(crosses, 0, approach.tries + 1),
+        on=crosses | verdict.closer,
+        which=xp.where(crosses, which, approach.which),
+        tau=xp.where(crosses, verdict.position * moved, tau),
+        reach=xp.where(crosses, moved, approach.reach),
+        rate=xp.where(crosses, fastest, approach.rate),
+        tries=xp.where(crosses, 0, approach.tries + 1),
     )
 
 

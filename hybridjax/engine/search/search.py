@@ -81,32 +81,31 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     xp = namespace(lanes.t)
     L = lanes.t.shape[0]
     u = task.u
-    finite = (
-        xp.isfinite(lanes.t)
-        & xp.isfinite(lanes.q).all(axis=0)
-        & xp.isfinite(u).all(axis=0)
-    )
+    finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0)
+    finite = finite & xp.isfinite(u).all(axis=0)
     result = update_result(result, ~finite, Result.BAD_INPUT)
-    watched = watch(
-        s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
-    )
-    implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows = implicit and task.tangents
-    along = task.stride.along
+    runs = result == Result.OK
+    watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, runs)
     none = xp.zeros(L, xp.int32)
     zero = xp.zeros(L)
     no = xp.zeros(L, bool)
+    armed = arm(s, lanes, watched, task.span) if new_input else lanes
+    counts = level_counts(watched, task.span)
+    along = task.stride.along
+    implicit = any(s.method(a).implicit for a in range(len(s.charts)))
+    if along is None and implicit and task.tangents:
+        along = deviation(s, lanes, task.settings)
     return State(
-        arm(s, lanes, watched, task.span) if new_input else lanes,
-        watched,
-        level_counts(watched, task.span),
-        Approach(no, none, zero, zero, zero, none),
-        task.stride.h,
-        deviation(s, lanes, task.settings) if follows and along is None else along,
-        zero,
-        result,
-        no,
-        xp.zeros((), xp.int32),
+        lanes=armed,
+        watched=watched,
+        aimed=counts,
+        approach=Approach(no, none, zero, zero, zero, none),
+        h=task.stride.h,
+        along=along,
+        error=zero,
+        result=result,
+        arrived=no,
+        i=xp.zeros((), xp.int32),
     )
 
 
@@ -140,11 +139,9 @@ def take_aim(state: State, task: Task) -> Aim:
     guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))
     level = np.arange(len(value))[:, None] == len(s.transitions)
     new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
-    within = guess <= xp.where(level, 1.0, _AIM_WITHIN) * step
-    expected = (
-        state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
-    )
-    expected = expected & ~at_once
+    within = (guess > 0) & (guess <= xp.where(level, 1.0, _AIM_WITHIN) * step)
+    known = ~approach.on & (lead > 0) & ~at_once
+    expected = state.ready & within & (level | new) & known
     guess = xp.where(expected, guess, xp.inf)
     nearest = xp.min(guess, axis=0)
     lands = xp.isfinite(nearest)
@@ -153,7 +150,15 @@ def take_aim(state: State, task: Task) -> Aim:
     last = last & ~lands & state.active
     step = xp.where(state.active, xp.where(approach.on, approach.tau, step), 0.0)
     reach = xp.where(approach.on, approach.reach, step)
-    return Aim(which, step, reach, due, xp.where(last, schedule, -1), last, at_once)
+    return Aim(
+        which=which,
+        step=step,
+        reach=reach,
+        due=due,
+        schedule=xp.where(last, schedule, -1),
+        last=last,
+        at_once=at_once,
+    )
 
 
 def initial_step(
