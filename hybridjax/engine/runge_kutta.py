@@ -273,7 +273,7 @@ def _increments(method, field, t, q, h):
     def correction(w):
         stages = q + _contract(method.a, w)
         residual = h * evaluate(t + c * h, stages) - w
-        solved: list[Any] = []
+        solved = []
         for i, r in enumerate(_contract(right, residual)):
             # (R is lower triangular: row i needs the rows before, which are solved.)
             known = [g * x for g, x in zip(R[i], solved, strict=False) if g != 0]
