@@ -54,8 +54,10 @@ def first_crossing(
     A guard that is not armed at the start counts only after it has become positive. Halfway it may
     be as far from the cubic as the `margin`.
     """
-    xp, rise = namespace(v1), v1 - v0
-    b, c = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
+    xp = namespace(v1)
+    rise = v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
 
     def cubic(s):
         return v0 + s * (d0 + s * (b + s * c))
@@ -68,9 +70,12 @@ def first_crossing(
     pivot = -(b + xp.where(b < 0, -1.0, 1.0) * xp.sqrt(xp.maximum(disc, 0.0)))
     r1 = _divide(pivot, 3 * c)
     r2 = _divide(d0, pivot)
-    r1, r2 = (xp.where((disc > 0) & (r > 0) & (r < 1), r, 1.0) for r in (r1, r2))
-    sa, sb = xp.minimum(r1, r2), xp.maximum(r1, r2)
-    va, vb = xp.where(sa < 1, cubic(sa), v1), xp.where(sb < 1, cubic(sb), v1)
+    r1 = xp.where((disc > 0) & (r1 > 0) & (r1 < 1), r1, 1.0)
+    r2 = xp.where((disc > 0) & (r2 > 0) & (r2 < 1), r2, 1.0)
+    sa = xp.minimum(r1, r2)
+    sb = xp.maximum(r1, r2)
+    va = xp.where(sa < 1, cubic(sa), v1)
+    vb = xp.where(sb < 1, cubic(sb), v1)
 
     first = armed & (va <= 0)
     second = (va > 0) & (vb <= 0) & (sb > sa)
@@ -82,14 +87,16 @@ def first_crossing(
     s = 0.5 * (lo + hi)
     for _ in range(10):  # Newton's steps within a bracket that shrinks, to rounding
         value = cubic(s)
-        lo, hi = xp.where(value > 0, s, lo), xp.where(value > 0, hi, s)
+        lo = xp.where(value > 0, s, lo)
+        hi = xp.where(value > 0, hi, s)
         guess = s - _divide(value, slope(s))
         s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
 
     position = xp.where(crosses, s, xp.inf)
     scale = xp.maximum(xp.abs(v0), xp.abs(v1))
     small = TOUCH * scale
-    touch = near = xp.zeros_like(armed)
+    touch = xp.zeros_like(armed)
+    near = xp.zeros_like(armed)
     for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
         dips = before & (node < 1) & (b + 3 * c * node > 0)
         sure = _beside(node, margin) <= small
@@ -110,8 +117,10 @@ def _beside(s, margin):
 
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
-    xp, rise = namespace(v1), v1 - v0
-    b, c = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
+    xp = namespace(v1)
+    rise = v1 - v0
+    b = 3 * rise - 2 * d0 - d1
+    c = d0 + d1 - 2 * rise
     s = xp.ones_like(v1)
     for _ in range(4):
         s = s - _divide(v0 + s * (d0 + s * (b + s * c)), d0 + s * (2 * b + s * 3 * c))
@@ -141,7 +150,8 @@ def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
     """Bounds of a function over a step that is as far from its cubic interpolant as the margin: the
     Bernstein coefficients of the quartics that are so far from it halfway."""
     xp = namespace(v1)
-    first, last = v0 + d0 / 4, v1 - d1 / 4
+    first = v0 + d0 / 4
+    last = v1 - d1 / 4
     middle = 0.5 * (v0 + v1) + (d0 - d1) / 6
     beside = 8 / 3 * margin
     low = xp.minimum(xp.minimum(v0, first), xp.minimum(last, v1))

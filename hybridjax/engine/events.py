@@ -27,7 +27,8 @@ INSTANT = 1e-12
 # Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
 # intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
 # lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
-_ZENO_STREAK, _ZENO_REST = 10, 1e-3
+_ZENO_STREAK = 10
+_ZENO_REST = 1e-3
 # A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno, too.
 # Higher: it is called grazing instead. Lower: a grazing is called Zeno.
 _ZENO_SLOW = 3
@@ -71,10 +72,8 @@ def await_schedules(
     xp = namespace(t)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
-            due, (_, period) = (
-                transition.guard.nearest(before),
-                transition.guard.numbers(t),
-            )
+            due = transition.guard.nearest(before)
+            _, period = transition.guard.numbers(t)
             away = xp.maximum(xp.abs(due - before), xp.abs(due - t))
             armed = put(armed, g, armed[g] | (away > SAME_TIME * period))
     return armed
@@ -123,11 +122,14 @@ def rearm(
     A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
     that the reset has led across it, or if it falls, and the old chart does not have it.
     """
-    xp, value, rate = namespace(fired), watched.value[:-1], watched.rate[:-1]
+    xp = namespace(fired)
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
     other = np.arange(len(s.transitions))[:, None] != fired
     zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
-    falls, late = rate < 0, overdue(watched, span) & (value < -zero)
+    falls = rate < 0
+    late = overdue(watched, span) & (value < -zero)
     at_zero = xp.abs(value) <= zero
     due = together & other & at_zero & falls
     put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
@@ -140,7 +142,8 @@ def rearm(
 def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
     """Scheduled events that are over after the transitions `fired` at t: those of the same clock,
     and of clocks of the same period, those that belong to an earlier period."""
-    xp, G = namespace(t), len(s.transitions)
+    xp = namespace(t)
+    G = len(s.transitions)
     over = xp.zeros((G, t.shape[0]), bool)
     clocks = [g for g in range(G) if s.clocks[g] >= 0]
     for g, h in itertools.product(clocks, clocks):
@@ -162,13 +165,14 @@ def guard_noise(
         if not rows:
             return out
 
-        t, q = only(here, lanes.t), only(here, lanes.q[: s.dims[a]])
+        t = only(here, lanes.t)
+        q = only(here, lanes.q[: s.dims[a]])
         first = xp.asarray(np.zeros(1, np.int32))
-        slopes = kernels.watched(s, a, None, t, q, only(here, u), first)[
-            :, 1 : 2 + len(q)
-        ]
-        by_size = xp.sum(xp.abs(slopes * xp.concatenate([t[None], q])), axis=1)
-        return put_rows(out, rows, here, ROUNDING * by_size)
+        watched = kernels.watched(s, a, None, t, q, only(here, u), first)
+        slopes = watched[:, 1 : 2 + len(q)]
+        terms = slopes * xp.concatenate([t[None], q])
+        size = xp.sum(xp.abs(terms), axis=1)
+        return put_rows(out, rows, here, ROUNDING * size)
 
     xp = namespace(lanes.t)
     nothing = xp.zeros((len(s.transitions), lanes.t.shape[0]))
@@ -187,7 +191,8 @@ def apply_resets(
 
         def work(carry, kind=kind, n=n, b=b, here=chosen, place=place):
             q, chart = carry
-            xp, point = namespace(q), (only(here, t), only(here, q[:n]), only(here, u))
+            xp = namespace(q)
+            point = (only(here, t), only(here, q[:n]), only(here, u))
             system, point = needed(here, (s, point))
             new = kernels.reset(system, Member(kind, place), *point, some=here)[:, 0]
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
@@ -231,29 +236,34 @@ def next_schedule(
     (it has not happened at t), and one that is due at `end` happens at `end`.
     """
     xp = namespace(t)
-    best, which = xp.full_like(t, xp.inf), xp.full_like(chart, -1)
+    best = xp.full_like(t, xp.inf)
+    which = xp.full_like(chart, -1)
     first = xp.full_like(t, xp.inf)
     for g, transition in enumerate(s.transitions):
-        if isinstance(transition.guard, Scheduled):
-            offset, period = transition.guard.numbers(t)
-            k = xp.floor((t - offset) / period + SAME_TIME)
-            past, later = offset + k * period, offset + (k + 1) * period
-            now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
-            time = xp.where(now, xp.maximum(past, t), later)
-            time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
-            # (Of several that are due now, the one of an earlier period is first.)
-            rank = xp.where(now, k, xp.inf)
-            sooner = (time < best) | ((time == best) & (rank < first))
-            sooner = sooner & (chart == s.chart_index(transition.source))
-            best, which = xp.where(sooner, time, best), xp.where(sooner, g, which)
-            first = xp.where(sooner, rank, first)
+        if not isinstance(transition.guard, Scheduled):
+            continue
+        offset, period = transition.guard.numbers(t)
+        k = xp.floor((t - offset) / period + SAME_TIME)
+        past = offset + k * period
+        later = offset + (k + 1) * period
+        now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
+        time = xp.where(now, xp.maximum(past, t), later)
+        time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
+        # (Of several that are due now, the one of an earlier period is first.)
+        rank = xp.where(now, k, xp.inf)
+        sooner = (time < best) | ((time == best) & (rank < first))
+        sooner = sooner & (chart == s.chart_index(transition.source))
+        best = xp.where(sooner, time, best)
+        which = xp.where(sooner, g, which)
+        first = xp.where(sooner, rank, first)
     return best, which
 
 
 def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
     """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
     its period and offset; t itself for other events."""
-    xp, time = namespace(t), t
+    xp = namespace(t)
+    time = t
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
             time = xp.where(fired == g, transition.guard.nearest(t), time)
@@ -268,20 +278,20 @@ def keep_pace(
 
     `slow` marks events whose guard is crossed at a vanishing speed.
     """
-    xp, (since, gap, streak, total) = namespace(pace), pace
+    xp = namespace(pace)
+    since, gap, streak, total = pace
     since = since + moved
     # (Events at one time, which take each other's place, are apart by rounding.)
     since = xp.where(event & (since <= INSTANT * span), 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)
-    shrinks = (since < gap) | (
-        since == 0
-    )  # (not the first interval after events at one time)
+    # (Not the first interval after events at one time.)
+    shrinks = (since < gap) | (since == 0)
     streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
-    to_come = xp.where(
-        shrinks, since * ratio / xp.where(shrinks, 1 - ratio, 1.0), xp.inf
-    )
+    series = since * ratio / xp.where(shrinks, 1 - ratio, 1.0)
+    to_come = xp.where(shrinks, series, xp.inf)
     zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
-    gap, since = xp.where(event, since, gap), xp.where(event, 0.0, since)
+    gap = xp.where(event, since, gap)
+    since = xp.where(event, 0.0, since)
     return xp.stack([since, gap, streak, total]), zeno

@@ -51,7 +51,8 @@ class Halfway(NamedTuple):
 def halfway(method: Method) -> Halfway | None:
     """The weights of a method; `None` if it has no order of 3, and is no more accurate than the
     cubic."""
-    a, every = np.array(method.a), np.ones(len(method.b), bool)
+    a = np.array(method.a)
+    every = np.ones(len(method.b), bool)
     if method.implicit:
         # (An explicit stage of a stiff chart may be large where a fast mode has been excited.)
         every = np.diag(a) != 0
@@ -68,15 +69,20 @@ def _weights(
     a: Float[np.ndarray, "s s"], usable: Bool[np.ndarray, " s"], order: int
 ) -> Float[np.ndarray, "2 s"] | None:
     """The smallest weights of usable stages for an order; `None` if there are none."""
-    trees = [tree for k in range(1, order + 1) for tree in _trees(k)]
+    trees: list[Tree] = []
+    for size in range(1, order + 1):
+        trees.extend(_trees(size))
     sums = np.array([_sums(tree, a) for tree in trees])[:, usable]
     sizes = np.array([_size(tree) for tree in trees])
-    state = 0.5**sizes / np.array([_density(tree) for tree in trees])
-    wanted = np.stack([state, sizes * state / 0.5], axis=1)
-    first = np.where(sizes < order, _FIRST, 1.0)[:, None]
-    weights = np.linalg.lstsq(first * sums, first * wanted, rcond=1e-12)[0]
+    densities = np.array([_density(tree) for tree in trees])
+    state = 0.5**sizes / densities
+    rate = sizes * state / 0.5
+    wanted = np.stack([state, rate], axis=1)
+    is_lower = sizes < order
+    first = np.where(is_lower, _FIRST, 1.0)[:, None]
+    weights, *_ = np.linalg.lstsq(first * sums, first * wanted, rcond=1e-12)
     violated = np.abs(sums @ weights - wanted).max(axis=1)
-    if np.any(violated > np.where(sizes < order, _ROUNDING, _VIOLATED)):
+    if np.any(violated > np.where(is_lower, _ROUNDING, _VIOLATED)):
         return None
     if np.abs(weights[:, 0]).max() > _LARGEST:
         return None
@@ -95,12 +101,11 @@ def _forests(size: int) -> list[Tree]:
     """Rooted trees that have so many nodes together, in any order."""
     if size == 0:
         return [()]
-    return [
-        (tree, *others)
-        for first in range(1, size + 1)
-        for tree in _trees(first)
-        for others in _forests(size - first)
-    ]
+    found: list[Tree] = []
+    for first in range(1, size + 1):
+        for tree, others in product(_trees(first), _forests(size - first)):
+            found.append((tree, *others))
+    return found
 
 
 def _size(tree: Tree) -> int:

@@ -58,9 +58,8 @@ def step(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None
 ) -> Step:
     """A step in chart a, without derivatives."""
-    return Step(
-        *s.kernel(_field, _ByMethod(_step, s.method(a)), a)(t, q, u, h, some=some)
-    )
+    of_lanes = s.kernel(_field, _ByMethod(_step, s.method(a)), a)
+    return Step(*of_lanes(t, q, u, h, some=some))
 
 
 def step_along(
@@ -74,10 +73,8 @@ def step_along(
     some: Some,
 ) -> tuple[Step, States, States]:
     """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
-    rows = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)(
-        t, q, u, h, along, some=some
-    )
-    *step, end, estimate = rows
+    of_lanes = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)
+    *step, end, estimate = of_lanes(t, q, u, h, along, some=some)
     return Step(*step), end, estimate
 
 
@@ -86,9 +83,8 @@ def linear_step(
 ) -> Expanded:
     """The end of a step in chart a, the field there, and the derivatives of the end by time,
     states, inputs and length of the step."""
-    return s.kernel(_field, _ByMethod(_linear_step, s.method(a)), a, lanes=POINTS)(
-        t, q, u, h
-    )
+    form = _ByMethod(_linear_step, s.method(a))
+    return s.kernel(_field, form, a, lanes=POINTS)(t, q, u, h)
 
 
 def watched(
@@ -105,11 +101,11 @@ def watched(
     """The guards of chart a, and the level if it has one, with their derivatives."""
     static = a, s.guard_kinds(a)
     if not on_host(q):
-        return s.by_lane(_columns(ft.partial(watched_at, *static)), levels)(
-            t, q, u, index
-        )
-    # (A program for many points is worth its compilation from so many calls on.)
-    lanes = lanes or (1 if q.shape[-1] < 4 * POINTS else POINTS)
+        of_point = _columns(ft.partial(watched_at, *static))
+        return s.by_lane(of_point, levels)(t, q, u, index)
+    if lanes is None:
+        # (A program for many points is worth its compilation from so many calls on.)
+        lanes = 1 if q.shape[-1] < 4 * POINTS else POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
 
@@ -141,9 +137,10 @@ def by_parameter_of_period(s: Structure) -> Any:
     """The derivative of the period of a clock by the only input, which is added to a parameter."""
     if is_traced(s):
         return jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))(jnp.zeros(1))[0, 0]
-    return s.kernel(_period, _expanded)(*(np.zeros(x) for x in [1, (0, 1), (1, 1)]))[
-        0, -1, 0
-    ]
+    t = np.zeros(1)
+    no_state = np.zeros((0, 1))
+    u = np.zeros((1, 1))
+    return s.kernel(_period, _expanded)(t, no_state, u)[0, -1, 0]
 
 
 def outputs(
@@ -164,9 +161,8 @@ def linear(
 ) -> Expanded:
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
-        return s.by_lane(_columns(ft.partial(function, a), 1 + len(trees)), *trees)(
-            t, q, u
-        )
+        of_point = _columns(ft.partial(function, a), 1 + len(trees))
+        return s.by_lane(of_point, *trees)(t, q, u)
     lanes = POINTS if q.shape[-1] < 16 * POINTS else 4 * POINTS
     return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
 
@@ -175,9 +171,9 @@ def levels(
     s: Structure, a: int, levels: AbstractLevels, n_sections: int, t: Times, q: States
 ) -> Float[Array, "N 2 L"]:
     """The levels of all sections in chart a, and their rates along the flow."""
-    return s.kernel(_levels, by_lane, a, n_sections, trees=(levels,), lanes=POINTS)(
-        t, q
-    )
+    static = a, n_sections
+    rows = s.kernel(_levels, by_lane, *static, trees=(levels,), lanes=POINTS)
+    return rows(t, q)
 
 
 # Functions of a point, by what is static, the structure, and other trees. (They belong to the
@@ -219,9 +215,8 @@ def _period(s: Structure, t, q, u):
 
 def _outputs(a: int, s: Structure, items: Items, t, q, u):
     under = s.under(u)
-    return under.resolve_outputs(items)(
-        a, t, q, u if under is s else jnp.zeros(under.nu)
-    )
+    inputs = u if under is s else jnp.zeros(under.nu)
+    return under.resolve_outputs(items)(a, t, q, inputs)
 
 
 def _due(g: int, s: Structure, t, q, u):
@@ -234,9 +229,10 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
     f = s.field(a, t, q, jnp.zeros(s.nu))
 
     def along(i):
-        return jax.jvp(
-            lambda t, q: levels.level(s, a, i, t, q), (t, q), (jnp.ones_like(t), f)
-        )
+        def level(t, q):
+            return levels.level(s, a, i, t, q)
+
+        return jax.jvp(level, (t, q), (jnp.ones_like(t), f))
 
     return jnp.stack(jax.vmap(along)(jnp.arange(n_sections, dtype=np.int32)), axis=1)
 
@@ -253,11 +249,20 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
     """A vector function of some trees and (t, q, u), and its derivatives, as columns."""
 
     def expand(*x):
-        bound, (t, q, u, *further) = x[:trees], x[trees:]
-        n, m = q.shape[0], 1 + q.shape[0] + u.shape[0]
-        at = lambda t, q, u: function(*bound, t, q, u, *further)  # noqa: E731
-        split = lambda x: (x[0], x[1 : 1 + n], x[1 + n :])  # noqa: E731
-        push = lambda dx: jax.jvp(at, (t, q, u), split(dx))  # noqa: E731
+        bound = x[:trees]
+        t, q, u, *further = x[trees:]
+        n = q.shape[0]
+        m = 1 + q.shape[0] + u.shape[0]
+
+        def at(t, q, u):
+            return function(*bound, t, q, u, *further)
+
+        def split(x):
+            return (x[0], x[1 : 1 + n], x[1 + n :])
+
+        def push(dx):
+            return jax.jvp(at, (t, q, u), split(dx))
+
         value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
         return jnp.concatenate([value[:, None], columns], axis=1)
 
@@ -276,8 +281,11 @@ class Tangents(Structure):
         self, s: Structure, along: Structure, levels, by_levels, directions: int
     ):
         super().__init__(s.source)
-        self.directions, self._levels, self._plain = directions, levels, s
-        self._along, self.nu = from_host((along, by_levels)), s.nu
+        self.directions = directions
+        self._levels = levels
+        self._plain = s
+        self._along = from_host((along, by_levels))
+        self.nu = s.nu
         leaves = map(np.asarray, jax.tree_util.tree_leaves((along, by_levels)))
         self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
@@ -290,9 +298,12 @@ class Tangents(Structure):
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
 
         def make():
-            still = lambda tree: jax.tree_util.tree_map(lambda _: None, tree)  # noqa: E731
+            def still(tree):
+                return jax.tree_util.tree_map(lambda _: None, tree)
+
             along = [self._along[1] if x is self._levels else still(x) for x in trees]
-            every, along = (self._plain, *trees), (self._along[0], *along)
+            every = (self._plain, *trees)
+            along = (self._along[0], *along)
             return kernel(
                 function, _Tangent(form, moving), static, (every, along), WIDE
             )
@@ -301,7 +312,8 @@ class Tangents(Structure):
 
         def call(*point, some=None):
             tangents = [point[k].imag / TINY for k in moving]
-            (u, x), further = np.split(point[2], [self.nu]), [y.real for y in point[3:]]
+            u, x = np.split(point[2], [self.nu])
+            further = [y.real for y in point[3:]]
             both = of_lanes(point[0].real, point[1].real, u, *further, *tangents, x)
             return both[0] + 1j * TINY * both[1]
 
@@ -315,24 +327,29 @@ class Systems(Structure):
 
     def __init__(self, source: PerLane):
         super().__init__(source)
-        first = lambda x: np.asarray(x)[..., 0] if eqx.is_array(x) else x  # noqa: E731
-        arrays = map(
-            np.asarray, jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array))
-        )
+
+        def first(x):
+            return np.asarray(x)[..., 0] if eqx.is_array(x) else x
+
+        leaves = jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array))
+        arrays = [np.asarray(x) for x in leaves]
         self._numbers = np.concatenate([x.reshape(-1, x.shape[-1]) for x in arrays])
         self._single = Structure(from_host(jax.tree_util.tree_map(first, source.tree)))
 
     def at(self, lane):
         other = copy.copy(self)
-        other._made, other._numbers = {}, self._numbers[:, lane]
+        other._made = {}
+        other._numbers = self._numbers[:, lane]
         return other
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
         every = self._single, *trees
-        make = lambda: kernel(function, _BySystem(form), static, every, WIDE)  # noqa: E731
-        return ft.partial(
-            self.once((function, form, static), trees, make), self._numbers
-        )
+
+        def make():
+            return kernel(function, _BySystem(form), static, every, WIDE)
+
+        of_lanes = self.once((function, form, static), trees, make)
+        return ft.partial(of_lanes, self._numbers)
 
 
 class _BySystem(NamedTuple):
@@ -348,12 +365,9 @@ class _BySystem(NamedTuple):
         def lanes(numbers, *point):
             parts = zip(leaves, jnp.split(numbers, ends), strict=True)
             arrays = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
-            systems = eqx.combine(
-                jax.tree_util.tree_unflatten(structure, arrays), static
-            )
-            return self.form(function, PerLane(systems, (True,) * len(arrays)), *trees)(
-                *point
-            )
+            numbers = jax.tree_util.tree_unflatten(structure, arrays)
+            systems = PerLane(eqx.combine(numbers, static), (True,) * len(arrays))
+            return self.form(function, systems, *trees)(*point)
 
         return lanes
 
@@ -372,10 +386,12 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
 
 def parted(tree: Any) -> tuple[Any, Any]:
     """Complex arrays (N, P, ...) as values (N, ...) and derivatives (P, N, ...)."""
-    by = lambda x: np.swapaxes(x.imag, 0, 1) / TINY  # noqa: E731
-    return jax.tree_util.tree_map(lambda x: x.real[:, 0], tree), jax.tree_util.tree_map(
-        by, tree
+
+    values = jax.tree_util.tree_map(lambda x: x.real[:, 0], tree)
+    derivatives = jax.tree_util.tree_map(
+        lambda x: np.swapaxes(x.imag, 0, 1) / TINY, tree
     )
+    return values, derivatives
 
 
 class _Tangent(NamedTuple):
@@ -387,7 +403,10 @@ class _Tangent(NamedTuple):
     def __call__(self, function: Callable, trees: tuple, along: tuple) -> Callable:
         def moved(trees, along, *point):
             *point, x = point
-            step = lambda y, dy: y if dy is None else y + jnp.tensordot(x, dy, 1)  # noqa: E731
+
+            def step(y, dy):
+                return y if dy is None else y + jnp.tensordot(x, dy, 1)
+
             return function(*jax.tree_util.tree_map(step, trees, along), *point)
 
         lanes = self.form(moved, trees, along)
@@ -414,21 +433,22 @@ class _ByMethod(NamedTuple):
 
     def __call__(self, function: Callable, *trees: Any) -> Callable:
         field = by_lane(function, *trees, quick=True)
-        return lambda t, q, u, h, *others: self.compute(
-            self.method, field, t, q, u, h, *others
-        )
+        return ft.partial(self.compute, self.method, field)
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
-    at = lambda t, q: field(t, q, u, h, *x)  # noqa: E731
+    def at(t, q):
+        return field(t, q, u, h, *x)
+
     # (With directions x it is differentiated.)
     return jnp.stack(take_step(method, at, t, q, h, still=at if x else None))
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
-    step, *tangent = _along(
-        method, lambda t, q: field(t, q, u, h, along), t, q, h, along
-    )
+    def at(t, q):
+        return field(t, q, u, h, along)
+
+    step, *tangent = _along(method, at, t, q, h, along)
     return jnp.stack([*step, *tangent])
 
 
@@ -438,10 +458,14 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
 
     def end(t, q, u, h):
         fixed = jax.lax.stop_gradient((u, h))
-        still = lambda t, q: field(t, q, *fixed, *x)  # noqa: E731
-        step = take_step(
-            method, lambda t, q: field(t, q, u, h, *x), t, q, h, still=still
-        )
+
+        def at(t, q):
+            return field(t, q, u, h, *x)
+
+        def still(t, q):
+            return field(t, q, *fixed, *x)
+
+        step = take_step(method, at, t, q, h, still=still)
         return step.q, step.f1
 
     n, L = q.shape

@@ -35,7 +35,8 @@ class Lanes(NamedTuple):
 def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     """Lanes before their first step. No guard is armed yet: the search does that."""
     # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
-    zero, armed = chart * 0, np.zeros((len(s.transitions), t.shape[0]), bool)
+    zero = chart * 0
+    armed = np.zeros((len(s.transitions), t.shape[0]), bool)
     pace = np.array([[0.0], [np.inf], [0.0], [0.0]]) + zero
     return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace)
 
@@ -45,7 +46,8 @@ def lane_at(s: Structure, chart: str, state: Array, t: ArrayLike, name: str) -> 
 
     **Raises:** `DefinitionError` for another number of states.
     """
-    a, q = s.chart_index(chart), np.asarray(state)
+    a = s.chart_index(chart)
+    q = np.asarray(state)
     if q.shape != (s.dims[a],):
         raise DefinitionError(
             f"{name} must give values for the {s.dims[a]} states {', '.join(s.charts[a].states)} "
@@ -112,8 +114,13 @@ def needed(mask: Mask, tree):
 
 def side_by_side(tree):
     """An axis of pieces of the flow of lanes, joined with that of lanes, if there is one."""
-    join = lambda x: x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])  # noqa: E731
-    move = lambda x: join(namespace(x).moveaxis(x, 0, -2)) if x.ndim > 1 else x  # noqa: E731
+
+    def join(x):
+        return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
+
+    def move(x):
+        return join(namespace(x).moveaxis(x, 0, -2)) if x.ndim > 1 else x
+
     return jax.tree_util.tree_map(move, tree)
 
 
@@ -143,9 +150,17 @@ class Tape(NamedTuple):
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
     """A tape without moves."""
-    xp, (d, L) = namespace(lanes.q), lanes.q.shape
-    times, states = lambda: xp.zeros((rows, L)), lambda: xp.zeros((rows, d, L))
-    code, chart = xp.full((rows, L), IDLE, xp.int32), xp.zeros((rows, L), xp.int32)
+    xp = namespace(lanes.q)
+    d, L = lanes.q.shape
+
+    def times():
+        return xp.zeros((rows, L))
+
+    def states():
+        return xp.zeros((rows, d, L))
+
+    code = xp.full((rows, L), IDLE, xp.int32)
+    chart = xp.zeros((rows, L), xp.int32)
     at_once = xp.zeros((rows, L), bool)
     return Tape(times(), code, times(), states(), states(), chart, at_once)
 
@@ -163,7 +178,8 @@ def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
 
 def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
     """Arrays of several tapes, the shorter ones with further rows without moves."""
-    rows, blank = max(map(len, parts)), IDLE if parts[0].dtype.kind == "i" else 0
+    rows = max(map(len, parts))
+    blank = IDLE if parts[0].dtype.kind == "i" else 0
     out = np.full((len(parts), rows, *parts[0].shape[1:]), blank, parts[0].dtype)
     for whole, part in zip(out, parts, strict=True):
         whole[: len(part)] = part

@@ -79,21 +79,17 @@ def through(
 
     **Returns:** the same at the end; by target (rows) the lanes before, their ends, and the tape.
     """
-    ends, levels = (
-        (targets.time, targets.index, targets.event, targets.limit),
-        targets.levels,
-    )
-    by = targets.missed, targets.event_sequence
+    ends = (targets.time, targets.index, targets.event, targets.limit)
+    levels = targets.levels
+    failures = targets.missed, targets.event_sequence
     if not options.at_once:
-        return _pieces(
-            (move, options, *by), s, levels, settings, ends, begin, u, patience
-        )
-    static = (
-        search,
-        options._replace(at_once=False),
-        *by,
-    )
-    make = lambda: whole(_pieces, (static,), (s, levels, settings))  # noqa: E731
+        static = (move, options, *failures)
+        return _pieces(static, s, levels, settings, ends, begin, u, patience)
+    static = (search, options._replace(at_once=False), *failures)
+
+    def make():
+        return whole(_pieces, (static,), (s, levels, settings))
+
     arguments = ends, begin, u, np.float64(patience)
     return s.once(("through", static), (levels, settings), make)(*arguments)
 
@@ -118,7 +114,8 @@ def _search(
     s, lanes, u, target, setout, result, settings, options: Options
 ) -> Recorded:
     def run(s, target, common, by_lane):
-        (settings, options), (lanes, u, setout, result) = common, by_lane
+        settings, options = common
+        lanes, u, setout, result = by_lane
         return search(s, lanes, u, target, shared(settings), setout, result, options)
 
     return _over_lanes(run, s, target, (settings, options), (lanes, u, setout, result))
@@ -130,7 +127,8 @@ def _over_lanes(
     """`run(s, target, common, by_lane)`, with the axes that `jax.vmap` maps as more lanes."""
 
     def whole(common, by_lane):
-        (source, levels, *common), (target, *by_lane) = common, by_lane
+        source, levels, *common = common
+        target, *by_lane = by_lane
         return run(Structure(source), target.with_levels(levels), common, by_lane)
 
     target, levels = target.split()
@@ -164,20 +162,21 @@ def _follow_jvp(primals, tangents):
     target, levels = target.split()
 
     def repeat(by_lane, common):
-        (t, q, u, time), (s, levels) = by_lane, common
+        t, q, u, time = by_lane
+        s, levels = common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
         return replay(s, begin, u, end, recorded.tape)
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
-    by_lane = (
-        (lanes.t, lanes.q, u, target.time),
-        (t_lanes.t, t_lanes.q, t_u, t_target.time),
-    )
-    (t, q), (t_t, t_q) = lane_jvp(
-        repeat, by_lane, ((s, levels), (t_s, t_target.levels))
-    )
-    ends = lambda x: (x.moved.lanes.t, x.moved.lanes.q)  # noqa: E731
+    point = lanes.t, lanes.q, u, target.time
+    t_point = t_lanes.t, t_lanes.q, t_u, t_target.time
+    common = (s, levels), (t_s, t_target.levels)
+    (t, q), (t_t, t_q) = lane_jvp(repeat, (point, t_point), common)
+
+    def ends(x):
+        return (x.moved.lanes.t, x.moved.lanes.q)
+
     out = eqx.tree_at(ends, recorded, (t, q))
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, eqx.tree_at(ends, none, (t_t, t_q), is_leaf=lambda x: x is None)
@@ -232,19 +231,25 @@ def tape_jacobian(
 
 def _columns(s, lanes, target, tape, of_states):
     """Derivatives (m, n, L) and (t, q) at the end (n, L)."""
-    L, d = lanes.t.shape[0], s.d
-    n = 1 + d + s.nu
+    L = lanes.t.shape[0]
+    states = slice(1, 1 + s.d)
+    inputs = slice(1 + s.d, None)
 
-    def flow(x):
-        start = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1 : 1 + d]))
-        t, q = replay(s, start, x[1 + d :], target, tape)
+    def flow(point):
+        begin = point[0], point[states]
+        start = eqx.tree_at(lambda x: (x.t, x.q), lanes, begin)
+        t, q = replay(s, start, point[inputs], target, tape)
         return jnp.concatenate([t[None], q])
 
-    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
-    directions = jnp.eye(n)[1 : 1 + d] if of_states else jnp.eye(n)
+    def push(tangent):
+        return jax.jvp(flow, (point,), (tangent,))
+
+    point = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
+    directions = jnp.eye(len(point))
+    if of_states:
+        directions = directions[states]
     tangents = jnp.broadcast_to(directions[:, :, None], (*directions.shape, L))
-    push = jax.vmap(lambda tangent: jax.jvp(flow, (x,), (tangent,)), out_axes=(None, 0))
-    end, columns = push(tangents)
+    end, columns = jax.vmap(push, out_axes=(None, 0))(tangents)
     return columns, end
 
 

@@ -56,10 +56,8 @@ def replay(
     tape: Tape,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
-    h, code, at_once = tape.h, tape.code, tape.at_once
-    scheduled = jnp.array(
-        [isinstance(tr.guard, Scheduled) for tr in s.transitions] + [False]
-    )
+    is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
+    scheduled = jnp.array([*is_scheduled, False])
 
     def row(carry, row):
         h, code, at_once = row
@@ -68,9 +66,8 @@ def replay(
             t, q, chart = carry
             by_clock = (code >= 0) & scheduled[code]
             due = scheduled_time(s, code, t + h)
-            h1 = jnp.where(
-                code == ARRIVE_TIME, target.time - t, jnp.where(by_clock, due - t, h)
-            )
+            h1 = jnp.where(by_clock, due - t, h)
+            h1 = jnp.where(code == ARRIVE_TIME, target.time - t, h1)
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
@@ -78,27 +75,27 @@ def replay(
             q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
             return t, q, chart
 
-        return jax.lax.cond(
-            (code != IDLE).any(), move, lambda carry: carry, carry
-        ), None
+        moves = (code != IDLE).any()
+        return jax.lax.cond(moves, move, lambda carry: carry, carry), None
 
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry, rows):
-        follow = lambda carry: jax.lax.scan(row, carry, rows)[0]  # noqa: E731
-        return jax.lax.cond(
-            (rows[1] != IDLE).any(), follow, lambda carry: carry, carry
-        ), None
+        def follow(carry):
+            return jax.lax.scan(row, carry, rows)[0]
+
+        _, code, _ = rows
+        moves = (code != IDLE).any()
+        return jax.lax.cond(moves, follow, lambda carry: carry, carry), None
 
     # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
     # mode keeps no more of a block than where it starts.
-    rows, L = h.shape
+    rows, L = tape.h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
-    h = jnp.pad(h, fill).reshape(-1, _BLOCK, L)
-    at_once = jnp.pad(at_once, fill).reshape(-1, _BLOCK, L)
-    code = jnp.pad(code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
-    (t, q, _), _ = jax.lax.scan(
-        block, (lanes.t, lanes.q, lanes.chart), (h, code, at_once)
-    )
+    h = jnp.pad(tape.h, fill).reshape(-1, _BLOCK, L)
+    at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
+    code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    begin = lanes.t, lanes.q, lanes.chart
+    (t, q, _), _ = jax.lax.scan(block, begin, (h, code, at_once))
     return t, q
 
 
@@ -112,7 +109,9 @@ def _advance(
     which: Index,
 ) -> tuple[Times, Padded]:
     """A step of every lane that moves, ended on the zero of its crossing function, if any."""
-    t, q, chart = lanes.t, lanes.q, lanes.chart
+    t = lanes.t
+    q = lanes.q
+    chart = lanes.chart
 
     def work(a, here, out):
         t_out, q_out = out
@@ -125,8 +124,8 @@ def _advance(
         # (The charts, which may hold traced values, are made here, and not within a branch.)
         method = flow.method
         crossing = jnp.where(here, which, -1)
-        # (A branch of its own, lest XLA masks the states again in every stage.)
 
+        # (A branch of its own, lest XLA masks the states again in every stage.)
         def step():
             end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
@@ -140,9 +139,9 @@ def _advance(
 
         if flow.rows:
             t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
-        return jnp.where(here, t1, t_out), q_out.at[:n].set(
-            jnp.where(here, q1, q_out[:n])
-        )
+        t_out = jnp.where(here, t1, t_out)
+        q_out = q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+        return t_out, q_out
 
     return for_each_chart(s, chart, moving, work, (t, q))
 
@@ -177,17 +176,16 @@ def chain(
     direction of the flow has no meaning: it is projected out of every move, so that it does not
     drown the other directions, however strongly the flow contracts.
     """
-    n, moves = 1 + s.d, recorded_moves(lanes, tape)
+    n = 1 + s.d
+    moves = recorded_moves(lanes, tape)
     end, by = linear_moves(s, moves, target)
     if across is not None:
         f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
         project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
         by[flows, :, 1:n] = by[flows, :, 1:n] @ project
-    columns, ends = (
-        _products(moves, by, len(lanes.t)),
-        np.concatenate([lanes.t[None], lanes.q]),
-    )
+    columns = _products(moves, by, len(lanes.t))
+    ends = np.concatenate([lanes.t[None], lanes.q])
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
     return columns[:, :, 1:n] if of_states else columns, ends
 
@@ -218,20 +216,30 @@ class Variation:
         times,
         twice,
     ):
-        moves, n, P = recorded_moves(lanes, tape), 1 + s.d, s.directions
-        self._s, self._moves, self.first = s, moves, np.flatnonzero(moves.order == 0)
+        moves = recorded_moves(lanes, tape)
+        n = 1 + s.d
+        P = s.directions
+        self._s = s
+        self._moves = moves
+        self.first = np.flatnonzero(moves.order == 0)
         if len(self.first) < len(lanes.t):
             raise NotOnHostError
+
         # Every move in all directions: of its start, and the P ones.
-        many = lambda x: np.repeat(x, n + P, axis=-1)  # noqa: E731
+        def many(x):
+            return np.repeat(x, n + P, axis=-1)
+
         aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
         along = Moves(*map(many, moves))
         lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
-        t, q, h = along.t + aside[0], along.q + aside[1:], along.h + 0j
+        t = along.t + aside[0]
+        q = along.q + aside[1:]
+        h = along.h + 0j
         for g, transition in enumerate(s.transitions):
             at = along.code == g
             if isinstance(transition.guard, Scheduled) and at.any():
-                end, u = (t + h).real[at] + 0j, kernels.unpushed(s, lane[at])
+                end = (t + h).real[at] + 0j
+                u = kernels.unpushed(s, lane[at])
                 h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
         along = along._replace(t=t, q=q, h=h, lane=lane)
         # A direction that moves only the start of the flow needs no lanes of its own: the start of
@@ -246,11 +254,10 @@ class Variation:
             index=many(np.broadcast_to(target.index, target.time.shape)),
         )
         end, by = linear_moves(s, along, target)
-        by, end = (
-            by.reshape(len(moves.t), -1, *by.shape[1:]),
-            end.reshape(len(moves.t), -1, n),
-        )
-        self._by, self._change = np.real(by[:, 0]), np.imag(by) / kernels.TINY
+        by = by.reshape(len(moves.t), -1, *by.shape[1:])
+        end = end.reshape(len(moves.t), -1, n)
+        self._by = np.real(by[:, 0])
+        self._change = np.imag(by) / kernels.TINY
         kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
         self._kick = np.moveaxis(kick, 1, 2) @ self._unit
 
@@ -268,45 +275,48 @@ class Variation:
     ) -> Any:
         """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
         their own in each direction, as complex numbers. `sizes`: as `across` of `chain`."""
-        moves, (M, n, m), P = self._moves, self._by.shape, tangents.shape[2]
-        along = np.concatenate([tangents[:-1], np.tile(self._unit, (M, 1, 1))], axis=1)
-        change = np.moveaxis(along, 1, 2) @ self._change.reshape(
-            *along.shape[:2], n * m
-        )
+        moves = self._moves
+        M, n, m = self._by.shape
+        P = tangents.shape[2]
+        unit = np.tile(self._unit, (M, 1, 1))
+        along = np.concatenate([tangents[:-1], unit], axis=1)
+        by_direction = self._change.reshape(*along.shape[:2], n * m)
+        change = np.moveaxis(along, 1, 2) @ by_direction
         by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
         if sizes is not None:
-            f = slopes(self._s, *self.points(tangents, np.arange(M))).T.reshape(
-                M, P, n - 1
-            )
+            f = slopes(self._s, *self.points(tangents, np.arange(M)))
+            f = f.T.reshape(M, P, n - 1)
             flows = ~moves.at_once
             project = projections(f[flows], sizes[moves.chart[flows]][:, None])
             by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
-        lane, order = (np.repeat(x, P) for x in (moves.lane, moves.order))
-        moves = moves._replace(lane=lane * P + np.arange(M * P) % P, order=order)
-        return _products(moves, by.reshape(-1, n, m), len(self.first) * P).reshape(
-            -1, P, n, m
-        )
+        lane = np.repeat(moves.lane, P) * P + np.arange(M * P) % P
+        each = moves._replace(lane=lane, order=np.repeat(moves.order, P))
+        columns = _products(each, by.reshape(-1, n, m), len(self.first) * P)
+        return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
         """Times, charts, states and inputs where some moves start, in each direction."""
         n, P = tangents.shape[1:]
         aside = 1j * kernels.TINY * np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
-        t, chart, q, *_ = (np.repeat(x[..., move], P, axis=-1) for x in self._moves)
-        return t + aside[0], chart, q + aside[1:], self._s.pushed(np.arange(len(t)) % P)
+        t = np.repeat(self._moves.t[move], P)
+        chart = np.repeat(self._moves.chart[move], P)
+        q = np.repeat(self._moves.q[:, move], P, axis=-1)
+        inputs = self._s.pushed(np.arange(len(t)) % P)
+        return t + aside[0], chart, q + aside[1:], inputs
 
 
 def linear_moves(
     s: Structure, moves: Moves, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
     """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
-    n, M = 1 + s.d, len(moves.t)
-    end, by = (np.zeros((M, *x), target.time.dtype) for x in ((n,), (n, n + s.nu)))
-    for a in np.unique(moves.chart):
-        in_chart = np.flatnonzero(moves.chart == a)
-        of_chart = Moves(*(x[..., in_chart] for x in moves))
-        end[in_chart], by[in_chart] = _linear(
-            s.at(of_chart.lane), int(a), of_chart, target
-        )
+    n = 1 + s.d
+    M = len(moves.t)
+    end = np.zeros((M, n), target.time.dtype)
+    by = np.zeros((M, n, n + s.nu), target.time.dtype)
+    for a in np.unique(moves.chart).tolist():
+        here = np.flatnonzero(moves.chart == a)
+        of_chart = Moves(*(x[..., here] for x in moves))
+        end[here], by[here] = _linear(s.at(of_chart.lane), a, of_chart, target)
     return end, by
 
 
@@ -314,7 +324,8 @@ def projections(
     f: Float[Array, "*K d"], sizes: Float[Array, "*K d"]
 ) -> Float[Array, "*K d d"]:
     """Projections of states along the flow f, orthogonal in sizes."""
-    xp, f = namespace(f), f / sizes
+    xp = namespace(f)
+    f = f / sizes
     f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
     project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
     return project * sizes[..., :, None] / sizes[..., None, :]
@@ -361,16 +372,20 @@ def _linear(
 
 def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends:
     """The ends of the steps."""
-    n, code = s.dims[a], moves.code
+    n = s.dims[a]
+    code = moves.code
     by_clock = np.isin(code, s.schedules(a))
     on_time = code == ARRIVE_TIME
     goal = target.time[moves.lane]
-    h = np.where(on_time, goal - moves.t, np.where(moves.at_once, 0.0, moves.h))
+    h = np.where(moves.at_once, 0.0, moves.h)
+    h = np.where(on_time, goal - moves.t, h)
+    t = np.where(on_time, goal, moves.t + h)
     expanded = _linear_step(s, a, moves.t, moves.q[:n], u, h)
     expanded = np.array(np.moveaxis(expanded, -1, 0))
-    q, field = expanded[:, :, 0].T, expanded[:, :, 1].T
-    by_start, by_length = expanded[:, :, 2:-1], expanded[:, :, -1:]
-    t = np.where(on_time, goal, moves.t + h)
+    q = expanded[:, :, 0].T
+    field = expanded[:, :, 1].T
+    by_start = expanded[:, :, 2:-1]
+    by_length = expanded[:, :, -1:]
     # A step to a known time shrinks with t, and lasts until a schedule has come.
     longer = np.zeros((len(t), 1, by_start.shape[2]), by_start.dtype)
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
@@ -390,7 +405,8 @@ def _at_zeros(
 ) -> _Ends:
     """The ends moved to the zeros of the functions that end their moves. The delay of a zero is
     that of the saltation formula (see `saltation.py`), here by time and state."""
-    n, code = s.dims[a], moves.code
+    n = s.dims[a]
+    code = moves.code
     by_clock = np.isin(code, s.schedules(a))
     crossed = np.where(by_clock | moves.at_once, -1, code)
     crossed = np.where(code == ARRIVE_LEVEL, len(s.transitions), crossed)
@@ -402,25 +418,29 @@ def _at_zeros(
     landing = s.at(lands)
     flow = ChartFlow(landing, a, u[:, lands], target.levels, index)
     zero = flow.locate(ends.t[lands], ends.q[:, lands], ends.field[:, lands], crossed)
-    t, q = ends.t.copy(), ends.q.copy()
+    t = ends.t.copy()
+    q = ends.q.copy()
     t[lands] += zero.past
     q[:, lands] = zero.q
     at = t[lands], q[:, lands], u[:, lands]
     by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
-    field, (f_t, f_q, f_u) = by_field[:, :, :1], _split(by_field, n)
+    field = by_field[:, :, :1]
+    f_t, f_q, f_u = _split(by_field, n)
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     row = np.argmax(np.array(flow.rows)[:, None] == crossed, axis=0)
     gradient = watched[row, :, np.arange(len(lands))][:, None]
     by_t, by_q, by_u = _split(gradient, n)
     # (Over the time past: nothing but rounding errors, with derivatives.)
     past = zero.past[:, None, None]
-    before, dt = ends.dq[lands], ends.dt[lands]
+    before = ends.dq[lands]
+    dt = ends.dt[lands]
     moved = before + past * (f_t @ dt + f_q @ before)
     moved[:, :, 1 + n :] += past * f_u
     change = by_t @ dt + by_q @ moved
     change[:, :, 1 + n :] += by_u
     delay = -change / (by_t + by_q @ field)
-    all_dt, all_dq = ends.dt.copy(), ends.dq.copy()
+    all_dt = ends.dt.copy()
+    all_dq = ends.dq.copy()
     all_dt[lands] = dt + delay
     all_dq[lands] = moved + field @ delay
     return _Ends(t, q, ends.field, all_dt, all_dq)
@@ -430,7 +450,8 @@ def _after_resets(
     s: Structure, moves: Moves, u, ends: _Ends
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends after the events of moves, padded to the states of all charts."""
-    M, n = len(ends.t), len(ends.q)
+    M = len(ends.t)
+    n = len(ends.q)
     end = np.zeros((M, 1 + s.d), ends.dq.dtype)
     by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
     columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
@@ -441,7 +462,8 @@ def _after_resets(
         now = np.flatnonzero(np.isin(event, kind))
         if not len(now):
             continue
-        after, by_start = ends.q[:, now], ends.dq[now]
+        after = ends.q[:, now]
+        by_start = ends.dq[now]
         if kind != (-1,):
             place = np.argmax(np.array(kind)[:, None] == event[now], axis=0)
             member = Member(kind, place.astype(np.int32))

@@ -63,8 +63,9 @@ def take_step(
     if method.implicit:
         return _implicit_step(method, field, t, q, h, still)
     unroll = q.shape[1] >= _UNROLLED_LANES
-    K: Any = (_unrolled_stages if unroll else _looped_stages)(method, field, t, q, h)
-    combined = _combine if unroll else lambda w, K: jnp.tensordot(np.array(w), K, 1)
+    stages: Any = _unrolled_stages if unroll else _looped_stages
+    combined: Any = _combine if unroll else _contract
+    K = stages(method, field, t, q, h)
     error = h * combined(np.array(method.error), K)
     end = q + h * combined(np.array(method.b), K)
     f1 = field(t + h, end)
@@ -96,8 +97,12 @@ def looped_step(
 ) -> tuple[States, States]:
     """The end of a step of an explicit method, and its estimated error; stages are not unrolled."""
     apart = jax.lax.optimization_barrier
-    stages, a, c = len(method.c), jnp.asarray(method.a), jnp.asarray(method.c)
-    weighted = lambda w, K: jnp.sum(w[:, None, None] * K, axis=0)  # noqa: E731
+    stages = len(method.c)
+    a = jnp.asarray(method.a)
+    c = jnp.asarray(method.c)
+
+    def weighted(w, K):
+        return jnp.sum(w[:, None, None] * K, axis=0)
 
     def stage(k, K):
         # (States and rates apart: XLA would compute one of them again in each row of the other.)
@@ -106,8 +111,9 @@ def looped_step(
         return jax.lax.dynamic_update_index_in_dim(K, rate, k, 0)
 
     K = jax.lax.fori_loop(0, stages, stage, jnp.zeros((stages, *q.shape), q.dtype))
-    end, error = (weighted(jnp.asarray(w), K) for w in (method.b, method.error))
-    return q + h * end, h * error
+    rate = weighted(jnp.asarray(method.b), K)
+    error_rate = weighted(jnp.asarray(method.error), K)
+    return q + h * rate, h * error_rate
 
 
 def _unrolled_stages(method, field, t, q, h) -> list[States]:
@@ -118,10 +124,18 @@ def _unrolled_stages(method, field, t, q, h) -> list[States]:
 
 
 def _combine(weights, K):
-    """Sum of weights times stages. Unrolled, it is compiled into one loop with the stage."""
-    return sum(
-        (float(w) * k for w, k in zip(weights, K, strict=False) if w != 0), start=0.0
-    )
+    """Sum of weights times the first stages. Unrolled, it is compiled into one loop with the
+    stage."""
+    total = 0.0
+    for weight, stage in zip(weights, K, strict=False):
+        if weight != 0:
+            total = total + float(weight) * stage
+    return total
+
+
+def _contract(weights, K):
+    """Sum of weights times stages, which are rows of one array."""
+    return jnp.tensordot(np.array(weights), K, 1)
 
 
 def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> States:
@@ -129,9 +143,8 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
     field at (t, q); zero where it is not finite."""
     # Shifts of both signs, odd and even; not all states by the same part, since a common factor may
     # cancel.
-    shifts = np.stack(
-        [np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)], axis=1
-    )
+    shifts = [np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)]
+    shifts = np.stack(shifts, axis=1)
     xp = namespace(q)
     shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
 
@@ -185,10 +198,9 @@ def _decoupled(method: Method) -> _Decoupled:
         return _Decoupled(np.eye(len(A)), A, np.eye(len(A)))
     values, T = np.linalg.eig(A)
     kept = np.imag(values) >= 0  # one of each conjugate pair, twice
-    values, left, right = values[kept], T[:, kept], np.linalg.inv(T)[kept]
-    return _Decoupled(
-        left * np.where(np.imag(values) > 0, 2, 1), np.diag(values), right
-    )
+    values = values[kept]
+    times = np.where(np.imag(values) > 0, 2, 1)
+    return _Decoupled(T[:, kept] * times, np.diag(values), np.linalg.inv(T)[kept])
 
 
 def _implicit_step(
@@ -204,26 +216,34 @@ def _implicit_step(
     w, left, J = _increments(method, still or field, *start)
     if still is not None:
         w = _with_derivatives(method, field, still, (t, q, h), w)
-    weights = method.b, method.error, method.rough or np.zeros(len(method.b))
-    change, plain, rough = (jnp.tensordot(np.array(x), w, 1) for x in weights)
-    shift = _shifted(J, method.filter * start[2])
-    estimate = _apply(inverse(shift), plain) if method.filter else plain
+    change = _contract(method.b, w)
+    plain = _contract(method.error, w)
+    rough = _contract(method.rough or np.zeros(len(method.b)), w)
+    estimate = plain
+    if method.filter:
+        shift = _shifted(J, method.filter * start[2])
+        estimate = _apply(inverse(shift), plain)
+
     # The method has a higher order than the estimate where it is smooth: the ratio of two estimates
     # takes the place of the step. It has not where a fast mode was excited, by however little, and
     # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
-    divide = lambda x: jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))  # noqa: E731
+    def divide(x):
+        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
+
     ratio = jnp.where(rough == 0, 1.0, jnp.maximum(divide(rough), 1 - divide(plain)))
     powers = round(method.order - method.order / method.gain)
     local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
     estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     end = q + change
-    f0, f1 = field(t, q), field(t + h, end)
+    f0 = field(t, q)
+    f1 = field(t + h, end)
     halves = halfway(method)
     if halves is None:
         middle = halfway_cubic(q, end, f0, f1, h)
     else:
-        before, rate = (jnp.tensordot(np.array(x), w, 1) for x in halves)
-        middle = q + before, rate / jnp.where(h == 0, 1.0, h)
+        until = _contract(halves.state, w)
+        rate = _contract(halves.rate, w) / jnp.where(h == 0, 1.0, h)
+        middle = q + until, rate
     return Step(end, f0, f1, estimate, local, *middle)
 
 
@@ -232,7 +252,10 @@ def step_along(
 ) -> tuple[Step, States, States]:
     """A step of an implicit method, and the derivatives of its end and of its estimate along a
     direction of states."""
-    step = lambda q: take_step(method, field, t, q, h, still=field)  # noqa: E731
+
+    def step(q):
+        return take_step(method, field, t, q, h, still=field)
+
     value, tangent = jax.jvp(step, (q,), (along,))
     return value, tangent.q, tangent.estimate
 
@@ -240,31 +263,31 @@ def step_along(
 def _increments(method, field, t, q, h):
     """Increments (s, n, L) by Newton's method, their last change (n, L), and the Jacobian (n, n, L)
     at the start."""
-    J, c = _jacobian(field, t, q), np.array(method.c)[:, None]
+    J = _jacobian(field, t, q)
+    c = np.array(method.c)[:, None]
     left, R, right = _decoupled(method)
     solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
     evaluate = jax.vmap(field)
     small = 4.0 * jnp.finfo(q.dtype).eps  # a few rounding errors
 
     def correction(w):
-        residual = (
-            h * evaluate(t + c * h, q + jnp.tensordot(np.array(method.a), w, 1)) - w
-        )
-        residual = jnp.tensordot(right, residual, 1)
+        stages = q + _contract(method.a, w)
+        residual = h * evaluate(t + c * h, stages) - w
         solved = []
-        for row, r in zip(R, residual, strict=True):
-            before = sum(
-                (g * x for g, x in zip(row, solved, strict=False) if g != 0), start=0.0
-            )
-            r = r if isinstance(before, float) else r + h * _apply(J, before)
-            g = row[len(solved)]
+        for i, r in enumerate(_contract(right, residual)):
+            # (R is lower triangular: row i needs the rows before, which are solved.)
+            known = [g * x for g, x in zip(R[i], solved, strict=False) if g != 0]
+            if known:
+                r = r + h * _apply(J, sum(known, start=0.0))
+            g = R[i, i]
             solved.append(_apply(solve[g], r) if g != 0 else r)
-        return jnp.real(jnp.tensordot(left, jnp.stack(solved), 1))
+        return jnp.real(_contract(left, jnp.stack(solved)))
 
     def iterate(carry):
         w, last, _, i = carry
         change = correction(w)
-        w, now = w + change, jnp.max(jnp.abs(change), axis=0)
+        w = w + change
+        now = jnp.max(jnp.abs(change), axis=0)
         size = jnp.abs(q) + jnp.max(jnp.abs(w), axis=0)
         # A component goes on while it moves by more than rounding errors, and converges.
         going = (now > small * size) & ((now < 0.5 * last) | (i < 2))
@@ -272,8 +295,11 @@ def _increments(method, field, t, q, h):
 
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
+
     # A step that needs more iterations is rejected for its error.
-    unsettled = lambda carry: carry[2] & (carry[3] < 12)  # noqa: E731
+    def unsettled(carry):
+        return carry[2] & (carry[3] < 12)
+
     w, last, *_ = jax.lax.while_loop(unsettled, iterate, begin)
     return w, last, J
 
@@ -281,16 +307,19 @@ def _increments(method, field, t, q, h):
 def _with_derivatives(method, field, still, start, w):
     """The increments w, as functions of the field and of the `start` (t, q, h) of the step."""
     t, q, h = start
-    A, c = np.array(method.a), np.array(method.c)[:, None]
-    (s, n, L), at = w.shape, jax.lax.stop_gradient
-    stages = at(q + jnp.tensordot(A, w, 1))
-    J = jax.vmap(lambda t, q: _jacobian(still, t, q))(at(t + c * h), stages)
+    A = np.array(method.a)
+    times = t + np.array(method.c)[:, None] * h
+    s, n, L = w.shape
+    fixed = jax.lax.stop_gradient
+    jacobians = jax.vmap(ft.partial(_jacobian, still))
+    J = jacobians(fixed(times), fixed(q + _contract(A, w)))
     coupled = jnp.einsum("ij,iabL->iajbL", A, J).reshape(s * n, s * n, L)
-    back = inverse(jnp.eye(s * n)[..., None] - at(h) * coupled)
+    newton = inverse(_shifted(coupled, fixed(h)))
     for _ in range(2):
-        stages = q + jnp.tensordot(A, w, 1)
-        residual = h * jax.vmap(field)(t + c * h, stages) - w
-        w = w + _apply(back, residual.reshape(s * n, L)).reshape(s, n, L)
+        stages = q + _contract(A, w)
+        residual = h * jax.vmap(field)(times, stages) - w
+        correction = _apply(newton, residual.reshape(s * n, L))
+        w = w + correction.reshape(s, n, L)
     return w
 
 
@@ -319,10 +348,10 @@ def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
     rows = np.arange(n)[:, None]
 
     def eliminate(k, X):
-        column = jnp.where(rows >= k, jnp.abs(X[:, k]), -1.0)
-        chosen = rows == jnp.argmax(column, axis=0)
-        pivot = jnp.sum(jnp.where(chosen[:, None], X, 0.0), axis=0)
-        X = jnp.where(chosen[:, None], X[k], X)
+        candidates = jnp.where(rows >= k, jnp.abs(X[:, k]), -1.0)
+        is_pivot = (rows == jnp.argmax(candidates, axis=0))[:, None]
+        pivot = jnp.sum(jnp.where(is_pivot, X, 0.0), axis=0)
+        X = jnp.where(is_pivot, X[k], X)
         pivot = pivot / pivot[k]
         X = X - X[:, k][:, None] * pivot
         return jnp.where((rows == k)[:, None], pivot, X)

@@ -65,21 +65,25 @@ def jump(
 ) -> Jump:
     """Transition g at times and states before it."""
     transition = s.transitions[g]
-    a, b = s.chart_index(transition.source), s.chart_index(transition.target)
+    a = s.chart_index(transition.source)
+    b = s.chart_index(transition.target)
     n = s.dims[a]
     point = t, q.T, u
     before = kernels.field(s, a, *point)[:, 0].T
     if isinstance(transition.guard, Scheduled):
         guard = kernels.due(s, g, *point)[0].T
     else:
-        row, first = s.guards(a).index(g), np.zeros(1, np.int32)
+        row = s.guards(a).index(g)
+        first = np.zeros(1, np.int32)
         guard = kernels.watched(s, a, None, *point, first)[row].T
     gradient = guard[:, 2 : 2 + n]
     rate = guard[:, 1] + np.sum(gradient * before, axis=1)
     never = np.full_like(rate, np.nan)
     delay_by_level = np.divide(-1.0, rate, where=rate != 0, out=never)
     reset = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
-    after, by_time, by_state = reset[:, :, 0], reset[:, :, 1], reset[:, :, 2 : 2 + n]
+    after = reset[:, :, 0]
+    by_time = reset[:, :, 1]
+    by_state = reset[:, :, 2 : 2 + n]
     field_after = kernels.field(s, b, t, after.T, u)[:, 0].T
     along = (by_state @ before[..., None])[..., 0]
     return Jump(

@@ -80,7 +80,9 @@ class Settings(eqx.Module):
         | None = None,
         solver: Solver | Mapping[str, Solver] | Literal["auto"] | None = None,
     ):
-        self.rtol, self.atol, self.scale = _kept(rtol), _kept(atol), _kept(scale)
+        self.rtol = _kept(rtol)
+        self.atol = _kept(atol)
+        self.scale = _kept(scale)
         self.max_steps = max_steps
         self.solver = solver if isinstance(solver, str) else solvers(solver)
 

@@ -65,7 +65,8 @@ class Target(eqx.Module):
 def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
     level that is filled in later), giving up at `limit`."""
-    xp, shape = namespace(time), time.shape
+    xp = namespace(time)
+    shape = time.shape
     later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
         time,

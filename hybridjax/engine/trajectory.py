@@ -52,11 +52,12 @@ class Event(NamedTuple):
     """State after the reset, by name."""
 
     def __repr__(self) -> str:
-        before, after = (
-            signal_values(x, x.values()) for x in (self.before, self.after)
+        before = signal_values(self.before, self.before.values())
+        after = signal_values(self.after, self.after.values())
+        return folded(
+            f"Event({self.name} at t = {number(self.time)}: {self.source} to {self.target}; "
+            f"before {before}; after {after})"
         )
-        event = f"Event({self.name} at t = {number(self.time)}: {self.source} to {self.target}; "
-        return folded(f"{event}before {before}; after {after})")
 
 
 @checked_methods
@@ -104,13 +105,12 @@ class Trajectory(eqx.Module):
     def events(self) -> list[Event]:
         """The events in order of time."""
         require_as_made(self.system, "this trajectory was computed")
-        events, s = [], self.structure
+        events = []
+        s = self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
-            before, after = (
-                s.by_name(s.chart_index(name), q[k])
-                for name, q in ((tr.source, self.before), (tr.target, self.after))
-            )
+            before = s.by_name(s.chart_index(tr.source), self.before[k])
+            after = s.by_name(s.chart_index(tr.target), self.after[k])
             events.append(
                 Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after)
             )
@@ -122,23 +122,25 @@ class Trajectory(eqx.Module):
         Between steps the cubic Hermite interpolant is used. At an event both sides appear, with
         the same time.
         """
-        h = np.diff(self.t)[:, None]
-        x = np.linspace(0.0, 1.0, per_step + 1)[None, :]
-        q0, q1 = self.after[:-1, None], self.before[1:, None]
-        d0, d1 = self.slope_after[:-1, None], self.slope_before[1:, None]
-        q = interpolate(x[..., None], h[..., None], q0, q1, d0, d1)
-        t = self.t[:-1, None] + h * x
-        chart = np.broadcast_to(self.chart[:-1, None], t.shape)
-        keep = np.ones(t.shape, bool)
-        keep[1:, 0] = (
-            self.event[1:-1] >= 0
-        )  # a step's start repeats the last end, but for resets
-        last = np.flatnonzero(self.event[-1:] >= 0) - 1
-        t, chart = (
-            np.append(t[keep], self.t[last]),
-            np.append(chart[keep], self.chart[last]),
+        duration = np.diff(self.t)[:, None, None]
+        part = np.linspace(0.0, 1.0, per_step + 1)[None, :, None]
+        states = interpolate(
+            part,
+            duration,
+            self.after[:-1, None],
+            self.before[1:, None],
+            self.slope_after[:-1, None],
+            self.slope_before[1:, None],
         )
-        return t, chart, np.vstack([q[keep], self.after[last]])
+        times = self.t[:-1, None] + (duration * part)[..., 0]
+        charts = np.broadcast_to(self.chart[:-1, None], times.shape)
+        # (The start of a step repeats the end of the last one, but for resets.)
+        is_new = np.ones(times.shape, bool)
+        is_new[1:, 0] = self.event[1:-1] >= 0
+        final_reset = np.flatnonzero(self.event[-1:] >= 0) - 1
+        t = np.append(times[is_new], self.t[final_reset])
+        chart = np.append(charts[is_new], self.chart[final_reset])
+        return t, chart, np.vstack([states[is_new], self.after[final_reset]])
 
     def at(
         self, t: Annotated[Numbers, Reals("p")]
@@ -156,9 +158,8 @@ class Trajectory(eqx.Module):
         k = np.searchsorted(self.t, t, side="right") - 1
         j = np.minimum(k + 1, len(self.t) - 1)
         h = (self.t[j] - self.t[k])[:, None]
-        x = np.divide(
-            t[:, None] - self.t[k, None], h, out=np.zeros_like(h), where=h > 0
-        )
+        since = t[:, None] - self.t[k, None]
+        x = np.divide(since, h, out=np.zeros_like(h), where=h > 0)
         ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
         return self.chart[k], interpolate(x, h, *ends)
 
@@ -172,18 +173,19 @@ class Trajectory(eqx.Module):
         return (point[0], *observed(self.structure, names, *point))
 
     def __repr__(self):
-        s, system = self.structure, self.system
-        counts = (
-            (np.sum(self.event == g), tr.name) for g, tr in enumerate(s.transitions)
-        )
-        events = (
-            ", ".join(f"{count} {name}" for count, name in counts if count)
-            or "no events"
-        )
-        span = f"t = {number(self.t[0])} to {number(self.t[-1], unit=system.time_unit)}"
+        s = self.structure
+        system = self.system
+        events = []
+        for g, transition in enumerate(s.transitions):
+            count = np.sum(self.event == g)
+            if count:
+                events.append(f"{count} {transition.name}")
+        begin = number(self.t[0])
+        end = number(self.t[-1], unit=system.time_unit)
         text = folded(
-            f"Trajectory({type(system).__name__}: {span}, {len(self.t) - 1} steps; {events}; "
-            f"ends in {s.names[self.chart[-1]]}: {self.result.message})"
+            f"Trajectory({type(system).__name__}: t = {begin} to {end}, {len(self.t) - 1} steps; "
+            f"{', '.join(events) or 'no events'}; ends in {s.names[self.chart[-1]]}: "
+            f"{self.result.message})"
         )
         return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
 
@@ -203,7 +205,8 @@ def observed(
     items = tuple(s.resolve_outputs(names).items)
     values = np.full((len(names), len(t)), np.nan)
     for a in np.unique(chart):
-        at, states = chart == a, s.charts[a].states
+        at = chart == a
+        states = s.charts[a].states
         if all(item in states for item in items):  # (without compiling a function)
             values[:, at] = q[at].T[[states.index(item) for item in items]]
             continue
@@ -253,17 +256,21 @@ def simulate(
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     check_schedules(s)
     start = Guess(chart, state, time)
-    lanes = begin = lane_at(s, chart, start.state, start.time, "`state`")
-    settings, u, end = (
-        settings.filled(SIMULATION),
-        constant[:, None],
-        lanes.t + float(duration),
-    )
-    tapes, steps, h, result = [], 0, None, Result.STEP_LIMIT
+    begin = lane_at(s, chart, start.state, start.time, "`state`")
+    lanes = begin
+    settings = settings.filled(SIMULATION)
+    u = constant[:, None]
+    end = lanes.t + float(duration)
+    tapes = []
+    steps = 0
+    h = None
+    result = Result.STEP_LIMIT
     while result == Result.STEP_LIMIT and steps < max_steps:
         moved, tape = _piece(s, lanes, u, end, settings, h)
         tapes.append(tape)
-        lanes, h, steps = moved.lanes, moved.h, steps + settings.max_steps
+        lanes = moved.lanes
+        h = moved.h
+        steps = steps + settings.max_steps
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
@@ -271,7 +278,8 @@ def simulate(
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
         path = path.until(passed, Result.GUARD_PASSED)
-    if (pulse := passed_over(path, constant, settings)) is not None:
+    pulse = passed_over(path, constant, settings)
+    if pulse is not None:
         path = path.until(pulse[0], Result.PULSE_PASSED)
     if throw and path.result != Result.OK:
         raise ComputationError(
@@ -288,28 +296,31 @@ def recorded(
     under another one in each piece (nu, pieces)."""
     rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
     for tape in tapes:
-        tape = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
-        columns = tape.t, tape.before, tape.after, tape.chart, tape.code
-        rows.append(tuple(x[tape.code != IDLE] for x in columns))
-    t, before, after, chart, event = (
-        np.concatenate(x) for x in zip(*rows, strict=True)
-    )
-    source, until = np.append(chart[:1], chart[:-1]), u
+        lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
+        columns = lane.t, lane.before, lane.after, lane.chart, lane.code
+        rows.append(tuple(x[lane.code != IDLE] for x in columns))
+    joined = [np.concatenate(x) for x in zip(*rows, strict=True)]
+    t, before, after, chart, event = joined
+    source = np.append(chart[:1], chart[:-1])
+    u_before = u
+    u_after = u
     if u.shape[1] > 1:
-        u = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
-        until, u = np.hstack([u[:, :1], u]), np.hstack([u, u[:, -1:]])
+        of_step = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        u_before = np.hstack([of_step[:, :1], of_step])
+        u_after = np.hstack([of_step, of_step[:, -1:]])
     with at_ease():
-        left, right = (
-            slopes(s, t, source, before.T, until).T,
-            slopes(s, t, chart, after.T, u).T,
-        )
-    return Trajectory(s, t, chart, before, after, left, right, event, result)
+        slope_before = slopes(s, t, source, before.T, u_before).T
+        slope_after = slopes(s, t, chart, after.T, u_after).T
+    return Trajectory(
+        s, t, chart, before, after, slope_before, slope_after, event, result
+    )
 
 
 def _constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
     names = system.inputs
-    nu, value = len(names), np.asarray(0.0)
+    nu = len(names)
+    value = np.asarray(0.0)
     if callable(input):
         with evaluating("input, a function of t alone,"):
             shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
@@ -327,10 +338,12 @@ def _constant_input(system: HybridSystem, input) -> np.ndarray:
 def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
     """Guards that have, at the start, the sign that they have after their event."""
     a = int(begin.chart[0])
-    guards, n = s.guards(a), s.dims[a]
+    guards = s.guards(a)
+    n = s.dims[a]
     if not guards:
         return
-    q, first = begin.q[:n], np.zeros(1, np.int32)
+    q = begin.q[:n]
+    first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, begin.t, q, u, first)[..., 0]
     point = np.append(begin.t, q)
     for g, row in zip(guards, rows, strict=True):
@@ -351,35 +364,36 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
     """The first event whose reset ends on a guard through which the state then goes, though it
     cannot count. (It may go through one that it was crossing.)"""
     passed: list[int] = []
-    events, first = np.flatnonzero(event[:-1] >= 0), np.zeros(1, np.int32)
-    for a in (a for a in np.unique(charts[events]) if s.guards(int(a))):
-        k, n = events[charts[events] == a], s.dims[a]
-
-        def guards(k, q, a=int(a), n=n):
-            return kernels.watched(s, a, None, t[k], q[k, :n].T, u, first)
-
-        now, was, later = (
-            guards(k, after),
-            guards(k, before)[:, 0],
-            guards(k + 1, before)[:, 0],
-        )
-        slope, f = (
-            now[:, 2 : 2 + n],
-            kernels.field(s, int(a), t[k], after[k, :n].T, u)[:, 0],
-        )
-        zero = _SAME * np.einsum(
-            "gnk,n->gk", np.abs(slope), np.abs(after[:, :n]).max(axis=0)
-        )
-        rate = now[:, 1] + np.einsum("gnk,nk->gk", slope, f)
-        still = np.abs(rate) <= _SAME * np.einsum(
-            "gnk,nk->gk", np.abs(slope), np.abs(f)
-        )
-        crossed = (
-            (np.abs(was) <= zero) & (np.array(s.dims)[charts[k - 1]] == n) & ~still
-        )
-        on = (np.abs(now[:, 0]) <= zero) & (later < 0) & ~crossed
-        passed += k[on.any(axis=0)].tolist()
+    events = np.flatnonzero(event[:-1] >= 0)
+    dims = np.array(s.dims)
+    for a in np.unique(charts[events]).tolist():
+        if not s.guards(a):
+            continue
+        n = s.dims[a]
+        rows = events[charts[events] == a]
+        sizes = np.abs(after[:, :n]).max(axis=0)
+        state = after[rows, :n].T
+        guard = _guards_at(s, a, t[rows], state, u)
+        value_before = _guards_at(s, a, t[rows], before[rows, :n].T, u)[:, 0]
+        value_later = _guards_at(s, a, t[rows + 1], before[rows + 1, :n].T, u)[:, 0]
+        value = guard[:, 0]
+        slope = guard[:, 2 : 2 + n]
+        field = kernels.field(s, a, t[rows], state, u)[:, 0]
+        rate = guard[:, 1] + np.einsum("gnk,nk->gk", slope, field)
+        # (Zeros are parts of the terms of values and rates.)
+        zero = _SAME * np.einsum("gnk,n->gk", np.abs(slope), sizes)
+        zero_rate = _SAME * np.einsum("gnk,nk->gk", np.abs(slope), np.abs(field))
+        still = np.abs(rate) <= zero_rate
+        had_guard = dims[charts[rows - 1]] == n
+        crosses = had_guard & (np.abs(value_before) <= zero) & (~still)
+        through = (np.abs(value) <= zero) & (value_later < 0) & ~crosses
+        passed += rows[through.any(axis=0)].tolist()
     return min(passed, default=None)
+
+
+def _guards_at(s: Structure, a: int, t, q, u):
+    """The guards of chart a at some points, with their derivatives."""
+    return kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))
 
 
 @host_first

@@ -3,7 +3,7 @@
 import functools as ft
 from collections.abc import Callable, Iterator
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +25,13 @@ from .settings import ROUNDING, Settings
 _POLES = frozenset(["pole"])
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
-_PIECES, _FEW = 64, 8
+_PIECES = 64
+_FEW = 8
 # In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
 # so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
 # integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
-_SAME, _SAME_GAIN = 1e3, 1e-5
+_SAME = 1e3
+_SAME_GAIN = 1e-5
 # A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
 # is taken to fall. Larger: such falls between steps are missed.
 _NEAR = 1e-5
@@ -42,7 +44,8 @@ _KINKS = frozenset(["decision", "kink"])
 # in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
 # errors of multipliers are as large. Farther points: steep functions are refused that steps
 # resolve. Closer: beside those that they do not resolve, multipliers are wrong.
-_JUMP, _STEEP = 1e-8, 1e7
+_JUMP = 1e-8
+_STEEP = 1e7
 # How often the quarter of an interval is taken in which the field changes most unlike in the
 # others. Fewer: jumps are missed behind other changes. More: time.
 _QUARTERS = 20
@@ -53,9 +56,11 @@ Points = Float[np.ndarray, "P 1+n"]
 
 def program_of(s: Structure, a: int, function: Callable | None = None):
     """The program of a function of chart a. Default: its field."""
-    real = jnp.result_type(float)
-    point = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (s.dims[a],), (s.nu,))]
-    return jax.make_jaxpr(function or ft.partial(s.field, a))(*point).jaxpr
+    if function is None:
+        function = ft.partial(s.field, a)
+    shapes = (), (s.dims[a],), (s.nu,)
+    point = [jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in shapes]
+    return jax.make_jaxpr(function)(*point).jaxpr
 
 
 def sudden(program: jax_compat.Program) -> Iterator[tuple[str, Any]]:
@@ -64,27 +69,26 @@ def sudden(program: jax_compat.Program) -> Iterator[tuple[str, Any]]:
     moving = set(program.invars)
     for equation in program.eqns:
         moves = [jax_compat.is_variable(x) and x in moving for x in equation.invars]
-        if any(moves):
-            moving.update(equation.outvars)
-            if jax_compat.solves_scalars_only(equation):
-                yield "pole", equation
-                continue
-            for call in jax_compat.inner_programs(equation):
-                yield from ((how, equation) for how, _ in sudden(call))
-            for how in jax_compat.suddenness(equation, moves):
+        if not any(moves):
+            continue
+        moving.update(equation.outvars)
+        if jax_compat.solves_scalars_only(equation):
+            yield "pole", equation
+            continue
+        for call in jax_compat.inner_programs(equation):
+            for how, _ in sudden(call):
                 yield how, equation
+        for how in jax_compat.suddenness(equation, moves):
+            yield how, equation
 
 
 def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
     """How operations of a module's function (structure, chart, *point) are `sudden`."""
     key = function, a, kind(s)
     if key not in _sudden:
-        names = (
-            name for name, _ in sudden(program_of(s, a, ft.partial(function, s, a)))
-        )
-        _sudden[key] = frozenset(names)
-        if _sudden[key] == {"power"}:
-            _sudden[key] = frozenset()
+        program = program_of(s, a, ft.partial(function, s, a))
+        names = frozenset(name for name, _ in sudden(program))
+        _sudden[key] = frozenset() if names == {"power"} else names
     return _sudden[key]
 
 
@@ -99,14 +103,14 @@ def passed_over(
 
     **Arguments:** `linear`: whether the path is linearized, so that steps must resolve jumps, too.
     """
-    s, passed = path.structure, []
+    s = path.structure
+    passed = []
     for a in np.unique(path.chart[:-1]).tolist():
         rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
         if len(rows) and may_have_pulses(s, a):
-            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))[
-                :1
-            ].tolist()
-            passed += [(int(rows[k]), column_name(s, a, j)) for k, j in wrong]
+            wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))
+            for k, j in wrong[:1].tolist():
+                passed.append((int(rows[k]), column_name(s, a, j)))
     return min(passed, default=None)
 
 
@@ -115,98 +119,149 @@ def _passing(
 ) -> np.ndarray:
     """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
     gain and guard: over what a polynomial through eight of its values in the step lacks."""
-    s, n, legendre = path.structure, path.structure.dims[a], np.polynomial.legendre
-    m, only_poles = n * (1 + s.nu), may_have_pulses(s, a) <= _POLES
-    pieces = _FEW if only_poles else 4 * _PIECES if linear else _PIECES
-    (x, _), (y, w) = legendre.leggauss(8), legendre.leggauss(4)
-    fine = 2 * (np.arange(pieces)[:, None] + (y + 1) / 2).ravel() / pieces - 1
-    polynomial = legendre.legvander(fine, 7) @ np.linalg.inv(legendre.legvander(x, 7))
-    weights, nodes = (
-        np.tile(w / 2 / pieces, pieces),
-        (np.append(x, fine)[:, None] + 1) / 2,
-    )
-    probes = _probes(s.method(a), (fine + 1) / 2, weights)
-    ends = (
-        path.after[:-1],
-        path.before[1:],
-        path.slope_after[:-1],
-        path.slope_before[1:],
-    )
+    s = path.structure
+    n = s.dims[a]
+    m = n * (1 + s.nu)
+    only_poles = may_have_pulses(s, a) <= _POLES
+    samples = _samples(s.method(a), only_poles, linear)
+    with_guards = bool(may_be_sudden(s, a, _guards))
     parts = []
     for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
         h = np.diff(path.t)[k, None, None]
-        q = interpolate(nodes, h, *(x[k, None, :n] for x in ends))
-        points = np.concatenate([path.t[k, None, None] + h * nodes, q], axis=2)
-        values = values_at(
-            s, a, points.reshape(-1, 1 + n), u, bool(may_be_sudden(s, a, _guards))
+        q = interpolate(
+            samples.nodes,
+            h,
+            path.after[k, None, :n],
+            path.before[k + 1, None, :n],
+            path.slope_after[k, None, :n],
+            path.slope_before[k + 1, None, :n],
         )
+        points = np.concatenate([path.t[k, None, None] + h * samples.nodes, q], axis=2)
+        values = values_at(s, a, points.reshape(-1, 1 + n), u, with_guards)
         values = values.reshape(*points.shape[:2], -1)
-        rates, (guards, enabled) = (
-            values[:, 8:, :m],
-            np.split(values[:, 8:, m:], 2, axis=2),
-        )
-        beside = rates - polynomial @ values[:, :8, :m]
-        low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
-        falls = (low & (np.maximum.accumulate(guards, 1) > 0) & (enabled > 0)).any(
-            axis=1
-        )
-        moved, passed = (
-            h[:, 0] * (weights @ np.abs(rates)),
-            h[:, 0] * np.abs(weights @ beside),
-        )
+        seen = values[:, :8, :m]
+        rates = values[:, 8:, :m]
+        beside = rates - samples.polynomial @ seen
+        duration = h[:, 0]
+        lacks = duration * np.abs(samples.weights @ beside)
         if linear and len(k) > 1 and not only_poles:
-            pairs = np.concatenate([rates[:-1, :, n:], rates[1:, :, n:]], axis=1)
-            off = np.abs(np.einsum("pf,kfj->kpj", probes, pairs)).max(
-                axis=1, initial=0.0
-            )
-            off = np.where(np.diff(k)[:, None] == 1, h[:-1, 0] * off, 0.0)
-            passed[:-1, n:] = np.maximum(passed[:-1, n:], off)
-        parts.append(
-            (moved, passed, *(np.abs(x).max(axis=1) for x in (beside, rates)), falls)
+            gains = rates[:, :, n:]
+            pairs = np.concatenate([gains[:-1], gains[1:]], axis=1)
+            errors = np.abs(np.einsum("pf,kfj->kpj", samples.probes, pairs))
+            error = duration[:-1] * errors.max(axis=1, initial=0.0)
+            follows = np.diff(k)[:, None] == 1
+            error = np.where(follows, error, 0.0)
+            lacks[:-1, n:] = np.maximum(lacks[:-1, n:], error)
+        part = _Part(
+            moved=duration * (samples.weights @ np.abs(rates)),
+            lacks=lacks,
+            beside=np.abs(beside).max(axis=1),
+            largest=np.abs(rates).max(axis=1),
+            falls=_falls(values[:, 8:, m:]),
         )
-    moved, passed, missed, largest, falls = map(
-        np.concatenate, zip(*parts, strict=True)
-    )
-    size, accuracy = moved.sum(axis=0), np.max(np.asarray(settings.rtol))
-    usual = (
-        np.abs(path.after[rows]).max(axis=0)
-        if settings.scale is None
-        else settings.scale[a]
-    )
+        parts.append(part)
+    whole = _Part(*map(np.concatenate, zip(*parts, strict=True)))
+
+    accuracy = np.max(np.asarray(settings.rtol))
+    if settings.scale is None:
+        usual = np.abs(path.after[rows]).max(axis=0)
+    else:
+        usual = settings.scale[a]
+    size = whole.moved.sum(axis=0)
     size[:n] = np.maximum(size[:n], usual[:n])
     same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
-    wrong = passed > same * size + ROUNDING * size.max()
+    wrong = whole.lacks > same * size + ROUNDING * size.max()
     if linear:
-        fastest = np.maximum(largest[:, :n].max(axis=0), usual[:n] / np.ptp(path.t))
+        fastest = whole.largest[:, :n].max(axis=0)
+        fastest = np.maximum(fastest, usual[:n] / np.ptp(path.t))
         # (The root of the accuracy, as at a kink. Less: kinks are refused. More: multipliers are
         # wrong beside steep functions that steps do not resolve.)
-        wrong[:, :n] |= missed[:, :n] > np.sqrt(accuracy) * fastest
-    return np.concatenate([wrong, falls], axis=1)
+        wrong[:, :n] |= whole.beside[:, :n] > np.sqrt(accuracy) * fastest
+    return np.concatenate([wrong, whole.falls], axis=1)
+
+
+class _Samples(NamedTuple):
+    """Where a step is looked at: eight points of a polynomial, and then F points in many pieces."""
+
+    nodes: np.ndarray
+    """Parts of the step (8 + F, 1)."""
+    polynomial: np.ndarray
+    """From values at the eight points to those of the polynomial at the others (F, 8)."""
+    weights: np.ndarray
+    """Of an integral over the step, at the F points."""
+    probes: np.ndarray
+    """See `_probes`."""
+
+
+def _samples(method: Method, only_poles: bool, linear: bool) -> _Samples:
+    """Where steps of a method are looked at."""
+    pieces = 4 * _PIECES if linear else _PIECES
+    if only_poles:
+        pieces = _FEW
+    legendre = np.polynomial.legendre
+    coarse, _ = legendre.leggauss(8)
+    inner, weights = legendre.leggauss(4)
+    within_pieces = np.arange(pieces)[:, None] + (inner + 1) / 2
+    fine = 2 * within_pieces.ravel() / pieces - 1
+    coefficients = np.linalg.inv(legendre.legvander(coarse, 7))
+    of_step = np.tile(weights / 2 / pieces, pieces)
+    return _Samples(
+        nodes=(np.append(coarse, fine)[:, None] + 1) / 2,
+        polynomial=legendre.legvander(fine, 7) @ coefficients,
+        weights=of_step,
+        probes=_probes(method, (fine + 1) / 2, of_step),
+    )
+
+
+class _Part(NamedTuple):
+    """Of K steps, by rate and gain (columns), or by guard."""
+
+    moved: np.ndarray
+    """Integrals of their sizes."""
+    lacks: np.ndarray
+    """Integrals that a polynomial, or a step of the method, lacks."""
+    beside: np.ndarray
+    """Largest distance from the polynomial."""
+    largest: np.ndarray
+    """Largest size."""
+    falls: np.ndarray
+    """Whether a guard falls below zero."""
+
+
+def _falls(values: np.ndarray) -> np.ndarray:
+    """Test whether guards fall below zero in steps, where they are enabled: (K, F, guards and
+    predicates)."""
+    guards, enabled = np.split(values, 2, axis=2)
+    low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
+    was_positive = np.maximum.accumulate(guards, 1) > 0
+    return (low & was_positive & (enabled > 0)).any(axis=1)
 
 
 def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Errors of a method's integrals over parts of two steps, as weights of samples in these steps:
     experiments and linearizations have other steps than the cycle, up to half as long again."""
-    t, rows = np.concatenate([within, 1 + within]), []
+    t = np.concatenate([within, 1 + within])
+    rows = []
     for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):
-        stages, inside = (
-            begin + length * np.array(method.c),
-            (t > begin) & (t < begin + length),
-        )
+        if begin + length > 2:
+            continue
+        stages = begin + length * np.array(method.c)
+        inside = (t > begin) & (t < begin + length)
+        # (The value at a stage lies between those of two samples.)
         left = np.clip(np.searchsorted(t, stages) - 1, 0, len(t) - 2)
-        part = (
-            length * np.array(method.b) * (stages - t[left]) / (t[left + 1] - t[left])
-        )
+        of_stage = length * np.array(method.b)
+        of_right = of_stage * (stages - t[left]) / (t[left + 1] - t[left])
         row = -np.tile(weights, 2) * inside
-        np.add.at(row, left, length * np.array(method.b) - part)
-        np.add.at(row, left + 1, part)
-        rows += [row] if begin + length <= 2 else []
+        np.add.at(row, left, of_stage - of_right)
+        np.add.at(row, left + 1, of_right)
+        rows.append(row)
     return np.stack(rows)
 
 
 def column_name(s: Structure, a: int, j: int) -> str:
     """The name of a column of `values_at`."""
-    n, states = s.dims[a], s.charts[a].states
+    n = s.dims[a]
+    states = s.charts[a].states
     if j < n:
         return f"rate of '{states[j]}'"
     row, column = divmod(j - n, max(s.nu, 1))
@@ -224,18 +279,19 @@ def values_at(
     lanes = kernels.POINTS if may_have_pulses(s, a) <= _POLES else kernels.WIDE
 
     def at(x):
-        point, n = (x[:, 0], x[:, 1:].T, u[:, None]), s.dims[a]
+        point = (x[:, 0], x[:, 1:].T, u[:, None])
+        n = s.dims[a]
         by = kernels.field(s, a, *point, lanes=lanes)
         rows = [by[:, 0], by[:, 2 + n :].reshape(-1, len(x))]
         if guards:
-            members, first = map(s.member, s.guards(a)), np.zeros(1, int)
+            members = map(s.member, s.guards(a))
+            first = np.zeros(1, int)
             rows += [kernels.watched(s, a, None, *point, first, lanes=lanes)[:, 0]]
             rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
         return np.concatenate(rows).T
 
-    return np.concatenate(
-        [at(x) for x in np.split(points, range(_POINTS, len(points), _POINTS))]
-    )
+    blocks = np.split(points, range(_POINTS, len(points), _POINTS))
+    return np.concatenate([at(block) for block in blocks])
 
 
 def may_have_pulses(s: Structure, a: int) -> frozenset[str]:
@@ -257,33 +313,40 @@ def jumps(
 ):
     """Yield times at which the field or a gain jumps within intervals of an orbit, the column of
     `values_at` that jumps, and the jump."""
-    n, m, parts = s.dims[a], s.dims[a] * (1 + s.nu), np.arange(1, 4)[:, None, None] / 4
-    at = lambda points: values_at(s, a, points, np.zeros(s.nu))[:, :m]  # noqa: E731
-    first, last = at(low), at(high)
+    n = s.dims[a]
+    m = n * (1 + s.nu)
+    quarters = np.arange(1, 4)[:, None, None] / 4
+
+    def at(points):
+        return values_at(s, a, points, np.zeros(s.nu))[:, :m]
+
+    first = at(low)
+    last = at(high)
     shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
-    rounding = np.nanquantile(
-        np.abs(at(shifted) - first), 0.9, axis=0
-    )  # (not at a jump)
+    # (A quantile: not the change at a jump.)
+    rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)
     limit = np.maximum(np.nanmax(np.abs(first), axis=0), rounding / _JUMP)
     limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
     limit[n:] = np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0))
     limit[n:] += np.finfo(float).tiny
     for _ in range(_QUARTERS):
-        points = np.stack([low, *(low + parts * (high - low)), high])
-        inside = at(np.concatenate(points[1:-1])).reshape(3, *first.shape)
+        between = low + quarters * (high - low)
+        points = np.stack([low, *between, high])
+        inside = at(np.concatenate(between)).reshape(3, *first.shape)
         values = np.nan_to_num(np.stack([first, *inside, last]))
-        change = np.abs(np.diff(values, axis=0)) / limit
-        near = np.abs(np.diff(points, axis=0) / sizes).max(axis=2, keepdims=True)
-        uneven = (
-            np.abs(np.diff(values, axis=0) - np.diff(values, axis=0).mean(axis=0))
-            / limit
-        )
-        worst, here = uneven.max(axis=2).argmax(axis=0), np.arange(len(low))
-        low, high = points[worst, here], points[worst + 1, here]
-        first, last = values[worst, here], values[worst + 1, here]
-        for i, j in np.argwhere(
-            ((change > _JUMP) & (change > _STEEP * near))[worst, here]
-        ):
+        changes = np.diff(values, axis=0)
+        change = np.abs(changes) / limit
+        distance = np.abs(np.diff(points, axis=0) / sizes).max(axis=2, keepdims=True)
+        uneven = np.abs(changes - changes.mean(axis=0)) / limit
+        # The quarter of each interval in which the field changes most unlike in the others.
+        worst = uneven.max(axis=2).argmax(axis=0)
+        here = np.arange(len(low))
+        low = points[worst, here]
+        high = points[worst + 1, here]
+        first = values[worst, here]
+        last = values[worst + 1, here]
+        is_jump = (change > _JUMP) & (change > _STEEP * distance)
+        for i, j in np.argwhere(is_jump[worst, here]):
             yield low[i, 0], j, change[worst[i], i, j] * limit[j]
         keep = uneven.max(axis=(0, 2)) > _JUMP
         low, high, first, last = (x[keep] for x in (low, high, first, last))
@@ -293,21 +356,17 @@ def jumps(
 
 def has_kinks(s: Structure) -> bool:
     """Test whether a field has operations with kinks or jumps, where many steps are rejected."""
-    return any(
-        may_be_sudden(s, a, Structure.field) & _KINKS for a in range(len(s.charts))
-    )
+    charts = range(len(s.charts))
+    return any(may_be_sudden(s, a, Structure.field) & _KINKS for a in charts)
 
 
 def lines_of_jumps(s: Structure, a: int) -> list[str]:
     """The lines of code by which the field of a chart may jump: those that decide, if there are
     any."""
-    lines = [
-        (name, _line_of(x)) for name, x in sudden(program_of(s, a)) if name != "power"
-    ]
-    decisions = [x for x in lines if x[0] == "decision"]
-    return [
-        line for line in dict.fromkeys(line for _, line in decisions or lines) if line
-    ]
+    found = [x for x in sudden(program_of(s, a)) if x[0] != "power"]
+    decisions = [x for x in found if x[0] == "decision"]
+    lines = [_line_of(equation) for _, equation in decisions or found]
+    return [line for line in dict.fromkeys(lines) if line]
 
 
 def _line_of(equation: Any) -> str:

@@ -87,7 +87,9 @@ class ChartFlow(NamedTuple):
 
     @property
     def has_level(self) -> bool:
-        s, a, levels = self.s, self.a, self.levels
+        s = self.s
+        a = self.a
+        levels = self.levels
         if levels is None:
             return False
         return s.once(("level", a), (levels,), lambda: shared(levels).present(s, a))
@@ -95,7 +97,10 @@ class ChartFlow(NamedTuple):
     @property
     def rows(self) -> list[int]:
         """Rows of a `Watch` that have a meaning in the chart: guards, and the target's level."""
-        return self.s.guards(self.a) + [len(self.s.transitions)] * self.has_level
+        rows = list(self.s.guards(self.a))
+        if self.has_level:
+            rows.append(len(self.s.transitions))
+        return rows
 
     def step(self, t: AnyTimes, q: States, h: AnyTimes) -> Step:
         """A step from (t, q) over h (see `take_step`)."""
@@ -115,21 +120,24 @@ class ChartFlow(NamedTuple):
 
     def watch(self, t: AnyTimes, q: States, f: States) -> Watch:
         """The watched functions, in the order of `rows`; f is the field there."""
-        a, levels, index = self.a, self.levels, self.index
+        a = self.a
+        levels = self.levels
+        index = self.index
         if on_host(q):
             rows = kernels.watched(self.s, a, levels, t, q, self.u, index, self.subset)
-            return Watch(
-                rows[:, 0], rows[:, 1] + np.sum(rows[:, 2 : 2 + len(q)] * f, axis=1)
-            )
+            gradient = rows[:, 2 : 2 + len(q)]
+            rate = rows[:, 1] + np.sum(gradient * f, axis=1)
+            return Watch(rows[:, 0], rate)
         kinds = self.s.guard_kinds(a)
 
         def watch(s, levels, t, q, u, i, f):
-            functions = lambda t, q: kernels.watched_at(a, kinds, s, levels, t, q, u, i)  # noqa: E731
+            def functions(t, q):
+                return kernels.watched_at(a, kinds, s, levels, t, q, u, i)
+
             return jax.jvp(functions, (t, q), (jnp.ones_like(t), f))
 
-        return Watch(
-            *self.s.by_lane(watch, levels, name=("watch", a))(t, q, self.u, index, f)
-        )
+        of_lanes = self.s.by_lane(watch, levels, name=("watch", a))
+        return Watch(*of_lanes(t, q, self.u, index, f))
 
     def locate(
         self,
@@ -145,10 +153,13 @@ class ChartFlow(NamedTuple):
         step. At the crossing itself (up to rounding) they change nothing, but carry the derivatives
         of its time and state exactly, to second order: this is the saltation formula.
         """
-        field, rows = self.field, self.rows
+        field = self.field
+        rows = self.rows
 
         def newton(t, q, f):
-            value, rate = (pick(x, rows, which) for x in self.watch(t, q, f))
+            watched = self.watch(t, q, f)
+            value = pick(watched.value, rows, which)
+            rate = pick(watched.rate, rows, which)
             return -value / namespace(rate).where(rate == 0, 1.0, rate)
 
         step = newton(t, q, f) if first is None else first
@@ -162,9 +173,8 @@ def chart_flow(
     s: Structure, a: int, here: Mask, u: Inputs, target: Target
 ) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
-    return ChartFlow(s, a, only(here, u), target.levels, only(here, target.index)).only(
-        here
-    )
+    flow = ChartFlow(s, a, only(here, u), target.levels, only(here, target.index))
+    return flow.only(here)
 
 
 def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Padded:
@@ -195,17 +205,21 @@ def watch(
         if not flow.rows:
             return out
         point = only(here, t), only(here, q[: s.dims[a]])
-        return write(out, flow.rows, here, flow.watch(*point, flow.field(*point)))
+        watched = flow.watch(*point, flow.field(*point))
+        return write(out, flow.rows, here, watched)
 
     return for_each_chart(s, chart, mask, work, no_events(s, t))
 
 
 def no_events(s: Structure, t: Times) -> Watch:
     """A `Watch` of lanes at times t whose rows have no meaning."""
-    xp, shape = namespace(t), (len(s.transitions) + 1, len(t))
+    xp = namespace(t)
+    shape = (len(s.transitions) + 1, len(t))
     return Watch(xp.ones(shape), xp.zeros(shape))
 
 
 def write(out: Watch, rows: list[int], here: Mask, new: Watch) -> Watch:
     """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
-    return Watch(*(put_rows(x, rows, here, y) for x, y in zip(out, new, strict=True)))
+    value = put_rows(out.value, rows, here, new.value)
+    rate = put_rows(out.rate, rows, here, new.rate)
+    return Watch(value, rate)

@@ -97,12 +97,13 @@ class ExperimentData(eqx.Module):
         a whole number of periods or is shorter than the window, and for NaN in an experiment whose
         `result` is OK.
         """
-        self.u, self.y = np.array(u), np.array(y)
+        self.u = np.array(u)
+        self.y = np.array(y)
         shapes = self.u.shape, self.y.shape
         if any(0 in s for s in shapes) or shapes[0][:2] != shapes[1][:2]:
-            text = "the same experiments and samples (their first two axes)"
             raise DefinitionError(
-                f"`u` {shapes[0]} and `y` {shapes[1]} must have {text}."
+                f"`u` {shapes[0]} and `y` {shapes[1]} must have the same experiments and samples "
+                "(their first two axes)."
             )
         self.result = (
             np.zeros(len(self.u), int) if result is None else np.asarray(result, int)
@@ -113,10 +114,12 @@ class ExperimentData(eqx.Module):
             )
         self.simulated = simulated
         self.cycle_outputs = None if cycle_outputs is None else np.array(cycle_outputs)
-        self.n_sections, self.periods = n_sections, periods
+        self.n_sections = n_sections
+        self.periods = periods
         sizes = self.u.shape[2], self.y.shape[2]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
-        (S, n, ny), N = self.y.shape, self.n_sections
+        S, n, ny = self.y.shape
+        N = self.n_sections
         if n % N:
             raise DefinitionError(
                 f"records must hold whole periods of N = {N} samples, not {n}."
@@ -128,17 +131,21 @@ class ExperimentData(eqx.Module):
             require_axes(
                 "`cycle_outputs`", self.cycle_outputs, {"sections": N, "outputs": ny}
             )
-        for name, values in (("u", self.u), ("y", self.y)):
-            finite = np.isfinite(values)
-            if finite.all():  # (along the last, short axis it takes ten times as long)
-                continue
-            bad = ~finite.all(axis=2) & self.ok[:, None]
-            if bad.any():
-                s, i = (int(x) for x in np.argwhere(bad)[0])
-                text = "repair the record, or mark the experiment as failed in `result`"
-                raise DefinitionError(
-                    f"experiment {s}: {name} is not finite at sample {i}: {text}."
-                )
+        self._require_finite("u", self.u)
+        self._require_finite("y", self.y)
+
+    def _require_finite(self, name: str, values: np.ndarray) -> None:
+        """**Raises:** `DefinitionError` for NaN in an experiment whose `result` is OK."""
+        finite = np.isfinite(values)
+        if finite.all():  # (along the last, short axis it takes ten times as long)
+            return
+        bad = ~finite.all(axis=2) & self.ok[:, None]
+        if bad.any():
+            s, i = np.argwhere(bad)[0].tolist()
+            raise DefinitionError(
+                f"experiment {s}: {name} is not finite at sample {i}: repair the record, or mark "
+                "the experiment as failed in `result`."
+            )
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:
@@ -197,11 +204,12 @@ class ExperimentData(eqx.Module):
 
         **Raises:** `DefinitionError` if the record is too short.
         """
-        n, length = self.u.shape[1], self.n_sections * self.periods
+        n = self.u.shape[1]
+        length = self.n_sections * self.periods
         if repeats * length > n:
-            text = f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods}"
             raise DefinitionError(
-                f"{text} periods: record more, or lower `periods` or repeats."
+                f"{n // self.n_sections} cycles are too few for {repeats} x P = {self.periods} "
+                "periods: record more, or lower `periods` or repeats."
             )
         first = n - repeats * length
         return [
@@ -216,9 +224,11 @@ class ExperimentData(eqx.Module):
 
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
-        label = f"{self.label}, " if self.label else ""
+        state = self.summary()
+        if self.label:
+            state = f"{self.label}, {state}"
         return folded(
-            f"ExperimentData({label}{self.summary()}; {n // self.n_sections} cycles of "
+            f"ExperimentData({state}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
@@ -232,21 +242,25 @@ class ExperimentData(eqx.Module):
 
         **Raises:** `DefinitionError` for experiments that are no such pairs.
         """
-        plus, minus = self.u[::2], self.u[1::2]
+        plus = self.u[::2]
+        minus = self.u[1::2]
         if len(self.u) % 2:
             raise DefinitionError(
                 f"{len(self.u)} experiments are not pairs: leave one out."
             )
-        unit = np.maximum(
-            np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0), np.finfo(float).tiny
-        )
-        total, size = (np.abs(x / unit).max(axis=(1, 2)) for x in (plus + minus, plus))
+        largest = np.abs(self.u[self.ok]).max(axis=(0, 1), initial=0)
+        unit = np.maximum(largest, np.finfo(float).tiny)
+        total = np.abs((plus + minus) / unit).max(axis=(1, 2))
+        size = np.abs(plus / unit).max(axis=(1, 2))
         apart = ~(total <= _OPPOSITE * size)
         if apart.any():
             k = 2 * int(np.argmax(apart))
-            text = "their inputs are not opposite (`Design.with_negatives` makes pairs)"
-            raise DefinitionError(f"experiments {k} and {k + 1} are no pair: {text}.")
-        first, second = self.result[::2], self.result[1::2]
+            raise DefinitionError(
+                f"experiments {k} and {k + 1} are no pair: their inputs are not opposite "
+                "(`Design.with_negatives` makes pairs)."
+            )
+        first = self.result[::2]
+        second = self.result[1::2]
         broken = first != Result.OK
         failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])
         error = np.maximum(self.error[::2], self.error[1::2])
@@ -271,10 +285,10 @@ def summary(
     text = [f"{len(result) - len(failed)}/{len(result)} ok"]
     for s in failed[:limit]:
         cycle, section = divmod(int(failed_at[s]), n_sections)
-        where = f"section {section}, cycle {cycle}: " if failed_at[s] >= 0 else ""
-        text.append(
-            f"#{s}: {where}{causes[s] if causes else Result(int(result[s])).message}"
-        )
+        cause = causes[s] if causes else Result(int(result[s])).message
+        if failed_at[s] >= 0:
+            cause = f"section {section}, cycle {cycle}: {cause}"
+        text.append(f"#{s}: {cause}")
     if len(failed) > limit:
         text.append(f"and {len(failed) - limit} more")
     return folded("; ".join(text))

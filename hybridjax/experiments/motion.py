@@ -38,22 +38,30 @@ def perturbed_trajectory(
     """
     require_x64()
     held: np.ndarray = np.asarray(inputs)
-    s, placed, N = placed.structure(), to_host(placed), placed.n_sections
+    s = placed.structure()
+    N = placed.n_sections
+    placed = to_host(placed)
     require_shape((1, *held.shape), N, s.nu)
     lanes = jax.tree_util.tree_map(lambda x: x[..., :1], placed.lanes)
-    period, turn = float(placed.cycle.period), len(placed.cycle.event_sequence)
-    settings, tapes, shift, begin = placed.cycle.settings, list[Tape](), 0.0, lanes
+    period = float(placed.cycle.period)
+    turn = len(placed.cycle.event_sequence)
+    settings = placed.cycle.settings
+    tapes = list[Tape]()
+    shift = 0.0
+    begin = lanes
     for k, u in enumerate(held[..., None]):
-        j, turns = (k + 1) % N, int((k + 1) % N == 0)
+        j = (k + 1) % N
+        turns = int(j == 0)
         target = placed.target(np.array([j]), lanes.t, np.array([turns]))
         with at_ease():
             moved, tape = move(
                 s, lanes, u, target, settings, options=Options(tape=True)
             )
         assert tape is not None
-        if (code := Result(int(moved.result[0]))) != Result.OK:
+        result = Result(int(moved.result[0]))
+        if result != Result.OK:
             raise ComputationError(
-                f"the motion stops after sample {k}: {code.message}."
+                f"the motion stops after sample {k}: {result.message}."
             )
         tapes.append(tape._replace(t=tape.t + shift))
         shift += turns * period

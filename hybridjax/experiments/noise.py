@@ -113,17 +113,17 @@ def simulate_experiments(
     is a P-th root of one).
     """
     require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
-    discard = (DISCARD if start == "cycle" else 0) if discard is None else discard
+    if discard is None:
+        discard = DISCARD if start == "cycle" else 0
     if start == "cycle" and discard and (np.abs(ldtp.multipliers) >= 1).any():
         raise DefinitionError(
             'the model is unstable: use start="periodic", or discard=0 for the transient itself.'
         )
-    u = applied = design.inputs(design.periods + discard)
-    x0 = (
-        ldtp.periodic_states(design.inputs(), design.periods)
-        if start == "periodic"
-        else None
-    )
+    u = design.inputs(design.periods + discard)
+    x0 = None
+    if start == "periodic":
+        x0 = ldtp.periodic_states(design.inputs(), design.periods)
+    applied = u
     if process_noise is not None:
         applied = u + process_noise.draw(u.shape, design.n_sections)
     return ExperimentData(
@@ -166,7 +166,9 @@ def add_noise(
     if snr is not None:
         data.require_ok()
         std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
-    std, N, ny = np.asarray(std), data.n_sections, data.y.shape[2]
+    std = np.asarray(std)
+    N = data.n_sections
+    ny = data.y.shape[2]
     require_axes("`std`", std, {}, {"outputs": ny}, {"sections": N, "outputs": ny})
     white = np.random.default_rng(seed).normal(size=data.y.shape)
     each = np.resize(np.broadcast_to(std, (N, ny)), data.y.shape[1:])

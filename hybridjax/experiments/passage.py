@@ -102,7 +102,8 @@ def follow_table(
     **Returns:** the response, and which experiments have left the table: their responses are
     meaningless.
     """
-    N, (S, n, nu) = len(course.bound.time), u.shape
+    N = len(course.bound.time)
+    S, n, nu = u.shape
     moves = _Moves(course, plan, settings, feedback, form)
     branches = [moves.of(body) for body in form.bodies]
     # Periods, then sections; lanes last.
@@ -129,7 +130,10 @@ def follow_table(
 
     begin = moves.begin(start, S)
     (end, _), (y, answers) = jax.lax.scan(turn, (begin, Kept.of(begin)), held)
-    to_experiments = lambda x: jnp.moveaxis(x, -1, 0).reshape(S, n, -1)  # noqa: E731
+
+    def to_experiments(x):
+        return jnp.moveaxis(x, -1, 0).reshape(S, n, -1)
+
     y = to_experiments(y)
     finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
     left = end.left | ~finite | (end.place != BEGIN)
@@ -163,8 +167,11 @@ class _Moves:
         feedback: Feedback | None,
         form: Form,
     ):
-        self.course, self.plan, self.settings = course, plan, settings
-        self.feedback, self.form = feedback, form
+        self.course = course
+        self.plan = plan
+        self.settings = settings
+        self.feedback = feedback
+        self.form = form
         self.s = Structure(course.system)
         self.outputs = self.s.resolve_outputs(course.outputs)
         self.levels = course.bound.levels
@@ -177,7 +184,8 @@ class _Moves:
     def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
         zero = jnp.zeros(S)
         value, rate = self._unknown(S)
-        answer = controller = None
+        answer = None
+        controller = None
         if self.feedback is not None:
             answer = jnp.zeros((self.s.nu, S))
             controller = jnp.zeros((self.feedback.matrices.A.shape[1], S))
@@ -251,7 +259,8 @@ class _Moves:
 
     def _event(self, body: Body, row: Rows, u, x: Passage, kept: Kept, acts):
         """An event, and the reset; or back to where the leg began."""
-        a, s = body.chart, self.s
+        a = body.chart
+        s = self.s
         b = s.chart_index(s.transitions[body.kind[0]].target)
         q = x.q[: s.dims[a]]
         u = self._applied(u, x)
@@ -336,7 +345,9 @@ class _Moves:
     # Functions of a chart.
 
     def _field(self, a: int, u):
-        of_lane = lambda s, t, q, u: s.field(a, t, q, u)  # noqa: E731
+        def of_lane(s, t, q, u):
+            return s.field(a, t, q, u)
+
         field = self.s.by_lane(of_lane, name=("field", a), by_row=False)
         return lambda t, q: field(t, q, u)
 
@@ -359,7 +370,10 @@ class _Moves:
         at = ft.partial(kernels.watched_at, a, self.s.guard_kinds(a))
         watched = self.s.by_lane(at, self.levels, name=("watched", a), by_row=False)
         index = ((row.section + 1) % self.N).astype(jnp.int32)[None]
-        values = lambda t, q: watched(t, q, u, index)  # noqa: E731
+
+        def values(t, q):
+            return watched(t, q, u, index)
+
         value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), f))
         more = (0, self.form.watched - len(value)), (0, 0)
         # (Rates of what is not watched are 1: nothing divides by zero.)
@@ -369,7 +383,8 @@ class _Moves:
     def _has_left(self, a: int, row: Rows, x: Passage, value, rate):
         """Test whether a watched function has another sign than on the cycle, or a guard has passed
         zero and come back in the last step."""
-        count, guards = self._functions(a), len(self.s.guards(a))
+        count = self._functions(a)
+        guards = len(self.s.guards(a))
         signs = row.signs[:, None]
         # (Comparisons with NaN are false.)
         other = ((signs != 0) & ~(jnp.sign(value) * signs > 0))[:count]

@@ -101,7 +101,10 @@ class Plan(eqx.Module):
 
     def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
         """Return the first step and its limits at section k, for so many lanes."""
-        fill = lambda x: jnp.full(lanes, x[k])  # noqa: E731
+
+        def fill(x):
+            return jnp.full(lanes, x[k])
+
         return Stride(fill(self.h), fill(self.lead), fill(self.slack))
 
 
@@ -117,64 +120,86 @@ def make_plan(
 
     **Raises:** `ComputationError` if no candidate reaches the next section.
     """
-    N = placed.n_sections
     placed = to_host(placed)
     *_, target = placed.onwards()
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
-    J, by_input = J[:, :, : scale.shape[1]], J[:, :, scale.shape[1] :]
+    by_input = J[:, :, scale.shape[1] :]
+    J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
     ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
     error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
-    impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
-    missed = (
-        np.isnan(ways.ends[0, -1]) & (np.arange(len(ways.ends[0, -1])) > 0)[:, None]
-    )
-    impacts = np.where(missed, 0.0, np.where(np.isnan(impact), np.inf, impact))
-    impact = impacts.max(axis=1)
-    lost = ~np.isfinite(impact).any(axis=0)
-    if lost.any():
-        k = int(np.argmax(lost))
-        text = "place more sections, or find the cycle with `settings=Settings(max_steps=...)`"
-        raise ComputationError(f"too many steps from section {k} to the next: {text}.")
-    estimate = np.maximum(ways.estimate, _LEAST_SHARE)
 
-    # The largest share of the accuracy for each section that keeps their sum.
-    section = np.arange(N)
-    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
-        # The first candidate of each section with so small an impact, or the best.
-        enough = impact <= share
-        best = np.where(
-            enough.any(axis=0), np.argmax(enough, axis=0), np.argmin(impact, axis=0)
-        )
-        total = impact[best, section].sum()
-        if total <= accuracy:
-            break
-    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
+    impacts = _impacts(ways, J, error, scale)
+    largest = impacts.max(axis=1)
+    _require_ways(largest)
+    best, total = _cheapest(largest, accuracy)
+    section = np.arange(placed.n_sections)
     # Small deviations, whose errors may be hidden by those on the cycle, have at most the least; it
     # holds the cycle's own, whose stiff states are less accurate than its others.
     least = np.zeros(())
     if ways.estimate.shape[1] > 1:
-        after = (section + 1) % N
+        after = np.roll(section, -1)
         own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
-        least = impact[best, section].sum() + np.abs(own).max()
+        least = largest[best, section].sum() + np.abs(own).max()
+
+    # The cycle itself comes first, and then the larger deviations.
     large = slice(1 + placed.structure().nu)
-    impact, estimate = impacts[best, large, section].T, estimate[best, large, section].T
+    impact = impacts[best, large, section].T
+    estimate = np.maximum(ways.estimate, _LEAST_SHARE)[best, large, section].T
     # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
-    together = (
-        _CAUTION * _accumulated(J, error[best, 0, section], scale) / impact[0].sum()
-    )
-    weight = (impact / estimate).max(axis=0) * np.maximum(
-        together, 1 / _MOST_CANCELLATION
-    )
-    impact, estimate = impact[0], estimate[0]
+    accumulated = _accumulated(J, error[best, 0, section], scale)
+    together = _CAUTION * accumulated / impact[0].sum()
+    weight = (impact / estimate).max(axis=0)
+    weight = weight * np.maximum(together, 1 / _MOST_CANCELLATION)
+
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
-    share = np.minimum(accuracy * estimate / impact, 1.0) / N
+    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0) / len(section)
+    spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
+    of_equal_steps = np.maximum(spare * estimate[0], share)
     slack = ways.slack[best]
-    slack = np.where(np.isinf(slack), np.maximum(spare * estimate, share), slack)
+    slack = np.where(np.isinf(slack), of_equal_steps, slack)
     return from_host(Plan(ways.first[best, section], ways.lead, slack, weight, least))
+
+
+def _impacts(ways: "_Ways", J, error, scale) -> Float[np.ndarray, "K M N"]:
+    """Return the largest later errors that each candidate causes from each start: infinite where it
+    does not arrive, and 0 for a deviation from which the reference does not arrive, either."""
+    impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
+    impact = np.where(np.isnan(impact), np.inf, impact)
+    reference = ways.ends[0, -1]
+    deviates = np.arange(len(reference))[:, None] > 0
+    return np.where(np.isnan(reference) & deviates, 0.0, impact)
+
+
+def _require_ways(impact: Float[np.ndarray, "K N"]) -> None:
+    """**Raises:** `ComputationError` if no candidate reaches the next section."""
+    lost = ~np.isfinite(impact).any(axis=0)
+    if lost.any():
+        raise ComputationError(
+            f"too many steps from section {int(np.argmax(lost))} to the next: place more sections, "
+            "or find the cycle with `settings=Settings(max_steps=...)`."
+        )
+
+
+def _cheapest(
+    impact: Float[np.ndarray, "K N"], accuracy: float
+) -> tuple[Int[np.ndarray, " N"], float]:
+    """Return the candidate of each section, and the sum of their impacts: the cheapest ones for the
+    largest share of the accuracy that keeps this sum."""
+    N = impact.shape[1]
+    section = np.arange(N)
+    most_accurate = np.argmin(impact, axis=0)
+    for share in accuracy * 0.5 ** np.arange(0, 4 + N.bit_length()):
+        enough = impact <= share
+        first = np.argmax(enough, axis=0)
+        best = np.where(enough.any(axis=0), first, most_accurate)
+        total = impact[best, section].sum()
+        if total <= accuracy:
+            break
+    return best, total
 
 
 class _Ways(NamedTuple):
@@ -193,47 +218,54 @@ class _Ways(NamedTuple):
 def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]:
     """Return inputs that cause deviations: none, and where methods are implicit, of each size by
     each input."""
-    s, nu = placed.structure(), by_input.shape[2]
+    s = placed.structure()
+    nu = by_input.shape[2]
     if not has_implicit(s):
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
-    largest = np.abs(by_input / np.roll(scale, -1, axis=0)[:, :, None])[:, time:].max(
-        axis=(0, 1)
-    )
-    one = np.diag(np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu)))
-    return np.concatenate([np.zeros((1, nu)), *(size * one for size in _KICKS)])
+    after = np.roll(scale, -1, axis=0)[:, :, None]
+    largest = np.abs(by_input / after)[:, time:].max(axis=(0, 1))
+    unit = np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu))
+    kicks = [size * np.diag(unit) for size in _KICKS]
+    return np.concatenate([np.zeros((1, nu)), *kicks])
 
 
 @host_first
 def _try_ways(
     placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]
 ) -> _Ways:
-    s, xp, N = placed.structure(), namespace(placed.lanes.t), placed.n_sections
-    M, implicit = len(kicks), has_implicit(s)
+    s = placed.structure()
+    xp = namespace(placed.lanes.t)
+    N = placed.n_sections
+    M = len(kicks)
+    implicit = has_implicit(s)
     equal = () if implicit else _EQUAL_STEPS
-    K, most = len(equal) + len(_TOLERANCES), _EQUAL_STEPS[-1]
+    K = len(equal) + len(_TOLERANCES)
+    most = _EQUAL_STEPS[-1]
     patience = max(settings.max_steps, PATIENCE)
     following, _, target = placed.onwards()
     lead = _lead(placed, target)
-    by_level = xp.isinf(placed.bound.time[following]) & (
-        placed.bound.event[following] < 0
-    )
+    by_level = xp.isinf(placed.bound.time[following])
+    by_level = by_level & (placed.bound.event[following] < 0)
     longest = placed.duration * xp.where(by_level, _ROOM, 1 + 1e-9)
 
     # A lane for every section in each of K candidates and the reference.
     W = K + 1
-    divide = np.array([*equal, *[most] * len(_TOLERANCES), 2])
-    slack = np.array([*[np.inf] * len(equal), *_TOLERANCES, 1.0])
+    divide = np.array([*equal, *(most for _ in _TOLERANCES), 2])
+    slack = np.array([*(np.inf for _ in equal), *_TOLERANCES, 1.0])
     by_estimate = np.isfinite(slack) & (np.arange(W) < K)
     rtol = xp.where(by_estimate, settings.rtol, ROUNDING)
 
-    all_ways = lambda tree: jax.tree_util.tree_map(lambda x: xp.tile(x, W * M), tree)  # noqa: E731
-    each = lambda x: xp.repeat(xp.asarray(x), M * N)  # noqa: E731
+    def all_ways(tree):
+        return jax.tree_util.tree_map(lambda x: xp.tile(x, W * M), tree)
+
+    def each(x):
+        return xp.repeat(xp.asarray(x), M * N)
+
     lanes = all_ways(placed.lanes)
     per_lane = ("time", "index", "event", "limit")
-    target = dataclasses.replace(
-        target, **{x: all_ways(getattr(target, x)) for x in per_lane}
-    )
+    ends_of_lanes = {name: all_ways(getattr(target, name)) for name in per_lane}
+    target = dataclasses.replace(target, **ends_of_lanes)
     start = Stride(all_ways(longest) / each(divide), all_ways(lead), each(slack))
     accuracy = each(rtol), each(settings.atol * rtol / settings.rtol)
     tolerance = Settings(1.0, 1.0, patience, settings.scale)
@@ -244,12 +276,12 @@ def _try_ways(
     )
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
     ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
-    estimate = moved.error.reshape(W, M, N)[:K] * (rtol[:K, None, None] / settings.rtol)
+    tolerances = rtol[:K, None, None] / settings.rtol
+    estimate = moved.error.reshape(W, M, N)[:K] * tolerances
     first = longest / divide[:K, None]
     if tape is not None:  # the first step that is accepted, or all the way
-        taken = xp.take_along_axis(
-            tape.h, xp.argmax(tape.code != IDLE, axis=0)[None], axis=0
-        )
+        accepted = xp.argmax(tape.code != IDLE, axis=0)[None]
+        taken = xp.take_along_axis(tape.h, accepted, axis=0)
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
     return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
@@ -257,38 +289,46 @@ def _try_ways(
 
 def _lead(placed: PlacedSections, target):
     """Return the time to the next level as a multiple of Newton's guess; 1 if the guess is bad."""
-    s, lanes = placed.structure(), placed.lanes
-    N, xp = placed.n_sections, namespace(lanes.t)
+    s = placed.structure()
+    lanes = placed.lanes
+    N = placed.n_sections
+    xp = namespace(lanes.t)
     watched = watch(
         s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)), target, xp.ones(N, bool)
     )
-    value, rate = watched.value[-1], watched.rate[-1]
+    value = watched.value[-1]
+    rate = watched.rate[-1]
     falls = (value > 0) & (rate < 0)
-    lead = placed.duration * xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    inverse_guess = xp.where(falls, -rate / xp.where(falls, value, 1.0), 0.0)
+    lead = placed.duration * inverse_guess
     return xp.where((lead > 1 / _WORST_GUESS) & (lead < _WORST_GUESS), lead, 1.0)
 
 
 def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     """Return the largest later errors that errors of the interval after section k (*K, N, n) cause,
     relative to the scales."""
-    N, after = len(scale), np.roll(scale, -1, axis=0)
+    N = len(scale)
+    after = np.roll(scale, -1, axis=0)
     # (All errors of a section side by side: one product of matrices for each.)
     x = (error / after).reshape(-1, *scale.shape).transpose(1, 2, 0)
     J = J * scale[:, None] / after[:, :, None]
-    section, worst = np.arange(N), np.zeros((_PERIODS, N, x.shape[2]))
+    section = np.arange(N)
+    worst = np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
-        np.maximum(worst[m // N], np.abs(x).max(axis=1), out=worst[m // N])
+        period = worst[m // N]
+        np.maximum(period, np.abs(x).max(axis=1), out=period)
         x = J[(section + 1 + m) % N] @ x
-    ratio = np.clip(worst[-1] / np.where(worst[-2] > 0, worst[-2], 1.0), 0.0, 0.999)
-    return (worst.sum(axis=0) + worst[-1] * ratio / (1 - ratio)).T.reshape(
-        error.shape[:-1]
-    )
+    *_, before, last = worst
+    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    later = last * ratio / (1 - ratio)
+    return (worst.sum(axis=0) + later).T.reshape(error.shape[:-1])
 
 
 def _accumulated(J, error, scale) -> float:
     """Return the largest error, relative to the scales, if all sections add `error` (N, n)."""
     N = len(scale)
-    total, largest = np.zeros(scale.shape[1]), 0.0
+    total = np.zeros(scale.shape[1])
+    largest = 0.0
     for m in range(_PERIODS * N):
         total = J[m % N] @ total + error[m % N]
         largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
@@ -324,9 +364,8 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         time = np.full((placed.n_sections, 1), float(cycle.period))
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
-        return Stepping(
-            make_plan(placed, settings, accuracy, scales), settings, scales, accuracy
-        )
+        plan = make_plan(placed, settings, accuracy, scales)
+        return Stepping(plan, settings, scales, accuracy)
 
     # A plan is no part of the program that JAX traces.
     inside = is_inside_program() and not is_traced(placed)

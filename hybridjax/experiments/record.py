@@ -62,14 +62,17 @@ class Record(eqx.Module):
         drift: Drift | None = None,
     ):
         """**Raises:** `DefinitionError` for shapes that do not fit together."""
-        self.u, self.y = np.array(u), np.array(y)
+        self.u = np.array(u)
+        self.y = np.array(y)
         if len(self.u) != len(self.y) or 0 in (len(self.u), *self.y.shape):
-            text = (
-                f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples"
+            raise DefinitionError(
+                f"`u` {self.u.shape} and `y` {self.y.shape} must have the same samples (their "
+                "first axes), one or more."
             )
-            raise DefinitionError(f"{text} (their first axes), one or more.")
         require_index("section", first_section, n_sections)
-        self.n_sections, self.first_section, self.lead = n_sections, first_section, lead
+        self.n_sections = n_sections
+        self.first_section = first_section
+        self.lead = lead
         self.drift = drift
         sizes = self.u.shape[1], self.y.shape[1]
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
@@ -85,14 +88,17 @@ class Record(eqx.Module):
         **Raises:** `DefinitionError` if there are none.
         """
         section = (self.first_section + first) % self.n_sections
-        u, y = self.u[first:stop], self.y[first:stop]
+        u = self.u[first:stop]
+        y = self.y[first:stop]
         return dataclasses.replace(self, u=u, y=y, first_section=section)
 
     def __repr__(self) -> str:
+        samples = f"{len(self.u)} samples from section {self.first_section}"
         missing = int(np.isnan(self.y).any(axis=1).sum())
-        gaps = f", {missing} with gaps" if missing else ""
+        if missing:
+            samples += f", {missing} with gaps"
         return folded(
-            f"Record({len(self.u)} samples from section {self.first_section}{gaps}; "
+            f"Record({samples}; "
             f"N = {self.n_sections}; {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
@@ -118,7 +124,9 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
     parts = [data] if isinstance(data, HasRecords) else data
-    records = [record for part in parts for record in part.records]
+    records: list[Record] = []
+    for part in parts:
+        records.extend(part.records)
     if not records:
         raise DefinitionError(
             "`data` holds no experiment that ran well: see `data.summary()`."
@@ -128,12 +136,15 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
             "`data` holds no input: name one, or use `hj.recordings.natural_multipliers`."
         )
     about = [(r.n_sections, r.inputs, r.outputs, r.lead, r.drift) for r in records]
-    if other := [x for x in about if x != about[0]]:
-        text = "the same sections, inputs, outputs, lead and drift"
+    others = [x for x in about if x != about[0]]
+    if others:
         raise DefinitionError(
-            f"records of `data` must have {text}, not {about[0]} and {other[0]}."
+            "records of `data` must have the same sections, inputs, outputs, lead and drift, not "
+            f"{about[0]} and {others[0]}."
         )
-    usable = [part for record in records for part in _with_known_inputs(record)]
+    usable: list[Record] = []
+    for record in records:
+        usable.extend(_with_known_inputs(record))
     if not usable:
         raise DefinitionError(
             "an input is NaN at every sample: give the input that acted."
@@ -155,19 +166,25 @@ def average_cycle(
 def require_deviations(records: Sequence[Record]) -> None:
     """**Raises:** `DefinitionError` if an output is nearly the same in all cycles, though no drift
     was declared and inputs change: it holds the limit cycle itself."""
-    N, nu = records[0].n_sections, len(records[0].inputs)
-    x = np.concatenate([np.concatenate([r.u, r.y], axis=1) for r in records])
-    section = (
-        np.concatenate([r.first_section + np.arange(len(r.u)) for r in records]) % N
-    )
-    left = x - average_cycle(section, x, N)[section]
+    N = records[0].n_sections
+    nu = len(records[0].inputs)
+    values = np.concatenate([np.hstack([r.u, r.y]) for r in records])
+    samples = [r.first_section + np.arange(len(r.u)) for r in records]
+    section = np.concatenate(samples) % N
+    if records[0].drift is not None or len(values) <= 3 * N:
+        return
+    deviations = values - average_cycle(section, values, N)[section]
     with np.errstate(invalid="ignore"):
-        changes = np.nansum(left**2, axis=0) / np.nansum(x**2, axis=0)
+        power = np.nansum(values**2, axis=0)
+        changes = np.nansum(deviations**2, axis=0) / power
+    of_inputs = changes[:nu].min()
     # (A response to inputs that nearly repeat may nearly repeat itself.)
-    fixed = changes[nu:] < 0.01 * changes[:nu].min() ** 2
-    if fixed.any() and records[0].drift is None and len(x) > 3 * N:
-        text = "is nearly the same in all cycles: subtract the limit cycle from the outputs."
-        raise DefinitionError(f"{records[0].outputs[int(np.argmax(fixed))]} {text}")
+    fixed = changes[nu:] < 0.01 * of_inputs**2
+    if fixed.any():
+        output = records[0].outputs[int(np.argmax(fixed))]
+        raise DefinitionError(
+            f"{output} is nearly the same in all cycles: subtract the limit cycle from the outputs."
+        )
 
 
 def _with_known_inputs(record: Record) -> Iterator[Record]:

@@ -112,27 +112,33 @@ def flow_batch(
     `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse mode
     stores the states at the sections and recomputes the flow between them.
     """
-    s, period, sequence = Structure(course.system), course.period, course.event_sequence
+    s = Structure(course.system)
+    period = course.period
+    sequence = course.event_sequence
     z = s.resolve_outputs(course.outputs)
-    N, (S, n, _) = len(course.bound.time), u.shape
+    N = len(course.bound.time)
+    S, n, _ = u.shape
     one_turn = len(sequence)
-    first = jax.tree_util.tree_map(lambda x: x[..., :1], course.lanes)
-    lanes = jax.tree_util.tree_map(
-        lambda x: jnp.broadcast_to(x, (*x.shape[:-1], S)), first
-    )
+
+    def many(x):
+        return jnp.broadcast_to(x[..., :1], (*x.shape[:-1], S))
+
+    lanes = jax.tree_util.tree_map(many, course.lanes)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
     @jax.checkpoint
     def section(carry, xs):
         lanes, result, state = carry
         k, u = xs
-        i, j = k % N, (k + 1) % N
+        i = k % N
+        j = (k + 1) % N
         answer = None
         if feedback is not None:  # of outputs before the input acts
             A, B, C, D, _ = (x[i] for x in feedback.matrices)
             deviation = observe(s, z, lanes, u) - feedback.on_cycle[i][:, None]
             answer = -(C @ state + D @ deviation)
-            state, u = A @ state + B @ deviation, u + answer
+            state = A @ state + B @ deviation
+            u = u + answer
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
         to = j[None], lanes.t, turns[None]
@@ -141,17 +147,13 @@ def flow_batch(
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result).moved
         # An event may change places with a section, but none may be left out or come in addition.
-        wrong = (
-            jnp.abs(moved.lanes.events - (course.lanes.events[j] + turns * one_turn))
-            > 1
-        )
+        expected = course.lanes.events[j] + turns * one_turn
+        wrong = jnp.abs(moved.lanes.events - expected) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
         # Times and events are counted within one turn, so that every turn is computed alike.
-        lanes = eqx.tree_at(
-            lambda x: (x.t, x.events),
-            moved.lanes,
-            (moved.lanes.t - turns * period, moved.lanes.events - turns * one_turn),
-        )
+        t = moved.lanes.t - turns * period
+        events = moved.lanes.events - turns * one_turn
+        lanes = moved.lanes._replace(t=t, events=events)
         ok = result == Result.OK
         share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
         return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
@@ -163,9 +165,8 @@ def flow_batch(
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
     error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
-    end = jnp.where(
-        result == Result.OK, jnp.concatenate([lanes.t[None], lanes.q]), jnp.nan
-    )
+    end = jnp.concatenate([lanes.t[None], lanes.q])
+    end = jnp.where(result == Result.OK, end, jnp.nan)
     answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
     return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
 
@@ -212,13 +213,17 @@ class ResponseFunction(eqx.Module):
         system has changed.
         """
         require_x64(system)
-        u, placed = jnp.asarray(u, float), self.placed
+        u = jnp.asarray(u, float)
+        placed = self.placed
         require_shape(u.shape, placed.n_sections, placed.cycle.structure.nu)
         if system is None:
             placed.require_current()
             require_as_made(self.outputs, "this response function was made")
         else:
-            both = lambda x: (x.cycle.system, x.cycle.numbers)  # noqa: E731
+
+            def both(x):
+                return (x.cycle.system, x.cycle.numbers)
+
             placed = eqx.tree_at(both, placed, (system, arrays_of(system)))
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
@@ -262,7 +267,8 @@ def response_function(
     range.
     """
     placed = as_placed(cycle, sections)
-    z, stepping = check_outputs(cycle, outputs), plan_flow(placed, accuracy)
+    z = check_outputs(cycle, outputs)
+    stepping = plan_flow(placed, accuracy)
     steps = max(_STEPS, _STEPS**2 // placed.n_sections)
     settings = dataclasses.replace(stepping.settings, max_steps=steps)
     stepping = dataclasses.replace(stepping, settings=settings)

@@ -10,7 +10,7 @@ turns out to lie beyond the next section is undone.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -122,22 +122,26 @@ class _Points(NamedTuple):
     """Newton's guesses of the times to their zeros."""
     signs: Int[np.ndarray, "P G"]
 
+    def part(self, points: slice) -> "_Points":
+        """The functions at some of the points."""
+        return _Points(self.newton[points], self.signs[points])
+
 
 def applies(s: Structure, placed: PlacedSections) -> bool:
     """Test whether experiments can follow a table: with explicit methods, and events at the zeros
     of guards that are always enabled."""
-    charts = np.unique(np.asarray(placed.lanes.chart)).tolist()
-    codes = np.unique(np.asarray(placed.tape.code))
-    taken = [s.transitions[g] for g in codes[codes >= 0].tolist()]
-    used = {*charts, *(s.chart_index(x.target) for x in taken)}
-    plain = all(
-        x.enabled is None and not isinstance(x.guard, Scheduled)
-        for x in s.transitions
-        if s.chart_index(x.source) in used
-    )
-    explicit = not any(s.method(a).implicit for a in used)
-    at_once = np.asarray(placed.tape.at_once)[np.asarray(placed.tape.code) >= 0].any()
-    return plain and explicit and not at_once
+    codes = np.asarray(placed.tape.code)
+    is_event = codes >= 0
+    if np.asarray(placed.tape.at_once)[is_event].any():
+        return False
+    charts = set(np.asarray(placed.lanes.chart).tolist())
+    for g in np.unique(codes[is_event]).tolist():
+        charts.add(s.chart_index(s.transitions[g].target))
+    if any(s.method(a).implicit for a in charts):
+        return False
+    possible = [x for x in s.transitions if s.chart_index(x.source) in charts]
+    scheduled = any(isinstance(x.guard, Scheduled) for x in possible)
+    return not scheduled and all(x.enabled is None for x in possible)
 
 
 class Tables(NamedTuple):
@@ -164,7 +168,10 @@ def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
 def _of_length(table: Table, other: Table) -> Table:
     """A table with at least as many rows as another has, repetitions of its last one."""
     more = max(len(other.rows.body) - len(table.rows.body), 0)
-    repeat = lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)])  # noqa: E731
+
+    def repeat(x):
+        return np.concatenate([x, np.repeat(x[-1:], more, axis=0)])
+
     return dataclasses.replace(table, rows=Rows(*map(repeat, table.rows)))
 
 
@@ -172,58 +179,72 @@ class _Writer:
     """Writes the rows of a table, one after the other."""
 
     def __init__(self, placed: PlacedSections, plan: Plan, spare: bool, density: int):
-        self.placed, self.plan = placed, plan
-        self.spare, self.density = spare, density
+        self.placed = placed
+        self.plan = plan
+        self.spare = spare
+        self.density = density
         self.s = placed.structure()
         self.N = placed.n_sections
-        self.t, self.chart = placed.lanes.t, placed.lanes.chart
+        self.t = placed.lanes.t
+        self.chart = placed.lanes.chart
         self.ends = self.t + placed.duration
         self.events = _events(placed)
         self.levels = placed.bound.levels
-        # (One scale of each guard for all points: at an event alone it would be rounding.)
-        at = [np.array([getattr(x, name) for x in self.events]) for name in _EVENT]
-        section, times, before, after = at
-        numbers = range(len(self.events))
-        places = [
-            (np.arange(self.N), self.t, self.chart, placed.lanes.q),
-            (section, times, [self._chart(e) for e in numbers], before.T),
-            (section, times, [self._chart(e + 1) for e in numbers], after.T),
-        ]
-        places = [x for x in places if len(x[0])]
-        joined = [np.concatenate(x, axis=-1) for x in zip(*places, strict=True)]
-        points = self._points(*joined)
-        cuts = np.cumsum([len(x[0]) for x in places])[:-1]
-        parts = [np.split(x, cuts) for x in points]
-        each = [_Points(*x) for x in zip(*parts, strict=True)]
-        self.at_sections = each[0]
-        if self.events:
-            _, self.before, self.after = each
+        self._watch_points()
         self.width = self.at_sections.signs.shape[1]
-        self.rows: list[tuple] = []
+        self.rows: list[dict[str, Any]] = []
         self.places: dict[tuple[int, int], int] = {(0, 0): BEGIN}
         self.bodies: list[Body] = []
+
+    def _watch_points(self) -> None:
+        """Evaluate the watched functions at sections, and before and after events.
+
+        (All at once, for one scale of each guard: at an event alone it would be rounding.)
+        """
+        N = self.N
+        events = self.events
+        E = len(events)
+        on_section = [np.arange(N), self.t, self.chart, self.placed.lanes.q]
+        if not events:
+            self.at_sections = self._points(*on_section)
+            return
+        section = [event.section for event in events]
+        t = [event.t for event in events]
+        chart_before = [self._chart(e) for e in range(E)]
+        chart_after = [self._chart(e + 1) for e in range(E)]
+        before = np.array([event.before for event in events]).T
+        after = np.array([event.after for event in events]).T
+        points = self._points(
+            np.concatenate([np.arange(N), section, section]),
+            np.concatenate([self.t, t, t]),
+            np.concatenate([self.chart, chart_before, chart_after]),
+            np.concatenate([self.placed.lanes.q, before, after], axis=1),
+        )
+        self.at_sections = points.part(slice(N))
+        self.before = points.part(slice(N, N + E))
+        self.after = points.part(slice(N + E, None))
 
     def written(self) -> Table:
         for k in range(self.N):
             self._interval(k)
         used = len(self.rows)
         self.rows += self.rows[-1:] * (-used % _ROUND)
-        number = np.int32
-        types: list[type] = [number, number, number, number, bool, bool, bool]
-        types += [number, float, float, number, bool, number]
-        columns = [
-            np.array(x).astype(d)
-            for x, d in zip(zip(*self.rows, strict=True), types, strict=True)
-        ]
+        columns = {}
+        for name in Rows._fields:
+            column = np.array([row[name] for row in self.rows])
+            if np.issubdtype(column.dtype, np.integer):
+                column = column.astype(np.int32)
+            columns[name] = column
         bodies = tuple(sorted(self.bodies))
-        place = np.array([bodies.index(body) for body in self.bodies], number)
-        rows = Rows(*columns)
+        place = np.array([bodies.index(body) for body in self.bodies], np.int32)
+        rows = Rows(**columns)
         rows = rows._replace(body=place[rows.body])
         return Table(Form(bodies, self.width), rows, used)
 
     def _interval(self, k: int) -> None:
         """Write the rows from section k to the next."""
-        events, passed = self._happening(k), self._passed(k)
+        events = self._happening(k)
+        passed = self._passed(k)
         for e in events:
             self._to_event(k, e, is_first=e == passed)
         for count in sorted(self._arriving(k)):
@@ -288,10 +309,12 @@ class _Writer:
         turn = e // len(self.events) * float(self.placed.cycle.period)
         duration = event.t + turn - begin
         if is_first or (before is not None and is_own):
-            newton, signs = points.newton[at, target], points.signs[at].copy()
+            newton = points.newton[at, target]
+            signs = points.signs[at].copy()
             signs[target] = max(signs[target], 0)
         else:
-            newton, duration = None, 0.0
+            newton = None
+            duration = 0.0
             signs = np.zeros(self.width, int)
             signs[target] = 1
         arrives = event.at_section and is_own
@@ -341,7 +364,8 @@ class _Writer:
         duration = self.ends[k] - begin
         by_time = np.isfinite(self.placed.bound.time[(k + 1) % self.N])
         target = -1 if by_time else len(self.s.guards(a))
-        signs, newton = np.zeros(self.width, int), None
+        signs = np.zeros(self.width, int)
+        newton = None
         if is_own:
             signs = points.signs[at]
             newton = None if by_time else points.newton[at, target]
@@ -374,7 +398,8 @@ class _Writer:
         """
         steps = max(1, int(np.ceil(duration / self.plan.h[k] - 1e-6)))
         steps *= self.density
-        part, fixed = 1 / steps, 0.0
+        part = 1 / steps
+        fixed = 0.0
         if newton is not None:
             if duration / _WORST_GUESS < newton < duration * _WORST_GUESS:
                 part = duration / newton / steps
@@ -414,18 +439,30 @@ class _Writer:
             self.bodies.append(body)
         number = self.bodies.index(body)
         at = self._place(section, passed)
-        after = passed + bool(body.kind)
-        then = (
-            self._place(section + 1, after) if arrives else self._place(section, after)
+        is_event = bool(body.kind)
+        then = self._place(section + int(arrives), passed + int(is_event))
+        row = dict(
+            body=number,
+            section=section,
+            at=at,
+            then=then,
+            begins=begins,
+            corrects=corrects,
+            arrives=arrives,
+            target=target,
+            part=part,
+            fixed=fixed,
+            place=place,
+            may_wait=may_wait,
+            signs=signs,
         )
-        row = number, section, at, then, begins, corrects, arrives
-        row += target, part, fixed, place, may_wait, signs
         self.rows.append(row)
 
     def _place(self, section: int, passed: int) -> int:
         """The number of a place by section and events passed since section 0."""
         if section == self.N:
-            section, passed = 0, passed - len(self.events)
+            section = 0
+            passed = passed - len(self.events)
         return self.places.setdefault((section, passed), len(self.places))
 
     def _event_kind(self, g: int) -> tuple[int, Kind, int]:
@@ -439,21 +476,23 @@ class _Writer:
 
     def _points(self, section, t, chart, q) -> _Points:
         """Watched functions at points after these sections."""
-        s, chart = self.s, np.asarray(chart, int)
-        charts = range(len(s.dims))
-        width = max(len(s.guards(a)) + self._has_level(a) for a in charts)
-        newton, signs = np.zeros((len(t), width)), np.zeros((len(t), width), int)
+        s = self.s
+        counts = [len(s.guards(a)) + self._has_level(a) for a in range(len(s.dims))]
+        newton = np.zeros((len(t), max(counts)))
+        signs = np.zeros((len(t), max(counts)), int)
         for a in np.unique(chart).tolist():
-            count = len(s.guards(a)) + self._has_level(a)
-            here = np.flatnonzero(chart == a)
+            count = counts[a]
             if not count:
                 continue
-            n, index = s.dims[a], (section[here] + 1) % self.N
-            point = np.asarray(t)[here], q[:n, here], np.zeros((s.nu, 1))
+            n = s.dims[a]
+            here = np.flatnonzero(chart == a)
+            index = (section[here] + 1) % self.N
+            point = t[here], q[:n, here], np.zeros((s.nu, 1))
             columns = kernels.watched(s, a, self.levels, *point, index)
             field = kernels.field(s, a, *point)[:, 0]
             value = columns[:, 0]
-            rate = columns[:, 1] + np.sum(columns[:, 2 : 2 + n] * field, axis=1)
+            gradient = columns[:, 2 : 2 + n]
+            rate = columns[:, 1] + np.sum(gradient * field, axis=1)
             with np.errstate(all="ignore"):
                 newton[here, :count] = np.nan_to_num(-value / rate).T
             largest = np.abs(value).max(axis=1, keepdims=True)
@@ -462,12 +501,10 @@ class _Writer:
         return _Points(newton, signs)
 
 
-_EVENT = "section", "t", "before", "after"
-
-
 def _events(placed: PlacedSections) -> list[_Event]:
     """The events of one turn, in order."""
-    tape, found = placed.tape, []
+    tape = placed.tape
+    found = []
     for k in range(placed.n_sections):
         rows = np.flatnonzero(tape.code[:, k] >= 0)
         moves = np.flatnonzero(tape.code[:, k] != IDLE)

@@ -58,7 +58,8 @@ DesignLike = Design | Annotated[np.ndarray | jax.Array, _SAMPLES]
 _LARGE = 2_000_000
 # Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
 # them, more leave the cache. On accelerators: more need more memory.
-_BATCH, _BATCH_ON_ACCELERATOR = 320, 16384
+_BATCH = 320
+_BATCH_ON_ACCELERATOR = 16384
 # Fewer experiments than this are not split among workers: smaller batches cost more than they gain.
 _UNDIVIDED = 32
 # Batches are multiples of this, the width of vector instructions: others take up to a third longer.
@@ -206,7 +207,8 @@ class Campaign:
         rows = slice(0, len(self.inputs)) if rows is None else rows
         workers = self.execution.workers if workers is None else workers
         execution = dataclasses.replace(self.execution, workers=workers)
-        u, N = self.inputs.part(rows), self.placed.n_sections
+        u = self.inputs.part(rows)
+        N = self.placed.n_sections
         start, parts = self._starts(u, rows.start, execution)
         applied = u
         if self.process_noise is not None:
@@ -215,7 +217,8 @@ class Campaign:
             parts = self._flow(applied, start, execution, "experiments")
         y, result, failed_at, error, answer = self._deviations(u.shape, parts)
         self._require_outputs(y, result)
-        z, label = self.at_sections.outputs, self.placed.family.label
+        z = self.at_sections.outputs
+        label = self.placed.family.label
         inputs: tuple[str, ...] = z.structure.inputs
         if answer is not None:
             u = np.concatenate([u + answer, u], axis=2)
@@ -257,7 +260,8 @@ class Campaign:
         """
         if self.model is None:
             return np.tile(to_host(self.placed).section_zero[:, None], len(u)), None
-        stepping, periods = self.stepping, self.inputs.periods
+        stepping = self.stepping
+        periods = self.inputs.periods
         window = u[:, : periods * self.placed.n_sections]
         predicted = periodic_start(self.placed, self.model, window)
         if self.start == "periodic":
@@ -273,9 +277,9 @@ class Campaign:
         )
         if (change > stepping.accuracy).any():
             s = int(np.nanargmax(change))
-            text = f"was found (Newton's last step: {change[s]:.1e}): lower the input, or discard"
             raise ComputationError(
-                f"experiment {first + s}: no periodic response {text} cycles."
+                f"experiment {first + s}: no periodic response was found (Newton's last step: "
+                f"{change[s]:.1e}): lower the input, or discard cycles."
             )
         start = np.where(np.isnan(change), predicted, start)
         return start, parts if still and window.shape == u.shape else None
@@ -283,10 +287,12 @@ class Campaign:
     def _deviations(self, shape: tuple[int, int, int], responses):
         """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
         errors, and what a controller added to the inputs, of such a shape."""
-        N, base = self.placed.n_sections, self.at_sections.on_cycle
+        N = self.placed.n_sections
+        base = self.at_sections.on_cycle
         S, n, _ = shape
         answer = None if self.feedback is None else np.empty(shape)
-        y, parts = np.empty((S, n // N, *base.shape)), []
+        y = np.empty((S, n // N, *base.shape))
+        parts = []
         for rows, part in responses:
             np.subtract(part.y.reshape(-1, *y.shape[1:]), base, out=y[rows])
             parts.append((part.result, part.failed_at, part.error))
@@ -318,7 +324,10 @@ class Campaign:
     @property
     def _tables(self) -> Tables | None:
         """The tables that experiments follow, made once for the same sections and schedule."""
-        make = lambda: tables(self.placed, self.stepping.plan)  # noqa: E731
+
+        def make():
+            return tables(self.placed, self.stepping.plan)
+
         return _tables.recall(self.stepping, None, make)
 
     def _completed(
@@ -344,14 +353,20 @@ class Campaign:
     ) -> Iterator[tuple[slice, Any]]:
         """Yield rows, their `Response` along a table, and which have left it, batch after batch."""
         further = table.form, table.rows, np.int32(table.count)
-        arguments = lambda rows: (*self._arguments(u, start, rows), *further)  # noqa: E731
+
+        def arguments(rows):
+            return (*self._arguments(u, start, rows), *further)
+
         return in_batches(program, arguments, len(u), execution, name)
 
     def _searched(
         self, u, start, execution: Execution, name: str
     ) -> Iterator[tuple[slice, Any]]:
         """Yield rows and their `Response` with a search for events, batch after batch."""
-        arguments = lambda rows: self._arguments(u, start, rows)  # noqa: E731
+
+        def arguments(rows):
+            return self._arguments(u, start, rows)
+
         search = _LARGE_SEARCH if self.large else _SEARCH
         return in_batches(search, arguments, len(u), execution, name)
 
@@ -391,14 +406,13 @@ def prepare(
     placed = as_placed(cycle, sections)
     items = (outputs,) if isinstance(outputs, str | Output) else tuple(outputs)
     check_outputs(cycle, items)
-    start, noise = options.start, options.process_noise
+    start = options.start
+    noise = options.process_noise
     feedback = None if options.feedback is None else _controller(placed, items, options)
     _require_return(cycle, placed, feedback is not None)
-    discard = (
-        (DISCARD if start == "cycle" else 0)
-        if options.discard is None
-        else options.discard
-    )
+    discard = options.discard
+    if discard is None:
+        discard = DISCARD if start == "cycle" else 0
     N = placed.n_sections
     inputs = check_inputs(design, discard, N, cycle.structure.inputs)
     if noise is not None:
@@ -432,12 +446,13 @@ def _controller(
     """
     if options.start != "cycle":
         raise DefinitionError("with `feedback`, use start='cycle', and discard cycles.")
-    model, F = linearize(placed.cycle, placed, outputs=outputs), options.feedback
+    model = linearize(placed.cycle, placed, outputs=outputs)
+    F = options.feedback
     loop = model.feedback(F)  # type: ignore[arg-type]  # (not None)
     if len(loop.multipliers) and abs(loop.multipliers[0]) >= 1:
-        text = f"its largest multiplier is {abs(loop.multipliers[0]):.4g} in modulus"
         raise ComputationError(
-            f"with this feedback the limit cycle is not stable: {text}."
+            "with this feedback the limit cycle is not stable: its largest multiplier is "
+            f"{abs(loop.multipliers[0]):.4g} in modulus."
         )
     if isinstance(F, LDTP):
         return to_host(F.matrices)
@@ -500,7 +515,8 @@ class _AtSections(NamedTuple):
     """The outputs by whose `id` this is found: they must not be collected."""
 
 
-_SEARCH, _LARGE_SEARCH = Program(flow_batch, False), Program(flow_batch, True)
+_SEARCH = Program(flow_batch, False)
+_LARGE_SEARCH = Program(flow_batch, True)
 _resolved = Memory()
 _tables = Memory()
 

@@ -36,7 +36,10 @@ def linearized(placed: PlacedSections) -> LDTP:
 
     **Raises:** as `linearize`.
     """
-    make = lambda: linearize(placed.cycle, placed, outputs=[_NOTHING])  # noqa: E731
+
+    def make():
+        return linearize(placed.cycle, placed, outputs=[_NOTHING])
+
     return _linearized.recall(placed, None, make)
 
 
@@ -69,20 +72,26 @@ def steady_start(
     """
     embed, back = (x[0] for x in to_host(placed).frames())
     phi = monodromy(to_host(model.A))
-    power, d = np.linalg.matrix_power(phi, periods), len(phi)
+    power = np.linalg.matrix_power(phi, periods)
+    d = len(phi)
+    scale = stepping.scales[0][:, None]
     # Newton's step is the defect plus `gain` times the defect.
-    gain = embed[:, :d] @ np.linalg.solve(np.eye(d) - power, power) @ back[:d]
+    of_sections = np.linalg.solve(np.eye(d) - power, power)
+    gain = embed[:, :d] @ of_sections @ back[:d]
     moves = np.ones((len(gain), 1))
     moves[0] = to_host(placed).time_is_state[0]
-    start, change = start.copy(), np.full(start.shape[1], np.inf)
+    change = np.full(start.shape[1], np.inf)
+    start = start.copy()
     for _ in range(MOST_STEPS):
         rows = np.flatnonzero(change > stepping.accuracy)  # (not where it is NaN)
         if len(rows) == 0:
             break
-        defect = (flow(start[:, rows], rows) - start[:, rows]) * moves
+        end = flow(start[:, rows], rows)
+        defect = (end - start[:, rows]) * moves
         step = defect + gain @ defect
-        change[rows] = np.max(np.abs(step) / stepping.scales[0][:, None], axis=0)
-        if len(rows) == len(change) and (change <= _LAST * stepping.accuracy).all():
+        change[rows] = np.max(np.abs(step) / scale, axis=0)
+        settled = (change <= _LAST * stepping.accuracy).all()
+        if len(rows) == len(change) and settled:
             return start, change, True
         start[:, rows] += step
     return start, change, False

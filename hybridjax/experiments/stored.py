@@ -60,7 +60,8 @@ class StoredExperiments:
         except (DefinitionError, KeyError, TypeError, ValueError) as error:
             raise DefinitionError(f"'{store}' holds no experiments.") from error
         blocks = self._store.layout.blocks
-        self.experiments, self.chunk = blocks.shape[0], blocks.block[0]
+        self.experiments = blocks.shape[0]
+        self.chunk = blocks.block[0]
         self._about = about["data"]
         self.n_sections: int = self._about["n_sections"]
 
@@ -76,7 +77,8 @@ class StoredExperiments:
         """Return chunk k. **Raises:** `FileFormatError` if it is damaged."""
         if k >= len(self):
             raise IndexError(f"there are {len(self)} chunks, and none of number {k}.")
-        x, about = self._store.read(k), self._about
+        x = self._store.read(k)
+        about = self._about
         return ExperimentData(
             x["u"],
             x["y"],
@@ -92,12 +94,11 @@ class StoredExperiments:
     def __iter__(self) -> Iterator[ExperimentData]:
         """Read chunk after chunk. **Raises:** `DefinitionError` if one is missing;
         `FileFormatError` if one is damaged."""
-        if missing := self.missing():
-            text = (
-                f"{len(missing)} of {len(self)} chunks in '{self.address}' are missing"
-            )
+        missing = len(self.missing())
+        if missing:
             raise DefinitionError(
-                f"{text}: make the call that began it again to run them."
+                f"{missing} of {len(self)} chunks in '{self.address}' are missing: make the call "
+                "that began it again to run them."
             )
         for k in range(len(self)):
             yield self[k]
@@ -205,9 +206,12 @@ class ExperimentJob:
 
     def begin(self) -> tuple["ExperimentJob", Layout]:
         """Return the job, and the form of its records."""
-        campaign, text = self.campaign, self.description
-        placed, values = campaign.placed, campaign.at_sections
-        n, u = campaign.inputs.cycles * placed.n_sections, placed.cycle.structure.inputs
+        campaign = self.campaign
+        text = self.description
+        placed = campaign.placed
+        values = campaign.at_sections
+        n = campaign.inputs.cycles * placed.n_sections
+        u = placed.cycle.structure.inputs
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
             "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
@@ -257,7 +261,9 @@ class ExperimentJob:
     def description(self) -> dict[str, Any]:
         """JSON from which the experiments can be told from others."""
         campaign = self.campaign
-        placed, inputs, noise = campaign.placed, campaign.inputs, campaign.process_noise
+        placed = campaign.placed
+        inputs = campaign.inputs
+        noise = campaign.process_noise
         z = campaign.at_sections.outputs
         return {
             "kind": _KIND,

@@ -18,7 +18,9 @@ from .state import Aim, Attempt, State, Task
 # The next step has this part of the length that the error estimate asks for, and lies between these
 # multiples of the last one (the lower where the estimate is no number). Nearer to 1: more steps
 # are rejected. Farther: more steps are taken.
-_CAUTION, _SHRINK, _GROW = 0.9, 0.2, 3.0
+_CAUTION = 0.9
+_SHRINK = 0.2
+_GROW = 3.0
 
 
 class Verdict(NamedTuple):
@@ -78,8 +80,11 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     A step is accepted if it is accurate, every watched function is resolved over it, and none
     crosses zero on the way before the zero on which it lands.
     """
-    approach, active, end = state.approach, state.active, new.watched
-    xp, within_error = namespace(t), accurate(new, task)
+    approach = state.approach
+    active = state.active
+    end = new.watched
+    xp = namespace(t)
+    within_error = accurate(new, task)
     # Which approaches succeed.
     tau = approach.tau + new.past
     beyond = LANDING * approach.reach + INSTANT * task.span
@@ -90,7 +95,8 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     closer = failed & (approach.tries < LANDING_TRIES)
     # What is crossed on the way.
     fresh = active & ~approach.on & within_error
-    looked_at, moved = fresh | lands, step_length(aim, new)
+    looked_at = fresh | lands
+    moved = step_length(aim, new)
     # (Where an event is at once, nothing is crossed.)
     ready = state.ready & ~aim.at_once
     crossing = _crossing(looked_at & ~aim.at_once, state, new, moved, ready)
@@ -98,7 +104,8 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
     positions = xp.where(chosen | at_end, xp.inf, crossing.position)
-    position, bent = xp.min(positions, axis=0), fresh & new.bent
+    position = xp.min(positions, axis=0)
+    bent = fresh & new.bent
     crosses = looked_at & xp.isfinite(position) & ~bent
     refine = bent | (looked_at & ~crosses & crossing.near.any(axis=0))
     lands = lands & ~crosses & ~refine
@@ -124,7 +131,9 @@ def step_length(aim: Aim, new: Attempt) -> Times:
 
 def next_step(h: Times, aim: Aim, error: Times, lanes: Lanes, task: Task) -> Times:
     """The length of the step after one with this error, where h was allowed."""
-    s, xp, error = task.s, namespace(error), error / task.stride.slack
+    s = task.s
+    xp = namespace(error)
+    error = error / task.stride.slack
     orders = [s.method(a).order for a in range(len(s.charts))]
     if set(orders) == {8.0}:  # cheaper than a power
         length = xp.sqrt(xp.sqrt(xp.sqrt(error)))
@@ -144,10 +153,12 @@ def _crossing(
     some: Mask, state: State, new: Attempt, moved: Times, ready: Bool[Array, "W L"]
 ) -> CubicCrossing:
     """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
-    start, end = state.watched, new.watched
+    start = state.watched
+    end = new.watched
     xp = namespace(ready)
     cubic = start.value, end.value, moved * start.rate, moved * end.rate
-    no, nowhere = xp.zeros_like(ready), xp.full_like(end.value, xp.inf)
+    no = xp.zeros_like(ready)
+    nowhere = xp.full_like(end.value, xp.inf)
     none = CubicCrossing(nowhere, no, no)
     return cond(
         some.any(), lambda: first_crossing(*cubic, ready, new.margin), lambda: none

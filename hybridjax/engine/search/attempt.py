@@ -85,7 +85,9 @@ def land(
 
     `before` are the watched functions at its start, `allowed` the errors that it may have.
     """
-    xp, tau, which = namespace(t), aim.step, aim.which
+    xp = namespace(t)
+    tau = aim.step
+    which = aim.which
     after = flow.watch(t + tau, step.q, step.f1)
     v0, r0, v1, r1 = (pick(x, flow.rows, which) for x in (*before, *after))
     by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
@@ -119,9 +121,13 @@ def land(
 
 def attempt(state: State, aim: Aim, task: Task) -> Attempt:
     """Let the active lanes step, and land those that come close to the zero they aim at."""
-    s, lanes, L = task.s, state.lanes, state.lanes.t.shape[0]
+    s = task.s
+    lanes = state.lanes
+    L = state.lanes.t.shape[0]
     xp = namespace(lanes.t)
-    zero, no, yes = xp.zeros(L), xp.zeros(L, bool), xp.ones(L, bool)
+    zero = xp.zeros(L)
+    no = xp.zeros(L, bool)
+    yes = xp.ones(L, bool)
     nothing = no_events(s, lanes.t)
     empty = Attempt(
         lanes.q, nothing, nothing.rate, zero, zero, no, no, no, state.along, yes
@@ -129,14 +135,14 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
 
     def work(a, here, out):
         flow = chart_flow(s, a, here, task.u, task.target)
-        n, rows, present = s.dims[a], flow.rows, here.any()
-        t, q, tau = (
-            only(here, lanes.t),
-            only(here, lanes.q[:n]),
-            xp.where(here, aim.step, 0.0),
-        )
-        before = None if out.along is None else only(here, out.along[:n])
-        step, along, change = _step(flow, present, t, q, tau, before, task)
+        n = s.dims[a]
+        rows = flow.rows
+        present = here.any()
+        t = only(here, lanes.t)
+        q = only(here, lanes.q[:n])
+        tau = xp.where(here, aim.step, 0.0)
+        old_along = None if out.along is None else only(here, out.along[:n])
+        step, along, change = _step(flow, present, t, q, tau, old_along, task)
         allowed, error = _errors(flow, t, q, tau, step, change, along, task)
         if along is not None and out.along is not None:
             along = put(out.along, slice(n), xp.where(here, along, out.along[:n]))
@@ -145,7 +151,8 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
         if rows:
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
-            goal, plain = aim._replace(which=which, step=tau), end
+            goal = aim._replace(which=which, step=tau)
+            plain = end
             landing = flow.only(which >= 0)
             end = cond(
                 (which >= 0).any(),
@@ -153,17 +160,18 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
                 lambda: plain,
             )
             moved = tau + xp.where(end.lands, end.past, 0.0)
-            after = cond(
-                present, lambda: flow.watch(t + moved, end.q, end.f), lambda: before
-            )
+
+            def watch_end():
+                return flow.watch(t + moved, end.q, end.f)
+
+            after = cond(present, watch_end, lambda: before)
             margin = _margin(flow, before, after, end, t, moved, task.span)
             bent = _bent(before, after, margin)
             chosen = (np.array(rows)[:, None] == which) & end.lands
             # (Where events coincide, the step to the second is rounding, and tells no speed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
-            far, slow = _clearance(
-                before, after, margin, moved, take_rows(state.ready, rows), judged
-            )
+            ready = take_rows(state.ready, rows)
+            far, slow = _clearance(before, after, margin, moved, ready, judged)
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
@@ -198,15 +206,18 @@ def _step(
     one is asked for that of a deviation that began with the flow or at the last event, and may have
     died out since, as it does where a chart is stiff.
     """
+
     # (A branch, since XLA would mask the states again in every stage.)
-    plain = lambda: flow.step(t, q, tau)  # noqa: E731
+    def plain():
+        return flow.step(t, q, tau)
+
     if along is not None and flow.method.implicit:
         return cond(
             present,
             lambda: flow.step_along(t, q, tau, along),
             lambda: (plain(), along, namespace(q).zeros_like(q)),
         )
-    step = cond(present, plain, lambda: Step(*[q] * len(Step._fields)))
+    step = cond(present, plain, lambda: Step(*(q for _ in Step._fields)))
     if not task.tangents:
         return step, None, None
     shift = _ASIDE * size(task.settings, flow.a, q, step.q)
@@ -223,13 +234,14 @@ def _errors(
 ) -> tuple[States, AnyTimes]:
     """The error that a step may have, and its error relative to that, with that of a derivative:
     a state at rest has no error of its own."""
-    xp, settings, a = namespace(q), task.settings, flow.a
+    xp = namespace(q)
+    settings = task.settings
+    a = flow.a
     assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        rounding = rounding_error(
-            flow.field, t, q, step.f0
-        )  # (a bad step may end anywhere)
+        # (At the start: a bad step may end anywhere.)
+        rounding = rounding_error(flow.field, t, q, step.f0)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     motion = step.error if change is None else step.estimate
     error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)
@@ -258,7 +270,8 @@ def _halfway(
     """
     xp = namespace(q)
     middle, rate = halfway_cubic(q, step.q, step.f0, step.f1, tau)
-    bend, twist = step.middle - middle, step.rate - rate
+    bend = step.middle - middle
+    twist = step.rate - rate
     share = moved / xp.where(tau == 0, 1.0, tau)
     middle, rate = halfway_cubic(q, end, step.f0, f, moved)
     return middle + bend * share**4, rate + twist * share**3
@@ -277,7 +290,8 @@ def _margin(
     by their values and rates halfway, less those of the interpolants, beyond rounding errors."""
     xp = namespace(moved)
     true = flow.watch(t + 0.5 * moved, end.middle, end.rate)
-    d0, d1 = moved * before.rate, moved * after.rate
+    d0 = moved * before.rate
+    d1 = moved * after.rate
     value = 0.5 * (before.value + after.value) + 0.125 * (d0 - d1)
     slope = 1.5 * (after.value - before.value) - 0.25 * (d0 + d1)
     missing = xp.abs(true.value - value) + 0.5 * xp.abs(moved * true.rate - slope)

@@ -40,9 +40,11 @@ def without_events(
 ) -> tuple[State, Tape]:
     """The state after steps that are accepted in all active lanes, without events, and the row of
     the tape. Lanes may arrive."""
-    lanes, active = state.lanes, state.active
+    lanes = state.lanes
+    active = state.active
     xp = namespace(lanes.t)
-    level, on_time = active & new.lands, aim.last
+    level = active & new.lands
+    on_time = aim.last
     moved = aim.step + xp.where(level, new.past, 0.0)
     t = xp.where(on_time, aim.due, lanes.t + moved)
     arrived = level | on_time
@@ -69,11 +71,17 @@ def without_events(
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
     """The state after steps that may be rejected or end in events, and the row of the tape."""
-    s, lanes, active, target = task.s, state.lanes, state.active, task.target
-    xp, G, moved = namespace(lanes.t), len(s.transitions), step_length(aim, new)
+    s = task.s
+    lanes = state.lanes
+    active = state.active
+    target = task.target
+    xp = namespace(lanes.t)
+    G = len(s.transitions)
+    moved = step_length(aim, new)
     t = xp.where(aim.last, aim.due, xp.where(active, lanes.t + moved, lanes.t))
     verdict = accept(state, aim, new, t, task)
-    accepted, lands = verdict.accepted, verdict.lands
+    accepted = verdict.accepted
+    lands = verdict.lands
     # Events, and arrivals.
     fires = lands & (aim.which < G) & enabled(s, t, new.q, task.u, aim.which)
     by_clock = verdict.plain & (aim.schedule >= 0)
@@ -87,10 +95,12 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
     # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
-    change, size = (xp.max(xp.abs(x), axis=0) for x in (new.q - lanes.q, lanes.q))
+    change = xp.max(xp.abs(new.q - lanes.q), axis=0)
+    size = xp.max(xp.abs(lanes.q), axis=0)
     still = (change <= 1e-3 * size) | ((size == 0) & xp.isfinite(change))
     unexpected = (fired >= 0) & ~_expected(target.event_sequence, lanes.events, fired)
-    result, unknown = state.result, xp.isnan(sum(new.watched)).any(axis=0)
+    result = state.result
+    unknown = xp.isnan(sum(new.watched)).any(axis=0)
     for failed, code in (
         (stuck & unknown, Result.FIELD_NOT_FINITE),
         (grazes, Result.GRAZING),
@@ -102,29 +112,30 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
         (active & ~arrived & (after.t >= target.limit), target.missed),
     ):
         result = update_result(result, failed, code)
-    if (along := new.along) is not None:
+    along = new.along
+    if along is not None:
         fresh = cond(
             (fired >= 0).any(),
             lambda: deviation(task.s, after, task.settings),
-            lambda: along,
+            lambda: new.along,
         )
         along = xp.where(fired >= 0, fresh, xp.where(accepted, along, state.along))
     end = State(
-        after,
-        watched,
-        aimed,
-        _approach(state, new, verdict, moved),
-        h,
-        along,
-        state.error + xp.where(accepted, new.error, 0.0),
-        result,
-        state.arrived | arrived,
-        state.i + 1,
+        lanes=after,
+        watched=watched,
+        aimed=aimed,
+        approach=_approach(state, new, verdict, moved),
+        h=h,
+        along=along,
+        error=state.error + xp.where(accepted, new.error, 0.0),
+        result=result,
+        arrived=state.arrived | arrived,
+        i=state.i + 1,
     )
-    code = xp.where(on_time, ARRIVE_TIME, xp.where(accepted, MOVE, IDLE))
-    code = xp.where(level, ARRIVE_LEVEL, xp.where(fired >= 0, fired, code)).astype(
-        xp.int32
-    )
+    code = xp.where(accepted, MOVE, IDLE)
+    code = xp.where(on_time, ARRIVE_TIME, code)
+    code = xp.where(fired >= 0, fired, code)
+    code = xp.where(level, ARRIVE_LEVEL, code).astype(xp.int32)
     at_once = aim.at_once & (fired >= 0)
     return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once)
 
@@ -140,7 +151,10 @@ def _after(
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
     """Lanes after their steps and events, the watched functions there, whether the target's level
     counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
-    lanes, end, accepted, xp = state.lanes, new.watched, verdict.accepted, namespace(t)
+    lanes = state.lanes
+    end = new.watched
+    accepted = verdict.accepted
+    xp = namespace(t)
     zero = width(t, task.span, end.rate)
     stays = verdict.lands | aim.at_once
     ready = (state.ready & ((end.value > 0) | stays)) | (end.value > zero)
@@ -179,7 +193,9 @@ def _reset(
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
     level counts."""
-    s, xp, fires = task.s, namespace(fired), fired >= 0
+    s = task.s
+    xp = namespace(fired)
+    fires = fired >= 0
 
     def work():
         q, chart = apply_resets(s, lanes.t, lanes.chart, lanes.q, task.u, fired)
@@ -199,53 +215,63 @@ def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
 
     (Charts of other numbers of states have no guards in common.)
     """
-    s, xp = task.s, namespace(lanes.t)
-    dims, same = xp.asarray(np.array(s.dims)), lanes.chart == new.chart
+    s = task.s
+    xp = namespace(lanes.t)
+    dims = xp.asarray(np.array(s.dims))
+    same = lanes.chart == new.chart
     alike = ~same & (dims[lanes.chart] == dims[new.chart])
 
     def compare():
+        """Guards of the new chart (rows) with the value that one of the old chart (columns) has at
+        the state before."""
         before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
         noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
-        value, rate = before.value[:-1], before.rate[:-1]
+        value = before.value[:-1]
+        rate = before.rate[:-1]
         zero = SAME_TIME * task.span * xp.abs(rate) + noise
         apart = xp.abs(value[:, None] - watched.value[None, :-1])
-        equal = (apart <= zero[:, None]) & belongs(s, lanes.chart)[None, :-1]
-        return equal.any(axis=1) & alike, (equal & lanes.armed).any(axis=1) & alike
+        has_guard = belongs(s, lanes.chart)[None, :-1]
+        equal = (apart <= zero[:, None]) & has_guard
+        known = equal.any(axis=1) & alike
+        armed = (equal & lanes.armed).any(axis=1) & alike
+        return known, armed
 
     no = xp.zeros_like(lanes.armed)
-    if not _share_guards(s):
-        return Entry(no | same, xp.where(same, lanes.armed, no))
-    known, armed = cond(alike.any(), compare, lambda: (no, no))
+    known = no
+    armed = no
+    if _share_guards(s):
+        known, armed = cond(alike.any(), compare, lambda: (no, no))
     return Entry(known | same, xp.where(same, lanes.armed, armed))
 
 
 def _share_guards(s: Structure) -> bool:
     """Test whether any transition leads to another chart that may have guards of the first one."""
-    ends = (
-        (s.chart_index(x.source), s.chart_index(x.target))
-        for x in s.transitions
-        if x.source != x.target
-    )
-    return any(
-        s.dims[a] == s.dims[b] and bool(s.guards(a)) and bool(s.guards(b))
-        for a, b in ends
-    )
+    for transition in s.transitions:
+        a = s.chart_index(transition.source)
+        b = s.chart_index(transition.target)
+        if a != b and s.dims[a] == s.dims[b] and s.guards(a) and s.guards(b):
+            return True
+    return False
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
     """The crossing that each lane approaches next: one met in this step, or the same from nearer
     by."""
-    approach, crosses, which = state.approach, verdict.crosses, verdict.which
+    approach = state.approach
+    crosses = verdict.crosses
+    which = verdict.which
     xp = namespace(moved)
-    fastest = xp.maximum(*(xp.abs(of_row(x.watched.rate, which)) for x in (state, new)))
+    rate_before = xp.abs(of_row(state.watched.rate, which))
+    rate_after = xp.abs(of_row(new.watched.rate, which))
+    fastest = xp.maximum(rate_before, rate_after)
     tau = xp.clip(approach.tau + new.past, 0.0, approach.reach)
     return Approach(
-        crosses | verdict.closer,
-        xp.where(crosses, which, approach.which),
-        xp.where(crosses, verdict.position * moved, tau),
-        xp.where(crosses, moved, approach.reach),
-        xp.where(crosses, fastest, approach.rate),
-        xp.where(crosses, 0, approach.tries + 1),
+        on=crosses | verdict.closer,
+        which=xp.where(crosses, which, approach.which),
+        tau=xp.where(crosses, verdict.position * moved, tau),
+        reach=xp.where(crosses, moved, approach.reach),
+        rate=xp.where(crosses, fastest, approach.rate),
+        tries=xp.where(crosses, 0, approach.tries + 1),
     )
 
 
@@ -253,18 +279,20 @@ def _next_step(
     state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
     """The next step, and lanes that are stuck: the step is too short to be taken."""
-    xp, (plain, too_long) = namespace(fired), (verdict.plain, verdict.too_long)
+    xp = namespace(fired)
+    plain = verdict.plain
+    too_long = verdict.too_long
     adapted = next_step(state.h, aim, new.error, state.lanes, task)
     h = xp.where(plain | too_long, adapted, state.h)
     h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
-    instant, t = INSTANT * task.span, state.lanes.t
+    instant = INSTANT * task.span
+    t = state.lanes.t
     # (A fast state needs steps that are shorter than an instant, as far as times resolve them.)
     shortest = xp.minimum(instant, ROUNDING * xp.abs(t) + _SHORTEST * task.span)
-    stuck = (too_long & (h < shortest)) | (
-        (verdict.refine | verdict.lost) & (h < instant)
-    )
+    misses = verdict.refine | verdict.lost
+    stuck = (too_long & (h < shortest)) | (misses & (h < instant))
     return h, stuck
 
 

@@ -5,12 +5,13 @@ its decisions are recorded in a `Tape`, which `replay` follows.
 """
 
 import numpy as np
+from jaxtyping import Float
 
 from ..._core.executor import cond, namespace, on_host, put, while_loop
 from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ...systems.transition import SAME_TIME
-from ..arrays import Index, Inputs, Times
+from ..arrays import Array, Index, Inputs, Mask, Times
 from ..events import arm, next_schedule, overdue
 from ..lanes import Lanes, Tape, blank_tape, for_each_chart, only, write_row
 from ..settings import Settings, size
@@ -77,66 +78,51 @@ def search(
 
 def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     """The state of the iteration at its start."""
-    s, xp, L, u = task.s, namespace(lanes.t), lanes.t.shape[0], task.u
-    finite = (
-        xp.isfinite(lanes.t)
-        & xp.isfinite(lanes.q).all(axis=0)
-        & xp.isfinite(u).all(axis=0)
-    )
+    s = task.s
+    xp = namespace(lanes.t)
+    L = lanes.t.shape[0]
+    u = task.u
+    finite = xp.isfinite(lanes.t) & xp.isfinite(lanes.q).all(axis=0)
+    finite = finite & xp.isfinite(u).all(axis=0)
     result = update_result(result, ~finite, Result.BAD_INPUT)
-    watched = watch(
-        s, lanes.t, lanes.chart, lanes.q, u, task.target, result == Result.OK
-    )
+    runs = result == Result.OK
+    watched = watch(s, lanes.t, lanes.chart, lanes.q, u, task.target, runs)
+    none = xp.zeros(L, xp.int32)
+    zero = xp.zeros(L)
+    no = xp.zeros(L, bool)
+    armed = arm(s, lanes, watched, task.span) if new_input else lanes
+    counts = level_counts(watched, task.span)
+    along = task.stride.along
     implicit = any(s.method(a).implicit for a in range(len(s.charts)))
-    follows, along = implicit and task.tangents, task.stride.along
-    none, zero, no = xp.zeros(L, xp.int32), xp.zeros(L), xp.zeros(L, bool)
+    if along is None and implicit and task.tangents:
+        along = deviation(s, lanes, task.settings)
     return State(
-        arm(s, lanes, watched, task.span) if new_input else lanes,
-        watched,
-        level_counts(watched, task.span),
-        Approach(no, none, zero, zero, zero, none),
-        task.stride.h,
-        deviation(s, lanes, task.settings) if follows and along is None else along,
-        zero,
-        result,
-        no,
-        xp.zeros((), xp.int32),
+        lanes=armed,
+        watched=watched,
+        aimed=counts,
+        approach=Approach(no, none, zero, zero, zero, none),
+        h=task.stride.h,
+        along=along,
+        error=zero,
+        result=result,
+        arrived=no,
+        i=xp.zeros((), xp.int32),
     )
 
 
 def take_aim(state: State, task: Task) -> Aim:
     """The steps of active lanes; steps of length 0 of all others."""
-    s, lanes, approach, target = task.s, state.lanes, state.approach, task.target
-    xp = namespace(lanes.t)
-    # Known times: the step is cut so that it ends on them exactly, in equal pieces.
-    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
-    due = xp.minimum(target.time, scheduled)
-    schedule = xp.where(scheduled <= target.time, which, -1)
-    # Events at once: of guards that a reset has put beyond zero.
-    beyond = lanes.armed & overdue(state.watched, task.span)
-    at_once = state.active & ~approach.on & beyond.any(axis=0)
-    due = xp.where(at_once, lanes.t, due)
-    if s.transitions:
-        overdue_first = xp.argmax(beyond, axis=0).astype(xp.int32)
-        schedule = xp.where(at_once, overdue_first, schedule)
-    left = xp.maximum(due - lanes.t, 0.0)
+    approach = state.approach
+    xp = namespace(state.lanes.t)
+    due, schedule, at_once = _known_time(state, task)
+    # The step is cut so that it ends on known times exactly, in equal pieces.
+    left = xp.maximum(due - state.lanes.t, 0.0)
     pieces = xp.ceil(xp.where(xp.isfinite(left), left / state.h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)
-    # A zero that Newton's guess places within the first step is aimed at, where the way is known.
-    value, rate = state.watched
-    lead = task.stride.lead
-    guess = value / xp.where(rate < 0, -rate, xp.inf)
-    guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))
-    level = np.arange(len(value))[:, None] == len(s.transitions)
-    new = (state.i == 0) | (lanes.pace[0] == 0)  # at the start, or right after an event
-    within = guess <= xp.where(level, 1.0, _AIM_WITHIN) * step
-    expected = (
-        state.ready & (guess > 0) & within & (level | new) & ~approach.on & (lead > 0)
-    )
-    expected = expected & ~at_once
-    guess = xp.where(expected, guess, xp.inf)
+    # A zero that Newton's guess places within the first step is aimed at.
+    guess = _expected_zeros(state, task, step, at_once)
     nearest = xp.min(guess, axis=0)
     lands = xp.isfinite(nearest)
     step = xp.where(lands, nearest, step)
@@ -144,7 +130,54 @@ def take_aim(state: State, task: Task) -> Aim:
     last = last & ~lands & state.active
     step = xp.where(state.active, xp.where(approach.on, approach.tau, step), 0.0)
     reach = xp.where(approach.on, approach.reach, step)
-    return Aim(which, step, reach, due, xp.where(last, schedule, -1), last, at_once)
+    return Aim(
+        which=which,
+        step=step,
+        reach=reach,
+        due=due,
+        schedule=xp.where(last, schedule, -1),
+        last=last,
+        at_once=at_once,
+    )
+
+
+def _known_time(state: State, task: Task) -> tuple[Times, Index, Mask]:
+    """The next known time, the transition that is due there (-1: none), and whether it is due at
+    once, since a reset has put its guard beyond zero."""
+    s = task.s
+    lanes = state.lanes
+    target = task.target
+    xp = namespace(lanes.t)
+    scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
+    due = xp.minimum(target.time, scheduled)
+    schedule = xp.where(scheduled <= target.time, which, -1)
+    beyond = lanes.armed & overdue(state.watched, task.span)
+    at_once = state.active & ~state.approach.on & beyond.any(axis=0)
+    due = xp.where(at_once, lanes.t, due)
+    if s.transitions:
+        overdue_first = xp.argmax(beyond, axis=0).astype(xp.int32)
+        schedule = xp.where(at_once, overdue_first, schedule)
+    return due, schedule, at_once
+
+
+def _expected_zeros(
+    state: State, task: Task, step: Times, at_once: Mask
+) -> Float[Array, "W L"]:
+    """Newton's guesses of the times to zeros of watched functions within the first `step`, where
+    the way is known; infinity for all others."""
+    approach = state.approach
+    xp = namespace(step)
+    value, rate = state.watched
+    lead = task.stride.lead
+    guess = value / xp.where(rate < 0, -rate, xp.inf)
+    guess = put(guess, -1, guess[-1] * xp.where(state.i == 0, lead, 1.0))
+    level = np.arange(len(value))[:, None] == len(task.s.transitions)
+    # At the start, or right after an event.
+    new = (state.i == 0) | (state.lanes.pace[0] == 0)
+    within = (guess > 0) & (guess <= xp.where(level, 1.0, _AIM_WITHIN) * step)
+    known = ~approach.on & (lead > 0) & ~at_once
+    expected = state.ready & within & (level | new) & known
+    return xp.where(expected, guess, xp.inf)
 
 
 def initial_step(
@@ -165,7 +198,8 @@ def initial_step(
         return xp.where(here, first, out)
 
     assert settings.rtol is not None
-    xp, rtol = namespace(lanes.t), settings.rtol
+    xp = namespace(lanes.t)
+    rtol = settings.rtol
     return for_each_chart(
         s, lanes.chart, xp.ones(lanes.t.shape[0], bool), work, _FIRST_STEP * span
     )

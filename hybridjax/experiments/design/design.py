@@ -127,7 +127,8 @@ class Design(eqx.Module):
 
         **Raises:** `DefinitionError` that names the experiment and the frequencies.
         """
-        P, N = self.periods, self.n_sections
+        P = self.periods
+        N = self.n_sections
         check_window(N, P)
         for name in ("line", "channel", "amplitude", "phase"):
             shapes = self.experiment.shape, getattr(self, name).shape
@@ -159,11 +160,10 @@ class Design(eqx.Module):
 
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
-        power, square = np.bincount(group, np.abs(u) ** 2), u**2
-        re, im = (
-            np.bincount(group, np.real(square)),
-            np.bincount(group, np.imag(square)),
-        )
+        power = np.bincount(group, np.abs(u) ** 2)
+        square = u**2
+        re = np.bincount(group, np.real(square))
+        im = np.bincount(group, np.imag(square))
         alike = np.hypot(re, im) / power
         self._refuse(
             (needs_two_phases(self.line, P, N) & (alike > 1 - SINGULAR)[group]),
@@ -228,10 +228,14 @@ class Design(eqx.Module):
         cycles = self.periods if cycles is None else cycles
         first, last, step = (experiments or slice(None)).indices(self.experiments)
         if step != 1 or last <= first:
-            text = f"consecutive experiments, such as slice(0, 10), not {experiments}"
-            raise DefinitionError(f"`experiments` must be a slice of {text}.")
+            raise DefinitionError(
+                "`experiments` must be a slice of consecutive experiments, such as slice(0, 10), "
+                f"not {experiments}."
+            )
         k = slice(*np.searchsorted(self.experiment, (first, last)))
-        experiment, line, channel = self.experiment[k], self.line[k], self.channel[k]
+        experiment = self.experiment[k]
+        line = self.line[k]
+        channel = self.channel[k]
         length = self.n_sections * self.periods
         spectrum = np.zeros(
             (last - first, length // 2 + 1, len(self.input_names)), complex
@@ -286,10 +290,8 @@ class Design(eqx.Module):
     def _times(self, count: int, phase, experiment) -> "Design":
         """Return the cosines repeated, with other phases, in other experiments."""
         same = [np.tile(x, count) for x in (self.line, self.channel, self.amplitude)]
-        cosines, experiments = (
-            [experiment.ravel(), *same, phase.ravel()],
-            count * self.experiments,
-        )
+        cosines = [experiment.ravel(), *same, phase.ravel()]
+        experiments = count * self.experiments
         return ordered(
             cosines, self.n_sections, self.periods, experiments, self.input_names
         )
@@ -317,14 +319,17 @@ class Design(eqx.Module):
     def crest_factors(self) -> Float[np.ndarray, " S"]:
         """Return max |u| / rms(u) of each experiment, the largest over its inputs."""
         u = self.inputs()
-        rms, peak = np.sqrt(np.mean(u**2, axis=1)), np.abs(u).max(axis=1)
+        rms = np.sqrt(np.mean(u**2, axis=1))
+        peak = np.abs(u).max(axis=1)
         return np.max(
             np.where(rms > 0, peak / np.where(rms > 0, rms, 1.0), 0.0), axis=1
         )
 
     def __repr__(self) -> str:
-        f, sizes = self.frequencies, np.bincount(self.experiment)
-        crest, per = self.crest_factors(), self.expected_variance()
+        f = self.frequencies
+        sizes = np.bincount(self.experiment)
+        crest = self.crest_factors()
+        per = self.expected_variance()
         per = per[np.isfinite(per)]
         rows = [
             f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
@@ -361,7 +366,8 @@ def ordered(
 
 
 def _span(values: np.ndarray) -> str:
-    low, high = f"{float(np.min(values)):.4g}", f"{float(np.max(values)):.4g}"
+    low = f"{float(np.min(values)):.4g}"
+    high = f"{float(np.max(values)):.4g}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -374,7 +380,8 @@ def require_inputs(
 ) -> None:
     """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
     of one input is that of another one there."""
-    what, names = f"design and {other}", design.input_names
+    what = f"design and {other}"
+    names = design.input_names
     require_equal(what, "n_sections", design.n_sections, n_sections)
     require_equal(what, "numbers of inputs", len(names), len(inputs))
     if any(x in inputs and x != y for x, y in zip(names, inputs, strict=True)):
@@ -384,8 +391,10 @@ def require_inputs(
 def check_window(n_sections: int, periods: int) -> None:
     """**Raises:** `DefinitionError` for windows that no memory holds."""
     if n_sections * periods > limits.WINDOW:
-        text = f"more samples than an experiment may have ({limits.WINDOW}): take fewer"
-        raise DefinitionError(f"{n_sections} sections in {periods} periods are {text}.")
+        raise DefinitionError(
+            f"{n_sections} sections in {periods} periods are more samples than an experiment may "
+            f"have ({limits.WINDOW}): take fewer."
+        )
 
 
 def to_lines(

@@ -97,10 +97,12 @@ def multisine(
     # A frequency that needs two phases is listed twice; `second` marks the repetition.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, n_sections)]]))
     second = np.concatenate([[False], j[1:] == j[:-1]])
-    nu, rng = len(names), np.random.default_rng(seed)
+    nu = len(names)
+    rng = np.random.default_rng(seed)
     total = _number(j, periods, nu, experiments)
     shares = [total // nu + (i < total % nu) for i in range(nu)]
-    sets, phases = [], []
+    sets = []
+    phases = []
     for i in range(nu):
         sets.append(assign(j, periods, shares[i], rng))
         if division == "sum-free":
@@ -109,33 +111,36 @@ def multisine(
         phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
         phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
     experiment = np.concatenate([sum(shares[:i]) + x for i, x in enumerate(sets)])
-    line, channel, phase = (
-        np.tile(j, nu),
-        np.repeat(np.arange(nu), len(j)),
-        np.concatenate(phases),
-    )
+    line = np.tile(j, nu)
+    channel = np.repeat(np.arange(nu), len(j))
+    phase = np.concatenate(phases)
     if division == "disjoint" and nu > 1:
         experiment = assign(line, periods, total, rng)
     elif division == "orthogonal" and nu > 1:
         experiment, line, channel, phase = _orthogonal(sets[0], j, np.array(phases))
-    size = np.asarray(amplitude(line / periods) if callable(amplitude) else amplitude)
-    if size.dtype.kind not in "fiu":
-        raise DefinitionError(
-            f"`amplitude` must return real numbers, not {size.dtype}."
-        )
-    if size.shape not in ((), line.shape):
-        raise DefinitionError(
-            f"`amplitude` must return a number for each of {len(line)} frequencies, not an array "
-            f"of the shape {size.shape}."
-        )
-    cosines = (
-        experiment,
-        line,
-        channel,
-        np.full(line.shape, size, float),
-        phase % (2 * np.pi),
-    )
+    sizes = _amplitudes(amplitude, line / periods)
+    cosines = experiment, line, channel, sizes, phase % (2 * np.pi)
     return ordered(cosines, n_sections, periods, int(experiment.max()) + 1, names)
+
+
+def _amplitudes(
+    amplitude: float | Callable[[np.ndarray], np.ndarray], frequencies: np.ndarray
+) -> np.ndarray:
+    """Return the amplitude of each cosine.
+
+    **Raises:** `DefinitionError` if the function returns something else than real numbers.
+    """
+    sizes = np.asarray(amplitude(frequencies) if callable(amplitude) else amplitude)
+    if sizes.dtype.kind not in "fiu":
+        raise DefinitionError(
+            f"`amplitude` must return real numbers, not {sizes.dtype}."
+        )
+    if sizes.shape not in ((), frequencies.shape):
+        raise DefinitionError(
+            f"`amplitude` must return a number for each of {len(frequencies)} frequencies, not an "
+            f"array of the shape {sizes.shape}."
+        )
+    return np.full(frequencies.shape, sizes, float)
 
 
 def _number(j: np.ndarray, periods: int, nu: int, experiments: int | None) -> int:
@@ -168,19 +173,16 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
         raise DefinitionError(
             f"`band` {band} must increase in [0, N/2 = {n_sections / 2}]."
         )
-    low, high = (
-        int(np.ceil(f_min * periods - OFF_LINE)),
-        int(np.floor(f_max * periods + OFF_LINE)),
-    )
+    low = int(np.ceil(f_min * periods - OFF_LINE))
+    high = int(np.floor(f_max * periods + OFF_LINE))
     j = np.arange(low, high + 1)
     if lines != "two-phase":
         j = j[~partition.is_half_integer(j, periods)]
     if lines == "odd":
         j = j[j % 2 == 1]
     if len(j) == 0:
-        text = "take more periods or a wider band"
         raise DefinitionError(
-            f"lines='{lines}' excites nothing in `band` {band}: {text}."
+            f"lines='{lines}' excites nothing in `band` {band}: take more periods or a wider band."
         )
     return j
 
@@ -237,7 +239,8 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
     **Raises:** `DefinitionError` if there is no phase to choose.
     """
-    nu, length = len(design.input_names), design.n_sections * design.periods
+    nu = len(design.input_names)
+    length = design.n_sections * design.periods
     _, pair, count = np.unique(
         design.line * nu + design.channel, return_inverse=True, return_counts=True
     )
@@ -264,7 +267,9 @@ def _lower(phase, free, line, size, length: int):
     """Return the free phases of one signal that minimize its peak."""
     from scipy.optimize import minimize  # (a third of a second, needed by few designs)
 
-    spectrum, best, least = np.zeros(length // 2 + 1, complex), phase[free], np.inf
+    spectrum = np.zeros(length // 2 + 1, complex)
+    best = phase[free]
+    least = np.inf
 
     def signal(x):
         value = size * np.exp(1j * np.where(free, 0.0, phase))
@@ -285,6 +290,8 @@ def _lower(phase, free, line, size, length: int):
     x = phase[free]
     for p in _POWERS:
         x = minimize(norm, x, p, "L-BFGS-B", jac=True, options={"maxiter": _STEPS}).x
-        if (peak := np.abs(signal(x)).max()) < least:
-            best, least = x, peak
+        peak = np.abs(signal(x)).max()
+        if peak < least:
+            best = x
+            least = peak
     return best

@@ -13,6 +13,7 @@ Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
 
 import itertools
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Complex, Int
@@ -26,6 +27,13 @@ from ...errors import DefinitionError
 # Smaller: inputs that only rounding separates are accepted. Larger: good experiments with unequal
 # inputs are refused.
 SINGULAR = 1e-6
+# Rounds of simulated annealing. Fewer: divisions are missed that there are. More: vain searches
+# last.
+_ROUNDS = 200_000
+# Rounds whose random numbers are drawn at once, after which the list of disturbed experiments is
+# made again. Fewer: searches last longer. More: the list holds more experiments without a product
+# on a line.
+_DRAWS = 4096
 
 
 def line_class(line: Int[np.ndarray, " K"], periods: int) -> Int[np.ndarray, " K"]:
@@ -82,7 +90,8 @@ def assign(
     at that moment (ties at random), so sizes differ by at most one. Needs
     `experiments >= fewest_experiments(line, periods)`, and then never fails.
     """
-    classes, load = line_class(line, periods), np.zeros(experiments, int)
+    classes = line_class(line, periods)
+    load = np.zeros(experiments, int)
     experiment = np.empty(len(line), int)
     for c in rng.permutation(np.unique(classes)):
         members = rng.permutation(np.flatnonzero(classes == c))
@@ -106,53 +115,116 @@ def avoid_second_order(
 
     **Raises:** `DefinitionError` if no such partition was found.
     """
-    classes, products = line_class(line, periods).tolist(), _products(periods)
-    members = [
-        np.flatnonzero(experiment == e).tolist() for e in range(experiment.max() + 1)
-    ]
-    held = [[classes[i] for i in m] for m in members]
-    hits = [_hits(c, products) for c in held]
-    draws: Iterator[list[float]] = iter(())
-    rounds = 200_000  # (fewer: divisions are missed that there are; more: vain searches last)
-    for k in range(rounds):
-        if k % 4096 == 0:
-            bad = [e for e, n in enumerate(hits) if n]
-            draws = iter(rng.random((4096, 5)).tolist())
-        if not bad:
-            break
-        x = next(draws)
-        e, f = bad[int(x[0] * len(bad))], int(x[1] * len(members))
-        if hits[e] == 0:
-            bad = [e for e, n in enumerate(hits) if n]
-            continue
-        i, j = int(x[2] * len(members[e])), int(x[3] * len(members[f]))
-        a, b = held[e][i], held[f][j]
-        if e == f or b in held[e] or a in held[f]:
-            continue
-        new_e, new_f = held[e].copy(), held[f].copy()
-        new_e[i], new_f[j] = b, a
-        hits_e, hits_f = _hits(new_e, products), _hits(new_f, products)
-        worse = hits_e + hits_f - hits[e] - hits[f]
-        heat = 0.5 * max(1 - 2 * k / rounds, 0.0) + 1e-3  # cold in the second half
-        if worse <= 0 or x[4] < np.exp(-worse / heat):
-            members[e][i], members[f][j] = members[f][j], members[e][i]
-            held[e], held[f], hits[e], hits[f] = new_e, new_f, hits_e, hits_f
-            if hits_f and f not in bad:
-                bad.append(f)
-    if any(hits):
-        more = (
-            "`periods` that 3 does not divide"
-            if periods / 3 in classes
-            else "more experiments"
-        )
+    division = _Division(experiment, line, periods)
+    _anneal(division, rng)
+    if not any(division.hits):
+        return division.experiment()
+    if (3 * line_class(line, periods) == periods).any():
         raise DefinitionError(
             "no division was found in which second-order products avoid the excited lines: take "
-            f"{more}, or division='random'."
+            "`periods` that 3 does not divide, or division='random'."
         )
-    out = np.empty_like(experiment)
-    for e, m in enumerate(members):
-        out[m] = e
-    return out
+    raise DefinitionError(
+        "no division was found in which second-order products avoid the excited lines: take more "
+        "experiments, or division='random'."
+    )
+
+
+def _anneal(division: "_Division", rng: np.random.Generator) -> None:
+    """Swap lines between experiments until no second-order product falls on a line, or too many
+    rounds have passed."""
+    disturbed: list[int] = []
+    draws: Iterator[list[float]] = iter(())
+    for k in range(_ROUNDS):
+        if k % _DRAWS == 0:
+            disturbed = division.disturbed()
+            draws = iter(rng.random((_DRAWS, 5)).tolist())
+        if not disturbed:
+            return
+        of_first, of_second, of_line, of_other, luck = next(draws)
+        first = disturbed[int(of_first * len(disturbed))]
+        if division.hits[first] == 0:
+            disturbed = division.disturbed()
+            continue
+        second = int(of_second * len(division.lines))
+        i = int(of_line * len(division.lines[first]))
+        j = int(of_other * len(division.lines[second]))
+        swap = division.swap(first, i, second, j)
+        if swap is None:
+            continue
+        heat = 0.5 * max(1 - 2 * k / _ROUNDS, 0.0) + 1e-3  # cold in the second half
+        if swap.worse <= 0 or luck < np.exp(-swap.worse / heat):
+            division.apply(swap)
+            if division.hits[second] and second not in disturbed:
+                disturbed.append(second)
+
+
+class _Swap(NamedTuple):
+    """An exchange of line i of one experiment for line j of another one."""
+
+    first: int
+    i: int
+    second: int
+    j: int
+    classes: tuple[list[int], list[int]]
+    """Classes in both experiments afterwards."""
+    hits: tuple[int, int]
+    """Products that fall on a line in both experiments afterwards."""
+    worse: int
+    """By how much the number of such products grows."""
+
+
+class _Division:
+    """A division of lines among experiments: by experiment, the numbers of its lines, their
+    classes, and how many second-order products fall on one of them."""
+
+    def __init__(
+        self,
+        experiment: Int[np.ndarray, " K"],
+        line: Int[np.ndarray, " K"],
+        periods: int,
+    ):
+        of_line = line_class(line, periods)
+        members = [np.flatnonzero(experiment == e) for e in range(experiment.max() + 1)]
+        self._products = _products(periods)
+        self.lines = [lines.tolist() for lines in members]
+        self.classes = [of_line[lines].tolist() for lines in members]
+        self.hits = [_hits(classes, self._products) for classes in self.classes]
+
+    def disturbed(self) -> list[int]:
+        """Return the experiments in which a product falls on a line."""
+        return [e for e, hits in enumerate(self.hits) if hits]
+
+    def swap(self, first: int, i: int, second: int, j: int) -> _Swap | None:
+        """Return the exchange of two lines; None if an experiment would have a class twice."""
+        leaves = self.classes[first][i]
+        comes = self.classes[second][j]
+        is_repeated = comes in self.classes[first] or leaves in self.classes[second]
+        if first == second or is_repeated:
+            return None
+        of_first = self.classes[first].copy()
+        of_second = self.classes[second].copy()
+        of_first[i] = comes
+        of_second[j] = leaves
+        hits = _hits(of_first, self._products), _hits(of_second, self._products)
+        worse = sum(hits) - self.hits[first] - self.hits[second]
+        return _Swap(first, i, second, j, (of_first, of_second), hits, worse)
+
+    def apply(self, swap: _Swap) -> None:
+        """Exchange the lines."""
+        first, i, second, j, *_ = swap
+        lines = self.lines
+        lines[first][i], lines[second][j] = lines[second][j], lines[first][i]
+        self.classes[first], self.classes[second] = swap.classes
+        self.hits[first], self.hits[second] = swap.hits
+
+    def experiment(self) -> Int[np.ndarray, " K"]:
+        """Return the experiment of each line."""
+        sizes = [len(lines) for lines in self.lines]
+        out = np.empty(sum(sizes), int)
+        for e, lines in enumerate(self.lines):
+            out[lines] = e
+        return out
 
 
 def _products(periods: int) -> list[list[int]]:
@@ -162,10 +234,13 @@ def _products(periods: int) -> list[list[int]]:
     def fold(x):
         return min(x % periods, -x % periods)
 
-    return [
-        [(1 << fold(a + b)) | (1 << fold(a - b)) for b in range(top)]
-        for a in range(top)
-    ]
+    def mask(a, b):
+        return (1 << fold(a + b)) | (1 << fold(a - b))
+
+    table = []
+    for a in range(top):
+        table.append([mask(a, b) for b in range(top)])
+    return table
 
 
 def _hits(classes: list[int], products: list[list[int]]) -> int:
@@ -184,21 +259,33 @@ def check_sharing(
     """
     classes = line_class(line, periods)
     order = np.lexsort((line, classes, experiment))
-    e, c, j = experiment[order], classes[order], line[order]
-    clash = (e[1:] == e[:-1]) & (c[1:] == c[:-1])
-    if clash.any():
-        k = int(np.argmax(clash))
-        low, high, number = int(j[k]), int(j[k + 1]), int(e[k + 1])
-        f = f"f = {low / periods:.10g}"
-        reason = f"{f} is excited twice"
-        if low < high:
-            relation = "add up to" if (high - low) % periods else "differ by"
-            reason = f"{f} and {high / periods:.10g} {relation} an integer"
-        remedy = "move one of them to another experiment"
-        if (
-            experiment == number
-        ).sum() > periods // 2 + 1:  # more than any design may have
-            remedy = f"a recorded input must repeat after P = {periods} periods, with noise below "
-            remedy += "`threshold`; one that a controller makes needs its `reference`"
-        text = f"{reason}, so their responses fall on the same frequencies: {remedy}"
-        raise DefinitionError(f"experiment {number}: {text}.")
+    number = experiment[order]
+    of_line = classes[order]
+    j = line[order]
+    clash = (number[1:] == number[:-1]) & (of_line[1:] == of_line[:-1])
+    if not clash.any():
+        return
+    k = int(np.argmax(clash))
+    reason = _reason(int(j[k]), int(j[k + 1]), periods)
+    lines = int((experiment == number[k]).sum())
+    if lines > periods // 2 + 1:  # more than any design may have
+        raise DefinitionError(
+            f"experiment {number[k]}: {reason}, so their responses fall on the same frequencies: a "
+            f"recorded input must repeat after P = {periods} periods, with noise below "
+            "`threshold`; one that a controller makes needs its `reference`."
+        )
+    raise DefinitionError(
+        f"experiment {number[k]}: {reason}, so their responses fall on the same frequencies: move "
+        "one of them to another experiment."
+    )
+
+
+def _reason(low: int, high: int, periods: int) -> str:
+    """Return how two lines of one class disturb each other."""
+    f = low / periods
+    g = high / periods
+    if low == high:
+        return f"f = {f:.10g} is excited twice"
+    if (high - low) % periods:
+        return f"f = {f:.10g} and {g:.10g} add up to an integer"
+    return f"f = {f:.10g} and {g:.10g} differ by an integer"
