@@ -120,6 +120,7 @@ def make_plan(
     N = placed.n_sections
     placed = to_host(placed)
     *_, target = placed.onwards()
+    assert placed.tape is not None
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
     J, by_input = J[:, :, : scale.shape[1]], J[:, :, scale.shape[1] :]

@@ -126,8 +126,10 @@ class _Points(NamedTuple):
 def applies(s: Structure, placed: PlacedSections) -> bool:
     """Test whether experiments can follow a table: with explicit methods, and events at the zeros
     of guards that are always enabled."""
+    tape = placed.tape
+    assert tape is not None
     charts = np.unique(np.asarray(placed.lanes.chart)).tolist()
-    codes = np.unique(np.asarray(placed.tape.code))
+    codes = np.unique(np.asarray(tape.code))
     taken = [s.transitions[g] for g in codes[codes >= 0].tolist()]
     used = {*charts, *(s.chart_index(x.target) for x in taken)}
     plain = all(
@@ -136,7 +138,7 @@ def applies(s: Structure, placed: PlacedSections) -> bool:
         if s.chart_index(x.source) in used
     )
     explicit = not any(s.method(a).implicit for a in used)
-    at_once = np.asarray(placed.tape.at_once)[np.asarray(placed.tape.code) >= 0].any()
+    at_once = np.asarray(tape.at_once)[np.asarray(tape.code) >= 0].any()
     return plain and explicit and not at_once
 
 
@@ -211,7 +213,7 @@ class _Writer:
         number = np.int32
         types: list[type] = [number, number, number, number, bool, bool, bool]
         types += [number, float, float, number, bool, number]
-        columns = [
+        columns: list[np.ndarray] = [
             np.array(x).astype(d)
             for x, d in zip(zip(*self.rows, strict=True), types, strict=True)
         ]
@@ -467,7 +469,9 @@ _EVENT = "section", "t", "before", "after"
 
 def _events(placed: PlacedSections) -> list[_Event]:
     """The events of one turn, in order."""
-    tape, found = placed.tape, []
+    tape = placed.tape
+    assert tape is not None
+    found = []
     for k in range(placed.n_sections):
         rows = np.flatnonzero(tape.code[:, k] >= 0)
         moves = np.flatnonzero(tape.code[:, k] != IDLE)
