@@ -116,10 +116,12 @@ def unit_circle(
 ) -> str:
     """A picture of multipliers, with the borders of their confidence regions."""
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
-    curves = [Curve(circle.real, circle.imag, color=COLORS[-1])]
+    curves = [Curve(np.real(circle), np.imag(circle), color=COLORS[-1])]
     for z in regions:
-        curves.append(Curve(z.real.clip(-3, 3), z.imag.clip(-3, 3), color=COLORS[0]))
-    curves.append(Curve(values.real, values.imag, color=COLORS[1], points=True))
+        x, y = np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3)
+        curves.append(Curve(x, y, color=COLORS[0]))
+    x, y = np.real(values), np.imag(values)
+    curves.append(Curve(x, y, color=COLORS[1], points=True))
     return picture(curves, "real part", "imaginary part", square=True)
 
 

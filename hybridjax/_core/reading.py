@@ -36,7 +36,7 @@ from .programs import digest_of_array
 
 _PLAIN = bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range, slice
 # Objects of these types that are no more than their values, if a class is made of them.
-_VALUES = bool, int, float, complex, str, bytes
+_VALUES: tuple[Any, ...] = bool, int, float, complex, str, bytes
 _JITTED: Any = type(jax.jit(len))
 
 # Functions that read files, the names of values, or the system.

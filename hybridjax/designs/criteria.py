@@ -110,7 +110,7 @@ def wanted_parts(
     names = list[str]()
     part = list[int]()
     if goal.which is None:
-        chosen = np.flatnonzero(multipliers.imag >= 0)  # one of each pair
+        chosen = np.flatnonzero(np.imag(multipliers) >= 0)  # one of each pair
     else:
         chosen = np.array([goal.which])
     for k in chosen:

@@ -147,8 +147,10 @@ def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
     over = xp.zeros((G, t.shape[0]), bool)
     clocks = [g for g in range(G) if s.clocks[g] >= 0]
     for g, h in itertools.product(clocks, clocks):
-        offset, period = s.transitions[g].guard.numbers(t)
-        later, other = s.transitions[h].guard.numbers(t)
+        own, others = s.transitions[g].guard, s.transitions[h].guard
+        assert isinstance(own, Scheduled) and isinstance(others, Scheduled)
+        offset, period = own.numbers(t)
+        later, other = others.numbers(t)
         earlier = xp.round((t - offset) / period) < xp.round((t - later) / other)
         same = (s.clocks[g] == s.clocks[h]) | ((period == other) & earlier)
         over = put(over, g, over[g] | ((fired == h) & same))

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import Program
 from ..engine import kernels
+from ..engine.arrays import Array
 from ..engine.itinerary.bodies import Watched, dips
 from ..engine.runge_kutta import looped_step
 from ..engine.settings import Settings, size
@@ -179,6 +180,7 @@ class _Moves:
         following = (jnp.arange(self.N) + 1) % self.N
         turns = jnp.where(following == 0, course.period, 0.0)
         self.ends = course.bound.time[following] + turns
+        assert settings.rtol is not None
         self.allowed = _LAST * course.period * jnp.sqrt(settings.rtol)
 
     def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
@@ -295,6 +297,7 @@ class _Moves:
         """The outputs at the section, for lanes that are there, and a controller's answer."""
         observe = self.s.by_lane(lambda s, t, q, u: self.outputs(a, t, q, u))
         if self.feedback is not None:
+            assert x.answer is not None and x.controller is not None
             A, B, C, D, _ = (m[row.section] for m in self.feedback.matrices)
             on_cycle = self.feedback.on_cycle[row.section][:, None]
             deviation = observe(x.t, q, u) - on_cycle

@@ -122,6 +122,7 @@ def make_plan(
     """
     placed = to_host(placed)
     *_, target = placed.onwards()
+    assert placed.tape is not None
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
     by_input = J[:, :, scale.shape[1] :]

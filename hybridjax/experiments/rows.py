@@ -130,6 +130,7 @@ class _Points(NamedTuple):
 def applies(s: Structure, placed: PlacedSections) -> bool:
     """Test whether experiments can follow a table: with explicit methods, and events at the zeros
     of guards that are always enabled."""
+    assert placed.tape is not None
     codes = np.asarray(placed.tape.code)
     is_event = codes >= 0
     if np.asarray(placed.tape.at_once)[is_event].any():
@@ -229,7 +230,7 @@ class _Writer:
             self._interval(k)
         used = len(self.rows)
         self.rows += self.rows[-1:] * (-used % _ROUND)
-        columns = {}
+        columns: dict[str, np.ndarray] = {}
         for name in Rows._fields:
             column = np.array([row[name] for row in self.rows])
             if np.issubdtype(column.dtype, np.integer):
@@ -504,6 +505,7 @@ class _Writer:
 def _events(placed: PlacedSections) -> list[_Event]:
     """The events of one turn, in order."""
     tape = placed.tape
+    assert tape is not None
     found = []
     for k in range(placed.n_sections):
         rows = np.flatnonzero(tape.code[:, k] >= 0)

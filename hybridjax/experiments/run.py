@@ -337,9 +337,11 @@ class Campaign:
         with more rows, in a batch of this size, and where they leave that too, by a search."""
         name = "experiments far from the cycle"
         if len(left):
+            tables = self._tables
+            assert tables is not None
             whole = Execution(batch=size, workers=1)
             again = u[left], start[:, left], whole, name
-            ((_, (new, gone)),) = self._followed(self._tables.far, *again)
+            ((_, (new, gone)),) = self._followed(tables.far, *again)
             part = _with_rows(part, left, new)
             left = left[gone]
         if len(left):

@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.compilation import identity, whole
 from .._core.executor import on_the_cpu
 from .._core.results import Result
+from ..engine.arrays import Array
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..orbits.near import first_order_cycle, route_near

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -225,23 +225,27 @@ class ModelFit(Fit):
         **Raises:** `DefinitionError` if a value is missing or was not fitted, or if the fit has no
         standard errors.
         """
+        given: Mapping[str, Any]
         if isinstance(true, HybridSystem):
             kept = {
                 x: y for x, y in arrays_of(self.system).items() if x not in self.names
             }
-            given = arrays_of(true).items()
-            true = {
-                x: y for x, y in given if not np.array_equal(y, kept.get(x, np.nan))
+            given = {
+                x: y
+                for x, y in arrays_of(true).items()
+                if not np.array_equal(y, kept.get(x, np.nan))
             }
-        if more := [name for name in true if name not in self.names]:
+        else:
+            given = true
+        if more := [name for name in given if name not in self.names]:
             raise DefinitionError(
                 f"`true` has another '{more[0]}', which was not fitted: free it."
             )
-        if missing := [name for name in self.names if name not in true]:
+        if missing := [name for name in self.names if name not in given]:
             raise DefinitionError(
                 f"`true` must have a value of '{missing[0]}', which was fitted."
             )
-        values = jnp.array([float(true[name]) for name in self.names])
+        values = jnp.array([float(given[name]) for name in self.names])
         self.cycle.require_current()
         r, *_ = evaluate(
             self.problem, self.problem.parameters.encode(values), self.cycle

@@ -84,10 +84,11 @@ def least_squares(
         end = optimize.least_squares(
             lambda x: at(c + to_c @ x)[0] / unit,  # noqa: B023
             np.zeros(to_c.shape[1]),
-            lambda x: at(c + to_c @ x)[1] @ to_c / unit,  # noqa: B023
+            # (SciPy declares no types: pyright takes those of the defaults.)
+            lambda x: at(c + to_c @ x)[1] @ to_c / unit,  # noqa: B023  # pyright: ignore[reportArgumentType]
             gtol=np.sqrt(max(_SETTLED_GAIN, settled_gain / cost)),
             xtol=ROUNDING,
-            ftol=None,
+            ftol=None,  # pyright: ignore[reportArgumentType]
             max_nfev=max_steps + 1,
         )
         c = c + to_c @ end.x

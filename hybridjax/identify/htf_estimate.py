@@ -175,7 +175,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
         solution = np.einsum("kij,kjml->kiml", inverse, right)
         explained = np.einsum("kiml,kiml->kml", solution.conj(), right).real
         H[entries] = solution[:, :nu]
-        spread[entries] = np.linalg.diagonal(inverse).real[:, :nu]
+        spread[entries] = np.real(np.linalg.diagonal(inverse))[:, :nu]
         residual[entries] = np.maximum(sums.energy[lines] - explained, 0)
 
     def variance(square):
@@ -213,7 +213,7 @@ def _roundness(
     shared = (gram * ~np.eye(nu, dtype=bool)).any()
     if shared or sums.mirrored[rows].any() or sums.count.max() > _FEW_REALIZATIONS:
         return None
-    power = np.linalg.diagonal(gram).real[None, :, None]
+    power = np.real(np.linalg.diagonal(gram))[None, :, None]
     energy = sums.energies[rows].transpose(2, 0, 3, 1)
     turned = sums.turned[rows].transpose(2, 0, 3, 1)
     square = energy - np.abs(H) ** 2 * power

@@ -359,4 +359,4 @@ def _adjoint(x: Complex[np.ndarray, "k a b"]) -> Complex[np.ndarray, "k b a"]:
 
 
 def _diagonal(x: Complex[np.ndarray, "k a a"]) -> Float[np.ndarray, "k a"]:
-    return np.linalg.diagonal(x).real
+    return np.real(np.linalg.diagonal(x))

@@ -315,7 +315,8 @@ def nearest(
     apart = (finite - finite.mean(axis=0)).filled(0.0)
     spread = np.sqrt(np.mean(apart**2, axis=0))
     points = apart / np.where(spread > 0, spread, 1.0)
-    return KDTree(points[: len(known)]).query(points[len(known) :])
+    distance, place = KDTree(points[: len(known)]).query(points[len(known) :])
+    return distance, np.asarray(place)
 
 
 def _pick(tree, rows):

@@ -79,12 +79,8 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
         cycle.require_found()
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)
-    s, period, path, groups = (
-        cycle.structure,
-        float(cycle.period),
-        cycle.trajectory(1.01),
-        [],
-    )
+    s, period, path = cycle.structure, float(cycle.period), cycle.trajectory(1.01)
+    groups: list[Coincidence | None] = []
     at = np.flatnonzero(path.event >= 0)
     times = path.t[at]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)

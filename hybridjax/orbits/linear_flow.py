@@ -410,7 +410,9 @@ def _linear_flow(
     # Lanes: by piece, node and direction. (Directions are lanes of their own, and come last.)
     each = 1 + d + np.arange(P * K * directions) % directions
     charts, times = np.repeat(chart, K * directions), pieces.time.ravel()
-    step = np.searchsorted(np.real(t[:-1, 0]), pieces.time.real[..., 0], "right") - 1
+    step = (
+        np.searchsorted(np.real(t[:-1, 0]), np.real(pieces.time)[..., 0], "right") - 1
+    )
     step = np.clip(step, pieces.first[:, None], pieces.last[:, None])
     begin, start = t[step].ravel(), np.moveaxis(q[step], 2, 0).reshape(d, -1)
     u = kernels.unpushed(s, each)

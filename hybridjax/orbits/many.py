@@ -262,5 +262,5 @@ def _key(map: ReturnMap, leaves: tuple[np.ndarray, ...]) -> tuple:
     arrays = [*jax.tree_util.tree_leaves(eqx.filter(map, eqx.is_array)), *leaves]
     digest = hashlib.sha1(usedforsecurity=False)
     for x in arrays:
-        digest.update(np.ascontiguousarray(x).view(np.uint8))
+        digest.update(np.ascontiguousarray(x).view(np.uint8).data)
     return identity(map), digest.digest()

@@ -246,7 +246,8 @@ def _damped(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarra
     for steps in itertools.count(1):
         turn = map.turn_with_jacobian((x + step) * sizes)
         residual = turn.residual / sizes
-        if (size := np.linalg.norm(residual)) < least:
+        size = float(np.linalg.norm(residual))
+        if size < least:
             x, least, damping, best = x + step, size, damping / 3.5, turn
             jacobian = np.vstack(
                 [turn.jacobian * sizes / sizes[:, None], np.eye(len(x))]

@@ -14,10 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.executor import namespace, on_host, svdvals, to_host
 from .._core.vector_math import factorizations
+from ..engine.arrays import Array
 from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
@@ -61,7 +62,7 @@ class Plan(NamedTuple):
     """What a turn repeats: the arrays of an itinerary."""
 
     rows: Rows
-    count: Int[Array, ""] | None
+    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
     """Of rows; None for all of them (see `follow`)."""
     last: Int[Array, ""]
     """Number of the last leg."""
@@ -73,10 +74,10 @@ class Plan(NamedTuple):
         return cls(itinerary.rows, *counts)
 
 
-def on_device(map: ReturnMap) -> ReturnMap:
-    """A return map with arrays of JAX."""
+def on_device(tree: Any) -> Any:
+    """`tree` with arrays of JAX."""
     move = lambda x: jnp.asarray(x) if on_host(x) else x  # noqa: E731
-    return jax.tree_util.tree_map(move, map)
+    return jax.tree_util.tree_map(move, tree)
 
 
 class Route(NamedTuple):
@@ -107,12 +108,12 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     **Arguments:** `turn`: the recorded pieces, side by side. Default: those of another turn.
     """
     map = to_host(map)
-    turn = side_by_side(to_host(map.pieces())) if turn is None else turn
+    pieces = side_by_side(to_host(map.pieces())) if turn is None else turn
     s, levels = map.structure, levels_of(map)
     # (Steps of implicit methods differ much in length: joined ones have large errors.)
     density = _FINER if has_implicit(s) else _DENSITY
     densities = density, density * _FINER, density * _OTHER
-    return Route(map, *(recorded(s, turn, levels, density) for density in densities))
+    return Route(map, *(recorded(s, pieces, levels, density) for density in densities))
 
 
 class Corrected(NamedTuple):
@@ -155,7 +156,8 @@ class Maps(NamedTuple):
         """The map of one lane."""
         leaves, t, expected = numbers
         arrays, static = eqx.partition(self.map.system, eqx.is_array)
-        arrays = jax.tree_util.tree_structure(arrays).unflatten(leaves)
+        structure = jax.tree_util.tree_structure(arrays)
+        arrays = jax.tree_util.tree_unflatten(structure, leaves)
         system = eqx.combine(arrays, static)
         anchor = self.map.anchor._replace(t=t[None])
         return dataclasses.replace(
@@ -232,7 +234,9 @@ def _solve(
 
 def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
     # (Steps are judged relative to `RTOL`.)
-    enough = jnp.minimum(_SMALL * maps.map.settings.rtol / RTOL, 1.0)
+    rtol = maps.map.settings.rtol
+    assert rtol is not None
+    enough = jnp.minimum(_SMALL * rtol / RTOL, 1.0)
 
     def again(carry):
         before, q, settled = carry

@@ -349,6 +349,7 @@ class ReturnMap(eqx.Module):
         smallest = xp.min(xp.where(counts, svdvals(defect), np.inf), axis=-1)
         # (Where derivatives are large, rounding errors of the start are, too, at the end.)
         grown = xp.max(xp.abs(defect), axis=(-2, -1))
+        assert self.settings.rtol is not None
         accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
         closed_enough = turn.closed & (turn.distance <= accuracy)
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)

@@ -259,10 +259,11 @@ def _jump(
     transition, n = s.transitions[g], s.dims[a]
     event = jump(s, g, np.array([t]), q[None, :n], np.zeros((s.nu, 1)))
     level, rate = event.level[0], event.rate[0]
-    noise = _noise(event.gradient[0], scale[a, :n])
+    noise = float(_noise(event.gradient[0], scale[a, :n]))
     delay, findings = np.zeros(s.d), []
     scheduled = isinstance(transition.guard, Scheduled)
     if scheduled and not at_once:
+        assert isinstance(transition.guard, Scheduled)
         late = t - float(transition.guard.nearest(np.array([t]))[0])
         findings = _off_schedule(transition, t, late)
     elif not scheduled and not at_once:
@@ -374,7 +375,7 @@ def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
         level = levels[k, :-1] if g == visit.event else levels[k]
         for point in _crossings(level):
             if _may_happen(s, g, visit, np.array([point])):
-                yield _passed(s.transitions[g], visit.t[point])
+                yield _passed(s.transitions[g], float(visit.t[point]))
                 break
 
 
@@ -419,6 +420,7 @@ def _skipped_schedules(s: Structure, visit: Visit) -> Iterable[Finding]:
     for g in s.schedules(visit.chart):
         transition = s.transitions[g]
         guard = transition.guard
+        assert isinstance(guard, Scheduled)
         period, offset = float(guard.period), float(guard.offset)
         since = (visit.t[0] - offset) / period
         until = (visit.t[-1] - offset) / period

@@ -545,7 +545,7 @@ def portrait(
             notes[g].set_ha("left" if x > 0 else "right")
             notes[g].set_va("bottom" if y > 0 else "top")
             notes[g].xy = end
-        points.set_data(cycle.multipliers.real, cycle.multipliers.imag)
+        points.set_data(np.real(cycle.multipliers), np.imag(cycle.multipliers))
         return [*orbits, marks, *notes, points]
 
     return draw

@@ -94,14 +94,15 @@ class _Markers(NamedTuple):
     def draw(self, ax: Axes, borders: list[np.ndarray]) -> None:
         """Draw them, with the borders of their confidence regions."""
         look = {"label": self.label, **self.look}
-        ax.plot(self.values.real, self.values.imag, ls="", **look)
+        ax.plot(np.real(self.values), np.imag(self.values), ls="", **look)
         for border in borders:
             # Of a real multiplier it is an interval, whose ends would not be seen.
             ends = []
-            if np.ptp(border.imag) == 0:
-                ends = [int(border.real.argmin()), int(border.real.argmax())]
+            x, y = np.real(border), np.imag(border)
+            if np.ptp(y) == 0:
+                ends = [int(x.argmin()), int(x.argmax())]
             edge: Any = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
-            ax.plot(border.real, border.imag, color=look["color"], **edge)
+            ax.plot(x, y, color=look["color"], **edge)
 
 
 @checked
@@ -194,7 +195,7 @@ def _zoom(
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    order = np.lexsort((-true.imag, -np.abs(true)))
+    order = np.lexsort((-np.imag(true), -np.abs(true)))
     leading = complex(true[order[0]])
     reaches = [1e-12]
     for z in series.values():

@@ -241,7 +241,8 @@ def coordinates_on(
 def recorded_flows(placed: PlacedSections) -> tuple[Any, Any]:
     """Starts and steps, side by side, of the flow from a cycle's beginning to the anchor of the
     family (None if that is no `Crossing`), and from there to one section after the other."""
-    cycle, flows = placed.cycle, []
+    cycle = placed.cycle
+    flows: list[Any] = []
     turn = None if has_implicit(cycle.structure) else last_turn(cycle)
     map, family = to_host((_patient(cycle), placed.family))
     _locate(map, family, turn, flows)
@@ -500,9 +501,9 @@ def _met(placed: PlacedSections, i: int) -> _Met:
     cycle = placed.cycle
     N, levels = placed.n_sections, placed.bound.levels
     items = getattr(placed.family, "items", (placed.family.anchor,))
-    section = None
-    if i < len(items) and isinstance(items[i], Crossing):
-        section = items[i]
+    item = items[i] if i < len(items) else None
+    section = item if isinstance(item, Crossing) else None
+    if section is not None:
         i, N, levels = 0, 1, ListLevels((section,))
     s = cycle.structure
     t, chart, q = cycle.trajectory().dense()

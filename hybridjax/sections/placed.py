@@ -161,6 +161,7 @@ class PlacedSections(eqx.Module):
         placed = self if is_hidden(self) else to_host(self)
         s, sizes = self.structure(), placed.across
         _, _, target = placed.onwards()
+        assert placed.tape is not None
         with at_ease():
             jacobian, _ = tape_jacobian(
                 s, placed.lanes, target, placed.tape, across=sizes

@@ -201,10 +201,12 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
     following, _, target = placed.onwards()
     s: Structure = placed.structure()
     z, lanes, n = s.resolve_outputs(items), placed.lanes, 1 + s.d
+    tape = placed.tape
+    assert tape is not None
 
     def work(x):
         begin = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
-        t, q = replay(s, begin, x[n:], target, placed.tape)
+        t, q = replay(s, begin, x[n:], target, tape)
         return jnp.concatenate([t[None], q, observe(s, z, begin, x[n:])])
 
     x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])

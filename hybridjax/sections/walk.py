@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import at_ease
 from .._core.executor import is_traced, on_the_cpu, to_host
@@ -20,6 +20,7 @@ from .._core.jax_compat import is_tracer, outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
+from ..engine.arrays import Array
 from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded_walk
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes
@@ -105,6 +106,7 @@ def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
         to = np.arange(int(begins_on_section), N + 1) % N
         before = None
         if lead is not None:
+            assert isinstance(family.anchor, Crossing)
             at_anchor = ListLevels((family.anchor,))
             nowhere = np.zeros(len(lead[0].t), np.int32)
             before, _ = recorded_walk(s, lead, at_anchor, nowhere, False, _DENSITY)

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from ...systems.structure import Member, Structure
 from ...systems.transition import SAME_TIME, Scheduled
+from ..arrays import Array
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
@@ -246,11 +247,11 @@ class Bodies:
         n = self.s.dims[a]
         solver, y = self.pairs(a), course.y[:, :n]
         y, error = steps.step(self.s, a, solver, course.t, y, h, self.inputs)
-        scale = self.settings.scale[a, :n]
-        allowed = self.settings.rtol * jnp.maximum(
-            jnp.abs(course.y[0, :n]), jnp.abs(y[0])
-        )
-        allowed = allowed + self.settings.atol * scale
+        settings = self.settings
+        assert settings.scale is not None and settings.rtol is not None
+        scale = settings.scale[a, :n]
+        allowed = settings.rtol * jnp.maximum(jnp.abs(course.y[0, :n]), jnp.abs(y[0]))
+        allowed = allowed + settings.atol * scale
         error = jax.lax.stop_gradient(jnp.max(jnp.abs(error) / allowed, initial=0.0))
         return course.y.at[:, :n].set(y), error
 

@@ -102,7 +102,7 @@ class Itinerary(NamedTuple):
 
     form: Form
     rows: Rows
-    count: int
+    count: int | Int[np.ndarray, ""]  # type: ignore[assignment]  # (not the method of tuples)
     """Rows that do something; the others follow."""
     ends: Float[np.ndarray, " E"]
     """Ends of the legs, from the beginning of the trajectory; that of the last one is repeated."""

@@ -110,7 +110,7 @@ def follow(
         one = lambda state, row: (steps.row(constants, row, state), None)  # noqa: E731
         for _ in range(passes):
             state = steps.depart(constants, state.course.ends)
-            state, _ = jax.lax.scan(one, state, rows)
+            state = jax.lax.scan(one, state, rows)[0]
     return _passage(state, form, columns, travelers.many)
 
 
@@ -220,6 +220,7 @@ class _Steps:
 
 def _is_new(constants: "_Constants", k: Int[Array, ""]) -> Bool[Array, ""]:
     """Whether step k is the first of a later pass."""
+    assert constants.count is not None
     return (k > 0) & (k % constants.count == 0)
 
 
@@ -229,6 +230,7 @@ def _chosen(mask: Bool[Array, ""], yes: Any, no: Any) -> Any:
 
 def _row(constants: "_Constants", k: Int[Array, ""]) -> Rows:
     """Row k, of the first or a later pass."""
+    assert constants.count is not None
     place = k % constants.count
     return jax.tree_util.tree_map(lambda x: x[place], constants.rows)
 
@@ -257,7 +259,7 @@ class _Constants(NamedTuple):
     levels: AbstractLevels | None
     settings: Settings
     rows: Rows
-    count: Int[Array, ""] | None
+    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
     begin: tuple
     known: Float[Array, " E"] | None
 

@@ -555,7 +555,7 @@ def gradient_covariance(
     score = np.concatenate([sum(part.score for part in grid) for grid in grids])
     by_white = np.concatenate([sum(part.expected for part in grid) for grid in grids])
     parts = list(itertools.chain(*grids))
-    squares = sum(part.squares for part in parts)
+    squares = np.sum([part.squares for part in parts], axis=0)
     filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)

@@ -134,7 +134,8 @@ class PreparedRecords:
         self.outputs = first.outputs
         self.grids = _grids(self.records)
         self.cycles = max(map(count_cycles, self.records))
-        self.sampled = sum(grid.sampled.sum(axis=(0, 1)) for grid in self.grids)
+        counts = [grid.sampled.sum(axis=(0, 1)) for grid in self.grids]
+        self.sampled = np.sum(counts, axis=0)
         u = np.concatenate([record.u for record in self.records])
         y = np.concatenate([record.y for record in self.records])
         _require_signals(self.inputs, np.any(u != 0, axis=0), "zero")
