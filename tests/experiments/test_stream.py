@@ -192,7 +192,7 @@ def test_another_process_can_run_a_piece(arguments, start):
     cloudpickle = pytest.importorskip("cloudpickle")
     options = Options(start=start, discard=8)
     job = ExperimentJob(
-        prepare(*arguments, options, 2, one_program=True), Blocks((COUNT,), (2,))
+        prepare(*arguments, options, 2), Blocks((COUNT,), (2,))
     )
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
