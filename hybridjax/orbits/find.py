@@ -181,8 +181,9 @@ def find_limit_cycle(
     _check_section(s, section)
     if not traced:
         checks.check_clock(s)
-    known = guess if isinstance(guess, LimitCycle) else None
-    if known is not None:
+    known: LimitCycle | None = None
+    if isinstance(guess, LimitCycle):
+        known = guess
         _check_fits(known, s, multiplicity, bool(settle) or max_period is not None)
         map = _map_near_cycle(known, s, section, settings, given)
         conserved = known.conserved if conserved is None else conserved
