@@ -84,7 +84,7 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
     rows = np.flatnonzero(path.event >= 0)
     times = path.t[rows]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
-    groups = []
+    groups: list[Coincidence | None] = []
     for first, after in itertools.pairwise([*starts, len(rows)]):
         since_begin = float(times[first]) - path.t[0]
         if not TOGETHER * period < since_begin <= (1 + TOGETHER) * period:
