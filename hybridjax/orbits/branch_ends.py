@@ -66,7 +66,8 @@ def _shrunk(cycle: LimitCycle) -> End | None:
     """An end at which an autonomous cycle without events becomes an equilibrium."""
     if cycle.clocked or cycle.event_sequence:
         return None
-    path, scale = cycle.trajectory(), np.asarray(cycle.settings.scale)
+    path = cycle.trajectory()
+    scale = np.asarray(cycle.settings.scale)
     a = int(path.chart[0])
     n = cycle.structure.dims[a]
     ranges = np.ptp(path.after[:, :n], axis=0) / scale[a, :n]
@@ -84,10 +85,13 @@ def _touched_section(cycle: LimitCycle) -> End | None:
     a = int(map.anchor.chart[0])
     n = map.structure.dims[a]
     target = to_section(until(map.anchor.t), map.base)
-    at = map.anchor.t, map.anchor.q[:n], np.zeros((map.structure.nu, 1))
+    s = map.structure
+    t = map.anchor.t
+    q = map.anchor.q[:n]
+    u = np.zeros((s.nu, 1))
     first = np.zeros(1, np.int32)
-    row = kernels.watched(map.structure, a, target.levels, *at, first)[-1, :, 0]
-    field = kernels.field(map.structure, a, *at)[:, 0, 0]
+    row = kernels.watched(s, a, target.levels, t, q, u, first)[-1, :, 0]
+    field = kernels.field(s, a, t, q, u)[:, 0, 0]
     if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
         return None
     text = (
@@ -100,16 +104,20 @@ def _touched_section(cycle: LimitCycle) -> End | None:
 def _touched_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
     """An end at which an event of the cycle is grazing."""
     s = cycle.structure
-    scale, period = np.asarray(cycle.settings.scale), float(cycle.period)
+    scale = np.asarray(cycle.settings.scale)
+    period = float(cycle.period)
+    u = np.zeros((s.nu, 1))
+    first = np.zeros(1, np.int32)
     for visit in visits:
         if visit.event < 0 or isinstance(s.transitions[visit.event].guard, Scheduled):
             continue
-        a, n = visit.chart, len(visit.q)
-        at = visit.t[-1:], visit.q[:, -1:], np.zeros((s.nu, 1))
-        rows = kernels.watched(s, a, None, *at, np.zeros(1, np.int32))
+        a = visit.chart
+        t = visit.t[-1:]
+        q = visit.q[:, -1:]
+        rows = kernels.watched(s, a, None, t, q, u, first)
         row = rows[s.guards(a).index(visit.event), :, 0]
-        field = kernels.field(s, a, *at)[:, 0, 0]
-        if _is_slow(row, field, scale[a, :n], period):
+        field = kernels.field(s, a, t, q, u)[:, 0, 0]
+        if _is_slow(row, field, scale[a, : len(q)], period):
             name = s.transitions[visit.event].name
             text = f"the guard of '{name}' is touched tangentially (grazing)"
             return End(Result.GRAZING, text)
@@ -125,9 +133,12 @@ def _is_slow(row, field, sizes, period: float) -> bool:
 
 def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
     """An end at which two events of the cycle happen at the same time."""
-    s, period = cycle.structure, float(cycle.period)
+    s = cycle.structure
+    period = float(cycle.period)
+    if len(visits) < 2:
+        return None
     for before, visit in zip([visits[-1], *visits[:-1]], visits, strict=True):
-        if visit.event < 0 or before.event < 0 or len(visits) < 2:
+        if visit.event < 0 or before.event < 0:
             continue
         if visit.t[-1] - visit.t[0] < _CLOSE * period:
             first, second = (s.transitions[x.event].name for x in (before, visit))
@@ -146,7 +157,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
         guards = s.guards(visit.chart)
         if not guards:
             continue
-        u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+        u = np.zeros((s.nu, 1))
+        first = np.zeros(1, np.int32)
         rows = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)[:, 0]
         for g, level in zip(guards, rows, strict=True):
             near = _CLOSE * np.ptp(level)
@@ -156,10 +168,10 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             if _has_minimum(level, near):
                 text = f"the guard of '{name}' is touched tangentially (grazing)"
                 return End(Result.GRAZING, text)
-            if g != visit.event and np.argmin(level[1:]) == len(level) - 2:
-                if level[-2] <= near:
-                    text = f"the event '{name}' begins to happen at the end of a stay"
-                    return End(Result.EVENT_ORDER, text)
+            least_at_end = np.argmin(level[1:]) == len(level) - 2
+            if g != visit.event and least_at_end and level[-2] <= near:
+                text = f"the event '{name}' begins to happen at the end of a stay"
+                return End(Result.EVENT_ORDER, text)
     return None
 
 
@@ -174,10 +186,11 @@ def _near_rest(cycle: LimitCycle, visits: list[Visit], result: Result) -> End | 
     """An end at which the period grows without bound, since the cycle passes an equilibrium."""
     if result != Result.SECTION_MISSED or cycle.clocked:
         return None
-    s, scale = cycle.structure, np.asarray(cycle.settings.scale)
+    s = cycle.structure
+    scale = np.asarray(cycle.settings.scale)
+    u = np.zeros((s.nu, 1))
     slowest = np.inf
     for visit in visits:
-        u = np.zeros((s.nu, 1))
         rates = kernels.field(s, visit.chart, visit.t, visit.q, u)[:, 0]
         speeds = np.abs(rates) / scale[visit.chart, : len(rates), None]
         slowest = min(slowest, float(speeds.max(axis=0).min()))
@@ -194,9 +207,9 @@ def _missed_section(cycle: LimitCycle, result: Result) -> End | None:
     """An end at which the cycle does not meet its section any more."""
     if result != Result.SECTION_MISSED or isinstance(cycle.base, AtEvent):
         return None
-    where = (
-        "the plane through the first guess" if is_default(cycle.base) else cycle.base
-    )
+    where = str(cycle.base)
+    if is_default(cycle.base):
+        where = "the plane through the first guess"
     text = (
         f"the cycle does not return to its section ({where}) within three periods: find the first "
         "cycle with another `section=`"

@@ -66,17 +66,17 @@ def check_clock(s: Structure) -> None:
             f"`period()` must return a positive number, not {period}."
         )
     for transition in s.transitions:
-        if isinstance(transition.guard, Scheduled):
-            if given is None:
-                raise DefinitionError(
-                    _no_period(s.system, f"'{transition.name}' is scheduled")
-                )
-            ratio = period / float(transition.guard.period)
-            if not abs(ratio - round(min(ratio, 1e9))) < SAME_TIME * ratio:
-                raise DefinitionError(
-                    f"the schedule of '{transition.name}' must divide the clock's period, which is "
-                    f"{period}: otherwise events do not repeat in each period."
-                )
+        if not isinstance(transition.guard, Scheduled):
+            continue
+        if given is None:
+            problem = f"'{transition.name}' is scheduled"
+            raise DefinitionError(_no_period(s.system, problem))
+        ratio = period / float(transition.guard.period)
+        if not abs(ratio - round(min(ratio, 1e9))) < SAME_TIME * ratio:
+            raise DefinitionError(
+                f"the schedule of '{transition.name}' must divide the clock's period, which is "
+                f"{period}: otherwise events do not repeat in each period."
+            )
     check_schedules(s)
 
 
@@ -100,19 +100,15 @@ def check_claims(
     if s.system.period() is None:
         return
     for a in np.unique(chart).tolist():
-        n, rows = s.dims[a], np.flatnonzero(chart == a)
+        n = s.dims[a]
+        rows = np.flatnonzero(chart == a)
         sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
+        # (As many times of one period in all as show pulses.)
         every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
         times = t[rows, None] + time * (_BASE + np.arange(every) / every)
+        states = q[:n, rows].repeat(every, axis=1)
         for name, function in _functions(s, a):
-            _compare(
-                s,
-                name,
-                function,
-                times.ravel(),
-                q[:n, rows].repeat(every, axis=1),
-                sizes,
-            )
+            _compare(s, name, function, times.ravel(), states, sizes)
 
 
 def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
@@ -124,19 +120,29 @@ def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     s = cycle.structure
     z = s.resolve_outputs(outputs)
     given = [outputs] if isinstance(outputs, str | Output) else outputs
-    for x in (x for x in given if isinstance(x, Output) and not is_traced(cycle)):
-        clocked = list(check_output(s, x))
-        if clocked and s.system.period() is None:
-            raise DefinitionError(
-                _no_period(s.system, f"the {clocked[0]} depends on t")
-            )
-        for a, t, q in points(s, cycle.legs) if clocked else ():
-            if s.resolve_outputs(x).defined(a):
-                size = np.append(
-                    float(cycle.period), np.asarray(cycle.settings.scale)[a, : len(q)]
-                )
-                _compare(s, *_output(s, a, x), t, q, size)
+    if is_traced(cycle):
+        return z
+    for output in given:
+        if isinstance(output, Output):
+            _check_output_period(cycle, output)
     return z
+
+
+def _check_output_period(cycle: LimitCycle, output: Output) -> None:
+    """**Raises:** `DefinitionError` as `check_outputs`."""
+    s = cycle.structure
+    clocked = list(check_output(s, output))
+    if not clocked:
+        return
+    if s.system.period() is None:
+        problem = f"the {clocked[0]} depends on t"
+        raise DefinitionError(_no_period(s.system, problem))
+    scale = np.asarray(cycle.settings.scale)
+    for a, t, q in points(s, cycle.legs):
+        if s.resolve_outputs(output).defined(a):
+            sizes = np.append(float(cycle.period), scale[a, : len(q)])
+            name, function = _output(s, a, output)
+            _compare(s, name, function, t, q, sizes)
 
 
 def _compare(
@@ -146,14 +152,16 @@ def _compare(
     by more than rounding, for times and states of this `size`."""
     clock: Any = s.system.period()
     period = float(clock)
-    now, later = function(t, q), [function(t + k * period, q) for k in (1, 2, 3)]
+    now = function(t, q)
+    later = [function(t + k * period, q) for k in (1, 2, 3)]
     change = np.abs(np.stack(later) - now).max(axis=0)
-    slope = np.sum(np.abs(now[:, 1 : 1 + len(size)]) * size[:, None], axis=1)
-    differs = change[:, 0] > SAME * np.abs(now[:, 0]) + ROUNDING * slope
-    gains = slice(1 + len(size), None)  # derivatives by inputs
-    if np.any(differs) or np.any(
-        change[:, gains] > SAME * np.abs(now)[:, gains].max(initial=0.0)
-    ):
+    by_point = np.abs(now[:, 1 : 1 + len(size)])
+    rounding = ROUNDING * np.sum(by_point * size[:, None], axis=1)
+    values_differ = change[:, 0] > SAME * np.abs(now[:, 0]) + rounding
+    by_inputs = np.abs(now[:, 1 + len(size) :])
+    largest = by_inputs.max(initial=0.0)
+    gains_differ = change[:, 1 + len(size) :] > SAME * largest
+    if np.any(values_differ) or np.any(gains_differ):
         raise DefinitionError(
             f"{name} does not have the period {period:.6g} that {type(s.system).__name__}.period() "
             "states."
@@ -162,45 +170,75 @@ def _compare(
 
 def _all(s: Structure, a: int, *point: Array) -> list[Array]:
     """Values of all of the user's functions of chart a."""
-    watched = [s.guard(g, *point) for g in s.guards(a)]
-    after = [
-        (s.reset(g, *point), s.enabled(g, *point)) for g in s.guards(a) + s.schedules(a)
-    ]
-    outputs = [s.resolve_outputs(x) for x in s.system.outputs()]
-    values = [x(a, *point) for x in outputs if x.defined(a)]
-    return [s.field(a, *point), *watched, *after, *values]
+    guards = [s.guard(g, *point) for g in s.guards(a)]
+    events = s.guards(a) + s.schedules(a)
+    after = [(s.reset(g, *point), s.enabled(g, *point)) for g in events]
+    outputs = [s.resolve_outputs(output) for output in s.system.outputs()]
+    values = [output(a, *point) for output in outputs if output.defined(a)]
+    return [s.field(a, *point), *guards, *after, *values]
 
 
-def _functions(s: Structure, a: int) -> Iterator:
+def _functions(s: Structure, a: int) -> Iterator[tuple[str, Callable]]:
     """The user's functions of chart a, by name, as functions (t, q) with derivatives."""
-    u, index = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
-    yield (
-        f"the field of chart '{s.names[a]}'",
-        lambda t, q: kernels.field(s, a, t, q, u),
-    )
+    u = np.zeros((s.nu, 1))
+
+    def field(t, q):
+        return kernels.field(s, a, t, q, u)
+
+    yield f"the field of chart '{s.names[a]}'", field
     for k, g in enumerate(s.guards(a)):
-        guard = lambda t, q, k=k: kernels.watched(s, a, None, t, q, u, index)[k : k + 1]  # noqa: E731
-        yield f"the guard of '{s.transitions[g].name}'", guard
+        yield f"the guard of '{s.transitions[g].name}'", _guard(s, a, k)
     for g in s.guards(a) + s.schedules(a):
-        reset = lambda t, q, g=g: kernels.reset(s, s.member(g), t, q, u)  # noqa: E731
-        yield f"the reset of '{s.transitions[g].name}'", reset
-
-        def holds(t, q, g=g):  # with derivatives that are zero
-            value = kernels.enabled(s, s.member(g), t, q, u) * 1.0
-            return np.concatenate([value[None], np.zeros((1 + len(q), len(t)))])[None]
-
+        name = s.transitions[g].name
+        yield f"the reset of '{name}'", _reset(s, g)
         if s.transitions[g].enabled is not None:
-            yield f"the predicate of '{s.transitions[g].name}'", holds
+            yield f"the predicate of '{name}'", _predicate(s, g)
     for output in s.system.outputs():
         if s.resolve_outputs(output).defined(a):
             yield _output(s, a, output)
 
 
-def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
+def _guard(s: Structure, a: int, k: int) -> Callable:
+    """Guard k of chart a, as a function (t, q) with derivatives."""
     u = np.zeros((s.nu, 1))
-    return f"the output '{output.name}'", lambda t, q: kernels.outputs(
-        s, a, (output,), t, q, u
-    )
+    index = np.zeros(1, np.int32)
+
+    def guard(t, q):
+        return kernels.watched(s, a, None, t, q, u, index)[k : k + 1]
+
+    return guard
+
+
+def _reset(s: Structure, g: int) -> Callable:
+    """The reset of transition g, as a function (t, q) with derivatives."""
+    u = np.zeros((s.nu, 1))
+
+    def reset(t, q):
+        return kernels.reset(s, s.member(g), t, q, u)
+
+    return reset
+
+
+def _predicate(s: Structure, g: int) -> Callable:
+    """The predicate of transition g, as a function (t, q) with derivatives, which are zero."""
+    u = np.zeros((s.nu, 1))
+
+    def predicate(t, q):
+        holds = kernels.enabled(s, s.member(g), t, q, u).astype(float)
+        derivatives = np.zeros((1 + len(q), len(t)))
+        return np.concatenate([holds[None], derivatives])[None]
+
+    return predicate
+
+
+def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
+    """The name of an output, and its function (t, q) with derivatives."""
+    u = np.zeros((s.nu, 1))
+
+    def values(t, q):
+        return kernels.outputs(s, a, (output,), t, q, u)
+
+    return f"the output '{output.name}'", values
 
 
 def _no_period(system: HybridSystem, problem: str) -> str:
@@ -215,7 +253,8 @@ def check_found(cycle: LimitCycle) -> None:
 
     **Raises:** `DefinitionError` as `check_clock`, `check_claims` and `check_jumps`.
     """
-    s, legs = cycle.structure, to_host(cycle.legs)
+    s = cycle.structure
+    legs = to_host(cycle.legs)
     check_clock(s)
     check_claims(
         s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period)
@@ -227,37 +266,46 @@ def check_found(cycle: LimitCycle) -> None:
 def check_jumps(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` if the field of a chart jumps on the cycle without an event, or
     has a pulse that is shorter than a step."""
-    s, period = cycle.structure, float(cycle.period)
+    s = cycle.structure
     charts = [a for a in range(len(s.charts)) if unresolved.may_have_pulses(s, a)]
     if not charts:
         return
-    scale, path = np.asarray(cycle.settings.scale), orbit(cycle)
+    path = orbit(cycle)
     pulse = passed_over(path, np.zeros(s.nu), to_host(cycle.settings), linear=True)
     if pulse is not None:
-        a, begin = int(path.chart[pulse[0]]), path.t[pulse[0]]
+        row, function = pulse
+        a = int(path.chart[row])
         raise DefinitionError(
-            f"the {pulse[1]} in chart '{s.names[a]}' has a pulse, a jump or another sudden change, "
-            f"over which the step from t = {begin:.6g} on passes{','.join(lines_of_jumps(s, a))}. "
+            f"the {function} in chart '{s.names[a]}' has a pulse, a jump or another sudden change, "
+            f"over which the step from t = {path.t[row]:.6g} on passes"
+            f"{','.join(lines_of_jumps(s, a))}. "
             "Begin and end a pulse by transitions (`hj.Scheduled` at known times); for a jump, "
             "write a chart for each side and a `Transition` between them."
         )
+    period = float(cycle.period)
     t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
     events = path.t[path.event >= 0]
     if path.event[-1] < 0:  # the cycle may begin where the field jumps
         t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
         t[-1] += period
-    for a in (a for a in charts if unresolved.may_jump(s, a)):
-        k = np.flatnonzero((chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0))
-        points = np.column_stack([t, q[:, : s.dims[a]]])
+    scale = np.asarray(cycle.settings.scale)
+    for a in charts:
+        if not unresolved.may_jump(s, a):
+            continue
+        inside = (chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0)
+        before = np.flatnonzero(inside)
+        if not len(before):
+            continue
+        samples = np.column_stack([t, q[:, : s.dims[a]]])
         sizes = np.append(period, scale[a, : s.dims[a]])
-        for time, j, jump in (
-            jumps(s, a, points[k], points[k + 1], sizes) if len(k) else ()
+        for time, column, jump in jumps(
+            s, a, samples[before], samples[before + 1], sizes
         ):
             apart = np.abs(time - events + period / 2) % period - period / 2
             if np.abs(apart).min(initial=np.inf) > SAME * period:
                 raise DefinitionError(
-                    f"the {column_name(s, a, j)} in chart '{s.names[a]}' jumps by {jump:.3g} at "
-                    f"t = {time:.6g}{','.join(lines_of_jumps(s, a))}, where the cycle has no "
+                    f"the {column_name(s, a, column)} in chart '{s.names[a]}' jumps by {jump:.3g} "
+                    f"at t = {time:.6g}{','.join(lines_of_jumps(s, a))}, where the cycle has no "
                     "event: linearizations would lack the saltation. Write a chart for each side "
                     "and a `Transition` between them, or `hj.sliding` for a surface along which "
                     "the state may slide."
@@ -266,9 +314,9 @@ def check_jumps(cycle: LimitCycle) -> None:
 
 def check_conserved(cycle: LimitCycle) -> None:
     """**Raises:** `DefinitionError` for a quantity in `conserved` that the system changes."""
-    if lost := cycle.conserved.keys() - _conserved_outputs(
-        cycle, tuple(cycle.conserved)
-    ):
+    kept = _conserved_outputs(cycle, tuple(cycle.conserved))
+    lost = cycle.conserved.keys() - kept.keys()
+    if lost:
         raise DefinitionError(
             f"'{min(lost)}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
             "cycle change it in one turn. Leave it out of `conserved`."
@@ -284,84 +332,101 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     changes = gradients @ monodromy(cycle.factors) - gradients
     changes = np.abs(changes * map.sizes).max(axis=1)
     kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
-    return {
-        name: float(x)
-        for name, x, same in zip(names, values, kept, strict=True)
-        if same
-    }
+    conserved = np.flatnonzero(kept).tolist()
+    return {names[k]: float(values[k]) for k in conserved}
 
 
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
-    name, code, s = (
-        type(cycle.system).__name__,
-        Result(int(cycle.result)),
-        cycle.structure,
-    )
-    if code == Result.COINCIDENCE and (pair := coincident(cycle.return_map, turn)):
-        first, second = (s.transitions[g].name for g in pair)
-        return (
-            f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
-            "they come in one order or the other, and no linearization holds for both: "
-            "`hj.coincidences` of the cycle, which `throw=False` returns, has the "
-            "derivatives of each. Let them happen at different times, or write them as one event."
-        )
+    code = Result(int(cycle.result))
+    if code == Result.COINCIDENCE:
+        pair = coincident(cycle.return_map, turn)
+        if pair is not None:
+            return _about_coincidence(cycle, pair)
     if code == Result.SINGULAR:
-        kept = _conserved_outputs(
-            cycle, tuple(output.name for output in cycle.system.outputs())
-        )
-        example = {name: float(f"{x:.4g}") for name, x in kept.items()} or {
-            "energy": 1.0
-        }
-        return (
-            f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
-            "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
-            "is wanted by the value of the quantity (an output of the system), e.g. "
-            f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
-        )
+        return _about_family(cycle)
+    name = type(cycle.system).__name__
     if code in (Result.GUARD_BEYOND, Result.NOT_VERIFIED):
         faults = [finding.text for finding in verdict(cycle).refused]
         reason = " ".join(faults[:2]) or f"{code.message}."
         return f"no limit cycle of {name} was found: Newton's method converged, but {reason}"
-    limit = f" from {cycle.settings.max_steps} (reached: {turn.period:.2g} of {expected:.3g})"
-    reason = code.message + limit * (code == Result.STEP_LIMIT)
     if code == Result.EXTRA_TURNS and cycle.multiplicity > 1:
         return (
             f"the cycle of {name} that was found closes sooner than after the "
             f"{cycle.multiplicity} periods of `multiplicity`: leave that out, or give a guess "
             "nearer to the longer cycle, with `settle` if it is stable."
         )
-    if code == Result.NOT_CONVERGED and np.isnan(cycle.residual):
-        reason = "Newton came to a state from where one period ends in another chart"
-    elif code == Result.NOT_CONVERGED and not np.all(np.isfinite(turn.factors)):
-        reason = (
-            "derivatives of the flow over one period are not finite: a function has none where the "
-            "cycle meets it, such as `sqrt(x)` and `x**0.0` at 0"
-        )
-    elif code == Result.NOT_CONVERGED and float(cycle.residual) > _FAR:
-        reason = (
-            "Newton did not converge, and from where it was nearest to a cycle, one turn ends "
-            f"{float(cycle.residual):.2g} of the sizes of the states away from its beginning: "
-            "there may be no cycle near the guess, but an equilibrium, a torus or chaos"
-        )
-    elif code == Result.NOT_CONVERGED:
-        reason = f"Newton did not converge (residual {float(cycle.residual):.2g})"
-        if cycle.conserved:
-            reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
+    reason = code.message
+    if code == Result.STEP_LIMIT:
+        reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
+        reason = f"{reason} from {cycle.settings.max_steps} {reached}"
+    if code == Result.NOT_CONVERGED:
+        reason = _why_not_converged(cycle, turn)
     better = (
         " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
         f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
     )
+    s = cycle.structure
     advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
     if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
         advice += _about_decisions(s)
     return f"no limit cycle of {name} was found: {reason}.{advice or better}"
 
 
+def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
+    """The reason for a search that ended where two events coincide."""
+    name = type(cycle.system).__name__
+    first, second = (cycle.structure.transitions[g].name for g in pair)
+    return (
+        f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
+        "they come in one order or the other, and no linearization holds for both: "
+        "`hj.coincidences` of the cycle, which `throw=False` returns, has the "
+        "derivatives of each. Let them happen at different times, or write them as one event."
+    )
+
+
+def _about_family(cycle: LimitCycle) -> str:
+    """The reason for a search that ended on a cycle of a family."""
+    name = type(cycle.system).__name__
+    outputs = tuple(output.name for output in cycle.system.outputs())
+    conserved = _conserved_outputs(cycle, outputs)
+    example = {output: float(f"{value:.4g}") for output, value in conserved.items()}
+    if not example:
+        example = {"energy": 1.0}
+    return (
+        f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
+        "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
+        "is wanted by the value of the quantity (an output of the system), e.g. "
+        f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
+    )
+
+
+def _why_not_converged(cycle: LimitCycle, turn: Turn) -> str:
+    """The reason for Newton's method that did not converge, from where it ended."""
+    residual = float(cycle.residual)
+    if np.isnan(residual):
+        return "Newton came to a state from where one period ends in another chart"
+    if not np.all(np.isfinite(turn.factors)):
+        return (
+            "derivatives of the flow over one period are not finite: a function has none where the "
+            "cycle meets it, such as `sqrt(x)` and `x**0.0` at 0"
+        )
+    if residual > _FAR:
+        return (
+            "Newton did not converge, and from where it was nearest to a cycle, one turn ends "
+            f"{residual:.2g} of the sizes of the states away from its beginning: "
+            "there may be no cycle near the guess, but an equilibrium, a torus or chaos"
+        )
+    reason = f"Newton did not converge (residual {residual:.2g})"
+    if cycle.conserved:
+        reason += f"; perhaps not all of {', '.join(cycle.conserved)} are conserved"
+    return reason
+
+
 def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -> str:
     """The place where steps shrank to nothing, or the mode that keeps them short."""
-    lanes = turn.legs
     if int(turn.result) == Result.STEP_COLLAPSE:
+        lanes = turn.legs
         a = int(lanes.chart[0])
         path = simulate(
             cycle.system,
@@ -390,8 +455,10 @@ def rate_of_short_steps(s: Structure, turn: Turn, expected: float) -> float:
     methods; 0 for none."""
     if int(turn.result) != Result.STEP_LIMIT:
         return 0.0
-    explicit = (x for x in points(s, turn.legs) if not is_implicit(s, x[0]))
-    rate = max((float(fastest(s, *x).max()) for x in explicit), default=0.0)
+    rate = 0.0
+    for a, times, states in points(s, turn.legs):
+        if not is_implicit(s, a):
+            rate = max(rate, float(fastest(s, a, times, states).max()))
     return rate if rate * expected >= STIFF else 0.0
 
 
@@ -412,19 +479,27 @@ def _about_guards(s: Structure, turn: Turn, better: str) -> str:
         return ""
     values: dict[int, list[float]] = {}
     for a, t, q in points(s, turn.legs):
-        if guards := s.guards(a):
-            u, index = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
-            rows = kernels.watched(s, a, None, t, q, u, index)[:, 0]
-            for g, row in zip(guards, rows, strict=True):
-                values.setdefault(g, []).extend(s.transitions[g].sign * row)
-    text = "; ".join(
-        f"the guard of '{s.transitions[g].name}', which should be {s.transitions[g].direction}, "
-        f"began {'past zero, ' * bool(s.transitions[g].sign * x[0] < 0)}at {x[0]:.3g} and stayed "
-        f"between {min(x):.3g} and {max(x):.3g}"
-        for g, x in values.items()
-    )
+        guards = s.guards(a)
+        if not guards:
+            continue
+        u = np.zeros((s.nu, 1))
+        index = np.zeros(1, np.int32)
+        rows = kernels.watched(s, a, None, t, q, u, index)[:, 0]
+        for g, row in zip(guards, rows, strict=True):
+            values.setdefault(g, []).extend(s.transitions[g].sign * row)
+    if not values:
+        return ""
+    text = "; ".join(_range_of_guard(s, g, x) for g, x in values.items())
     advice = "Check its direction, and that the system does not come to rest."
+    return f" In the last turn tried no event happened: {text}. {advice}{better}"
+
+
+def _range_of_guard(s: Structure, g: int, values: list[float]) -> str:
+    """A phrase on the values of a guard along a turn without events."""
+    transition = s.transitions[g]
+    past = "past zero, " if transition.sign * values[0] < 0 else ""
     return (
-        f" In the last turn tried no event happened: {text}. {advice}{better}"
-        * bool(text)
+        f"the guard of '{transition.name}', which should be {transition.direction}, "
+        f"began {past}at {values[0]:.3g} and stayed "
+        f"between {min(values):.3g} and {max(values):.3g}"
     )

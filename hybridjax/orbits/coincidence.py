@@ -79,34 +79,48 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
         cycle.require_found()
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)
-    s, period, path = cycle.structure, float(cycle.period), cycle.trajectory(1.01)
-    groups: list[Coincidence | None] = []
-    at = np.flatnonzero(path.event >= 0)
-    times = path.t[at]
+    path = cycle.trajectory(1.01)
+    period = float(cycle.period)
+    rows = np.flatnonzero(path.event >= 0)
+    times = path.t[rows]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
-    for first, after in itertools.pairwise([*starts, len(at)]):
-        t, k = float(times[first]), at[first]
-        if not TOGETHER * period < t - path.t[0] <= (1 + TOGETHER) * period:
+    groups: list[Coincidence | None] = []
+    for first, after in itertools.pairwise([*starts, len(rows)]):
+        since_begin = float(times[first]) - path.t[0]
+        if not TOGETHER * period < since_begin <= (1 + TOGETHER) * period:
             continue
-        group = path.event[at[first:after]].tolist()
-        events = {*group, *_missed(s, group, t, period)}
-        together = range(at[first], at[after - 1])
-        in_order = all(_follows_at_once(path, k, period) for k in together)
-        if len(events) > 1 and len(events) == len(group) and in_order:
+        group = rows[first:after].tolist()
+        events = path.event[group].tolist()
+        missed = _missed(cycle.structure, events, float(times[first]), period)
+        count = len({*events, *missed})
+        if count < 2:
+            continue
+        before_last = range(group[0], group[-1])
+        in_order = all(_follows_at_once(path, k, period) for k in before_last)
+        if count == len(events) and in_order:
             groups.append(None)
-        elif len(events) > 1:
-            a = int(path.chart[k - 1])
-            n = s.dims[a]
-            before = _Order((), a, path.before[k, :n], np.eye(n))
-            orders = list(_orders(s, t, before, len(events), 10 * TOGETHER * period))
-            names = tuple(
-                tuple(s.transitions[g].name for g in x.events) for x in orders
-            )
-            commute = _commute(np.asarray(cycle.settings.scale), a, orders)
-            groups.append(
-                Coincidence(t, names, tuple(x.derivative for x in orders), commute)
-            )
+        else:
+            groups.append(_coincidence(cycle, path, group[0], count))
     return groups
+
+
+def _coincidence(
+    cycle: LimitCycle, path: Trajectory, k: int, count: int
+) -> Coincidence:
+    """The group of so many events of which event k of a path is the first."""
+    s = cycle.structure
+    t = float(path.t[k])
+    a = int(path.chart[k - 1])
+    n = s.dims[a]
+    before = _Order((), a, path.before[k, :n], np.eye(n))
+    due = 10 * TOGETHER * float(cycle.period)
+    orders = list(_orders(s, t, before, count, due))
+    names = tuple(
+        tuple(s.transitions[g].name for g in order.events) for order in orders
+    )
+    derivatives = tuple(order.derivative for order in orders)
+    commute = _commute(np.asarray(cycle.settings.scale), a, orders)
+    return Coincidence(t, names, derivatives, commute)
 
 
 def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
@@ -115,27 +129,35 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     """
     s = path.structure
     g, later = path.event[k : k + 2].tolist()
-    scheduled = [isinstance(s.transitions[x].guard, Scheduled) for x in (g, later)]
-    if scheduled[1] or later < 0:
-        return all(scheduled)
-    a, b = int(path.chart[k - 1]), int(path.chart[k])
-    n, m = s.dims[a], s.dims[b]
-    time, u = path.t[[k]], np.zeros((s.nu, 1))
-    before, after = path.before[k, :n, None], path.after[k, :m, None]
-    watched = kernels.watched(s, b, None, time, after, u, np.zeros(1, np.int32))
-    guard = watched[s.guards(b).index(later), :, 0]
-    value, by_t, by_q, by_u = guard[0], guard[1], guard[2 : 2 + m], guard[2 + m :]
-    rate = by_t + by_q @ kernels.field(s, b, time, after, u)[:, 0, 0]
+    is_scheduled, next_is_scheduled = (
+        isinstance(s.transitions[x].guard, Scheduled) for x in (g, later)
+    )
+    if next_is_scheduled or later < 0:
+        return is_scheduled and next_is_scheduled
+    n = s.dims[int(path.chart[k - 1])]
+    chart = int(path.chart[k])
+    m = s.dims[chart]
+    time = path.t[[k]]
+    u = np.zeros((s.nu, 1))
+    before = path.before[k, :n, None]
+    after = path.after[k, :m, None]
+    first = np.zeros(1, np.int32)
+    watched = kernels.watched(s, chart, None, time, after, u, first)
+    guard = watched[s.guards(chart).index(later), :, 0]
+    value = guard[0]
+    by_t = guard[1]
+    by_q = guard[2 : 2 + m]
+    by_u = guard[2 + m :]
+    rate = by_t + by_q @ kernels.field(s, chart, time, after, u)[:, 0, 0]
     if value < -TOGETHER * period * abs(rate):
         return True
     # The guard after the reset, by the time, the state before it and the inputs: zero up to
     # rounding, if it is zero in each neighbor.
     by_reset = kernels.reset(s, s.member(g), time, before, u)[:, 1:, 0]
-    still = np.zeros(n)
-    direct = np.concatenate([[by_t], still, by_u])
+    direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
     size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
-    if scheduled[0]:  # (its time is the same in all neighbors)
+    if is_scheduled:  # (its time is the same in all neighbors)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
 
@@ -149,22 +171,27 @@ def commutes(cycle: LimitCycle) -> bool:
 
 def events_of(turn: Turn) -> list[tuple[int, float]]:
     """The transitions of a turn by index, with their times."""
-    codes, times = np.ravel(np.asarray(turn.codes)), np.ravel(np.asarray(turn.times))
+    codes = np.ravel(np.asarray(turn.codes))
+    times = np.ravel(np.asarray(turn.times))
     return [(int(g), float(t)) for g, t in zip(codes, times, strict=True) if g >= 0]
 
 
 def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
     """Two transitions of a turn, by index, that are due at the same time; the turn may have passed
     over a scheduled one."""
-    s, period, events = map.structure, float(turn.period), events_of(turn)
+    s = map.structure
+    period = float(turn.period)
+    events = events_of(turn)
+    from_begin = events
     if map.event >= 0:  # the turn begins with the event that ends it
-        events = [(map.event, float(np.asarray(turn.legs.t)[0])), *events]
-    for (g, t), (other, later) in itertools.pairwise(events):
+        begin = float(np.asarray(turn.legs.t)[0])
+        from_begin = [(map.event, begin), *events]
+    for (g, t), (other, later) in itertools.pairwise(from_begin):
         # (Clocks tick in the same order for all neighbors.)
         by_clock = s.clocks[g] >= 0 and s.clocks[other] >= 0
         if later - t <= TOGETHER * period and not by_clock:
             return g, other
-    for g, t in events[map.event >= 0 :]:
+    for g, t in events:
         for other in _missed(s, [g], t, period):
             return g, other
     return None
@@ -179,7 +206,9 @@ def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
     xp = namespace(times)
     times = xp.where(codes >= 0, times, xp.inf)
     order = xp.argsort(times, stable=True)
-    codes, times, at_once = codes[order], times[order], at_once[order]
+    codes = codes[order]
+    times = times[order]
+    at_once = at_once[order]
     by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
     close = times[1:] <= times[:-1] + TOGETHER * stop_gradient(period)
     fixed = at_once[1:] | (by_clock[1:] & by_clock[:-1])
@@ -198,11 +227,13 @@ def together(
     **Arguments:** `codes`, negative for no event, and `times`, of the events in order; `begin`,
     times at which the turns begin, minus infinity for one that begins with no event.
     """
+    row, column = np.nonzero(codes >= 0)
+    time = times[row, column]
+    is_first = np.diff(row, prepend=-1) > 0
+    before = np.where(is_first, begin[row], np.roll(time, 1))
+    close = time - before <= TOGETHER * period[row]
     out = np.zeros(len(codes), bool)
-    event = np.flatnonzero(codes >= 0)
-    row, t = event // codes.shape[1], times.ravel()[event]
-    before = np.where(np.diff(row, prepend=-1) > 0, begin[row], np.roll(t, 1))
-    out[row[t - before <= TOGETHER * period[row]]] = True
+    out[row[close]] = True
     return out
 
 
@@ -210,8 +241,10 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
     """The scheduled events that are due together with a group that contains one of a guard."""
     if all(isinstance(s.transitions[g].guard, Scheduled) for g in group):
         return set()
-    ends = ((s.transitions[g].source, s.transitions[g].target) for g in group)
-    charts = {s.chart_index(name) for pair in ends for name in pair}
+    charts = set()
+    for g in group:
+        transition = s.transitions[g]
+        charts |= {s.chart_index(transition.source), s.chart_index(transition.target)}
     happened = {int(s.clocks[g]) for g in group}
     return {
         g
@@ -234,7 +267,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
         return False
     m, n = orders[0].derivative.shape
     rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
-    return bool(np.max(np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]) < SAME)
+    apart = np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]
+    return bool(np.max(apart) < SAME)
 
 
 def _orders(
@@ -244,7 +278,9 @@ def _orders(
     if not left:
         yield before
         return
-    a, q, u = before.chart, before.state[None], np.zeros((s.nu, 1))
+    a = before.chart
+    q = before.state[None]
+    u = np.zeros((s.nu, 1))
     time = np.array([t])
     happened = [s.clocks[g] for g in before.events]
     scheduled = [
@@ -253,10 +289,9 @@ def _orders(
         if _scheduled_at(s, g, t, due) and s.clocks[g] not in happened
     ]
     for g in [*scheduled, *s.guards(a)]:
-        if (
-            g in before.events
-            or not kernels.enabled(s, s.member(g), time, q.T, u).all()
-        ):
+        if g in before.events:
+            continue
+        if not kernels.enabled(s, s.member(g), time, q.T, u).all():
             continue
         event = jump(s, g, time, q, u)
         saltation = event.saltation[0]
@@ -273,7 +308,8 @@ def _orders(
 def check_begin(map: ReturnMap) -> None:
     """**Raises:** `ComputationError` if turns begin at an event that may or may not belong to
     them."""
-    s, base = map.structure, map.base
+    s = map.structure
+    base = map.base
     if not (base is None or isinstance(base, AtEvent)):
         return
     guards, rates = jax.device_get(_at_anchor(map))

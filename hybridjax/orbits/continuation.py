@@ -324,36 +324,56 @@ class _Trace(NamedTuple):
 
     def run(self, start: Point) -> tuple[list[Point], BranchEnd]:
         """The points along a tangent, those of changes of stability among them, and the end."""
-        points, length, moved, before = [start], self.step, None, None
-        low, high = self.values[0], self.values[-1]
-        over = start.value == (high if start.tangent[-1] > 0 else low)
+        points = [start]
+        length = self.step
+        before: Point | None = None
+        moved: Point | None = None
+        last_value = self.values[-1] if start.tangent[-1] > 0 else self.values[0]
+        over = bool(start.value == last_value)
         while not over and len(points) < self.max_points:
             last = points[-1]
             say(f"{self.curve.parameter} = {last.value:.5g}, {len(points)} cycles")
-            point = self.curve.step(before, last, length)
-            if isinstance(point, Point) and not low <= point.value <= high:
-                over = True
-                point = self.curve.land(last, point, np.clip(point.value, low, high))
-            if isinstance(point, Point) and point.cosine(last) < _STRAIGHT:
-                point = Result.NOT_CONVERGED
+            point, over = self._next(before, last, length)
             if isinstance(point, Point):
-                points, before = points + self.between(last, point), last
-                length = min(
-                    self.step, length * (1.5 if point.steps <= USUAL_STEPS else 1.0)
-                )
+                points += self.between(last, point)
+                before = last
+                longer = 1.5 * length if point.steps <= USUAL_STEPS else length
+                length = min(self.step, longer)
                 continue
-            length, over = length / 2, False
+            length = length / 2
             if length >= _SHORTEST * self.step:
                 continue
+            at_other_phase = None
             if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
-                if (moved := self.curve.elsewhere(last)) is not None:
-                    points[-1], length = moved, self.step
-                    continue
-            return points, BranchEnd(last.value, point, point.message)
-        end = Result.STEP_LIMIT, f"{self.max_points} cycles; `max_points` raises it"
+                at_other_phase = self.curve.elsewhere(last)
+            if at_other_phase is None:
+                return points, BranchEnd(last.value, point, point.message)
+            moved = at_other_phase
+            points[-1] = moved
+            length = self.step
+        value = points[-1].value
         if over:
-            end = Result.OK, "end of the parameter range"
-        return points, BranchEnd(points[-1].value, *end)
+            return points, BranchEnd(value, Result.OK, "end of the parameter range")
+        text = f"{self.max_points} cycles; `max_points` raises it"
+        return points, BranchEnd(value, Result.STEP_LIMIT, text)
+
+    def _next(
+        self, before: Point | None, last: Point, length: float
+    ) -> tuple[Point | Result, bool]:
+        """The next point, or why there is none, and whether the values end with it."""
+        low = self.values[0]
+        high = self.values[-1]
+        point = self.curve.step(before, last, length)
+        if isinstance(point, Result):
+            return point, False
+        over = not low <= point.value <= high
+        if over:
+            point = self.curve.land(last, point, np.clip(point.value, low, high))
+        if isinstance(point, Result):
+            return point, False
+        if point.cosine(last) < _STRAIGHT:
+            return Result.NOT_CONVERGED, False
+        return point, over
 
     def between(self, a: Point, b: Point) -> list[Point]:
         """Changes of stability and values after a point until its neighbor, which comes last."""
@@ -364,21 +384,27 @@ class _Trace(NamedTuple):
                 continue
             if kind == "branch point" and a.tests["fold"] * b.tests["fold"] < 0:
                 continue  # the parameter turns back
-            if (located := self.locate(a, b, kind)) is not None:
+            located = self.locate(a, b, kind)
+            if located is not None:
                 where, point = located
-                marked.setdefault(
-                    (round(where, 9), point.kind), point
-                )  # (once for a pair)
-        points, last = [], a
+                # (Two multipliers of a pair cross at the same place.)
+                marked.setdefault((round(where, 9), point.kind), point)
+        points = []
+        last = a
         for point in [*(marked[key] for key in sorted(marked)), b]:
-            passed = [
-                v for v in self.values if (last.value - v) * (point.value - v) < 0
-            ]
-            for value in sorted(passed, key=lambda v: abs(v - last.value)):
-                landed = self.curve.land(last, point, value)
-                points += [landed] if isinstance(landed, Point) else []
+            points += self._at_values(last, point)
             points.append(point)
             last = point
+        return points
+
+    def _at_values(self, a: Point, b: Point) -> list[Point]:
+        """The points at the values that are passed between two points."""
+        passed = [v for v in self.values if (a.value - v) * (b.value - v) < 0]
+        points = []
+        for value in sorted(passed, key=lambda v: abs(v - a.value)):
+            landed = self.curve.land(a, b, value)
+            if isinstance(landed, Point):
+                points.append(landed)
         return points
 
     def locate(self, a: Point, b: Point, kind: str | int) -> tuple[float, Point] | None:
@@ -388,22 +414,26 @@ class _Trace(NamedTuple):
         """
         from scipy.optimize import brentq  # (a third of a second)
 
-        points, crossing = {0.0: a, 1.0: b}, False
+        points = {0.0: a, 1.0: b}
+        beside: set[float] = set()  # where only a point beside could be computed
 
-        def test(where):
-            nonlocal crossing
-            for aside in _ASIDE if where not in points else ():
+        def compute(where: float) -> None:
+            for aside in _ASIDE:
                 point = self.curve.between(a, b, where + aside)
                 if isinstance(point, Point):
                     points[where] = point
-                    crossing |= aside != 0
-                    break
+                    if aside != 0:
+                        beside.add(where)
+                    return
+
+        def test(where: float) -> float:
+            if where not in points:
+                compute(where)
             return points[where].tests[kind]
 
+        accuracy: Any = dict(xtol=1e-13, rtol=np.float64(1e-14), maxiter=60)
         try:
-            where: Any = brentq(
-                test, 0.0, 1.0, xtol=1e-13, rtol=np.float64(1e-14), maxiter=60
-            )
+            where: Any = brentq(test, 0.0, 1.0, **accuracy)
             test(where)
         except (KeyError, RuntimeError):
             return None
@@ -413,19 +443,22 @@ class _Trace(NamedTuple):
             if critical.imag == 0 and critical.real > 0:
                 return None  # (a fold, or a branch point)
             kind = "Neimark-Sacker" if critical.imag else "flip"
-        return where, dataclasses.replace(
-            point, kind="branch point" if crossing else kind
-        )
+        if beside:
+            kind = "branch point"
+        return where, dataclasses.replace(point, kind=kind)
 
 
 def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
     """The points as cycles."""
-    cycle, stack = curve.cycle, lambda *x: np.stack([np.asarray(y) for y in x])
+    cycle = curve.cycle
+
+    def stack(*arrays) -> np.ndarray:
+        return np.stack([np.asarray(x) for x in arrays])
+
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
-    anchor, turn = jax.tree_util.tree_map(
-        stack, *((p.departure, p.turn) for p in points)
-    )
+    pairs = [(point.departure, point.turn) for point in points]
+    anchor, turn = jax.tree_util.tree_map(stack, *pairs)
     cycles = LimitCycles(
         systems,
         cycle.base,

@@ -22,10 +22,10 @@ from .return_map import ENOUGH, ReturnMap, Turn, turn_product
 from .shooting import newton_steps
 
 
-# Newton's method ends with a step this small, in sizes of the states; from the second number on,
-# rounding errors may be all that is left. Smaller: it does not end. Larger: points are less
-# accurate.
-_SMALL, _ROUNDING = 1e-11, 1e-8
+# Newton's method ends with a step this small, in sizes of the states; below `_ROUNDING`, rounding
+# errors may be all that is left. Smaller: it does not end. Larger: points are less accurate.
+_SMALL = 1e-11
+_ROUNDING = 1e-8
 # The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
 # move shorten the steps. Larger: steps are longer than the orbit.
 _LEAST_RANGE = 0.02
@@ -84,9 +84,8 @@ class Point:
     @ft.cached_property
     def multipliers(self) -> Complex[np.ndarray, " d"]:
         """All multipliers, by decreasing modulus, padded with zeros."""
-        values = np.linalg.eigvals(turn_product(self.turn.factors[None])[0]).astype(
-            complex
-        )
+        monodromy = turn_product(self.turn.factors[None])[0]
+        values = np.linalg.eigvals(monodromy).astype(complex)
         return values[np.argsort(-np.abs(values))]
 
     @ft.cached_property
@@ -105,7 +104,9 @@ class Curve:
     """Points of the curve through a cycle."""
 
     def __init__(self, cycle: LimitCycle, parameter: str, span: float):
-        self.cycle, self.parameter, self.span = cycle, parameter, span
+        self.cycle = cycle
+        self.parameter = parameter
+        self.span = span
         map = to_host(cycle.return_map)
         # (As many steps as single searches take where the usual limit is reached.)
         steps = max(map.settings.max_steps, ENOUGH)
@@ -128,7 +129,8 @@ class Curve:
     def step(self, before: Point | None, last: Point, length: float) -> Point | Result:
         """The next point, about `length` further along the tangent. `before`: the point a step
         before the last one, if any."""
-        ahead, row = length * last.tangent * last.size, last.tangent / last.size
+        ahead = length * last.tangent * last.size
+        row = last.tangent / last.size
         guess = last.z + ahead
         period = last.period
         if before and before.anchor is last.anchor:
@@ -171,17 +173,21 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        legs, events = point.turn.legs, point.turn.times[point.turn.codes >= 0]
+        legs = point.turn.legs
+        events = point.turn.times[point.turn.codes >= 0]
         if self.map.base is not None or not len(events):
             return None
         k = far_from_events(legs.t, events, float(point.turn.period))
         phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
         anchor = point.anchor._replace(t=phase, chart=legs.chart[[k]])
+        if k == 0:
+            return None
         forward = self._by_value() * np.sign(point.tangent[-1])
-        z, row = np.append(legs.q[:, k], point.value), self._by_value(point.size)
+        z = np.append(legs.q[:, k], point.value)
+        row = self._by_value(point.size)
         begin = anchor, point.period
         moved = self._correct(z, row, point.size, forward, begin)
-        return None if k == 0 or isinstance(moved, Result) else moved
+        return None if isinstance(moved, Result) else moved
 
     def _by_value(
         self, size: float | Float[np.ndarray, " n"] = 1.0
@@ -205,18 +211,21 @@ class Curve:
         last = np.inf
         for k in range(FEW_STEPS):
             turn = self.turn(map, z)
-            if (failure := self._failure(turn)) is not None:
+            failure = self._failure(turn)
+            if failure is not None:
                 return failure
             point = Point(anchor, z, size, forward, turn, k)
             equations = np.vstack([point.scaled, row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
             (change,) = newton_steps(equations[None], residual[None], rounding)
             length = np.linalg.norm(change)
-            if length <= _SMALL or (length <= _ROUNDING and length >= 0.5 * last):
+            only_rounding = length <= _ROUNDING and length >= 0.5 * last
+            if length <= _SMALL or only_rounding:
                 return self._settled(point)
             if not length <= 2 * last:
                 break
-            z, last = z + change * size, length
+            z = z + change * size
+            last = length
         return Result.NOT_CONVERGED
 
     def turn(self, map: ReturnMap, z: Float[np.ndarray, " n"]) -> Turn:
@@ -240,14 +249,16 @@ class Curve:
 
     def _settled(self, point: Point) -> Point | Result:
         """The point with a tangent, and sizes by the range of each state on the cycle."""
-        legs, scale = point.turn.legs, np.asarray(self.map.scale)
+        legs = point.turn.legs
+        scale = np.asarray(self.map.scale)
         ranges = np.ptp(legs.q / scale[legs.chart].T, axis=1)
         if self.map.base is not None and np.max(ranges) <= SAME:
             return Result.EQUILIBRIUM
         sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)
         point = dataclasses.replace(point, size=np.append(sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
-        tangent = right[-1] * (1.0 if right[-1] @ point.tangent >= 0 else -1.0)
+        same = right[-1] @ point.tangent >= 0
+        tangent = right[-1] if same else -right[-1]
         return dataclasses.replace(point, tangent=tangent)
 
 
@@ -279,7 +290,8 @@ def away_from_events(cycle: LimitCycle) -> LimitCycle:
     if not cycle.clocked or what_changed(cycle.system, cycle.numbers):
         return cycle
     path = cycle.trajectory()
-    if not len(events := path.t[path.event >= 0]):
+    events = path.t[path.event >= 0]
+    if not len(events):
         return cycle
     k = far_from_events(last_turn(cycle)[0].t, events, float(cycle.period))
     return begin_later(cycle, k) if k else cycle

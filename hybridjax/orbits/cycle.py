@@ -178,32 +178,45 @@ class LimitCycle(eqx.Module):
 
     @remembered
     def _multipliers(self) -> Complex[np.ndarray, " r"]:
-        # The factors in sizes of the states, without padding.
-        dims, scale = (
-            self.dims,
-            np.asarray(self.settings.scale)[np.asarray(self.legs.chart)],
-        )
-        after = np.roll(np.arange(len(dims)), -1)
-        factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
-        blocks = [f[: dims[after[n]], : dims[n]] for n, f in enumerate(factors)]
+        blocks = self._scaled_factors()
         # (The weakest direction of an autonomous flow is its own, which was projected out.)
         weaker = 0 if self.clocked else 1
-        strong = np.isfinite(self.residual)
-        strong = strong and min(weakest(block, weaker) for block in blocks) < WEAKEST
+        strong = bool(np.isfinite(self.residual)) and any(
+            weakest(block, weaker) < WEAKEST for block in blocks
+        )
         if strong:
             blocks = fine_factors(self)
         values = product_eigenvalues(blocks, rtol=ROUNDING)
         if strong and has_implicit(self.structure):
-            lost = np.abs(values) < _LEAST_OF_IMPLICIT
-            values = np.where(lost, 0.0, values)
-            if (
-                lost.sum() == 1 and not self.event_sequence
-            ):  # it follows from the product of all
-                resolved = np.prod(values[~lost]).real
-                values[lost] = np.exp(log_determinant(self)) / resolved
-        values[np.argsort(np.abs(values - 1))[: len(self.conserved)]] = 1
+            values = self._without_lost(values)
+        # Of each conserved quantity one is known.
+        near_one = np.argsort(np.abs(values - 1))[: len(self.conserved)]
+        values[near_one] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
+        return values
+
+    def _scaled_factors(self) -> list[Matrix]:
+        """The factors in sizes of the states, without padding."""
+        dims = self.dims
+        scale = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
+        after = np.roll(np.arange(len(dims)), -1)
+        factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
+        return [
+            factor[: dims[end], : dims[begin]]
+            for begin, (end, factor) in enumerate(zip(after, factors, strict=True))
+        ]
+
+    def _without_lost(
+        self, values: Complex[np.ndarray, " r"]
+    ) -> Complex[np.ndarray, " r"]:
+        """Multipliers with zeros for those that are lost in errors of implicit steps. A single one
+        on a cycle without events follows from the product of all."""
+        lost = np.abs(values) < _LEAST_OF_IMPLICIT
+        values = np.where(lost, 0.0, values)
+        if lost.sum() == 1 and not self.event_sequence:
+            resolved = np.prod(values[~lost]).real
+            values[lost] = np.exp(log_determinant(self)) / resolved
         return values
 
     @property
@@ -262,13 +275,21 @@ class LimitCycle(eqx.Module):
         self.require_current()
         if periods == 1 and int(self.result) == Result.OK:
             return orbit(self)
-        s, anchor = self.structure, to_host(self.anchor)
+        s = self.structure
+        anchor = to_host(self.anchor)
         a = int(anchor.chart[0])
-        begin = s.names[a], anchor.q[: s.dims[a], 0], float(self.period) * periods
-        options: Any = dict(time=float(anchor.t[0]), settings=self.settings)
-        return _trajectories.recall(
-            self, periods, lambda: simulate(self.system, *begin, **options)
-        )
+
+        def simulated() -> Trajectory:
+            return simulate(
+                self.system,
+                s.names[a],
+                anchor.q[: s.dims[a], 0],
+                float(self.period) * periods,
+                time=float(anchor.t[0]),
+                settings=self.settings,
+            )
+
+        return _trajectories.recall(self, periods, simulated)
 
     def responses(self, modes: Index | None = None) -> Responses:
         """Responses to brief pushes, at every phase: of the phase, and of the amplitudes of modes.
@@ -372,67 +393,88 @@ class LimitCycle(eqx.Module):
             return f"LimitCycle({type(self.system).__name__}, traced)"
         if what_changed(self.system, self.numbers) or int(self.result) not in _FOUND:
             return f"LimitCycle({self._title()})"
-        least = "1e-10" if has_implicit(self.structure) else "1e-308"
-        shown = (number(z, 9) if z else f"below {least}" for z in self.multipliers)
-        multipliers = ", ".join(shown) or "none but zero"
-        if self.conserved:
-            multipliers += f" (1: conserved {', '.join(self.conserved)})"
-        lines = (
-            f"\n  {name}   {value}"
-            if name.startswith("at t")
-            else f"\n  {name:<11}  {value}"
-            for name, value in self._facts({"multipliers": multipliers}).items()
-        )
+        shown = {"multipliers": self._multipliers_text()}
+        lines = []
+        for name, value in self._facts(shown).items():
+            heading = name if name.startswith("at t") else f"{name:<11}"
+            space = "   " if name.startswith("at t") else "  "
+            lines.append(f"\n  {heading}{space}{value}")
         return f"LimitCycle({self._title()}){''.join(lines)}"
+
+    def _multipliers_text(self) -> str:
+        """The multipliers, printed."""
+        least = "1e-10" if has_implicit(self.structure) else "1e-308"
+        shown = [number(z, 9) if z else f"below {least}" for z in self.multipliers]
+        text = ", ".join(shown) or "none but zero"
+        if self.conserved:
+            text += f" (1: conserved {', '.join(self.conserved)})"
+        return text
 
     def _repr_html_(self) -> str | None:
         if is_traced(self):
             return None
         if what_changed(self.system, self.numbers) or int(self.result) != Result.OK:
             return card("LimitCycle", self._title(), facts(self._facts()))
-        multipliers = multiplier_table(self.multipliers), unit_circle(self.multipliers)
-        orbit = orbit_picture(self.trajectory())
         return card(
-            "LimitCycle", self._title(), facts(self._facts()), orbit, *multipliers
+            "LimitCycle",
+            self._title(),
+            facts(self._facts()),
+            orbit_picture(self.trajectory()),
+            multiplier_table(self.multipliers),
+            unit_circle(self.multipliers),
         )
 
     def _title(self) -> str:
-        message = (
-            what_changed(self.system, self.numbers) or Result(int(self.result)).message
-        )
-        if message == Result.OK.message and verdict(self).refused:
-            message = f"refused ({verdict(self).refused[0].cause})"
+        name = type(self.system).__name__
+        change = what_changed(self.system, self.numbers)
+        if change:
+            return f"{name}: {change}"
+        message = Result(int(self.result)).message
+        if message != Result.OK.message:
+            return f"{name}: {message}"
+        refused = verdict(self).refused
+        if refused:
+            return f"{name}: refused ({refused[0].cause})"
         # (By rounding, those of neutral cycles are a little larger than 1.)
-        grows = (
-            message == Result.OK.message
-            and np.abs(self.multipliers).max(initial=0) > 1 + 1e-6
-        )
-        return f"{type(self.system).__name__}: {message}{', unstable' if grows else ''}"
+        grows = np.abs(self.multipliers).max(initial=0) > 1 + 1e-6
+        return f"{name}: {message}{', unstable' if grows else ''}"
 
     def _facts(self, multipliers: Mapping[str, str] = {}) -> dict[str, str]:  # noqa: B006
         """The printed lines, by their headings."""
-        s, time, anchor = self.structure, self.system.time_unit, to_host(self.anchor)
-        names = [tr.name for tr in s.transitions]
-        units, scale = map(unit_of, s.states(int(anchor.chart[0]))), self.scale
-        rounding = np.finfo(float).eps
-        stiff = stiff_charts(s, to_host(self.legs), float(self.period))
-        sentences = (
-            f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an explicit "
-            'method; `Settings(solver="auto")` takes an implicit one'
-            for name, rate in stiff.items()
-        )
-        return {
-            "period": number(self.period, 12, time),
-            f"at t = {number(anchor.t[0], 6, time)}": ", ".join(
-                f"{name} = {number(0.0 if abs(x) <= rounding * scale[name] else x, 9, unit)}"
-                for (name, x), unit in zip(self.state.items(), units, strict=True)
-            ),
-            "events": ", ".join(names[g] for g in self.event_sequence) or "none",
+        time_unit = self.system.time_unit
+        names = [transition.name for transition in self.structure.transitions]
+        events = [names[g] for g in self.event_sequence]
+        begin = number(to_host(self.anchor).t[0], 6, time_unit)
+        residual = f"{float(self.residual):.2g}"
+        lines = {
+            "period": number(self.period, 12, time_unit),
+            f"at t = {begin}": self._state_text(),
+            "events": ", ".join(events) or "none",
             **multipliers,
-            "residual": f"{float(self.residual):.2g} after {int(self.iterations)} Newton steps",
+            "residual": f"{residual} after {int(self.iterations)} Newton steps",
             **self._checks(),
-            **({"stiff": "; ".join(sentences)} if stiff else {}),
         }
+        stiff = stiff_charts(self.structure, to_host(self.legs), float(self.period))
+        if stiff:
+            sentences = (
+                f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an "
+                'explicit method; `Settings(solver="auto")` takes an implicit one'
+                for name, rate in stiff.items()
+            )
+            lines["stiff"] = "; ".join(sentences)
+        return lines
+
+    def _state_text(self) -> str:
+        """The state at the anchor, printed, with zeros for what is only rounding."""
+        chart = int(to_host(self.anchor).chart[0])
+        units = [unit_of(state) for state in self.structure.states(chart)]
+        rounding = np.finfo(float).eps
+        scale = self.scale
+        texts = []
+        for (name, x), unit in zip(self.state.items(), units, strict=True):
+            shown = 0.0 if abs(x) <= rounding * scale[name] else x
+            texts.append(f"{name} = {number(shown, 9, unit)}")
+        return ", ".join(texts)
 
     def _checks(self) -> dict[str, str]:
         """The printed lines on the checks of a cycle that was found."""
@@ -463,15 +505,17 @@ def what_changed(
 ) -> str:
     """A sentence on what of a system has changed since its cycle was found, if anything has; of
     systems side by side, of which `single` is one."""
-    now, name, changed = arrays_of(system), type(system).__name__, ""
-    change = change_of(system if single is None else single)
-    if change is not None:
-        changed = f"{change} has"
+    now = arrays_of(system)
+    changed = change_of(system if single is None else single)
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
-            changed = f"`{key}` of {name} has"
-    hint = "changed since this limit cycle was found: find it again, with this one as the guess"
-    return changed and f"{changed} {hint}"
+            changed = f"`{key}` of {type(system).__name__}"
+    if changed is None:
+        return ""
+    return (
+        f"{changed} has changed since this limit cycle was found: find it again, with this one as "
+        "the guess"
+    )
 
 
 def as_found(cycle: LimitCycle) -> LimitCycle:
@@ -494,9 +538,8 @@ def require_unchanged(
 
 
 def _differ(x: Any, y: Any) -> bool:
-    if is_tracer(x) or is_tracer(
-        y
-    ):  # (a parameter alone is, if it was replaced in there)
+    # (A parameter alone is traced, if it was replaced inside of a transformation.)
+    if is_tracer(x) or is_tracer(y):
         return not is_tracer(y)
     return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
 
@@ -513,23 +556,33 @@ def orbit_picture(
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
-    s, turn = orbit.structure, orbit.dense()
-    names = [x for x in s.state_names() if all(x in c.states for c in s.charts)][:2]
+    s = orbit.structure
+    turn = orbit.dense()
+    everywhere = [
+        name
+        for name in s.state_names()
+        if all(name in chart.states for chart in s.charts)
+    ]
+    names = everywhere[:2]
     if not names:
         return ""
-    axes = lambda t, *point: [t, *observed(s, names, t, *point)][-2:]  # noqa: E731
-    chart, (x, y) = turn[1], axes(*turn)
+
+    def axes(t, chart, q) -> list:
+        return [t, *observed(s, names, t, chart, q)][-2:]
+
+    chart = turn[1]
+    x, y = axes(*turn)
     curves = []
     for a in np.unique(chart):
         name = s.names[a] if len(s.names) > 1 else ""
-        curves.append(
-            Curve(np.where(chart == a, x, np.nan), y, name, CHARTS[a % len(CHARTS)])
-        )
+        color = CHARTS[a % len(CHARTS)]
+        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, color))
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
-    units = ("t", orbit.system.time_unit), *((x, unit_of(x)) for x in names)
-    return picture(curves, *(with_unit(*x) for x in units[-2:]))
+    units = [("t", orbit.system.time_unit), *((name, unit_of(name)) for name in names)]
+    labels = [with_unit(name, unit) for name, unit in units[-2:]]
+    return picture(curves, *labels)
 
 
 def fine_factors(cycle: LimitCycle) -> list[Matrix]:
@@ -538,27 +591,17 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
     A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
     """
-    map, record = hosted(cycle).return_map, last_turn(cycle)
-    structure, moves = map.structure, recorded_moves(*record)
+    map = hosted(cycle).return_map
+    structure = map.structure
+    record = last_turn(cycle)
+    moves = recorded_moves(*record)
     by = linear_moves(structure, moves, recorded_ends(map, record[0]))[1]
-    fields = slopes(
-        structure, moves.t, moves.chart, moves.q, np.zeros((structure.nu, 1))
-    ).T
-    frames: list[tuple[int, np.ndarray, Matrix]] = []
-    for chart, f, at_once in zip(moves.chart, fields, moves.at_once, strict=True):
-        n = structure.dims[chart]
-        size, basis = np.append(map.expected, map.scale[chart, :n]), np.eye(1 + n)
-        if map.base is not None and at_once:  # (there is no flow before it)
-            basis = basis[:, 1:]
-        elif map.base is not None:
-            basis = np.pad(
-                np.linalg.svd(f[None, :n] / size[1:])[2][1:].T, [(1, 0), (0, 0)]
-            )
-        frames.append((1 + n, size, basis))
+    frames = _frames(map, moves)
     factors: list[Matrix] = []
-    for k, (n, size, basis) in enumerate(frames):
-        m, size_after, basis_after = frames[(k + 1) % len(frames)]
-        parts = basis_after.T, by[k, :m, :n] * size / size_after[:, None], basis
+    for k, (size, basis) in enumerate(frames):
+        size_after, basis_after = frames[(k + 1) % len(frames)]
+        derivative = by[k, : len(size_after), : len(size)]
+        parts = basis_after.T, derivative * size / size_after[:, None], basis
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
@@ -571,6 +614,26 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     return factors
 
 
+def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], Matrix]]:
+    """Sizes of the time and the states at the beginning of each move, and a basis of deviations in
+    these sizes: for an autonomous system, across the flow at equal times."""
+    s = map.structure
+    fields = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+    frames: list[tuple[np.ndarray, Matrix]] = []
+    for chart, field, at_once in zip(moves.chart, fields, moves.at_once, strict=True):
+        n = s.dims[chart]
+        sizes = map.scale[chart, :n]
+        if map.base is None:
+            basis = np.eye(1 + n)
+        elif at_once:  # (there is no flow before it)
+            basis = np.eye(1 + n)[:, 1:]
+        else:
+            across = np.linalg.svd(field[None, :n] / sizes)[2][1:].T
+            basis = np.pad(across, [(1, 0), (0, 0)])
+        frames.append((np.append(map.expected, sizes), basis))
+    return frames
+
+
 def log_determinant(cycle: LimitCycle) -> float:
     """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
     of the field, integrated over one turn.
@@ -578,26 +641,29 @@ def log_determinant(cycle: LimitCycle) -> float:
     Steps of an implicit method lose a mode that decays within them; this gives its decay.
     """
     flow = linear_flow(cycle)
-    return float(
-        flow.length @ np.trace(flow.by_state, axis1=2, axis2=3) @ rule().weights
-    )
+    divergence = np.trace(flow.by_state, axis1=2, axis2=3)
+    return float(flow.length @ divergence @ rule().weights)
 
 
 def orbit(cycle: LimitCycle) -> Trajectory:
     """One turn from the anchor, in the steps by which it is linearized."""
-    map, (_, tape) = to_host(cycle.return_map), last_turn(cycle)
-    pieces = [Tape(*(x[..., k, None] for x in tape)) for k in range(tape.t.shape[-1])]
-    begin, u = map.departure(map.anchor.q[:, 0]), np.zeros((map.structure.nu, 1))
-    make = lambda: recorded(map.structure, begin, pieces, u, Result.OK)  # noqa: E731
-    return _trajectories.recall(cycle, 1.0, make)
+    map = to_host(cycle.return_map)
+    _, tape = last_turn(cycle)
+
+    def turn() -> Trajectory:
+        begin = map.departure(map.anchor.q[:, 0])
+        u = np.zeros((map.structure.nu, 1))
+        count = tape.t.shape[-1]
+        pieces = [Tape(*(x[..., k, None] for x in tape)) for k in range(count)]
+        return recorded(map.structure, begin, pieces, u, Result.OK)
+
+    return _trajectories.recall(cycle, 1.0, turn)
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:
     """The gain of a factor in its weakest direction but for so many `weaker` ones, relative to the
     gain in its strongest, or to 1 if that is smaller."""
     singular = np.linalg.svd(factor, compute_uv=False)
-    return (
-        singular[-1 - weaker] / max(singular[0], 1.0)
-        if len(singular) > weaker
-        else np.inf
-    )
+    if len(singular) <= weaker:
+        return np.inf
+    return singular[-1 - weaker] / max(singular[0], 1.0)

@@ -5,7 +5,7 @@ If Newton's method fails, `newton.search` makes further attempts.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -56,11 +56,16 @@ from .verdict import verdict
 # this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
 _OFF = 4.0
 # Periods of the flow after which a search begins again that ended beyond a guard, or in another
-# chart than it began; after the last of them, one that Newton's method may have led astray; and
-# those within which an event is chosen as the section, in place of a plane. Fewer: slow transients
-# remain. More: a vain search takes longer.
-_LATER = 8, 40
+# chart than it began; and after which one begins again that Newton's method may have led astray.
+# Fewer: slow transients remain. More: a vain search takes longer.
+_LATER = (8, 40)
+_LATEST = 40
+# Periods within which an event is chosen as the section, in place of a plane. Fewer: rare events
+# are missed. More: time.
 _EVENTFUL = 8
+# Results of a search that has found a cycle, on its own or of a family; and of one that Newton's
+# method may have led astray.
+_FOUND = Result.OK, Result.SINGULAR
 _STRAYED = (
     Result.NOT_CONVERGED,
     Result.EQUILIBRIUM,
@@ -152,53 +157,36 @@ def find_limit_cycle(
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":
-        again: Any = dict(
-            section=section, multiplicity=multiplicity, conserved=conserved
-        )
-        again |= dict(
-            settings=dataclasses.replace(settings, solver=None),
+        explicit = dataclasses.replace(settings, solver=None)
+        first: dict[str, Any] = dict(settle=settle, max_period=max_period)
+        each: dict[str, Any] = dict(
+            section=section,
+            multiplicity=multiplicity,
+            conserved=conserved,
             scale=scale,
+            settings=explicit,
             throw=throw,
         )
-        return _find_with_auto(
-            system, guess, dict(settle=settle, max_period=max_period), again
-        )
+        return _find_with_auto(system, guess, first, each)
     system = settings.system(system)
     traced = is_traced((system, conserved))
     if not traced:
         require_x64(system, guess, section, settings)
         checks.check_periodic(system)
-    s, settings = Structure(system), settings.filled(LIMIT_CYCLE)
+    s = Structure(system)
+    settings = settings.filled(LIMIT_CYCLE)
     patient = settings.max_steps == Settings().max_steps
-    if has_implicit(s) or has_kinks(s):
-        settings = dataclasses.replace(
-            settings, max_steps=max(settings.max_steps, PATIENCE)
-        )
-    given = {} if settings.scale is None else sizes_of(s, settings.scale)
-    given |= given_sizes(s, scale)
-    if section is not None:
-        if system.period() is not None:
-            raise DefinitionError(
-                "a clocked system returns to itself after its clock's period: leave out `section` "
-                "(sections of any kind are for linearize and run_experiments)."
-            )
-        section.check(s)
+    settings = _with_enough_steps(s, settings)
+    given = _sizes_that_are_given(s, settings, scale)
+    _check_section(s, section)
     if not traced:
         checks.check_clock(s)
+    known: LimitCycle | None = None
     if isinstance(guess, LimitCycle):
-        _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
-        conserved = guess.conserved if conserved is None else conserved
-        moving = [name for name, x in arrays_of(system).items() if is_tracer(x)]
-        for name in [] if is_traced(guess) else moving:
-            check_symmetry(
-                guess.system, guess.structure.sizes(guess.settings.scale), name
-            )
-        map = guess.return_map.at_phase_of(system)
-        settings = dataclasses.replace(
-            settings, scale=scale_of(s, given, guess.settings.scale)
-        )
-        base = map.base if section is None else section
-        map = dataclasses.replace(map, settings=settings, base=base)
+        known = guess
+        _check_fits(known, s, multiplicity, bool(settle) or max_period is not None)
+        map = _map_near_cycle(known, s, section, settings, given)
+        conserved = known.conserved if conserved is None else conserved
     elif traced:
         raise DefinitionError(
             "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
@@ -208,77 +196,196 @@ def find_limit_cycle(
         map = return_map_near(
             s, guess, section, multiplicity or 1, settle, max_period, settings, given
         )
-    map = dataclasses.replace(
-        map, conserved={k: real(v) for k, v in (conserved or {}).items()}
+    values = {name: real(value) for name, value in (conserved or {}).items()}
+    map = dataclasses.replace(map, conserved=values)
+    request = _Request(map, known, section, given, patient, settle, throw)
+    if known is None:
+        return _from_guess(request)
+    return _near_cycle(request, known, traced)
+
+
+class _Request(NamedTuple):
+    """A search for a limit cycle that is asked for, with its arguments checked and prepared."""
+
+    map: ReturnMap
+    """The return map where the search begins, in rough sizes of the states."""
+    known: LimitCycle | None
+    """The cycle that is the guess, if a cycle is."""
+    section: Crossing | AtEvent | None
+    """The section that is given; by default the map has one of its own."""
+    given: Sizes
+    """Sizes of states that are given."""
+    patient: bool
+    """Whether more steps may follow: the user has not limited them."""
+    settle: float
+    throw: bool
+
+
+def _with_enough_steps(s: Structure, settings: Settings) -> Settings:
+    """Settings with a larger limit on steps, where steps are shorter than usual."""
+    if not (has_implicit(s) or has_kinks(s)):
+        return settings
+    return dataclasses.replace(settings, max_steps=max(settings.max_steps, PATIENCE))
+
+
+def _sizes_that_are_given(
+    s: Structure, settings: Settings, scale: Mapping[str, float] | None
+) -> Sizes:
+    """Sizes of states that users give, by name or in the settings.
+
+    **Raises:** `DefinitionError` for a state that does not exist.
+    """
+    of_settings = {} if settings.scale is None else sizes_of(s, settings.scale)
+    return of_settings | given_sizes(s, scale)
+
+
+def _check_section(s: Structure, section: Crossing | AtEvent | None) -> None:
+    """**Raises:** `DefinitionError` for a section that does not fit, or of a clocked system."""
+    if section is None:
+        return
+    if s.system.period() is not None:
+        raise DefinitionError(
+            "a clocked system returns to itself after its clock's period: leave out `section` "
+            "(sections of any kind are for linearize and run_experiments)."
+        )
+    section.check(s)
+
+
+def _map_near_cycle(
+    known: LimitCycle,
+    s: Structure,
+    section: Crossing | AtEvent | None,
+    settings: Settings,
+    given: Sizes,
+) -> ReturnMap:
+    """The return map of a system, at the anchor of a cycle of a similar one.
+
+    **Raises:** `DefinitionError` if a traced number has derivatives that a symmetry, which the
+    known cycle's system states, does not have.
+    """
+    if not is_traced(known):
+        sizes = known.structure.sizes(known.settings.scale)
+        for name, value in arrays_of(s.system).items():
+            if is_tracer(value):
+                check_symmetry(known.system, sizes, name)
+    map = known.return_map.at_phase_of(s.system)
+    scale = scale_of(s, given, known.settings.scale)
+    return dataclasses.replace(
+        map,
+        settings=dataclasses.replace(settings, scale=scale),
+        base=map.base if section is None else section,
     )
-    near = last_turn(guess) if isinstance(guess, LimitCycle) else None
-    if isinstance(guess, LimitCycle) and section is None and is_inside_program():
-        route = route_near(guess)
+
+
+def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycle:
+    """The cycle of a system that is similar to that of a known cycle: on the route of the known
+    one where it has one, otherwise by Newton's method."""
+    map = request.map
+    if request.section is None and is_inside_program():
+        route = route_near(known)
         if route is not None:
-            return traced_cycle(guess, route, map)
-    if isinstance(guess, LimitCycle) and traced:
-        solution = solve(map, True, True, near)
-        # (Of events that coincide on the guess, too, its search has compared the orders.)
-        if near is None or not meet(map.structure, guess.period, near[1]):
-            together = meet(map.structure, solution.turn.period, solution.turn.tapes)
-            code = update_result(solution.result, together, Result.COINCIDENCE)
-            solution = solution._replace(result=code)
-        cycle = _cycle(map, solution, guess.event_sequence)
-        keep_turn(cycle, solution.turn)
-        return cycle
-    s.resolve_outputs(tuple(map.conserved)).require(
-        int(np.asarray(map.anchor.chart)[0])
-    )
-    if isinstance(map.base, AtEvent) and not isinstance(guess, LimitCycle):
-        check_begin(map)
-    if isinstance(guess, LimitCycle) and section is None:
-        cycle = repeated_cycle(guess, map)
+            return traced_cycle(known, route, map)
+    if traced:
+        return _traced_without_route(known, map)
+    _require_conserved(map)
+    if request.section is None:
+        cycle = repeated_cycle(known, map)
         if cycle is not None and _sizes_hold(map, cycle):
-            if conserved:
+            if map.conserved:
                 checks.check_conserved(cycle)
             return cycle
-    solution, map = _solution(map, patient, near, guess)
-    cycle, turn = _judged(map, solution, given)
+    return _searched(request)
+
+
+def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
+    """The cycle of a traced system near a known cycle, by Newton's method, with derivatives."""
+    near = last_turn(known)
+    solution = solve(map, True, True, near)
+    # (Of events that coincide on the guess, too, its search has compared the orders.)
+    if near is None or not meet(map.structure, known.period, near[1]):
+        together = meet(map.structure, solution.turn.period, solution.turn.tapes)
+        code = update_result(solution.result, together, Result.COINCIDENCE)
+        solution = solution._replace(result=code)
+    cycle = _cycle(map, solution, known.event_sequence)
+    keep_turn(cycle, solution.turn)
+    return cycle
+
+
+def _from_guess(request: _Request) -> LimitCycle:
+    """The cycle near a guess that is a state."""
+    _require_conserved(request.map)
+    if isinstance(request.map.base, AtEvent):
+        check_begin(request.map)
+    return _searched(request)
+
+
+def _require_conserved(map: ReturnMap) -> None:
+    """**Raises:** `DefinitionError` if conserved quantities do not exist where a map begins."""
+    chart = int(np.asarray(map.anchor.chart)[0])
+    map.structure.resolve_outputs(tuple(map.conserved)).require(chart)
+
+
+def _searched(request: _Request) -> LimitCycle:
+    """The cycle to which a search leads, with the result of all checks.
+
+    **Raises:** `ComputationError` for none, with the reason, unless errors are not to be raised.
+    """
+    solution, map = _solution(request)
+    cycle, turn = _judged(map, solution, request.given)
     later_fault = ""
-    slow = _is_slow(map, turn)
-    for periods in () if settle or slow else _times_later(cycle, guess):
-        # (From there the flow may lead to a cycle that is stable.)
-        say(f"the same after {periods} periods")
-        try:
-            later = _map_after(map, section, periods, given)
-            other, other_turn = _judged(later, solve(later, False, True, None), given)
-        except ComputationError as error:
-            later_fault = f" From the guess the flow leads to no cycle either: {error}"
-            break
-        if int(other.result) in (Result.OK, Result.SINGULAR):
-            cycle, turn = other, other_turn
-            break
-    code = Result(int(cycle.result))
+    if not request.settle and not _is_slow(map, turn):
+        later, later_fault = _found_later(request, map, cycle)
+        if later is not None:
+            cycle, turn = later
     checks.check_found(cycle)
-    if code in (Result.OK, Result.SINGULAR):
-        if conserved:
-            checks.check_conserved(cycle)
-    if throw and code != Result.OK:
-        reason = checks.explain(cycle, turn, float(map.expected), settle)
+    if map.conserved and int(cycle.result) in _FOUND:
+        checks.check_conserved(cycle)
+    if request.throw and int(cycle.result) != Result.OK:
+        reason = checks.explain(cycle, turn, float(map.expected), request.settle)
         raise ComputationError(reason + later_fault)
     return cycle
+
+
+def _found_later(
+    request: _Request, map: ReturnMap, failed: LimitCycle
+) -> tuple[tuple[LimitCycle, Turn] | None, str]:
+    """The cycle, and its turn, that is found from where the flow leads from a guess whose own
+    search has failed (the flow may lead to a stable one); None for none. A sentence on a flow that
+    fails, for the message."""
+    for periods in _times_later(failed, request.known):
+        say(f"the same after {periods} periods")
+        try:
+            later = _map_after(map, request.section, periods, request.given)
+            solution = solve(later, False, True, None)
+            cycle, turn = _judged(later, solution, request.given)
+        except ComputationError as error:
+            fault = f" From the guess the flow leads to no cycle either: {error}"
+            return None, fault
+        if int(cycle.result) in _FOUND:
+            return (cycle, turn), ""
+    return None, ""
 
 
 def _sizes_hold(map: ReturnMap, cycle: LimitCycle) -> bool:
     """Test whether the sizes of states are those of a cycle, nearly."""
     rough = sizes_of(map.structure, map.scale)
     own = sizes_on(map.structure, to_host(cycle.legs), float(cycle.period))
-    return all(rough[name] <= _OFF * max(own[name], SAME * rough[name]) for name in own)
+    return all(
+        rough[name] <= _OFF * max(size, SAME * rough[name])
+        for name, size in own.items()
+    )
 
 
-def _solution(
-    map: ReturnMap, patient: bool, near: Any, guess: Any
-) -> tuple[Solution, ReturnMap]:
+def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
     """The end of Newton's method, and the map on which it ended: that of another phase where an
     event has passed the phase of the guess, or one with more steps."""
+    map = request.map
+    known = request.known
+    patient = request.patient
+    near = None if known is None else last_turn(known)
     solution = search(map, patient, near)
-    if int(solution.result) == Result.NOT_CONVERGED and isinstance(guess, LimitCycle):
-        distant = away_from_events(guess).return_map.at_phase_of(map.system)
+    if int(solution.result) == Result.NOT_CONVERGED and known is not None:
+        distant = away_from_events(known).return_map.at_phase_of(map.system)
         if float(distant.anchor.t[0]) != float(map.anchor.t[0]):
             say("the same from a phase far from events")
             map = dataclasses.replace(map, anchor=distant.anchor)
@@ -323,7 +430,8 @@ def _judged(
 
 def kept(map: ReturnMap, solution: Solution) -> LimitCycle:
     """The cycle of a solution, which remembers its last turn."""
-    cycle = _cycle(map, solution, tuple(g for g, _ in events_of(solution.turn)))
+    events = tuple(event for event, _ in events_of(solution.turn))
+    cycle = _cycle(map, solution, events)
     keep_turn(cycle, solution.turn)
     return cycle
 
@@ -343,13 +451,14 @@ def _is_slow(map: ReturnMap, turn: Turn) -> bool:
     return stiff or map.settings.max_steps >= ENOUGH
 
 
-def _times_later(cycle: LimitCycle, guess: Any) -> tuple[int, ...]:
-    """The periods of the flow after which a search that failed begins again."""
+def _times_later(cycle: LimitCycle, known: LimitCycle | None) -> tuple[int, ...]:
+    """The periods of the flow after which a search that failed begins again. `known`: the cycle
+    from which it began, if from one."""
     strays = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
     if strays or cycle.result == Result.GUARD_BEYOND:
         return _LATER
-    if int(cycle.result) in _STRAYED and not isinstance(guess, LimitCycle):
-        return _LATER[-1:]
+    if int(cycle.result) in _STRAYED and known is None:
+        return (_LATEST,)
     return ()
 
 
@@ -361,46 +470,58 @@ def _map_after(
 
     **Raises:** `ComputationError` if the flow fails.
     """
-    s, rough = map.structure, sizes_of(map.structure, map.scale)
+    s = map.structure
+    rough = sizes_of(s, map.scale)
     wait = periods * float(map.expected)
     if isinstance(map.base, AtEvent):  # (also of a guess that names it)
         section = map.base
 
-    def near(guess, settle, sizes):
-        limits = map.multiplicity, settle, None
-        return return_map_near(s, guess, section, *limits, map.settings, sizes)
+    def begun(guess: Guess, settle: float, sizes: Sizes) -> ReturnMap:
+        return return_map_near(
+            s, guess, section, map.multiplicity, settle, None, map.settings, sizes
+        )
 
-    later = near(_guess_at(map), wait, rough)
+    later = begun(_guess_at(map), wait, rough)
     begin = None
     if is_default(later.base):
         begin = after_rarest_event(later, _EVENTFUL)
-    later = near(_guess_at(later) if begin is None else begin, 0.0, given)
+    if begin is None:
+        begin = _guess_at(later)
+    later = begun(begin, 0.0, given)
     return dataclasses.replace(later, conserved=map.conserved)
 
 
 def _guess_at(map: ReturnMap) -> Guess:
     """The anchor of a map, as a guess."""
-    s, anchor = map.structure, to_host(map.anchor)
+    s = map.structure
+    anchor = to_host(map.anchor)
     a = int(anchor.chart[0])
     name = map.base.name if isinstance(map.base, AtEvent) else None
     state = anchor.q[: s.dims[a], 0]
     return Guess(s.names[a], state, time=float(anchor.t[0]), after=name)
 
 
-def _find_with_auto(system, guess, first: dict, options: dict) -> LimitCycle:
-    """Return the cycle with an implicit method in those charts that are stiff on it. `first` holds
-    the options of the first search only."""
-    cycle = find_limit_cycle(integrated(system, Radau()), guess, **first, **options)
+def _find_with_auto(
+    system: HybridSystem,
+    guess: Guess | LimitCycle | None,
+    first: dict[str, Any],
+    each: dict[str, Any],
+) -> LimitCycle:
+    """The cycle with an implicit method in those charts that are stiff on it.
+
+    **Arguments:** options of `find_limit_cycle`: `first`, of the first search only; `each`, of
+    the search for the faster cycle, too.
+    """
+    cycle = find_limit_cycle(integrated(system, Radau()), guess, **first, **each)
     explicit = dataclasses.replace(cycle, system=integrated(system, None))
     stiff = stiff_charts(explicit.structure, to_host(cycle.legs), float(cycle.period))
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
-    settings = options["settings"]
-    settings = dataclasses.replace(
-        settings, max_steps=max(settings.max_steps, PATIENCE)
-    )
-    options |= dict(settings=settings, throw=False)
+    settings = each["settings"]
+    steps = max(settings.max_steps, PATIENCE)
+    settings = dataclasses.replace(settings, max_steps=steps)
+    options = each | dict(settings=settings, throw=False)
     faster = find_limit_cycle(fitting, cycle, **options)
     return faster if faster.result == Result.OK else cycle
 
@@ -409,61 +530,78 @@ def _in_own_sizes(
     map: ReturnMap, solution: Solution, given: Sizes
 ) -> tuple[ReturnMap, Solution]:
     """A cycle that was found in rough sizes, in the sizes that states have on it."""
-    s, shrunk = map.structure, 0
+    s = map.structure
     at_rest = sizes_of(s, map.scale)
-    distant = _is_distant(map, solution)
+    shrinks_left = _SHRINKS if _is_distant(map, solution) else 0
     while solution.is_fixed_point:
-        turn, rough = solution.turn, sizes_of(s, map.scale)
+        turn = solution.turn
+        rough = sizes_of(s, map.scale)
         own = sizes_on(s, turn.legs, float(turn.period))
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
-        moving = {k: x for k, x in own.items() if x > SAME * rough[k]}
+        moving = {name: x for name, x in own.items() if x > SAME * rough[name]}
         sizes = at_rest | moving if moving else own
         # The sizes of a distant guess say nothing: states have smaller ones until they move.
-        shrinks = distant and shrunk < _SHRINKS and 0 < len(moving) < len(own)
+        shrinks = shrinks_left > 0 and 0 < len(moving) < len(own)
         if shrinks:
-            shrunk += 1
-            smaller = {k: max(own[k], SAME * x) for k, x in rough.items()}
+            shrinks_left -= 1
+            smaller = {name: max(own[name], SAME * x) for name, x in rough.items()}
             sizes = smaller | moving
         sizes = sizes | given
-        fine = dataclasses.replace(
-            map,
-            settings=dataclasses.replace(map.settings, scale=scale_of(s, sizes)),
-            anchor=solution.anchor,
-            expected=map.expected if map.base is None else turn.period,
-        )
-        if all(
-            rough[name] <= _OFF * size for name, size in sizes.items()
-        ):  # accurate enough
-            residual, before = np.abs(turn.residual), to_host(map).sizes
-            after = to_host(fine).sizes
-            # (Gaps between moves are part of the distance, too.)
-            gap = np.asarray(turn.distance) - np.max(residual / before)
-            distance = real(np.max(residual / after) + gap * np.max(before / after))
-            return fine, solution._replace(turn=turn._replace(distance=distance))
+        fine = _with_sizes(map, solution, sizes)
+        accurate = all(rough[name] <= _OFF * size for name, size in sizes.items())
+        if accurate:
+            return fine, _with_distance_in(solution, map, fine)
         say("Newton's method, in the sizes of the cycle")
-        again = solve(fine, False, True, (turn.legs, side_by_side(to_host(turn.tapes))))
+        pieces = turn.legs, side_by_side(to_host(turn.tapes))
+        again = solve(fine, False, True, pieces)
         if again.is_fixed_point:
-            map, solution = fine, again._replace(steps=solution.steps)
-        elif shrinks and int(again.result) in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
-            shrunk = _SHRINKS  # (rounding errors of states at rest make steps short)
-        elif shrinks:
-            return fine, again
-        else:
+            map = fine
+            solution = again._replace(steps=solution.steps)
+        elif not shrinks:
             break
+        elif int(again.result) in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+            shrinks_left = 0  # (rounding errors of states at rest make steps short)
+        else:
+            return fine, again
     return map, solution
+
+
+def _with_sizes(map: ReturnMap, solution: Solution, sizes: Sizes) -> ReturnMap:
+    """The return map at the anchor of a solution, in other sizes of the states."""
+    scale = scale_of(map.structure, sizes)
+    return dataclasses.replace(
+        map,
+        settings=dataclasses.replace(map.settings, scale=scale),
+        anchor=solution.anchor,
+        expected=map.expected if map.base is None else solution.turn.period,
+    )
+
+
+def _with_distance_in(solution: Solution, map: ReturnMap, fine: ReturnMap) -> Solution:
+    """A solution of one return map, with the distance of its ends in the sizes of another."""
+    turn = solution.turn
+    residual = np.abs(turn.residual)
+    before = to_host(map).sizes
+    after = to_host(fine).sizes
+    # (Gaps between moves are part of the distance, too.)
+    gap = np.asarray(turn.distance) - np.max(residual / before)
+    distance = np.max(residual / after) + gap * np.max(before / after)
+    return solution._replace(turn=turn._replace(distance=real(distance)))
 
 
 def _is_distant(map: ReturnMap, solution: Solution) -> bool:
     """Test whether a state at the guess is far larger than on the cycle that was found."""
     if not solution.is_fixed_point:
         return False
-    s, a = map.structure, int(np.asarray(map.anchor.chart)[0])
+    s = map.structure
+    a = int(np.asarray(map.anchor.chart)[0])
     own = sizes_on(s, solution.turn.legs, float(solution.turn.period))
     guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
+    names = s.charts[a].states
     return any(
-        x > _DISTANT * own[str(name)]
-        for name, x in zip(s.charts[a].states, guess, strict=True)
+        size > _DISTANT * own[str(name)]
+        for name, size in zip(names, guess, strict=True)
     )
 
 

@@ -7,7 +7,7 @@ phase Z . x diffuses and is taken out: the deviations are those across the cycle
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -81,37 +81,39 @@ class Fluctuations(eqx.Module):
             raise ComputationError(
                 "steps skip fast decays: use an explicit method or `durations`."
             )
-        C, d = self.at_nodes, self.at_nodes.shape[-1]
+        covariance = self.at_nodes
         if lag:
-            turns = namespace(C).linalg.matrix_power(self.step[:d, :d], lag - 1)
-            C = self.to_nodes @ turns @ self.to_end @ C
-        return self.flow.at(phase, self.period, C)[1]
+            d = covariance.shape[-1]
+            power = namespace(covariance).linalg.matrix_power
+            turns = power(self.step[:d, :d], lag - 1)
+            covariance = self.to_nodes @ turns @ self.to_end @ covariance
+        return self.flow.at(phase, self.period, covariance)[1]
 
     def durations(self, lag: Index = 0) -> Float[Array, "E E"]:
         """Covariance of the durations that end at the `events` of a turn, each since the event
         before, with those `lag` turns before. The sum of all entries is the covariance of periods
         from the last event to the next such event."""
         n = len(self.joint) - len(self.events)
-        xp, varies = namespace(self.joint), self.varies
+        xp = namespace(self.joint)
         later = xp.linalg.matrix_power(self.step, lag) @ self.joint
-        return xp.where(varies[:, None] & varies, later[n:, n:], 0.0)
+        both = self.varies[:, None] & self.varies
+        return xp.where(both, later[n:, n:], 0.0)
 
     def __repr__(self):
-        name, unit = (
-            type(self.structure.system).__name__,
-            self.structure.system.time_unit,
-        )
+        system = self.structure.system
+        name = type(system).__name__
         if is_traced(self):
             return f"Fluctuations({name}, traced)"
-        rows = [f"{number(self.diffusion, unit=unit)}: diffusion of the phase"]
-        rows = rows if self.diffusion else []
-        before, spread = (
-            [*self.events[-1:], *self.events],
-            np.sqrt(np.diag(self.durations())),
-        )
-        for a, b, x in zip(before, self.events, spread, strict=False):
+        unit = system.time_unit
+        rows = []
+        if self.diffusion:
+            diffusion = number(self.diffusion, unit=unit)
+            rows.append(f"{diffusion}: diffusion of the phase")
+        before = [*self.events[-1:], *self.events]
+        deviations = np.sqrt(np.diag(self.durations()))
+        for a, b, x in zip(before, self.events, deviations, strict=False):
             rows.append(f"{number(x, 6, unit)}: standard deviation from {a} to {b}")
-        return f"Fluctuations({name})" + "".join(f"\n  {x}" for x in rows)
+        return f"Fluctuations({name})" + "".join(f"\n  {row}" for row in rows)
 
 
 def fluctuations(
@@ -121,113 +123,248 @@ def fluctuations(
     return _noisy(cycle, linear_flow(cycle), white, guards, resets)
 
 
+class _Pieces(NamedTuple):
+    """The pieces of a turn, each with the event at its end, for vectors of n numbers: the d states,
+    the delay of the last event, and the durations of the turn so far."""
+
+    forward: Float[Array, "P n n"]
+    """The effect of the piece."""
+    collected: Float[Array, "P n n"]
+    """Covariance of the noise that is collected over the piece."""
+    jump: Float[Array, "P n n"]
+    """The effect of the event."""
+    added: Float[Array, "P n n"]
+    """Covariance of the noise that the event adds."""
+
+
+class _Events(NamedTuple):
+    """The events at the ends of pieces."""
+
+    hit: Bool[Array, " P"]
+    """Whether there is one."""
+    delay: Float[Array, "P d"]
+    """Derivative of its time by the state before it."""
+    delay_by_noise: Float[Array, " P"]
+    """Standard deviation of its time by the noise in its own level."""
+    slot: Bool[Array, "P E"]
+    """Which of the durations ends with it."""
+
+
 @one_program
 def _noisy(
     cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any
 ) -> Fluctuations:
-    map, events = cycle.return_map, cycle.event_sequence
-    s, period = map.structure, map.expected
+    map = cycle.return_map
+    s = map.structure
+    xp = namespace(flow.q)
     levels, scatter = _at_events(s, guards, resets)
-    xp, jumps = namespace(flow.q), flow.jumps
-    (P, _, d), clocked, f = flow.q.shape, map.base is None, flow.field[0, 0]
-    names = [s.transitions[g].name for g in events] or (
-        [] if clocked else [str(map.base)]
-    )
-    n, E = d + 1 + len(names), len(names)
-    sizes = map.scale[flow.chart]
-    # Noise in the states, collected over each piece.
-    B, (free, _) = _columns(s, flow, white), flow.forward
-    turned = xp.swapaxes(flow.adjoint, -1, -2) @ B
-    weight = (flow.length[:, None] * rule().weights)[..., None, None]
-    collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
-    # Noise of events, and what each makes of the states before, of the delay of the last event,
-    # and of durations.
-    hit, delay = flow.event >= 0, jumps.delay_by_state
-    if not (clocked or events):  # the section is the event
-        hit, delay = put(hit, -1, True), put(delay, -1, section_delay(map, f)[0])
-    slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(E)) & hit[:, None]
-    each, none = slot[..., None], xp.zeros((P, d, 1 + E))
-    jump = xp.block(
-        [
-            [jumps.by_state, none],
-            [delay[:, None], 1.0 - hit[:, None, None], none[:, :1, 1:]],
-            [each * delay[:, None], -1.0 * each, (1.0 - each) * np.eye(E)],
-        ]
-    )
-    late = xp.asarray(levels)[flow.event] * jumps.delay_by_level
-    late = late[:, None] * xp.concatenate([jumps.slip, xp.ones((P, 1)), slot], axis=1)
-    added = late[:, :, None] * late[:, None]
-    added += _pad(xp.asarray(scatter)[flow.event][:, :, None] ** 2 * np.eye(d), n)
-    forward = _pad(free[:, -1], n) + np.diag(np.arange(n) >= d)
-
-    def turn(carry, piece):
-        forward, collected, jump, added = piece
-        (M, C), after = carry, forward @ carry[1] @ forward.T + collected
-        return (jump @ forward @ M, jump @ after @ jump.T + added), (M, C, after)
-
-    pieces = forward, _pad(collected, n), jump, added
-    (M, Q), (begin, *_) = scan(turn, (xp.eye(n), xp.zeros((n, n))), pieces)
-    M = xp.where(xp.append(map.valid, xp.ones(n - d, bool))[:, None], M, 0.0)
-    _, Z = loop(map, M[:d, :d], f)
-    spread, to_end = Z @ Q[:d, :d] @ Z, flow.covectors(xp.eye(d))
-    reached = spread > _rounding(Z, Q[:d, :d], map.sizes)
-    diffusion = xp.where(reached, spread / period, 0.0)
+    events = _events(cycle, flow, levels)
+    names = _names_of_events(cycle)
+    columns = _columns(s, flow, white)
+    pieces = _pieces(flow, events, columns, scatter)
+    n = pieces.forward.shape[-1]
+    d = flow.q.shape[-1]
+    (turn, noise), (begin, *_) = _around(pieces, xp.zeros((n, n)))
+    valid = xp.append(map.valid, xp.ones(n - d, bool))
+    turn = xp.where(valid[:, None], turn, 0.0)
+    field = flow.field[0, 0]
+    _, phase = loop(map, turn[:d, :d], field)
+    diffusion = _diffusion(map, phase, noise[:d, :d])
     # (A state ahead of the cycle meets the next events earlier.)
-    ahead = xp.concatenate([-f, xp.ones(1), xp.zeros(E)])
-    last = xp.eye(n) + ahead[:, None] * xp.append(Z, xp.zeros(n - d))
-    across = np.eye(d) - flow.field[..., None] * (to_end @ Z)[..., None, :]
-    step, Q = last @ M, last @ Q @ last.T
-    states, noise = step[:d, :d], Q[:d, :d]
-    if (
-        on_host(step)
-        and not np.abs(np.linalg.eigvals(states)).max(initial=0.0) < 1 - SINGULAR
-    ):
-        raise ComputationError(
-            "noise drives deviations away, because the cycle is not stable."
-        )
-    joint = xp.linalg.solve(np.eye(d * d) - xp.kron(states, states), noise.ravel())
-    joint = _pad(joint.reshape(d, d), n)
-    for _ in range(
-        2
-    ):  # durations follow from the states of this turn and from the last
-        joint = step @ joint @ step.T + Q
-    _, (_, C, after) = scan(turn, (xp.eye(n), joint), pieces)
-    inward = solve(free, B)
-    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
-    integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
-    whole = xp.einsum("ij,pjab->piab", integral, rate)
-    C = free @ (C[:, None, :d, :d] + whole) @ xp.swapaxes(free, -1, -2)
-    off = xp.max(xp.abs(C[:, -1] - after[:, :d, :d]), axis=0)
-    size = xp.sqrt(xp.max(xp.abs(xp.diagonal(C, axis1=2, axis2=3)), axis=(0, 1)))
-    unresolved = xp.max(off / xp.maximum(size[:, None] * size, 1e-300))
-    C = across @ C @ xp.swapaxes(across, -1, -2)
-    variance = xp.diagonal(C, axis1=2, axis2=3) / sizes[:, None] ** 2
-    random = variance > _ROUNDING**2 * xp.max(variance)
-    C = xp.where(random[..., None] & random[..., None, :], C, 0.0)
-    # A delay of an event counts for the durations before and after it.
-    before, by_level = after[:, :d, :d], xp.asarray(levels)[flow.event]
-    late = xp.sum(xp.einsum("pi,pij->pj", delay, before) * delay, axis=-1)
-    of_chance = xp.stack(
-        [_rounding(*x) for x in zip(delay, before, sizes, strict=True)]
-    )
-    by_noise = hit & ((late > of_chance) | (by_level * jumps.delay_by_level != 0))
-    late_ends = xp.any(by_noise[:, None] & slot, axis=0)
-    varies = late_ends | xp.roll(late_ends, 1)
-    to_end = last[:d, :d] @ xp.swapaxes(to_end, -1, -2)
+    ahead = xp.concatenate([-field, xp.ones(1), xp.zeros(n - d - 1)])
+    across = xp.eye(n) + ahead[:, None] * xp.append(phase, xp.zeros(n - d))
+    step = across @ turn
+    noise = across @ noise @ across.T
+    joint = _stationary(step, noise, d)
+    _, (_, before_pieces, before_events) = _around(pieces, joint)
+    before_events = before_events[:, :d, :d]
+    at_nodes = _within_pieces(flow, columns, before_pieces[:, :d, :d])
+    unresolved = _largest_difference(at_nodes, before_events)
+    to_end = flow.covectors(xp.eye(d))
+    along = flow.field[..., None] * (to_end @ phase)[..., None, :]
+    across_nodes = np.eye(d) - along
+    at_nodes = across_nodes @ at_nodes @ xp.swapaxes(across_nodes, -1, -2)
+    sizes = map.scale[flow.chart]
+    free, _ = flow.forward
     return Fluctuations(
         diffusion,
         tuple(names),
         s,
         flow,
-        period,
+        map.expected,
         step,
         joint,
-        varies,
-        C,
+        _varying_durations(events, before_events, sizes),
+        _without_rounding(at_nodes, sizes),
         unresolved,
-        across @ free @ begin[:, None, :d, :d],
-        to_end,
+        across_nodes @ free @ begin[:, None, :d, :d],
+        across[:d, :d] @ xp.swapaxes(to_end, -1, -2),
     )
+
+
+def _names_of_events(cycle: Any) -> list[str]:
+    """Names of the events of a turn; of its section for an autonomous cycle without events."""
+    map = cycle.return_map
+    names = [map.structure.transitions[g].name for g in cycle.event_sequence]
+    if names or map.base is None:
+        return names
+    return [str(map.base)]
+
+
+def _events(cycle: Any, flow: LinearFlow, levels: np.ndarray) -> _Events:
+    """The events of a cycle, with the section in place of one for an autonomous cycle without any.
+
+    `levels`: standard deviations of levels, by index of the transition."""
+    map = cycle.return_map
+    xp = namespace(flow.q)
+    hit = flow.event >= 0
+    delay = flow.jumps.delay_by_state
+    if map.base is not None and not cycle.event_sequence:
+        hit = put(hit, -1, True)
+        delay = put(delay, -1, section_delay(map, flow.field[0, 0])[0])
+    delay_by_noise = xp.asarray(levels)[flow.event] * flow.jumps.delay_by_level
+    count = len(_names_of_events(cycle))
+    slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(count)) & hit[:, None]
+    return _Events(hit, delay, delay_by_noise, slot)
+
+
+def _pieces(
+    flow: LinearFlow,
+    events: _Events,
+    columns: Float[Array, "P K d r"],
+    scatter: Float[np.ndarray, "G d"],
+) -> _Pieces:
+    """The pieces of a turn. `columns`: effects of white noise on the states; `scatter`: standard
+    deviations of states after events, by index of the transition."""
+    xp = namespace(flow.q)
+    P, _, d = flow.q.shape
+    E = events.slot.shape[-1]
+    n = d + 1 + E
+    turned = xp.swapaxes(flow.adjoint, -1, -2) @ columns
+    weight = (flow.length[:, None] * rule().weights)[..., None, None]
+    collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
+    free, _ = flow.forward
+    forward = _pad(free[:, -1], n) + np.diag(np.arange(n) >= d)
+    # An event begins a delay of its own, and ends a duration, from the delay before to its own.
+    none = xp.zeros((P, d, 1 + E))
+    each = events.slot[..., None]
+    delay = events.delay[:, None]
+    kept = 1.0 - events.hit[:, None, None]
+    jump = xp.block(
+        [
+            [flow.jumps.by_state, none],
+            [delay, kept, none[:, :1, 1:]],
+            [each * delay, -1.0 * each, (1.0 - each) * np.eye(E)],
+        ]
+    )
+    by_delay = xp.concatenate([flow.jumps.slip, xp.ones((P, 1)), events.slot], axis=1)
+    late = events.delay_by_noise[:, None] * by_delay
+    scattered = xp.asarray(scatter)[flow.event][:, :, None] ** 2 * np.eye(d)
+    added = late[:, :, None] * late[:, None] + _pad(scattered, n)
+    return _Pieces(forward, _pad(collected, n), jump, added)
+
+
+def _around(pieces: _Pieces, covariance: Float[Array, "n n"]):
+    """One turn from deviations with this covariance: its derivative and the covariance after it;
+    and these two before each piece, with the covariance before each event."""
+
+    def over_piece(carry, piece):
+        forward, collected, jump, added = piece
+        derivative, covariance = carry
+        before_event = forward @ covariance @ forward.T + collected
+        after = jump @ forward @ derivative, jump @ before_event @ jump.T + added
+        return after, (derivative, covariance, before_event)
+
+    begin = namespace(covariance).eye(len(covariance)), covariance
+    return scan(over_piece, begin, tuple(pieces))
+
+
+def _diffusion(
+    map: Any, phase: Float[Array, " d"], noise: Float[Array, "d d"]
+) -> Float[Array, ""]:
+    """Growth of the variance of the phase per time. `phase`: its gradient; `noise`: covariance
+    that a turn adds to the states."""
+    xp = namespace(noise)
+    spread = phase @ noise @ phase
+    reached = spread > _rounding(phase, noise, map.sizes)
+    return xp.where(reached, spread / map.expected, 0.0)
+
+
+def _stationary(
+    step: Float[Array, "n n"], noise: Float[Array, "n n"], d: int
+) -> Float[Array, "n n"]:
+    """The covariance that a turn keeps, which has this effect and adds this noise: first of the d
+    states, whose deviations alone last for more than a turn.
+
+    **Raises:** `ComputationError` for a cycle that is not stable.
+    """
+    xp = namespace(step)
+    states = step[:d, :d]
+    if on_host(step):
+        largest = np.abs(np.linalg.eigvals(states)).max(initial=0.0)
+        if not largest < 1 - SINGULAR:
+            raise ComputationError(
+                "noise drives deviations away, because the cycle is not stable."
+            )
+    lyapunov = np.eye(d * d) - xp.kron(states, states)
+    of_states = xp.linalg.solve(lyapunov, noise[:d, :d].ravel())
+    joint = _pad(of_states.reshape(d, d), len(step))
+    # Durations follow from the states of this turn and from those of the last one.
+    for _ in range(2):
+        joint = step @ joint @ step.T + noise
+    return joint
+
+
+def _within_pieces(
+    flow: LinearFlow,
+    columns: Float[Array, "P K d r"],
+    before: Float[Array, "P d d"],
+) -> Float[Array, "P K d d"]:
+    """Covariances of the states at the nodes of pieces, from those before the pieces."""
+    xp = namespace(before)
+    free, _ = flow.forward
+    inward = solve(free, columns)
+    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
+    integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
+    collected = xp.einsum("ij,pjab->piab", integral, rate)
+    return free @ (before[:, None] + collected) @ xp.swapaxes(free, -1, -2)
+
+
+def _largest_difference(
+    at_nodes: Float[Array, "P K d d"], ends: Float[Array, "P d d"]
+) -> Float[Array, ""]:
+    """Largest difference of covariances at the ends of pieces, relative to those on the cycle."""
+    xp = namespace(ends)
+    difference = xp.max(xp.abs(at_nodes[:, -1] - ends), axis=0)
+    variance = xp.abs(xp.diagonal(at_nodes, axis1=2, axis2=3))
+    size = xp.sqrt(xp.max(variance, axis=(0, 1)))
+    # (States that no noise reaches have no size.)
+    return xp.max(difference / xp.maximum(size[:, None] * size, 1e-300))
+
+
+def _without_rounding(
+    covariance: Float[Array, "P K d d"], sizes: Float[Array, "P d"]
+) -> Float[Array, "P K d d"]:
+    """Covariances with zeros for states that noise does not reach."""
+    xp = namespace(covariance)
+    variance = xp.diagonal(covariance, axis1=2, axis2=3) / sizes[:, None] ** 2
+    random = variance > _ROUNDING**2 * xp.max(variance)
+    return xp.where(random[..., None] & random[..., None, :], covariance, 0.0)
+
+
+def _varying_durations(
+    events: _Events, before: Float[Array, "P d d"], sizes: Float[Array, "P d"]
+) -> Bool[Array, " E"]:
+    """Whether noise reaches each duration. `before`: covariances of the states before events."""
+    xp = namespace(before)
+    by_states = xp.einsum("pi,pij->pj", events.delay, before)
+    variance = xp.sum(by_states * events.delay, axis=-1)
+    of_piece = zip(events.delay, before, sizes, strict=True)
+    rounding = xp.stack([_rounding(*x) for x in of_piece])
+    varies = events.hit & ((variance > rounding) | (events.delay_by_noise != 0))
+    late_ends = xp.any(varies[:, None] & events.slot, axis=0)
+    # A delay of an event counts for the durations before and after it.
+    return late_ends | xp.roll(late_ends, 1)
 
 
 def _rounding(
@@ -244,6 +381,7 @@ def _rounding(
 
 
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
+    """Matrices with zeros for further rows and columns."""
     more = n - x.shape[-1]
     return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
 
@@ -256,22 +394,25 @@ def _columns(
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
     names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
     of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
-    direct = surface(s, flow) @ (of_states[flow.chart][:, None, :, None] * np.eye(s.d))
-    driven = flow.by_input * np.array([white.get(x, 0.0) for x in s.inputs])
-    return xp.concatenate([direct, driven], axis=-1)
+    of_inputs = np.array([white.get(x, 0.0) for x in s.inputs])
+    alone = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
+    direct = surface(s, flow) @ alone
+    return xp.concatenate([direct, flow.by_input * of_inputs], axis=-1)
 
 
-def _at_events(s: Structure, guards: Strengths, resets: Resets):
-    """Standard deviations of levels and of states after events, by index of the transition."""
-    names = [x.name for x in s.transitions]
-    for argument, given in (("guards", guards), ("resets", resets)):
-        require_among("transition", given, names, f"`{argument}`: ")
+def _at_events(
+    s: Structure, guards: Strengths, resets: Resets
+) -> tuple[Float[np.ndarray, " G+1"], Float[np.ndarray, "G+1 d"]]:
+    """Standard deviations of levels, and of states after events, by index of the transition. The
+    last ones are zero, for no transition."""
+    names = [transition.name for transition in s.transitions]
+    require_among("transition", guards, names, "`guards`: ")
+    require_among("transition", resets, names, "`resets`: ")
+    levels = np.array([*(guards.get(name, 0.0) for name in names), 0.0])
     scatter = np.zeros((len(names) + 1, s.d))
-    for row, x in zip(scatter, s.transitions, strict=False):
-        states, chosen = (
-            s.charts[s.chart_index(x.target)].states,
-            resets.get(x.name, {}),
-        )
-        require_among("state", chosen, states, f"`resets`: after '{x.name}' ")
-        row[: len(states)] = [chosen.get(y, 0.0) for y in states]
-    return np.array([*(guards.get(x, 0.0) for x in names), 0.0]), scatter
+    for row, transition in zip(scatter, s.transitions, strict=False):
+        states = s.charts[s.chart_index(transition.target)].states
+        chosen = resets.get(transition.name, {})
+        require_among("state", chosen, states, f"`resets`: after '{transition.name}' ")
+        row[: len(states)] = [chosen.get(state, 0.0) for state in states]
+    return levels, scatter

@@ -78,76 +78,101 @@ def return_map_near(
     **Raises:** `DefinitionError` for a guess that does not fit the system; `ComputationError` if
     the flow does not lead from it to the section and back, or nothing moves.
     """
-    system, period = s.system, s.system.period()
-    # (JAX would compile each operation on numbers of its own.)
-    near = lambda x: np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x  # noqa: E731
-    guess = jax.tree_util.tree_map(near, system).guess() if guess is None else guess
+    guess = _own_guess(s.system) if guess is None else guess
+    lane = lane_at(s, guess.chart, guess.state, guess.time, "the guess")
+    _check_event_before(s, guess)
+    _check_field(s, guess, lane)
+    lanes = from_host(lane)
+    given_period = s.system.period()
+    period = None if given_period is None else float(given_period)
+    a = int(lane.chart[0])
+    near = sizes_near(s, a, lane.t[0], lane.q[:, 0], period)
+    settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
+    charts = np.arange(len(s.charts))
+    times = np.repeat(lane.t, len(charts))
+    check_claims(s, times, charts, near.points.T, settings.scale, near.time)
+    map = ReturnMap(s.system, settings, lanes, None, real(np.nan), {}, multiplicity)
+    if settle:
+        map = _settled(map, float(settle), period)
+    if period is not None:
+        return dataclasses.replace(map, expected=real(multiplicity * period))
+    base = section
+    if base is None and guess.after is not None:
+        base = AtEvent(guess.after)
+    is_after = section is None and not settle
+    return _on_section(map, base, is_after, near.time, max_period)
+
+
+def _own_guess(system: HybridSystem) -> Guess:
+    """The guess of the model.
+
+    **Raises:** `DefinitionError` if it has none.
+    """
+
+    def of_host(x):
+        # (JAX would compile each operation on numbers of its own.)
+        return np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x
+
+    guess = jax.tree_util.tree_map(of_host, system).guess()
     if guess is None:
         raise DefinitionError(
             f"{type(system).__name__} has no guess: pass `Guess(chart, state)`."
         )
-    time, (a,), q, *_ = lanes = lane_at(
-        s, guess.chart, guess.state, guess.time, "the guess"
-    )
-    if guess.after is not None:
-        event = s.transitions[s.transition_index(guess.after)]
-        if event.target != guess.chart:
-            raise DefinitionError(
-                f"the guess is in chart '{guess.chart}', but the event '{event.name}', after which "
-                f"it is said to be, leads to chart '{event.target}'."
-            )
-    rate = kernels.field(s, a, time, q[: s.dims[a]], np.zeros((s.nu, 1)))[:, 0, 0]
+    return guess
+
+
+def _check_event_before(s: Structure, guess: Guess) -> None:
+    """**Raises:** `DefinitionError` for a guess after an event that leads to another chart."""
+    if guess.after is None:
+        return
+    event = s.transitions[s.transition_index(guess.after)]
+    if event.target != guess.chart:
+        raise DefinitionError(
+            f"the guess is in chart '{guess.chart}', but the event '{event.name}', after which "
+            f"it is said to be, leads to chart '{event.target}'."
+        )
+
+
+def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
+    """**Raises:** `DefinitionError` for a guess at which the field is not finite."""
+    a = int(lane.chart[0])
+    u = np.zeros((s.nu, 1))
+    rate = kernels.field(s, a, lane.t, lane.q[: s.dims[a]], u)[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
             f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
             "elsewhere, or look for a division by zero or a mass matrix that is singular or not "
             "positive."
         )
-    lanes = from_host(lanes)
-    near = sizes_near(s, a, time[0], q[:, 0], None if period is None else float(period))
-    settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
-    charts = np.arange(len(s.charts))
-    check_claims(
-        s,
-        np.repeat(time, len(charts)),
-        charts,
-        near.points.T,
-        settings.scale,
-        near.time,
-    )
-    map = ReturnMap(system, settings, lanes, None, real(np.nan), {}, multiplicity)
-    if settle:
-        say("settling")
-        wait = (
-            float(settle)
-            if period is None
-            else np.ceil(settle / period) * float(period)
-        )
-        end = np.asarray(lanes.t) + wait
-        lanes = _go(map, "settling", lanes, toward(end, -1, end))
-        if period is not None:
-            lanes = lanes._replace(t=real(np.asarray(lanes.t) - wait))
-        map = dataclasses.replace(map, anchor=lanes)
+
+
+def _settled(map: ReturnMap, settle: float, period: float | None) -> ReturnMap:
+    """The map at the state to which the flow leads in some time; a clocked one after whole periods,
+    at the same time of the clock."""
+    say("settling")
+    lanes = map.anchor
+    wait = settle if period is None else np.ceil(settle / period) * period
+    end = np.asarray(lanes.t) + wait
+    lanes = _go(map, "settling", lanes, toward(end, -1, end))
     if period is not None:
-        return dataclasses.replace(map, expected=real(multiplicity * float(period)))
-    after = None if guess.after is None else AtEvent(guess.after)
-    base = after if section is None else section
-    return _on_section(
-        map, base, bool(section is None and not settle), near.time, max_period
-    )
+        lanes = lanes._replace(t=real(np.asarray(lanes.t) - wait))
+    return dataclasses.replace(map, anchor=lanes)
 
 
 def _patience(map: ReturnMap, lanes: Lanes) -> float:
     """The time after which a search for a section is given up at a lane."""
-    s, lane = map.structure, to_host(lanes)
-    a, t = int(lane.chart[0]), float(lane.t[0])
+    s = map.structure
+    lane = to_host(lanes)
+    a = int(lane.chart[0])
+    t = float(lane.t[0])
     near = sizes_near(s, a, t, lane.q[:, 0], None)
     return _PATIENCE * max(near.time, slow_time(s, t, near.points))
 
 
 def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     """Test whether a mode decays at a lane."""
-    s, lane = map.structure, to_host(lanes)
+    s = map.structure
+    lane = to_host(lanes)
     a = int(lane.chart[0])
     return bool(fastest(s, a, lane.t, lane.q[: s.dims[a]])[0] > 0)
 
@@ -168,7 +193,9 @@ def _on_section(
     states at the anchor and where the search ends. `last`: whether to give up if the default plane
     is missed; otherwise a plane through the state to which the flow has led is the next.
     """
-    s, lanes, at_guess = map.structure, map.anchor, map
+    s = map.structure
+    at_guess = map
+    lanes = map.anchor
     a = int(np.asarray(lanes.chart)[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
     f, level, rate = jax.device_get(_at_anchor(dataclasses.replace(map, base=section)))
@@ -178,56 +205,28 @@ def _on_section(
             f"the search starts at an equilibrium of chart '{s.names[a]}', {q}, from where nothing "
             "moves: start elsewhere."
         )
-    place, advice = str(section), ""
+    place = str(section)
+    advice = ""
     on_section = rate < 0 and abs(level) <= -SAME * time * rate  # up to rounding
     if isinstance(section, AtEvent):
         on_section = is_after
     if section is None:
-        sizes = np.asarray(map.settings.scale)[a, : s.dims[a]]
-        plane = _Plane(real(q), real(f / sizes**2 / np.linalg.norm(f / sizes)))
-        section, on_section = Crossing(plane, "rising", charts=(s.names[a],)), True
+        section = _across(map, a, q, f)
+        on_section = True
         place = "through the guess, across the flow"
-        events = [f"AtEvent({transition.name!r})" for transition in s.transitions]
-        example = [*events, f"Crossing({s.state_names()[0]!r}, 'rising')"][0]
-        advice = (
-            f"Choose a section that each turn crosses once, e.g. `section={example}`. "
-        )
+        advice = _another_section(s)
     map = dataclasses.replace(map, base=section)
-
-    def missed(moved):
-        return int(np.asarray(moved.result)[0]) == Result.SECTION_MISSED
-
-    def next_crossing(lanes):
-        wait = _patience(map, lanes) if max_period is None else max_period
-        begin = float(np.asarray(lanes.t)[0])
-        for _ in range(_LOOKS):
-            target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
-            moved = _moved(map, lanes, to_section(target, section, map.event))
-            waited = float(np.asarray(moved.lanes.t)[0]) - begin
-            if not missed(moved) or max_period is not None:
-                break
-            # (The states may have become slower than they were at the guess, or drift away.)
-            lanes, wait = moved.lanes, _patience(map, moved.lanes) - waited
-            if wait <= 0 or not _decays(map, lanes):
-                break
-        if missed(moved):
-            _require_motion(map, moved.lanes)
-        late = (
-            f"Allow more time than {waited:.3g}, by `max_period`, or for the slow modes of a stiff "
-            'system, take `settings=Settings(solver="auto")`. '
-        )
-        return moved, late
-
     if not on_section:
         doing = "looking for the section"
         say(doing)
-        moved, late = next_crossing(lanes)
+        moved, late = _next_crossing(map, section, lanes, max_period)
         lanes = _arrived(map, f"{doing} ({place})", moved, advice, late)
-    back, doing = lanes, "looking for the return to the section"
+    back = lanes
+    doing = "looking for the return to the section"
     for _ in range(map.multiplicity):
         say(doing)
-        moved, late = next_crossing(back)
-        if is_default(section) and missed(moved) and not last:
+        moved, late = _next_crossing(map, section, back, max_period)
+        if is_default(section) and _misses(moved) and not last:
             say("a section where the flow has led")
             # (A search that is given up may end at an event.)
             end = np.asarray(moved.lanes.t) + _ONWARD * _patience(map, moved.lanes)
@@ -239,17 +238,72 @@ def _on_section(
     return dataclasses.replace(map, anchor=lanes, expected=real(duration))
 
 
+def _across(map: ReturnMap, a: int, q: np.ndarray, f: np.ndarray) -> Crossing:
+    """The plane through a state of chart a that is orthogonal to the field there, in sizes."""
+    sizes = np.asarray(map.scale)[a, : len(q)]
+    normal = f / sizes**2 / np.linalg.norm(f / sizes)
+    plane = _Plane(real(q), real(normal))
+    return Crossing(plane, "rising", charts=(map.structure.names[a],))
+
+
+def _another_section(s: Structure) -> str:
+    """Advice to choose a section, with an example."""
+    example = f"Crossing({s.state_names()[0]!r}, 'rising')"
+    if s.transitions:
+        example = f"AtEvent({s.transitions[0].name!r})"
+    return f"Choose a section that each turn crosses once, e.g. `section={example}`. "
+
+
+def _misses(moved: Moved) -> bool:
+    """Test whether a flow to a section was given up."""
+    return int(np.asarray(moved.result)[0]) == Result.SECTION_MISSED
+
+
+def _next_crossing(
+    map: ReturnMap,
+    section: Crossing | AtEvent,
+    lanes: Lanes,
+    max_period: float | None,
+) -> tuple[Moved, str]:
+    """The flow to the next crossing of a section, and advice if it was given up.
+
+    **Raises:** `ComputationError` if the flow comes to rest before.
+    """
+    wait = _patience(map, lanes) if max_period is None else max_period
+    begin = float(np.asarray(lanes.t)[0])
+    for _ in range(_LOOKS):
+        target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
+        moved = _moved(map, lanes, to_section(target, section, map.event))
+        waited = float(np.asarray(moved.lanes.t)[0]) - begin
+        if not _misses(moved) or max_period is not None:
+            break
+        # (The states may have become slower than they were at the guess, or drift away.)
+        lanes = moved.lanes
+        wait = _patience(map, lanes) - waited
+        if wait <= 0 or not _decays(map, lanes):
+            break
+    if _misses(moved):
+        _require_motion(map, moved.lanes)
+    late = (
+        f"Allow more time than {waited:.3g}, by `max_period`, or for the slow modes of a stiff "
+        'system, take `settings=Settings(solver="auto")`. '
+    )
+    return moved, late
+
+
 def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     """The state right after the event that is rarest within some periods from the anchor on: each
     turn meets it less often than other sections. `None` without events."""
-    s, lanes = map.structure, to_host(map.anchor)
+    s = map.structure
+    lanes = to_host(map.anchor)
     end = lanes.t + periods * float(map.expected)
-    rough = np.array(TRANSIENT)
-    settings = Settings(rough, rough, _RECORDED, to_host(map.settings).scale)
-    options, u = Options(tape=True), np.zeros((s.nu, 1))
-    tape = move(s, lanes, u, until(end), settings, options=options).tape
+    accuracy = np.array(TRANSIENT)
+    settings = Settings(accuracy, accuracy, _RECORDED, to_host(map.settings).scale)
+    u = np.zeros((s.nu, 1))
+    tape = move(s, lanes, u, until(end), settings, options=Options(tape=True)).tape
     assert tape is not None
-    code, follows = np.asarray(tape.code)[:, 0], np.asarray(tape.at_once)[:, 0]
+    code = np.asarray(tape.code)[:, 0]
+    follows = np.asarray(tape.at_once)[:, 0]
     # (A section at an event that another one follows at once is refused.)
     happens = (code >= 0) & ~np.append(follows[1:], False)
     if not happens.any():
@@ -265,12 +319,16 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
 
 def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     """**Raises:** `ComputationError` if the states of a lane are at rest."""
-    s, lane = map.structure, to_host(lanes)
-    a, t = int(lane.chart[0]), lane.t
+    s = map.structure
+    lane = to_host(lanes)
+    a = int(lane.chart[0])
+    t = lane.t
     n = s.dims[a]
-    by = kernels.field(s, a, t, lane.q[:n], np.zeros((s.nu, 1)))[..., 0]
+    u = np.zeros((s.nu, 1))
+    field = kernels.field(s, a, t, lane.q[:n], u)[..., 0]
     sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
-    rate, jacobian = by[:, 0] / sizes, by[:, 2 : 2 + n] * sizes / sizes[:, None]
+    rate = field[:, 0] / sizes
+    jacobian = field[:, 2 : 2 + n] * sizes / sizes[:, None]
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):
@@ -282,7 +340,7 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     beyond = []
     guards = s.guards(a)
     if guards:
-        u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+        first = np.zeros(1, np.int32)
         levels = kernels.watched(s, a, None, t, lane.q[:n], u, first)[:, 0, 0]
         passed = [g for g, level in zip(guards, levels, strict=True) if level < 0]
         beyond = [f"'{s.transitions[g].name}'" for g in passed]
@@ -321,7 +379,8 @@ def _arrived(
     """
     result = Result(int(np.asarray(moved.result)[0]))
     if result != Result.OK:
-        lanes, s = to_host(moved.lanes), map.structure
+        lanes = to_host(moved.lanes)
+        s = map.structure
         advice += if_late if result == Result.SECTION_MISSED else ""
         raise ComputationError(
             f"{doing} failed at t = {float(lanes.t[0]):.6g} in chart "
@@ -333,7 +392,8 @@ def _arrived(
 
 @host_first
 def _moved(map: ReturnMap, lanes: Lanes, target: Target) -> Moved:
-    settings = Settings(np.array(TRANSIENT), np.array(TRANSIENT), 1_000_000, map.scale)
+    accuracy = np.array(TRANSIENT)
+    settings = Settings(accuracy, accuracy, 1_000_000, map.scale)
     u = namespace(lanes.t).zeros((map.structure.nu, 1))
     return move(map.structure, lanes, u, target, settings).moved
 

@@ -66,22 +66,25 @@ def sizes_near(
     """
     points = _reached(s, chart, t, q)
     reached = np.flatnonzero(np.isfinite(points).all(axis=1))
-    reached = np.roll(
-        reached, -int(np.argmax(reached == chart))
-    )  # the guess's chart first
+    # The guess's chart comes first.
+    reached = np.roll(reached, -int(np.argmax(reached == chart)))
     # Of the clock's phases an odd number, since an even one may repeat a symmetry.
     phases = np.zeros(1) if period is None else period * np.arange(7) / 7
-    R, n = len(reached), len(phases)
-    times, states = np.repeat(float(t) + phases, R), np.tile(points[reached].T, n)
-    fields = _fields(s, np.tile(reached, n), times, states)
-    q, near = states[:, :R], _Fields(*(x[..., :R] for x in fields))
-    time = _time_scale(q, near)
+    R = len(reached)
+    times = np.repeat(float(t) + phases, R)
+    charts = np.tile(reached, len(phases))
+    fields = _fields(s, charts, times, points[charts].T)
+    states = points[reached].T
+    near = _Fields(*(x[..., :R] for x in fields))
+    time = _time_scale(states, near)
     turn = _MODES * time
     if period is not None:
-        turn, time = period, min(time, period / (2 * np.pi))
-    size = np.abs(q) + time * np.abs(near.f) + time**2 * np.abs(near.change)
-    floor = (_TIMES_ROUNDING * turn * fields.rounding).reshape(s.d, n, R).max(axis=1)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, floor)), time, points)
+        turn = period
+        time = min(time, period / (2 * np.pi))
+    size = np.abs(states) + time * np.abs(near.f) + time**2 * np.abs(near.change)
+    floor = _TIMES_ROUNDING * turn * fields.rounding
+    largest = floor.reshape(s.d, len(phases), R).max(axis=1)
+    return GuessSizes(_by_name(s, reached, np.maximum(size, largest)), time, points)
 
 
 def sizes_on(s: Structure, lanes: Lanes, period: float) -> Sizes:
@@ -117,18 +120,19 @@ def scale_of(
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     """Sizes by name, from `Settings.scale`."""
-    by_chart, charts = np.asarray(scale), list(enumerate(s.charts))
-    return {
-        n: float(by_chart[a, k])
-        for a, c in reversed(charts)
-        for k, n in enumerate(c.states)
-    }
+    sizes = {}
+    # (A state that several charts have takes the size of the first.)
+    for a in reversed(range(len(s.charts))):
+        names = s.charts[a].states
+        sizes |= dict(zip(names, np.asarray(scale)[a].tolist(), strict=False))
+    return sizes
 
 
 def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
     """The charts with explicit methods that are stiff on a cycle, each with the rate of its fastest
     mode. `legs`: states at equal distances in time, of a turn in this period."""
-    stiff, step = {}, period / len(np.ravel(legs.t))
+    stiff = {}
+    step = period / len(np.ravel(legs.t))
     for a, t, q in points(s, legs):
         rates = fastest(s, a, t, q)
         if step * rates.sum() > STIFF and not is_implicit(s, a):
@@ -206,21 +210,19 @@ def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
 
 
 def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
-    n, eps = len(q), np.finfo(float).eps
+    n = len(q)
+    eps = np.finfo(float).eps
     # First no shift, then states (not all by the same part, which may cancel), then t.
     shifts = np.zeros((n, 1 + 2 * len(_SHIFTS)))
     shifts[:, 1 : len(_SHIFTS) + 1] = [np.roll(_SHIFTS, k) for k in range(n)]
     moved = q[..., None] * (1 + eps * shifts[:, None])
     later = t[:, None] * (1 + eps * np.append(np.zeros(len(_SHIFTS) + 1), _SHIFTS))
     u = np.zeros((s.nu, 1))
-    rows = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u).reshape(
-        n, -1, *later.shape
-    )
-    values, by_time, derivative = (
-        rows[:, 0],
-        rows[:, 1, :, :1],
-        rows[:, 2 : 2 + n, :, 0],
-    )
+    rows = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u)
+    rows = rows.reshape(n, -1, *later.shape)
+    values = rows[:, 0]
+    by_time = rows[:, 1, :, :1]
+    derivative = rows[:, 2 : 2 + n, :, 0]
     f = values[..., 0]
     change = by_time[..., 0] + np.einsum("ijk,jk->ik", derivative, f)
     smooth = np.einsum("ijk,jks->iks", derivative, moved - q[..., None])
@@ -230,24 +232,27 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     by_state, in_time = np.split(off, [len(_SHIFTS) + 1], axis=-1)
     in_time = in_time - 2 * eps * np.abs(by_time * t[:, None])
     # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
-    sides = [x.max(axis=-1) for x in np.split(in_time, 2, axis=-1)]
-    rounding = np.maximum(
-        by_state.max(axis=-1), np.minimum(*sides)
-    )  # without a shift it is zero
+    earlier_and_later = [x.max(axis=-1) for x in np.split(in_time, 2, axis=-1)]
+    rounding = np.maximum(by_state.max(axis=-1), np.minimum(*earlier_and_later))
     return _Fields(f, change, derivative, rounding)
 
 
 def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
     """A state in every chart, by resets from the guess's; NaN in charts that none leads to."""
     states = np.full((len(s.charts), s.d), np.nan)
-    states[chart], reached = q, {chart}
+    states[chart] = q
+    reached = {chart}
+    time = np.array([t])
+    u = np.zeros((s.nu, 1))
     for _ in s.charts:
         for g, transition in enumerate(s.transitions):
-            a, b = s.chart_index(transition.source), s.chart_index(transition.target)
+            a = s.chart_index(transition.source)
+            b = s.chart_index(transition.target)
             if a in reached and b not in reached:
-                point = np.array([t]), states[a, : s.dims[a], None], np.zeros((s.nu, 1))
-                after = kernels.reset(s, s.member(g), *point)[:, 0, 0]
-                states[b], reached = np.pad(after, (0, s.d - len(after))), reached | {b}
+                before = states[a, : s.dims[a], None]
+                after = kernels.reset(s, s.member(g), time, before, u)[:, 0, 0]
+                states[b] = np.pad(after, (0, s.d - len(after)))
+                reached.add(b)
     return states
 
 
@@ -255,7 +260,8 @@ def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
     """The time of the fastest mode of the field's derivative at the first point that has one (the
     guess comes first); in free flight, the time in which a state changes by its size."""
     for derivative in np.moveaxis(near.derivative, -1, 0):
-        if (rate := np.max(np.abs(np.linalg.eigvals(derivative)))) > 0:
+        rate = np.max(np.abs(np.linalg.eigvals(derivative)))
+        if rate > 0:
             return 1 / float(rate)
     q, f, change = (np.abs(x[:, 0]) for x in (q, near.f, near.change))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.findings import Finding
 from .._core.memo import Memory
@@ -34,15 +34,19 @@ from .walk import ROUGH, Stretch, Walked, walk
 
 
 # Largest distance, in sizes of the states, between the walk and a point of the cycle; of cycles
-# that are computed with larger errors, this multiple of the error of a step. Larger: wrong cycles
+# that are computed with larger errors, `_STEPS` times the error of a step. Larger: wrong cycles
 # pass. Smaller: errors of steps that add up are taken for faults.
-_APART, _STEPS = 1e-6, 1e4
+_APART = 1e-6
+_STEPS = 1e4
 # Largest difference of sums of powers of multipliers of the two integrations, relative to their
 # size. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken for faults.
 _DIFFERENT = 1e-4
 # A guard is beyond zero if its value exceeds the change that deviations of this size, in sizes of
 # the states, could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
 _BEYOND = 1e-6
+# The same for the time of an event, as a part of the period. Larger: an event beside its guard
+# passes. Smaller: rounding errors of times are called faults.
+_LATE = 1e-10
 # The shortest visit of a chart, in periods, in which guards are watched. Shorter: rounding decides
 # on the side of guards between events that nearly coincide.
 _SHORT = 1e-9
@@ -154,19 +158,19 @@ def visits_of(cycle) -> list[Visit]:
 
 
 def _verdict(cycle) -> Verdict:
-    s, period = cycle.structure, float(cycle.period)
+    s = cycle.structure
+    period = float(cycle.period)
     scale = np.asarray(cycle.settings.scale)
     path = _walk_along(cycle)
     visits = _visits(s, path)
-    findings = [*path.findings]
     long = [visit for visit in visits if visit.t[-1] - visit.t[0] > _SHORT * period]
     never = set(range(len(s.transitions))) - set(cycle.event_sequence)
-    findings += _beyond_guards(s, long, never, scale)
+    findings = [*path.findings, *_beyond_guards(s, long, never, scale)]
     for visit in long:
         findings += _passed_guards(s, visit, scale)
         findings += _skipped_schedules(s, visit)
-    sooner, apart = None, np.nan
     accurate = path.error <= ROUGH
+    sooner = None
     if accurate:
         findings += _departure(cycle, path)
         sooner = _closes_sooner(cycle, path)
@@ -175,7 +179,9 @@ def _verdict(cycle) -> Verdict:
     if sooner is not None:
         findings.append(_shorter(sooner, period))
     findings += _rest(s, path, scale)
-    if accurate and s.d <= _MANY and not any(x.action == "refused" for x in findings):
+    apart = np.nan
+    refused = any(finding.action == "refused" for finding in findings)
+    if accurate and s.d <= _MANY and not refused:
         apart = _apart(cycle, path.monodromy)
         findings += _other_multipliers(apart)
     return Verdict(
@@ -190,32 +196,35 @@ def _verdict(cycle) -> Verdict:
 def _walk_along(cycle) -> _Path:
     """Walk along all moves of a cycle side by side, and through the events at their ends."""
     map = cycle.return_map
-    s, scale = map.structure, np.asarray(map.scale)
+    s = map.structure
+    scale = np.asarray(map.scale)
     moves = recorded_moves(*last_turn(cycle))
     t = np.append(moves.t, moves.t[0] + float(cycle.period))
     event = np.maximum(moves.code, -1)
-    length = np.diff(t)
     # (A short move is known to more digits than the times of its ends.)
-    length = np.where(
-        np.abs(moves.h - length) <= 1e-14 * np.abs(t[1:]), moves.h, length
-    )
-    stretch = Stretch(t[:-1], length, moves.chart, moves.q)
-    walked = walk(s, stretch, scale)
-    chart, q = moves.chart.copy(), walked.q.copy()
+    between = np.diff(t)
+    same = np.abs(moves.h - between) <= 1e-14 * np.abs(t[1:])
+    length = np.where(same, moves.h, between)
+    walked = walk(s, Stretch(t[:-1], length, moves.chart, moves.q), scale)
+    chart = moves.chart.copy()
+    q = walked.q.copy()
     by_state = np.moveaxis(walked.by_state, -1, 0).copy()
     findings: list[Finding] = []
     delay = np.zeros(s.d)
     for k in np.flatnonzero(event >= 0):
+        at_once = bool(moves.at_once[k])
         at = float(t[k + 1]), int(chart[k]), q[:, k]
-        jumped = _jump(s, int(event[k]), *at, scale, bool(moves.at_once[k]))
+        span = float(cycle.period)
+        jumped = _jump(s, int(event[k]), *at, scale, span, at_once)
         # (The event before one at once has brought this about, and has delayed it.)
-        before = k - 1 if moves.at_once[k] else k
-        if not moves.at_once[k]:
+        before = k - 1 if at_once else k
+        if not at_once:
             delay = jumped.delay @ by_state[k]
         by_state[before] = jumped.by_state @ by_state[before]
         by_state[before] += np.outer(jumped.slip, delay)
         findings += jumped.findings
-        chart[k], q[:, k] = jumped.chart, jumped.q
+        chart[k] = jumped.chart
+        q[:, k] = jumped.q
     monodromy = np.eye(s.d)
     for of_move in by_state:
         monodromy = of_move @ monodromy
@@ -228,12 +237,17 @@ def _walk_along(cycle) -> _Path:
 def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
     """Largest distance between ends of moves and the points where the moves after them begin."""
     chart, q = ends
-    other_chart, other = points
-    if (chart != other_chart).any():
+    next_chart, begin = points
+    if (chart != next_chart).any():
         return np.inf
-    sizes = np.maximum(scale[chart].T, np.abs(other))
-    exists = np.arange(s.d)[:, None] < np.array(s.dims)[chart]
-    return float(np.max(np.where(exists, np.abs(q - other) / sizes, 0.0)))
+    sizes = np.maximum(scale[chart].T, np.abs(begin))
+    distance = np.abs(q - begin) / sizes
+    return float(np.max(distance, where=_exists(s, chart), initial=0.0))
+
+
+def _exists(s: Structure, chart: Int[np.ndarray, " P"]) -> Bool[np.ndarray, "d P"]:
+    """Which of the padded states of points exist in their charts."""
+    return np.arange(s.d)[:, None] < np.array(s.dims)[chart]
 
 
 class _Jump(NamedTuple):
@@ -252,32 +266,36 @@ class _Jump(NamedTuple):
 
 
 def _jump(
-    s: Structure, g: int, t: float, a: int, q, scale, at_once: bool = False
+    s: Structure, g: int, t: float, a: int, q, scale, span: float, at_once: bool = False
 ) -> _Jump:
     """Event g of a state of chart a, at its own time; or `at_once` after another event, which has
-    led to this state, where its guard is at zero, or beyond."""
-    transition, n = s.transitions[g], s.dims[a]
+    led to this state, where its guard is at zero, or beyond. `span`: the period."""
+    transition = s.transitions[g]
+    n = s.dims[a]
     event = jump(s, g, np.array([t]), q[None, :n], np.zeros((s.nu, 1)))
-    level, rate = event.level[0], event.rate[0]
-    noise = float(_noise(event.gradient[0], scale[a, :n]))
-    delay, findings = np.zeros(s.d), []
-    scheduled = isinstance(transition.guard, Scheduled)
-    if scheduled and not at_once:
-        assert isinstance(transition.guard, Scheduled)
-        late = t - float(transition.guard.nearest(np.array([t]))[0])
-        findings = _off_schedule(transition, t, late)
-    elif not scheduled and not at_once:
-        delay[:n] = event.delay_by_state[0]
-        findings = _off_guard(transition, t, level, rate, noise)
-    elif not scheduled and level > 10 * noise:
-        findings = _off_guard(transition, t, level, -1.0, 0.0)
+    delay = np.zeros(s.d)
+    if isinstance(transition.guard, Scheduled):
+        findings = [] if at_once else _off_schedule(transition, t)
+    else:
+        level = event.level[0]
+        noise = _noise(event.gradient[0], scale[a, :n])
+        if at_once:
+            findings = _not_due(transition, t, level, noise)
+        else:
+            delay[:n] = event.delay_by_state[0]
+            rate = event.rate[0]
+            # (A guard that depends on the time alone has no noise of states.)
+            noise = noise + abs(rate) * _LATE * span
+            findings = _off_guard(transition, t, level, rate, noise)
     m = event.after.shape[1]
-    out, slip, by_state = np.zeros(s.d), np.zeros(s.d), np.zeros((s.d, s.d))
-    out[:m] = event.after[0]
+    after = np.zeros(s.d)
+    slip = np.zeros(s.d)
+    by_state = np.zeros((s.d, s.d))
+    after[:m] = event.after[0]
     slip[:m] = event.slip[0]
     by_state[:m, :n] = event.by_state[0]
-    b = s.chart_index(transition.target)
-    return _Jump(b, out, by_state, slip, delay, findings)
+    chart = s.chart_index(transition.target)
+    return _Jump(chart, after, by_state, slip, delay, findings)
 
 
 def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
@@ -285,18 +303,34 @@ def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
     return _BEYOND * np.tensordot(sizes, np.abs(slope), axes=1)
 
 
-def _off_guard(transition, t: float, level: float, rate: float, noise: float):
+def _off_guard(
+    transition, t: float, level: float, rate: float, noise: float
+) -> list[Finding]:
+    """A finding on an event at which the guard is not zero, or is not crossed in its direction."""
     if abs(level) <= 10 * noise and rate < 0:
         return []
+    return [_without_guard(transition, t, level, rate)]
+
+
+def _not_due(transition, t: float, level: float, noise: float) -> list[Finding]:
+    """A finding on an event at once after another one that has not led to or beyond its guard."""
+    if level > 10 * noise:
+        return [_without_guard(transition, t, level, -1.0)]
+    return []
+
+
+def _without_guard(transition, t: float, level: float, rate: float) -> Finding:
     text = (
         f"the event '{transition.name}' happens at t = {t:.6g}, where its guard is "
         f"{transition.sign * level:.3g} and changes at a rate of {transition.sign * rate:.3g}: it "
         f"should be zero and {transition.direction}."
     )
-    return [Finding("an event without its guard", text, "refused")]
+    return Finding("an event without its guard", text, "refused")
 
 
-def _off_schedule(transition, t: float, late: float):
+def _off_schedule(transition, t: float) -> list[Finding]:
+    """A finding on a scheduled event at another time."""
+    late = t - float(transition.guard.nearest(np.array([t]))[0])
     if abs(late) <= 10 * SAME_TIME * float(transition.guard.period):
         return []
     text = (
@@ -309,36 +343,42 @@ def _off_schedule(transition, t: float, late: float):
 def _visits(s: Structure, path: _Path) -> list[Visit]:
     """The visits of charts on the cycle; one that the beginning of the turn divides is whole."""
     M = len(path.event)
-    ends = np.flatnonzero(path.event >= 0)
     period = path.t[-1] - path.t[0]
-    if not len(ends):
-        groups = [np.arange(M)]
-    else:
-        # (The first visit may begin before the turn, at negative indices.)
-        before = np.append(ends[-1] - M, ends[:-1])
-        groups = [np.arange(a + 1, b + 1) for a, b in zip(before, ends, strict=True)]
     visits = []
-    for group in groups:
-        a = int(path.chart[group[0]])
-        times, states = [], []
-        for k in group:
+    for moves in _moves_of_visits(path.event):
+        times = []
+        states = []
+        for k in moves:
             own = path.walked.lane == k % M
             later = period if k >= 0 else 0.0
             times.append(later + np.append(path.t[k % M], path.walked.t[own]))
-            states.append(
-                np.column_stack([path.begin[:, k % M], path.walked.points[:, own]])
-            )
-        t, q = np.concatenate(times), np.concatenate(states, axis=1)
-        visits.append(Visit(a, t, q[: s.dims[a]], int(path.event[group[-1]])))
+            points = path.begin[:, k % M], path.walked.points[:, own]
+            states.append(np.column_stack(points))
+        a = int(path.chart[moves[0]])
+        q = np.concatenate(states, axis=1)[: s.dims[a]]
+        event = int(path.event[moves[-1]])
+        visits.append(Visit(a, np.concatenate(times), q, event))
     return visits
+
+
+def _moves_of_visits(event: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " m"]]:
+    """The moves of each visit, up to the one that ends with its event. The first visit may begin
+    before the turn, at negative indices."""
+    ends = np.flatnonzero(event >= 0)
+    if not len(ends):
+        return [np.arange(len(event))]
+    before = np.append(ends[-1] - len(event), ends[:-1])
+    return [np.arange(a + 1, b + 1) for a, b in zip(before, ends, strict=True)]
 
 
 def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
     """Guards at the points of a visit, with zero for what may be an error of the walk."""
-    a, n = visit.chart, len(visit.q)
+    a = visit.chart
+    n = len(visit.q)
     if not s.guards(a):
         return np.zeros((0, len(visit.t)))
-    u, first = np.zeros((s.nu, 1)), np.zeros(1, np.int32)
+    u = np.zeros((s.nu, 1))
+    first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
     noise = _noise(np.moveaxis(rows[:, 2 : 2 + n], 0, 1), scale[a, :n])
     return np.where(np.abs(rows[:, 0]) > noise, rows[:, 0], 0.0)
@@ -358,13 +398,11 @@ def _beyond_guards(
             values = np.concatenate([level[k] for level in levels])
             if g not in never or values.max() > 0 or values.min() == 0:
                 continue
-            pairs = zip(here, levels, strict=True)
-            if any(
-                _may_happen(s, g, visit, np.flatnonzero(level[k] < 0))
-                for visit, level in pairs
-                if (level[k] < 0).any()
-            ):
-                yield _beyond(s, s.transitions[g], a, values)
+            for visit, level in zip(here, levels, strict=True):
+                beyond = np.flatnonzero(level[k] < 0)
+                if len(beyond) and _may_happen(s, g, visit, beyond):
+                    yield _beyond(s, s.transitions[g], a, values)
+                    break
 
 
 def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
@@ -391,8 +429,8 @@ def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
     if s.transitions[g].enabled is None:
         return True
     u = np.zeros((s.nu, 1))
-    at = visit.t[points], visit.q[:, points]
-    return bool(kernels.enabled(s, s.member(g), *at, u).any())
+    holds = kernels.enabled(s, s.member(g), visit.t[points], visit.q[:, points], u)
+    return bool(holds.any())
 
 
 def _beyond(s: Structure, transition, a: int, level) -> Finding:
@@ -428,7 +466,8 @@ def _skipped_schedules(s: Structure, visit: Visit) -> Iterable[Finding]:
         if due >= until - 10 * SAME_TIME:
             continue
         time = offset + due * period
-        if not _may_happen(s, g, visit, np.array([np.searchsorted(visit.t, time) - 1])):
+        before = np.array([np.searchsorted(visit.t, time) - 1])
+        if not _may_happen(s, g, visit, before):
             continue
         text = (
             f"the scheduled event '{transition.name}' is due at t = {time:.6g} in chart "
@@ -459,9 +498,10 @@ def _not_walked(path: _Path) -> Finding:
 
 def _rest(s: Structure, path: _Path, scale) -> list[Finding]:
     """A finding on a cycle on which nothing moves but the clock."""
+    if (path.event >= 0).any():
+        return []
     apart = np.abs(path.begin - path.begin[:, :1]) / scale[path.chart].T
-    exists = np.arange(s.d)[:, None] < np.array(s.dims)[path.chart]
-    if (path.event >= 0).any() or np.where(exists, apart, 0.0).max() > _APART:
+    if np.max(apart, where=_exists(s, path.chart), initial=0.0) > _APART:
         return []
     text = (
         "no state moves on the cycle: it is an equilibrium, and only the clock goes on."
@@ -480,18 +520,18 @@ def _shorter(sooner: float, period: float) -> Finding:
 def _closes_sooner(cycle, path: _Path) -> float | None:
     """The time after which the cycle closes, if that is a part of its period."""
     map = cycle.return_map
-    s, period = map.structure, float(cycle.period)
     parts = [p for p in _PRIMES if map.base is not None or cycle.multiplicity % p == 0]
     if not parts:
         return None
-    times = path.t[0] + period / np.array(parts)
+    scale = np.asarray(map.scale)
+    times = path.t[0] + float(cycle.period) / np.array(parts)
     moves = np.searchsorted(path.t, times) - 1
     begins = path.t[moves]
-    stretch = Stretch(begins, times - begins, path.chart[moves], path.begin[:, moves])
-    reached = walk(s, stretch, np.asarray(map.scale)).q
-    sizes = np.asarray(map.scale)[path.chart[0]][:, None]
-    apart = np.max(np.abs(reached - path.begin[:, :1]) / sizes, axis=0)
-    closed = (apart <= _APART) & (stretch.chart == path.chart[0])
+    chart = path.chart[moves]
+    stretch = Stretch(begins, times - begins, chart, path.begin[:, moves])
+    reached = walk(map.structure, stretch, scale).q
+    distance = np.abs(reached - path.begin[:, :1]) / scale[path.chart[0]][:, None]
+    closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])
     return min(times[closed] - path.t[0], default=None)
 
 
@@ -506,11 +546,15 @@ def _apart(cycle, monodromy: Float[np.ndarray, "d d"]) -> float:
     along = 0.0 if cycle.clocked else 1.0
     size = np.asarray(cycle.settings.scale)[int(cycle.anchor.chart[0])]
     units = size / size[:, None]
-    power, other, largest = np.eye(len(first)), np.eye(len(first)), 0.0
+    power_of_cycle = np.eye(len(first))
+    power_of_walk = np.eye(len(first))
+    largest = 0.0
     for _ in range(len(first)):
-        power, other = power @ first, other @ monodromy
-        weight = max(np.abs(power * units).max(), np.abs(other * units).max(), 1.0)
-        difference = np.trace(power) + along - np.trace(other)
+        power_of_cycle = power_of_cycle @ first
+        power_of_walk = power_of_walk @ monodromy
+        powers = np.stack([power_of_cycle, power_of_walk])
+        weight = max(np.abs(powers * units).max(), 1.0)
+        difference = np.trace(power_of_cycle) + along - np.trace(power_of_walk)
         largest = max(largest, abs(difference) / weight)
     return float(largest)
 

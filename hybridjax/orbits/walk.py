@@ -32,7 +32,9 @@ _MIDPOINT_STEPS = (2, 4, 6)
 _EULER_STEPS = (1, 2, 3, 4, 5, 6)
 # The change of the length of a step, at most and at least, and the safety factor: those of Hairer
 # and Wanner's codes ODEX and SEULEX.
-_LONGER, _SHORTER, _SAFE = 4.0, 0.2, 0.8
+_LONGER = 4.0
+_SHORTER = 0.2
+_SAFE = 0.8
 # Points within a step at which the path is known, as fractions of it; the last is its end. More:
 # guards cost more. Fewer: a guard that dips below zero and back is missed.
 _FRACTIONS = np.linspace(0.0, 1.0, 9)[1:]
@@ -69,29 +71,35 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
     **Arguments:** `scale`: sizes of the states by chart.
     """
     d, L = stretch.q.shape
-    q, by_state, error = np.zeros((d, L)), np.zeros((d, d, L)), np.zeros(L)
-    points: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    q = np.zeros((d, L))
+    by_state = np.zeros((d, d, L))
+    error = np.zeros(L)
+    # Parts of the path, first one without any point.
+    lane = [np.zeros(0, int)]
+    time = [np.zeros(0)]
+    points = [np.zeros((d, 0))]
     for a in np.unique(stretch.chart).tolist():
-        n, lanes = s.dims[a], np.flatnonzero(stretch.chart == a)
-        times = stretch.t[lanes], stretch.length[lanes]
+        n = s.dims[a]
+        lanes = np.flatnonzero(stretch.chart == a)
         x, error[lanes], path = _in_chart(
-            s, a, *times, stretch.q[:n, lanes], scale[a, :n]
+            s,
+            a,
+            stretch.t[lanes],
+            stretch.length[lanes],
+            stretch.q[:n, lanes],
+            scale[a, :n],
         )
         q[:n, lanes] = x[..., 0].T
         by_state[:n, :n, lanes] = np.moveaxis(x[..., 1:], 0, -1)
         for within, t, states in path:
-            padded = np.zeros((d, len(within)))
-            padded[:n] = states
-            points.append((lanes[within], t, padded))
-    if not points:
-        nothing = np.zeros(0)
-        return Walked(
-            q, by_state, error, nothing.astype(int), nothing, np.zeros((d, 0))
-        )
-    lane, t = (np.concatenate([x[k] for x in points]) for k in (0, 1))
-    states = np.concatenate([x[2] for x in points], axis=1)
-    order = np.lexsort((t, lane))
-    return Walked(q, by_state, error, lane[order], t[order], states[:, order])
+            lane.append(lanes[within])
+            time.append(t)
+            points.append(np.pad(states, [(0, d - n), (0, 0)]))
+    all_lanes = np.concatenate(lane)
+    times = np.concatenate(time)
+    order = np.lexsort((times, all_lanes))
+    all_points = np.concatenate(points, axis=1)[:, order]
+    return Walked(q, by_state, error, all_lanes[order], times[order], all_points)
 
 
 # In a chart with n states, x (L, n, 1 + n) holds states in its first column, in the others their
@@ -111,7 +119,10 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
         return np.moveaxis(rows, -1, 0)
 
     x = np.concatenate([q.T[..., None], np.tile(np.eye(n), (L, 1, 1))], axis=2)
-    past, h, error, path = np.zeros(L), length.copy(), np.zeros(L), []
+    past = np.zeros(L)
+    h = length.copy()
+    error = np.zeros(L)
+    path = []
     with np.errstate(all="ignore"):
         by_field = field(begin, x).copy()
         for _ in range(_PATIENCE):
@@ -129,15 +140,16 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
             lanes = going[good]
             if len(lanes):
                 left = length[lanes] - past[lanes]
-                ended = np.where(
-                    h[lanes] >= left, length[lanes], past[lanes] + h[lanes]
-                )
+                onward = past[lanes] + h[lanes]
+                ended = np.where(h[lanes] >= left, length[lanes], onward)
                 by_end = field(begin[lanes] + ended, end[good])
-                step = h[lanes], x[lanes], end[good], by_field[lanes], by_end
-                path += [
-                    (lanes, time, state.T) for time, state in _between(t[good], *step)
-                ]
-                past[lanes], x[lanes], by_field[lanes] = ended, end[good], by_end
+                within = _between(
+                    t[good], h[lanes], x[lanes], end[good], by_field[lanes], by_end
+                )
+                path += [(lanes, time, state.T) for time, state in within]
+                past[lanes] = ended
+                x[lanes] = end[good]
+                by_field[lanes] = by_end
                 error[lanes] += off[good]
             h[going] *= np.clip(longer, _SHORTER, _LONGER)
             h = np.minimum(h, length - past)
@@ -158,10 +170,12 @@ def _midpoint(field: Callable, by_field, t, length, x) -> tuple[np.ndarray, np.n
     rates = _rates(by_field, x)
     for count in _MIDPOINT_STEPS:
         h = (length / count)[:, None, None]
-        before, now = x, x + h * rates
+        before = x
+        now = x + h * rates
         for k in range(1, count):
             ahead = before + 2 * h * _rates(field(t + k * length / count, now), now)
-            before, now = now, ahead
+            before = now
+            now = ahead
         last = _rates(field(t + length, now), now)
         table.append((before + now + h * last) / 2)
     return _extrapolate(table, np.square(_MIDPOINT_STEPS))
@@ -207,13 +221,13 @@ def _between(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Times and states within steps, by the polynomials of degree 5 that have the states, rates and
     accelerations of both ends."""
-    n, h = x0.shape[1], length[:, None]
+    n = x0.shape[1]
+    h = length[:, None]
 
     def rate_and_bend(by_field):
         f = by_field[..., 0]
-        acceleration = (
-            by_field[..., 1] + (by_field[..., 2 : 2 + n] @ f[..., None])[..., 0]
-        )
+        along = (by_field[..., 2 : 2 + n] @ f[..., None])[..., 0]
+        acceleration = by_field[..., 1] + along
         return h * f, h**2 * acceleration
 
     rate0, bend0 = rate_and_bend(by_begin)

@@ -191,9 +191,7 @@ def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = Options(start=start, discard=8)
-    job = ExperimentJob(
-        prepare(*arguments, options, 2), Blocks((COUNT,), (2,))
-    )
+    job = ExperimentJob(prepare(*arguments, options, 2), Blocks((COUNT,), (2,)))
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
     mine = job.run(0, None)
