@@ -176,3 +176,35 @@ def test_simulate_names_a_guard_beyond_which_it_starts():
     assert [x.cause for x in path.findings] == ["beyond a guard"]
     assert "'spike 2'" in repr(path)
     assert not hj.simulate(TwoCells(), "rest", (0.0, 0.5), 3.0).findings
+
+
+class Switched(hj.HybridSystem):
+    """A capacitor that a clock charges and discharges, by a guard of the time alone."""
+
+    def charts(self):
+        up = Field(("x",), lambda t, q, u: (1 - q[0],))
+        down = Field(("x",), lambda t, q, u: (-1 - q[0],))
+        return {"up": up, "down": down}
+
+    def transitions(self):
+        def clock(t, q, u):
+            return jnp.cos(2 * jnp.pi * t)
+
+        def other_half(t, q, u):
+            return -jnp.cos(2 * jnp.pi * t)
+
+        return (
+            hj.Transition("off", "up", "down", guard=clock),
+            hj.Transition("on", "down", "up", guard=other_half),
+        )
+
+    def period(self):
+        return 1.0
+
+
+def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard():
+    cycle = hj.find_limit_cycle(Switched(), hj.Guess("up", (0.0,), time=0.0))
+    half = np.exp(-0.5)
+    at_switch = 1 - (1 - cycle.anchor.q[0, 0]) * np.exp(-0.25)
+    assert at_switch == pytest.approx((1 - half) / (1 + half), abs=1e-12)
+    assert cycle.multipliers == pytest.approx([np.exp(-1)], abs=1e-12)
