@@ -23,6 +23,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.lanes import Lanes, side_by_side
 from ..engine.replay import Moves, Variation
+from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import SINGULAR, Return, ReturnMap, Turn, across
@@ -31,6 +32,7 @@ from .shooting import (
     RTOL,
     excess,
     fixed_point,
+    follow_moves,
     newton_steps,
     travel,
 )
@@ -196,21 +198,46 @@ def root(
 def _root_on_host(
     map: ReturnMap, max_steps: int, near: Any
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method from the fixed point of the moves of a `near` turn, or from the anchor's
-    state."""
+    """Newton's method from the fixed point of the moves of a `near` turn, or from where rough turns
+    lead; if these lead nowhere, from the anchor's state."""
     begin = map.anchor.q[:, 0] / map.sizes
-    moves = None
     if near is not None:
-        begin, moves = fixed_point(map, near, begin)
-    return _newton(map, begin, moves, max_steps)
+        return _newton(map, *fixed_point(map, near, begin), 0, max_steps)
+    end = _newton(map, *_by_rough_turns(map, begin), max_steps)
+    return end if np.isfinite(end[0]).all() else _newton(map, begin, None, 0, max_steps)
+
+
+def _by_rough_turns(
+    map: ReturnMap, x: np.ndarray
+) -> tuple[np.ndarray, Moves | None, int]:
+    """Newton's method on turns with errors of `TRANSIENT`, until the moves of one have a fixed
+    point: that of these moves, divided at full accuracy, the moves, and the number of steps."""
+    rough = Settings(
+        np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale
+    )
+    rough_map, moves = dataclasses.replace(map, settings=rough), None
+    for steps in range(1, FEW_STEPS + 1):  # noqa: B007
+        turn, step = _step_from(rough_map, x)
+        x = newton = x + step
+        if np.isfinite(x).all():
+            x, moves = fixed_point(
+                rough_map, (turn.legs, side_by_side(turn.tapes)), newton
+            )
+        if x is not newton or not np.isfinite(x).all():
+            break
+    pieces = moves and follow_moves(
+        map, map.departure(x * map.sizes), map.ends(), moves
+    )
+    x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
+    return x, moves, steps
 
 
 def _newton(
-    map: ReturnMap, x: np.ndarray, moves: Moves | None, max_steps: int
+    map: ReturnMap, x: np.ndarray, moves: Moves | None, first: int, max_steps: int
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
-    turn makes the `moves` if they are right."""
-    for steps in itertools.count(1):
+    turn makes the `moves` if they are right; `first` steps were taken before."""
+    for steps in itertools.count(first + 1):
         travelled = None if moves is None else travel(map, x * map.sizes, moves)
         turn, step = _step_from(map, x, travelled)
         x = x + step
@@ -219,7 +246,11 @@ def _newton(
             np.asarray(map.settings.rtol) if travelled else 0.0
         )
         # (The first state need not be as accurate as a Newton step.)
-        done = excess(x[None], step[None])[0] < 1 and close and (travelled or steps > 1)
+        done = (
+            excess(x[None], step[None])[0] < 1
+            and close
+            and (travelled or steps > first + 1)
+        )
         if done or steps == max_steps or not np.isfinite(x).all():
             break
         moves = None

@@ -239,6 +239,6 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
         recorded = (turn.legs, side_by_side(turn.tapes))
         x, moves = fixed_point(map, recorded, q / map.sizes)
         for gap, steps in ((8e-13, 1), (1e-9, 2)):
-            end, _, taken = newton._newton(map, x + gap, moves, 9)
+            end, _, taken = newton._newton(map, x + gap, moves, 0, 9)
             assert taken == steps
             assert abs(end / map.sizes - x) < 1e-12
