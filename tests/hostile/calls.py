@@ -38,6 +38,7 @@ def systems(t):
 
     yield hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0, after="hit")
     yield hj.Output, dict(name="z", function=flow)
+    yield hj.Output("z", flow).in_chart, dict(name="plane")
     ends = dict(name="hit", source="flow", target="flow", guard=flow)
     yield hj.Transition, ends | dict(direction="falling", reset=flow)
     yield hj.Scheduled, dict(period=1.0, offset=0.0)
@@ -197,6 +198,7 @@ def estimates(t):
 def series(t):
     yield hj.fit_series, dict(data=t.record, order=2)
     yield t.fit.impulse_response, dict(n_lags=3)
+    yield t.fit.interval, dict(level=0.9)
     yield t.fit.htf, dict(f=np.array([0.1, 0.2]))
     yield hj.validate, dict(model=t.fit, data=t.record)
 

@@ -80,7 +80,10 @@ def test_all_public_names_are_called(outcome):
             or owner in CALLED_BY_THE_ENGINE | SLOW_TO_MAKE
         ):
             continue
-        if name.removesuffix(".__call__") not in outcome["calls"]:
+        called = name.removesuffix(".__call__")
+        if owner == "Fit":  # (The base class has no objects of its own.)
+            called = f"SeriesFit.{method}"
+        if called not in outcome["calls"]:
             missing.append(name)
     assert not missing, missing
 
