@@ -120,7 +120,7 @@ def scale_of(
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     """Sizes by name, from `Settings.scale`."""
-    sizes = {}
+    sizes: Sizes = {}
     # (A state that several charts have takes the size of the first.)
     for a in reversed(range(len(s.charts))):
         names = s.charts[a].states

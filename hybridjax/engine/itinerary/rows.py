@@ -175,6 +175,11 @@ class _Leg(NamedTuple):
     section: int = 0
     """Index of the level that is watched."""
 
+    @property
+    def unknown(self) -> Int[np.ndarray, " G"]:
+        """Signs of which nothing is known."""
+        return np.zeros(self.begins.shape[1], int)
+
     def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
         """Beginnings of steps, and the end, with so many steps for each recorded one."""
         if self.at_once or self.times[-1] == self.times[0]:
@@ -246,53 +251,76 @@ def _written(
     **Arguments:** `pieces`: leg and number of the node at which each piece begins; node -1 for one
     that begins with the leg, on a section.
     """
-    unknown = np.zeros(legs[0].begins.shape[1], int)
-    charts: list[int] = []
-    befores: list[int] = []
-    armed: list[np.ndarray] = []
-
-    def begin(k: int, leg: _Leg, t: float) -> None:
-        table.add(Body(PIECE, leg.chart), k, unknown, piece=len(charts))
-        charts.append(leg.chart)
-        befores.append(sum(before.code >= 0 for before in legs[:k]))
-        armed.append(_armed(s, leg.chart, t, leg.signs(t)))
-
+    begun = _Begun(s, legs, table)
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
-        a = leg.chart
         if (k, -1) in pieces:
-            begin(k, leg, times[0])
-        if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
-            table.add(Body(SCHEDULE, a, (leg.code,)), k, unknown)
-        for j, (t, fraction) in enumerate(zip(times, _fractions(times), strict=False)):
-            if (k, j) in pieces:
-                begin(k, leg, t)
-            signs, section = leg.signs(t), leg.section
-            table.add(Body(STEP, a), k, signs, fraction=fraction, section=section)
+            begun.piece(k, times[0])
+        begins = {j for j in range(len(times)) if (k, j) in pieces}
+        _rows_of_leg(s, table, k, leg, times, begun, begins)
         # (A trajectory that ends with an event ends at a time that is free.)
-        ends = k == len(legs) - 1 or (k + 1, -1) in pieces
-        before = leg.signs(times[-2]) if len(times) > 1 else unknown
-        _end(s, table, k, leg, before, goes_on=not ends)
-    events = tuple(leg.code for leg in legs if leg.code >= 0)
-    certain = all(_is_certain(s, leg) for leg in legs)
+        is_end = k == len(legs) - 1 or (k + 1, -1) in pieces
+        before = leg.signs(times[-2]) if len(times) > 1 else leg.unknown
+        _end(s, table, k, leg, before, goes_on=not is_end)
     if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
         # (The end at a time may lie in any chart: all of these itineraries share a program.)
         table.include(Body(TIME, leg.chart) for leg in legs)
     table.include(Body(PIECE, leg.chart) for leg in legs)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
     form, rows, used = _finished(table)
-    last = len(ends) - 1
+    armed = np.array(begun.armed).reshape(len(begun.charts), len(s.transitions))
     return Itinerary(
         form,
         rows,
-        used,
-        np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS)),
-        last,
-        np.array(charts, np.int32),
-        np.array(befores, np.int32),
-        np.array(armed).reshape(len(charts), len(s.transitions)).T,
-        events,
-        certain,
+        count=used,
+        ends=np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS)),
+        last=len(ends) - 1,
+        charts=np.array(begun.charts, np.int32),
+        begins=np.array(begun.events, np.int32),
+        armed=armed.T,
+        events=tuple(leg.code for leg in legs if leg.code >= 0),
+        certain=all(_is_certain(s, leg) for leg in legs),
     )
+
+
+class _Begun:
+    """The pieces of an itinerary that have begun: their charts, the numbers of events before them,
+    and the transitions that are armed."""
+
+    def __init__(self, s: Structure, legs: list[_Leg], table: _Table):
+        self._s, self._legs, self._table = s, legs, table
+        self.charts: list[int] = []
+        self.events: list[int] = []
+        self.armed: list[np.ndarray] = []
+
+    def piece(self, k: int, t: float) -> None:
+        """Begin a piece at a time in leg k."""
+        leg = self._legs[k]
+        number = len(self.charts)
+        self._table.add(Body(PIECE, leg.chart), k, leg.unknown, piece=number)
+        self.charts.append(leg.chart)
+        self.events.append(sum(before.code >= 0 for before in self._legs[:k]))
+        self.armed.append(_armed(self._s, leg.chart, t, leg.signs(t)))
+
+
+def _rows_of_leg(
+    s: Structure,
+    table: _Table,
+    k: int,
+    leg: _Leg,
+    times: Float[np.ndarray, " 1+n"],
+    begun: _Begun,
+    begins: set[int],
+) -> None:
+    """Add the rows of leg k until its end. `begins`: numbers of the steps at which pieces begin."""
+    if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
+        table.add(Body(SCHEDULE, leg.chart, (leg.code,)), k, leg.unknown)
+    step = Body(STEP, leg.chart)
+    for j, fraction in enumerate(_fractions(times)):
+        t = times[j]
+        if j in begins:
+            begun.piece(k, t)
+        signs = leg.signs(t)
+        table.add(step, k, signs, fraction=fraction, section=leg.section)
 
 
 def _is_certain(s: Structure, leg: _Leg) -> bool:
