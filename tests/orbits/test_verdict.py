@@ -178,13 +178,19 @@ def test_simulate_names_a_guard_beyond_which_it_starts():
     assert not hj.simulate(TwoCells(), "rest", (0.0, 0.5), 3.0).findings
 
 
+class Capacitor(hj.Chart):
+    states = ("x",)
+    voltage: float
+
+    def field(self, t, q, u):
+        return (self.voltage - q[0],)
+
+
 class Switched(hj.HybridSystem):
     """A capacitor that a clock charges and discharges, by a guard of the time alone."""
 
     def charts(self):
-        up = Field(("x",), lambda t, q, u: (1 - q[0],))
-        down = Field(("x",), lambda t, q, u: (-1 - q[0],))
-        return {"up": up, "down": down}
+        return {"up": Capacitor(1.0), "down": Capacitor(-1.0)}
 
     def transitions(self):
         def clock(t, q, u):
