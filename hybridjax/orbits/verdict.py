@@ -278,7 +278,7 @@ def _jump(
         findings = [] if at_once else _off_schedule(transition, t)
     else:
         level = event.level[0]
-        noise = _noise(event.gradient[0], scale[a, :n])
+        noise = float(_noise(event.gradient[0], scale[a, :n]))
         if at_once:
             findings = _not_due(transition, t, level, noise)
         else:
