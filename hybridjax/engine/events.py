@@ -79,9 +79,13 @@ def await_schedules(
     return armed
 
 
-def overdue(watched: Watch, span: Times) -> Bool[Array, "G L"]:
-    """Guards that are beyond zero, by more than rounding errors of times."""
-    return watched.value[:-1] < -SAME_TIME * span * abs(watched.rate[:-1])
+def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
+    """Guards that are beyond zero at t, by more than rounding errors of times.
+
+    A piece of flow between two events at the same time has no `span`: that of its clock is left.
+    """
+    late = SAME_TIME * span + ROUNDING * abs(t)
+    return watched.value[:-1] < -late * abs(watched.rate[:-1])
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
@@ -129,7 +133,7 @@ def rearm(
     zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     falls = rate < 0
-    late = overdue(watched, span) & (value < -zero)
+    late = overdue(watched, lanes.t, span) & (value < -zero)
     at_zero = xp.abs(value) <= zero
     due = together & other & at_zero & falls
     put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)

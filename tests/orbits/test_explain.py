@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import hybridjax as hj
+from hybridjax.orbits import newton
 
 from ..toys import Field, toy
 
@@ -77,8 +78,12 @@ DAMPED = toy({"a": Field(("y", "v"), rates)}, period=1.0)
 BALLS = hj.Guess("air", (0.1, 4.7, 0.1, 4.7), 0.1)
 
 
-def test_events_that_coincide_in_either_order():
-    """Balls that know nothing of each other: twice the multipliers of one."""
+@pytest.mark.parametrize("by_rough_turns", [True, False])
+def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
+    """Balls that know nothing of each other: twice the multipliers of one, also if the search puts
+    both impacts at the same time to the last bit."""
+    if not by_rough_turns:
+        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
     cycle = hj.find_limit_cycle(Balls(), BALLS)
     (both,) = hj.coincidences(cycle)
     assert both.commute

@@ -151,7 +151,7 @@ def _known_time(state: State, task: Task) -> tuple[Times, Index, Mask]:
     scheduled, which = next_schedule(s, lanes.t, lanes.chart, target.time, lanes.armed)
     due = xp.minimum(target.time, scheduled)
     schedule = xp.where(scheduled <= target.time, which, -1)
-    beyond = lanes.armed & overdue(state.watched, task.span)
+    beyond = lanes.armed & overdue(state.watched, lanes.t, task.span)
     at_once = state.active & ~state.approach.on & beyond.any(axis=0)
     due = xp.where(at_once, lanes.t, due)
     if s.transitions:
