@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import assume, given, settings, strategies as st
 from numpy.testing import assert_allclose
 
-from hybridjax.engine.cubic import first_crossing
+from hybridjax.engine.cubic import first_crossing, halfway_cubic
 
 
 number = st.floats(-4.0, 4.0).map(lambda x: round(x, 3))
@@ -97,3 +97,15 @@ def test_a_guard_that_starts_at_zero_must_leave_it_first():
     # s^3 - s^2 + 0.1 s (zero to first order only) falls and rises without being positive first.
     wave = crossing(-1e-18, -0.5, 0.0, -1.0, armed=False)
     assert np.isinf(wave.position[0])
+
+
+def test_halfway_a_cubic_is_met_exactly():
+    coefficients = np.array([0.7, -1.2, 0.4, 2.0])
+    slopes = np.polyder(coefficients)
+    length = 0.8
+    ends = np.array([0.0, length])
+    values = np.polyval(coefficients, ends)
+    rates = np.polyval(slopes, ends)
+    state, rate = halfway_cubic(*values, *rates, np.array(length))
+    assert_allclose(state, np.polyval(coefficients, length / 2), rtol=1e-14)
+    assert_allclose(rate, np.polyval(slopes, length / 2), rtol=1e-13)
