@@ -304,8 +304,8 @@ def _short(value: complex) -> str:
     return f"{value.real:+.7f}{imaginary}"
 
 
-class MultiplierEstimate(MultiplierFit):
-    """Multipliers and their covariance alone, such as a bound of what any estimate can reach."""
+class FitWithoutModel(MultiplierFit):
+    """A fit that has neither a model of the system nor one of the noise."""
 
     @property
     def model(self) -> None:
@@ -314,3 +314,7 @@ class MultiplierEstimate(MultiplierFit):
     @property
     def noise(self) -> None:
         return None
+
+
+class MultiplierEstimate(FitWithoutModel):
+    """Multipliers and their covariance alone, such as a bound of what any estimate can reach."""

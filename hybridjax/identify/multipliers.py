@@ -23,7 +23,11 @@ from . import variable_projection as varpro, weights
 from .denominator import divided_by_chi, multipliers_of
 from .descent import ROUNDING, Coefficients
 from .fit import not_converged
-from .multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
+from .multiplier_estimate import (
+    FitWithoutModel,
+    MultiplierEstimate,
+    RoughFit,
+)
 
 
 # Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
@@ -31,7 +35,7 @@ from .multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
 _REWEIGHTINGS = 2
 
 
-class StructuredFit(MultiplierFit):
+class StructuredFit(FitWithoutModel):
     r"""All harmonics, outputs and inputs with one denominator in $z^{-N}$.
 
     $$H_m(z) = \frac{B_m(z^{-1})}{\chi(z^{-N})}, \qquad
@@ -67,14 +71,6 @@ class StructuredFit(MultiplierFit):
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
-
-    @property
-    def model(self) -> None:
-        return None
-
-    @property
-    def noise(self) -> None:
-        return None
 
     @checked
     def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
