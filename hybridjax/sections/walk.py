@@ -123,25 +123,25 @@ def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     if np.isfinite(raw.time[0]):
         late = np.rint((placed.bound.time[0] - raw.time[0]) / placed.cycle.period)
     return Walk(
-        None if before is None else Path.of(before),
-        Path.of(path),
-        np.asarray(placed.cycle.period),
-        np.asarray(late),
-        begin.chart,
-        arrivals,
-        begins_on_section,
-        False,
-        path.charts,
-        path.armed,
-        path.begins,
+        lead=None if before is None else Path.of(before),
+        path=Path.of(path),
+        period=np.asarray(placed.cycle.period),
+        late=np.asarray(late),
+        chart_at_anchor=begin.chart,
+        arrivals=arrivals,
+        begins_on_section=begins_on_section,
+        forwards=False,
+        chart=path.charts,
+        armed=path.armed,
+        events=path.begins,
     )
 
 
 def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     """The walk for a traced cycle that was found beside a known one; None if there is none."""
-    walk = _walks.get(cycle, id(family))
-    if walk is not None:
-        return walk
+    for other, walk in _walks.get(cycle, None) or []:
+        if other is family:
+            return walk
     known = known_beside(cycle)
     if known is None or is_traced(known, family):
         return None
@@ -151,7 +151,7 @@ def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 def walk_with(cycle: LimitCycle, family: AbstractSections, walk: Walk | None) -> None:
     """Have a traced cycle follow a walk to the sections of a family."""
     if walk is not None:
-        _walks.recall(cycle, id(family), lambda: walk)
+        _walks.recall(cycle, None, list).append((family, walk))
 
 
 def walked(
@@ -183,12 +183,12 @@ def walked(
     code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
     N = family.n_sections
     lanes = Lanes(
-        passage.legs_t,
-        jnp.asarray(walk.chart),
-        passage.legs_q.T,
-        jnp.asarray(walk.armed),
-        jnp.asarray(walk.events),
-        jnp.tile(jnp.array([[0.0], [jnp.inf], [0.0], [0.0]]), N),
+        t=passage.legs_t,
+        chart=jnp.asarray(walk.chart),
+        q=passage.legs_q.T,
+        armed=jnp.asarray(walk.armed),
+        events=jnp.asarray(walk.events),
+        pace=jnp.tile(jnp.array([[0.0], [jnp.inf], [0.0], [0.0]]), N),
     )
     duration = jnp.diff(passage.legs_t, append=passage.t[None])
     fields = bound, lanes, None, duration, jnp.full(N, code)
