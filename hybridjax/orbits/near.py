@@ -5,7 +5,6 @@ derivatives. Outside of these, what leaves the route goes to the search.
 """
 
 import collections
-import functools as ft
 from typing import Any
 
 import jax
@@ -87,14 +86,14 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
 
     A cycle that leaves the route has a result code.
     """
-    begin = _beginning(route, map)
     traced = [x.size for x in leaves_of(map) if is_tracer(x)]
+
+    # (The beginning depends on what is traced: it is made where that has derivatives.)
+    def find(map: ReturnMap, **options: Any) -> Corrected:
+        return _found(route, "all", _beginning(route, map), map, **options)
+
     few = sum(traced) <= JACOBIAN_COLUMNS
-    if few:
-        find = ft.partial(_found, route, "all", begin)
-        found = by_jacobian(find)(map)
-    else:
-        found = _found(route, "all", begin, map, reverse=True)
+    found = by_jacobian(find)(map) if few else find(map, reverse=True)
     cycle = _cycle(route.finer, route, map, found, _result(route, map, found))
     _beside.recall(cycle, None, lambda: known)
     return cycle

@@ -189,9 +189,11 @@ def turn(maps: Maps, form: Form, plan: Plan, q, ends, **options: Any):
 
     **Arguments:** `options`: of `follow`.
     """
+    known = None
     if maps.map.base is None:
         end = (maps.t + maps.expected)[..., None]
-        ends = jnp.where(jnp.arange(ends.shape[-1]) >= plan.last, end, ends)
+        is_last = jnp.arange(ends.shape[-1]) >= plan.last
+        known = jnp.where(is_last, end, jnp.inf)
     travelers = Travelers(
         lambda numbers: maps.of(numbers).structure, maps.numbers, maps.many
     )
@@ -204,6 +206,7 @@ def turn(maps: Maps, form: Form, plan: Plan, q, ends, **options: Any):
         plan.count,
         (maps.t, q),
         ends,
+        known=known,
         **options,
     )
 

@@ -165,10 +165,8 @@ def walked(
     if walk.lead is not None:
         assert isinstance(family.anchor, Crossing)
         at_anchor = ListLevels((family.anchor,))
-        ends = start[0] + walk.lead.ends * (map.expected / walk.period)
-        free = jnp.full_like(ends, jnp.inf)
-        options = dict(columns=False, forwards=walk.forwards)
-        lead = _followed(map, walk.lead, at_anchor, start, ends, free, **options)
+        free = jnp.full_like(walk.lead.ends, jnp.inf)
+        lead = _followed(map, walk, walk.lead, at_anchor, start, free, columns=False)
         begin = lead.t, lead.q
         code = _code(map, walk.lead, lead, start[0])
     orbit = map.anchor._replace(
@@ -176,10 +174,8 @@ def walked(
     )
     bound = bind_at(map, family, orbit)
     bound = dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
-    ends = begin[0] + walk.path.ends * (map.expected / walk.period)
     known = _known_ends(map, walk, bound)
-    options = dict(columns=True, forwards=walk.forwards)
-    passage = _followed(map, walk.path, bound.levels, begin, ends, known, **options)
+    passage = _followed(map, walk, walk.path, bound.levels, begin, known, columns=True)
     code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
     N = family.n_sections
     lanes = Lanes(
@@ -206,22 +202,21 @@ def _known_ends(map: ReturnMap, walk: Walk, bound: BoundSections) -> Float[Array
 
 def _followed(
     map: ReturnMap,
+    walk: Walk,
     path: Path,
     levels: AbstractLevels | None,
     begin: tuple,
-    ends: Float[Array, " E"],
     known: Float[Array, " E"],
     columns: bool,
-    forwards: bool,
 ) -> Passage:
-    """A trajectory of a system on a path, with derivatives.
+    """A trajectory of a system on a path of a walk, with derivatives.
 
-    **Arguments:** `ends`: guessed ends of legs; `known`: the same where they are known, otherwise
-    infinite.
+    **Arguments:** `known`: ends of legs where they are known, otherwise infinite.
     """
     everything = map, begin, known, levels
     leaves = jax.tree_util.tree_leaves(everything)
-    few = forwards or sum(x.size for x in leaves if is_tracer(x)) <= JACOBIAN_COLUMNS
+    few = sum(x.size for x in leaves if is_tracer(x)) <= JACOBIAN_COLUMNS
+    few = few or walk.forwards
 
     def passage(moving) -> Passage:
         map, begin, known, levels = moving
@@ -234,10 +229,12 @@ def _followed(
         )
         settings = jax.lax.stop_gradient(map.settings)
         table = path.form, path.rows, path.count if few else None
+        ends = begin[0] + path.ends * (map.expected / walk.period)
         options: Any = dict(columns=columns, known=known, passes=_PASSES)
         return follow(travelers, levels, settings, *table, begin, ends, **options)
 
-    return (by_jacobian(passage) if few and not forwards else passage)(everything)
+    by_columns = few and not walk.forwards
+    return (by_jacobian(passage) if by_columns else passage)(everything)
 
 
 def _code(map: ReturnMap, path: Path, passage: Passage, begin) -> Int[Array, ""]:

@@ -19,7 +19,7 @@ class Free(hj.Chart):
     def field(self, t, q, u):
         x, v = q
         s = self.system
-        return v, -x - s.damping * v + s.drive * jnp.cos(1.3 * t) + u[0]
+        return v, -x - s.damping * v + s.drive * jnp.cos(s.rate * t) + u[0]
 
 
 class Rebound(hj.HybridSystem):
@@ -28,6 +28,7 @@ class Rebound(hj.HybridSystem):
     drive: hj.Parameter = hj.parameter(0.3)
     damping: hj.Parameter = hj.parameter(0.4)
     restitution: hj.Parameter = hj.parameter(0.6)
+    rate: hj.Parameter = hj.parameter(1.3)
 
     def charts(self):
         return {"free": Free(self)}
@@ -42,7 +43,7 @@ class Rebound(hj.HybridSystem):
         return [hj.Transition("bounce", "free", "free", stop, "rising", bounce)]
 
     def period(self):
-        return 2 * jnp.pi / 1.3
+        return 2 * jnp.pi / self.rate
 
     def guess(self):
         return hj.Guess("free", (0.3, 0.0))
@@ -130,23 +131,21 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
 
 
 def test_gradients_inside_of_programs_are_differences(free):
-    def state(drive, damping):
-        system = Rebound(drive=drive, damping=damping)
+    """By the field's parameters, and by the rate of the clock, which sets the period."""
+
+    def state(drive, damping, rate):
+        system = Rebound(drive=drive, damping=damping, rate=rate)
         cycle = hj.find_limit_cycle(system, free)
         monodromy = jnp.linalg.multi_dot(cycle.factors[::-1])
         return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
 
-    value = jax.jit(state)
-    reverse_mode = jax.jit(jax.grad(state, argnums=(0, 1)))
-    by_drive, by_damping = reverse_mode(0.5, 0.4)
-    h = 1e-4
-    difference = (value(0.5 + h, 0.4) - value(0.5 - h, 0.4)) / (2 * h)
-    assert_allclose(by_drive, difference, rtol=1e-6)
-    difference = (value(0.5, 0.4 + h) - value(0.5, 0.4 - h)) / (2 * h)
-    assert_allclose(by_damping, difference, rtol=1e-6)
-    forward_mode = jax.jit(jax.jacfwd(state, argnums=(0, 1)))
-    forward = forward_mode(0.5, 0.4)
-    assert_allclose(forward, (by_drive, by_damping), rtol=1e-10)
+    value, at, h = jax.jit(state), np.array([0.5, 0.4, 1.3]), 1e-4
+    gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
+    for slope, step in zip(gradient, h * np.eye(3), strict=True):
+        difference = (value(*(at + step)) - value(*(at - step))) / (2 * h)
+        assert_allclose(slope, difference, rtol=1e-6)
+    forwards = jax.jit(jax.jacfwd(state, argnums=(0, 1, 2)))(*at)
+    assert_allclose(forwards, gradient, rtol=1e-10)
 
 
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
