@@ -7,24 +7,23 @@ import numpy as np
 from hybridjax._core.loops import loop, pushed
 
 
-def step(constants, k, carry):
-    x, steps = carry
+def step(constants, k, x, steps):
     return jnp.sin(constants["a"] * x) + k * x**2 / 10, steps + 1
 
 
-def step_along(constants, by_constants, k, carry, columns):
-    one = lambda constants, carry: step(constants, k, carry)  # noqa: E731
-    return pushed(one, constants, by_constants, carry, columns)
+def step_along(constants, by_constants, k, x, columns, steps):
+    one = lambda constants, x, steps: step(constants, k, x, steps)  # noqa: E731
+    return pushed(one, constants, by_constants, x, columns, steps)
 
 
 def with_own_derivatives(a, x):
-    end, steps = loop(step, step_along, {"a": a}, (x, jnp.asarray(0)), 7)
+    end, steps = loop(step, step_along, {"a": a}, x, jnp.asarray(0.0), 7)
     return end
 
 
 def with_derivatives_of_jax(a, x):
-    run = lambda k, carry: step({"a": a}, k, carry)  # noqa: E731
-    return jax.lax.fori_loop(0, 7, run, (x, jnp.asarray(0)))[0]
+    run = lambda k, x: step({"a": a}, k, x, 0)[0]  # noqa: E731
+    return jax.lax.fori_loop(0, 7, run, x)
 
 
 def test_first_and_second_derivatives_are_those_of_jax():

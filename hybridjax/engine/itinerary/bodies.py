@@ -23,7 +23,7 @@ from ..arrays import Array
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
-from .rows import JUMP, LEVEL, NOTHING, PIECE, SCHEDULE, STEP, TIME, Body, Rows
+from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Rows
 
 
 # Times of a schedule are equal if they differ by less than this part of its period. Larger: an
@@ -39,13 +39,18 @@ class Course(NamedTuple):
     y: Float[Array, "1+C d"]
     """The state, then its columns."""
     rate: Float[Array, " d"]
-    """The field where the present piece began."""
+    """The field where the last step began."""
     begin: Float[Array, ""]
     """Time at which the present leg began."""
     delay: Float[Array, " C"]
     """Columns of the time of the last event, or of the arrival on a section."""
     ends: Float[Array, " E"]
     """Ends of legs: as guessed, and as found once they are past."""
+
+
+class Flags(NamedTuple):
+    """How well a trajectory follows its itinerary. Flags have no derivatives."""
+
     before: "Watched"
     """Watched functions where the last row began, and since then."""
     error: Float[Array, ""]
@@ -77,90 +82,98 @@ class Bodies:
     """Functions of a row and a course for every kind of row.
 
     **Fields:** `levels`: of the sections, if there are any; `width`: largest number of watched
-    functions of a chart; `pairs`: a solver for each chart; `inputs`: those of each column, None for
-    columns without inputs.
+    functions of a chart; `pieces`: their number; `pairs`: a solver for each chart; `inputs`: those
+    of each column, None for columns without inputs.
     """
 
     s: Structure
     levels: AbstractLevels | None
     settings: Settings
     width: int
+    pieces: int
     pairs: Callable[[int], steps.Solver]
     inputs: Float[Array, "C nu"] | None = None
 
-    def of(self, body: Body) -> Callable[[Rows, Course], Course]:
+    def of(self, body: Body) -> Callable[[Rows, Course, Flags], tuple[Course, Flags]]:
         """The function of rows with this body."""
         work: Any = {
-            NOTHING: lambda body, row, course: course,
-            PIECE: self._piece,
+            NOTHING: lambda body, row, course, flags: (course, flags),
             SCHEDULE: self._schedule,
             STEP: self._step,
             JUMP: self._jump,
             LEVEL: self._level,
             TIME: self._time,
         }[body.does]
-        return lambda row, course: work(body, row, course)
+        return lambda row, course, flags: work(body, row, course, flags)
 
-    def _piece(self, body: Body, row: Rows, course: Course) -> Course:
-        """A piece begins: columns begin anew. (`follow` keeps those of the last one.)
-
-        On a section, the first one is that of the time: who begins later is behind by the flow.
-        """
-        n, d, C = self.s.dims[body.chart], course.y.shape[1], course.y.shape[0] - 1
-        rate = self._field(body.chart, course.t, self._state(body.chart, course))
-        rate = jnp.pad(rate, (0, d - n))
-        delay = course.delay
-        if self.inputs is None:
-            unit = jnp.eye(C, d)
-        else:
-            unit = jnp.concatenate([-rate[None], jnp.eye(C - 1, d)])
-            delay = jnp.zeros(C).at[0].set(1.0)
-        unit = jnp.where(jnp.arange(d) < n, unit, 0.0)
-        return course._replace(y=course.y.at[1:].set(unit), rate=rate, delay=delay)
-
-    def _schedule(self, body: Body, row: Rows, course: Course) -> Course:
+    def _schedule(self, body: Body, row: Rows, course: Course, flags: Flags):
         """A leg begins whose end is known: the tick nearest to the guess."""
         guard = self.s.transitions[body.transition].guard
         assert isinstance(guard, Scheduled)
         tick = guard.nearest(course.ends[row.leg])
-        return course._replace(ends=course.ends.at[row.leg].set(tick))
+        return course._replace(ends=course.ends.at[row.leg].set(tick)), flags
 
-    def _step(self, body: Body, row: Rows, course: Course) -> Course:
+    def _step(self, body: Body, row: Rows, course: Course, flags: Flags):
         """A part of the leg, or a Newton step on a watched function."""
         a = body.chart
         q = self._state(a, course)
         field = self._field(a, course.t, q)
-        now = self._watched(a, row, course.t, q, field)
+        # (Corrections converge, so that the rate of their function needs no derivative.)
+        now = self._watched(a, row, *_still((course.t, q, field)))
+        flags = self._noted(a, row, flags, now)
+        course = self._begun(a, row, course, field)
         h = row.fraction * (course.ends[row.leg] - course.begin)
         if self._functions(a):
             is_correction = row.target >= 0
+            value = self._values(a, row, course.t, q, self._no_input)[row.target]
             # (Where none is made, the rate may be zero, and NaN would enter reverse mode.)
-            rate = jnp.where(is_correction, now.rate, 1.0)
-            newton = _newton(now._replace(rate=rate), row.target)
-            h = jnp.where(is_correction, newton, h)
+            rate = jnp.where(is_correction, now.rate[row.target], 1.0)
+            h = jnp.where(is_correction, -value / rate, h)
         y, error = self._advanced(a, course, h)
+        course = course._replace(t=course.t + h, y=y)
+        flags = flags._replace(
+            error=jnp.maximum(flags.error, error),
+            left=flags.left | self._has_tick(a, course),
+        )
+        return course, flags
+
+    def _begun(self, a: int, row: Rows, course: Course, field) -> Course:
+        """The course with columns that begin anew, if a piece begins. (`follow` keeps those of the
+        piece before.)
+
+        On a section, the first one is that of the time: who begins later is behind by the flow.
+        """
+        n, d, C = self.s.dims[a], course.y.shape[1], course.y.shape[0] - 1
+        rate = jnp.pad(field, (0, d - n))
+        delay = jnp.zeros(C)
+        if self.inputs is None:
+            unit = jnp.eye(C, d)
+        else:
+            unit = jnp.concatenate([-rate[None], jnp.eye(C - 1, d)])
+            delay = delay.at[0].set(1.0)
+        unit = jnp.where(jnp.arange(d) < n, unit, 0.0)
+        begins = row.piece < self.pieces
+        columns = jnp.where(begins, unit, course.y[1:])
         return course._replace(
-            t=course.t + h,
-            y=y,
-            before=now,
-            error=jnp.maximum(course.error, error),
-            left=course.left | self._has_left(a, row, course, now),
+            y=course.y.at[1:].set(columns),
+            rate=rate,
+            delay=jnp.where(begins, delay, course.delay),
         )
 
-    def _jump(self, body: Body, row: Rows, course: Course) -> Course:
+    def _jump(self, body: Body, row: Rows, course: Course, flags: Flags):
         """An event, and the reset."""
         s, a, member = self.s, body.chart, Member(body.kind, row.place)
         b = s.chart_index(s.transitions[body.kind[0]].target)
         q, u = self._state(a, course), self._no_input
         field = self._field(a, course.t, q)
         now = self._watched(a, row, course.t, q, field)
+        flags = self._noted(a, row, flags, _still(now))
         delay, late = course.delay, jnp.zeros(())
         if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
             delay = jnp.zeros_like(delay)
         elif not body.at_once:
             late = _newton(now, row.target)
             delay = self._delay(a, row, course, q, now)
-        left = course.left | self._has_left(a, row, course, now)
         t, q = course.t + late, q + field * late
         after = s.reset(member, t, q, u)
         onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
@@ -175,60 +188,44 @@ class Bodies:
         columns = self._each(column, course.y[1:, : s.dims[a]], delay)
         moved = jnp.concatenate([after[None], columns])
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
-        left = left | self._has_tick(a, course, t)
-        return course._replace(
-            t=t,
-            y=y,
-            begin=t,
-            delay=delay,
-            ends=course.ends.at[row.leg].set(t),
-            before=Watched.unknown(t, self.width),
-            last=jnp.maximum(course.last, jnp.abs(late)),
-            left=left | (t < course.begin),
-        )
+        moved = course._replace(t=t, y=y)
+        unknown = Watched.unknown(_still(t), self.width)
+        left = flags.left | self._has_tick(a, moved)
+        flags = flags._replace(before=unknown, left=left)
+        return self._arrived(row, moved, flags, late, delay)
 
-    def _level(self, body: Body, row: Rows, course: Course) -> Course:
+    def _level(self, body: Body, row: Rows, course: Course, flags: Flags):
         """The arrival on a level."""
         a = body.chart
         n, q = self.s.dims[a], self._state(a, course)
         field = self._field(a, course.t, q)
         now = self._watched(a, row, course.t, q, field)
+        flags = self._noted(a, row, flags, _still(now))
         late = _newton(now, row.target)
         delay = self._delay(a, row, course, q, now)
         arrived = jnp.outer(jnp.append(late, delay), field)
-        left = course.left | self._has_left(a, row, course, now)
-        course = course._replace(y=course.y.at[:, :n].add(arrived), left=left)
-        return self._arrived(a, row, course, now, late, delay)
+        y = course.y.at[:, :n].add(arrived)
+        course = course._replace(t=course.t + late, y=y)
+        left = flags.left | self._has_tick(a, course)
+        flags = _leveled(flags._replace(left=left), row)
+        return self._arrived(row, course, flags, late, delay)
 
-    def _time(self, body: Body, row: Rows, course: Course) -> Course:
+    def _time(self, body: Body, row: Rows, course: Course, flags: Flags):
         """The arrival at a time that is known."""
-        a, q = body.chart, self._state(body.chart, course)
-        now = self._watched(a, row, course.t, q, self._field(a, course.t, q))
-        left = course.left | self._has_left(a, row, course, now)
         # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
-        misses = jnp.abs(course.ends[row.leg] - course.t)
-        course = course._replace(left=left, last=jnp.maximum(course.last, misses))
+        misses = course.ends[row.leg] - course.t
         delay = jnp.zeros_like(course.delay)
-        return self._arrived(a, row, course, now, jnp.zeros(()), delay)
+        return self._arrived(row, course, _leveled(flags, row), misses, delay)
 
-    def _arrived(
-        self, a: int, row: Rows, course: Course, now: Watched, late, delay
-    ) -> Course:
-        """A course on a section, where the next leg begins."""
-        t = course.t + late
-        before = now
-        if self._has_level(a):  # (The next section has another one.)
-            level = len(self.s.guards(a))
-            before = now._replace(value=now.value.at[level].set(jnp.inf))
-        return course._replace(
-            t=t,
-            begin=t,
-            delay=delay,
-            ends=course.ends.at[row.leg].set(t),
-            before=before,
-            last=jnp.maximum(course.last, jnp.abs(late)),
-            left=course.left | self._has_tick(a, course, t) | (t < course.begin),
+    def _arrived(self, row: Rows, course: Course, flags: Flags, late, delay):
+        """A course where a leg has ended, and the next one begins."""
+        t, late = course.t, _still(late)
+        flags = flags._replace(
+            last=jnp.maximum(flags.last, jnp.abs(late)),
+            left=flags.left | _still(t < course.begin),
         )
+        ends = course.ends.at[row.leg].set(t)
+        return course._replace(begin=t, delay=delay, ends=ends), flags
 
     # Functions of a chart.
 
@@ -306,7 +303,14 @@ class Bodies:
         inputs = () if self.inputs is None else (self.inputs,)
         return jax.vmap(function)(*columns, *inputs)
 
-    def _has_left(self, a: int, row: Rows, course: Course, now: Watched):
+    def _noted(self, a: int, row: Rows, flags: Flags, now: Watched) -> Flags:
+        """The flags at a row, where watched functions have these values."""
+        left = flags.left | self._has_left(row, flags.before, now, self._functions(a))
+        return flags._replace(before=now, left=left)
+
+    def _has_left(
+        self, row: Rows, before: Watched, now: Watched, functions: int
+    ) -> Bool[Array, ""]:
         """Test whether the itinerary is left between the row before and this one.
 
         - Where a leg begins, watched functions must have the signs of the recorded trajectory.
@@ -314,9 +318,9 @@ class Bodies:
           later than recorded. (A fall is no event where its predicate does not hold.)
         - The one at whose zero the leg ends must have been positive, and must fall.
         """
-        if not self._functions(a):
+        if not functions:
             return jnp.asarray(False)
-        known, before = row.signs != 0, course.before
+        known = row.signs != 0
         known = known & (jnp.arange(self.width) != row.target)
         begins = jnp.isinf(before.value)
         # (Comparisons with NaN are false.)
@@ -337,9 +341,9 @@ class Bodies:
         falls = now.rate[row.target] < 0
         return (row.target >= 0) & ~(was_positive & falls)
 
-    def _has_tick(self, a: int, course: Course, t) -> Bool[Array, ""]:
-        """Test whether a scheduled event was due in a leg that ends at t, before its end."""
-        due = jnp.asarray(False)
+    def _has_tick(self, a: int, course: Course) -> Bool[Array, ""]:
+        """Test whether a scheduled event has been due since the leg began, and before now."""
+        due, t = jnp.asarray(False), course.t
         for g in self.s.schedules(a):
             guard = self.s.transitions[g].guard
             assert isinstance(guard, Scheduled)
@@ -348,6 +352,19 @@ class Bodies:
             last = jnp.ceil((t - offset) / period - _SAME_TICK) - 1
             due = due | (last > before)
         return jax.lax.stop_gradient(due)
+
+
+def _still(tree: Any) -> Any:
+    return jax.lax.stop_gradient(tree)
+
+
+def _leveled(flags: Flags, row: Rows) -> Flags:
+    """Flags on a section: of the level of the next one nothing is known. (Charts without a level
+    have no such row: nothing is set.)"""
+    value = flags.before.value
+    if value.size:
+        value = value.at[row.target].set(jnp.inf, mode="drop")
+    return flags._replace(before=flags.before._replace(value=value))
 
 
 def _newton(now: Watched, target) -> Float[Array, ""]:

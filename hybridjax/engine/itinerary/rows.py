@@ -37,7 +37,7 @@ _LEGS = 4
 _NEAR_ZERO = 1e-7
 
 # What a row does.
-NOTHING, PIECE, SCHEDULE, STEP, JUMP, LEVEL, TIME = range(7)
+NOTHING, SCHEDULE, STEP, JUMP, LEVEL, TIME = range(6)
 
 
 class Rows(NamedTuple):
@@ -49,12 +49,12 @@ class Rows(NamedTuple):
     fraction: Float[np.ndarray, " R"]
     """Length of a step, as a part of the leg."""
     target: Int[np.ndarray, " R"]
-    """Of a correction: the row of the watched function of the chart that it brings to zero. -1 for
-    a step."""
+    """Of a correction: the row of the watched function of the chart that it brings to zero. Of an
+    arrival on a section: that of the level. -1 for a step."""
     place: Int[np.ndarray, " R"]
     """Of a jump: index of the transition among those of its kind."""
     piece: Int[np.ndarray, " R"]
-    """Number of the piece that begins; that of all pieces for none."""
+    """Of a step: number of the piece that begins with it; that of all pieces for none."""
     onward: Bool[np.ndarray, " R"]
     """Of a jump: whether the trajectory goes on after it. Otherwise it ends on a section right
     after the event."""
@@ -251,20 +251,15 @@ def _written(
     **Arguments:** `pieces`: leg and number of the node at which each piece begins; node -1 for one
     that begins with the leg, on a section.
     """
-    begun = _Begun(s, legs, table)
+    begun = _Begun(s, legs)
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
-        if (k, -1) in pieces:
-            begun.piece(k, times[0])
-        begins = {j for j in range(len(times)) if (k, j) in pieces}
+        begins = {j for j in range(-1, len(times)) if (k, j) in pieces}
         _rows_of_leg(s, table, k, leg, times, begun, begins)
         # (A trajectory that ends with an event ends at a time that is free.)
-        is_end = k == len(legs) - 1 or (k + 1, -1) in pieces
+        is_last = k == len(legs) - 1
+        goes_on = not is_last and (k + 1, -1) not in pieces
         before = leg.signs(times[-2]) if len(times) > 1 else leg.unknown
-        _end(s, table, k, leg, before, goes_on=not is_end)
-    if legs[-1].code < 0 and legs[-1].code != ARRIVE_LEVEL:
-        # (The end at a time may lie in any chart: all of these itineraries share a program.)
-        table.include(Body(TIME, leg.chart) for leg in legs)
-    table.include(Body(PIECE, leg.chart) for leg in legs)
+        _end(s, table, k, leg, before, goes_on, is_last)
     ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
     form, rows, used = _finished(table)
     armed = np.array(begun.armed).reshape(len(begun.charts), len(s.transitions))
@@ -286,20 +281,19 @@ class _Begun:
     """The pieces of an itinerary that have begun: their charts, the numbers of events before them,
     and the transitions that are armed."""
 
-    def __init__(self, s: Structure, legs: list[_Leg], table: _Table):
-        self._s, self._legs, self._table = s, legs, table
+    def __init__(self, s: Structure, legs: list[_Leg]):
+        self._s, self._legs = s, legs
         self.charts: list[int] = []
         self.events: list[int] = []
         self.armed: list[np.ndarray] = []
 
-    def piece(self, k: int, t: float) -> None:
-        """Begin a piece at a time in leg k."""
+    def piece(self, k: int, t: float) -> int:
+        """Begin a piece at a time in leg k, and return its number."""
         leg = self._legs[k]
-        number = len(self.charts)
-        self._table.add(Body(PIECE, leg.chart), k, leg.unknown, piece=number)
         self.charts.append(leg.chart)
         self.events.append(sum(before.code >= 0 for before in self._legs[:k]))
         self.armed.append(_armed(self._s, leg.chart, t, leg.signs(t)))
+        return len(self.charts) - 1
 
 
 def _rows_of_leg(
@@ -311,16 +305,25 @@ def _rows_of_leg(
     begun: _Begun,
     begins: set[int],
 ) -> None:
-    """Add the rows of leg k until its end. `begins`: numbers of the steps at which pieces begin."""
+    """Add the rows of leg k until its end.
+
+    **Arguments:** `begins`: numbers of the steps at which pieces begin; -1 for the beginning of the
+    leg, on a section.
+    """
     if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
         table.add(Body(SCHEDULE, leg.chart, (leg.code,)), k, leg.unknown)
     step = Body(STEP, leg.chart)
-    for j, fraction in enumerate(_fractions(times)):
+    fractions = _fractions(times)
+    if -1 in begins and not len(fractions):
+        # (A piece begins with a step, if need be with one of no time.)
+        fractions = np.zeros(1)
+    for j, fraction in enumerate(fractions):
         t = times[j]
-        if j in begins:
-            begun.piece(k, t)
-        signs = leg.signs(t)
-        table.add(step, k, signs, fraction=fraction, section=leg.section)
+        piece = None
+        if j in begins or (j == 0 and -1 in begins):
+            piece = begun.piece(k, t)
+        where: Any = dict(piece=piece, section=leg.section)
+        table.add(step, k, leg.signs(t), fraction=fraction, **where)
 
 
 def _is_certain(s: Structure, leg: _Leg) -> bool:
@@ -363,7 +366,13 @@ def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
 
 
 def _end(
-    s: Structure, table: _Table, k: int, leg: _Leg, before: np.ndarray, goes_on: bool
+    s: Structure,
+    table: _Table,
+    k: int,
+    leg: _Leg,
+    before: np.ndarray,
+    goes_on: bool,
+    is_last: bool,
 ) -> None:
     """Add the rows with which leg k ends. `before`: signs where its last step begins."""
     a, signs = leg.chart, leg.ends[-1]
@@ -373,7 +382,10 @@ def _end(
         body = Body(LEVEL, a)
         table.add(body, k, signs, target=target, section=leg.section)
     elif leg.code < 0:
-        table.add(Body(TIME, a), k, signs, section=leg.section)
+        if is_last:
+            # (The next row tests what has happened in a step. Here none would follow.)
+            table.add(Body(STEP, a), k, signs, section=leg.section)
+        table.add(Body(TIME), k, leg.unknown, target=len(s.guards(a)))
     else:
         jump, place = _jump(s, leg.code, leg.at_once)
         target = -1

@@ -13,7 +13,7 @@ from ..._core.loops import loop, pushed
 from ...systems.structure import Structure
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import Bodies, Course, Watched
+from .bodies import Bodies, Course, Flags, Watched
 from .rows import Body, Form, Rows
 from .steps import Solver, solver_of
 
@@ -102,16 +102,18 @@ def follow(
     rows = jax.tree_util.tree_map(jnp.asarray, rows)
     numbers = travelers.numbers
     constants = _Constants(numbers, levels, settings, rows, count, begin, known)
-    state = steps.depart(constants, ends)
+    state, flags = steps.depart(constants, ends)
     if count is not None:
         every = passes * count
-        state = loop(steps.take, steps.take_along, constants, state, every)
+        state, flags = loop(
+            steps.take, steps.take_along, constants, state, flags, every
+        )
     else:
-        one = lambda state, row: (steps.row(constants, row, state), None)  # noqa: E731
+        one = lambda both, row: (steps.row(constants, row, *both), None)  # noqa: E731
         for _ in range(passes):
-            state = steps.depart(constants, state.course.ends)
-            state = jax.lax.scan(one, state, rows)[0]
-    return _passage(state, form, columns, travelers.many)
+            both = steps.depart(constants, state.course.ends)
+            (state, flags), _ = jax.lax.scan(one, both, rows)
+    return _passage(state, flags, form, columns, travelers.many)
 
 
 def _number_of_columns(columns: bool, inputs: Array | None, d: int) -> int:
@@ -132,7 +134,7 @@ class _Steps:
     reverse: bool
     passes: int
 
-    def depart(self, constants: "_Constants", ends) -> "_State":
+    def depart(self, constants: "_Constants", ends) -> "tuple[_State, Flags]":
         """The beginning, with guessed ends of legs."""
         known = constants.known
         ends = jax.lax.stop_gradient(ends)
@@ -142,75 +144,86 @@ class _Steps:
         def of_lane(t, q, ends):
             return _departed(t, q, ends, self.columns, self.form)
 
-        course = self.travelers.each(of_lane)(*constants.begin, ends)
+        course, flags = self.travelers.each(of_lane)(*constants.begin, ends)
         # (Rows at which no piece begins write into one more place.)
         kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
         begun = _Begun(*map(kept, (course.t, course.y, course.delay, course.rate)))
-        return _State(course, begun)
+        return _State(course, begun), flags
 
-    def take(self, constants: "_Constants", k, state: "_State") -> "_State":
+    def take(self, constants: "_Constants", k, state: "_State", flags: Flags):
         """Step k, which may be the first of another pass."""
         if self.passes > 1:
-            again = self._restart(constants, state)
-            state = _chosen(_is_new(constants, k), again, state)
-        return self.row(constants, _row(constants, k), state)
+            again = self._restart(constants, state, flags)
+            state, flags = _chosen(_is_new(constants, k), again, (state, flags))
+        return self.row(constants, _row(constants, k), state, flags)
 
     def take_along(
-        self, constants, by_constants, k, state: "_State", columns: "_State"
+        self, constants, by_constants, k, state: "_State", columns: "_State", flags
     ):
         """The same, with derivatives in directions on the first axis."""
         if self.passes > 1:
-            again = pushed(self._restart, constants, by_constants, state, columns)
-            state, columns = _chosen(_is_new(constants, k), again, (state, columns))
+            carry = state, columns, flags
+            again = pushed(self._restart, constants, by_constants, *carry)
+            state, columns, flags = _chosen(_is_new(constants, k), again, carry)
         row = _row(constants, k)
 
         # (Derivatives of the bodies, not of the choice among them: that takes many times as long.)
         def along(body):
-            def of(row, course, by_course):
+            def of(row, course, by_course, flags):
                 one = ft.partial(self._body, body, row)
-                return pushed(one, constants, by_constants, course, by_course)
+                return pushed(one, constants, by_constants, course, by_course, flags)
 
             return of
 
         branches = [along(body) for body in self.form.bodies]
         ended = state.begun.ended(row, state.course)
         by_ended = columns.begun.ended(row, columns.course, 1)
-        both = state.course, columns.course
-        course, by_course = jax.lax.switch(row.body, branches, row, *both)
+        carry = state.course, columns.course, flags
+        course, by_course, flags = jax.lax.switch(row.body, branches, row, *carry)
         begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
-        return _State(course, begun), _State(by_course, by_begun)
+        return _State(course, begun), _State(by_course, by_begun), flags
 
-    def row(self, constants: "_Constants", row: Rows, state: "_State") -> "_State":
+    def row(self, constants: "_Constants", row: Rows, state: "_State", flags: Flags):
         """What a row does."""
 
         # (Constants are no arguments: sections also hold names.)
         def branch(body):
-            return lambda row, course: self._body(body, row, constants, course)
+            return lambda row, course, flags: self._body(
+                body, row, constants, course, flags
+            )
 
         branches = [branch(body) for body in self.form.bodies]
         ended = state.begun.ended(row, state.course)
-        course = jax.lax.switch(row.body, branches, row, state.course)
-        return _State(course, ended.begun(row, course))
+        course, flags = jax.lax.switch(row.body, branches, row, state.course, flags)
+        return _State(course, ended.begun(row, course)), flags
 
-    def _restart(self, constants: "_Constants", state: "_State") -> "_State":
+    def _restart(self, constants: "_Constants", state: "_State", flags: Flags):
         return self.depart(constants, state.course.ends)
 
-    def _body(self, body: Body, row: Rows, constants: "_Constants", course: Course):
+    def _body(
+        self,
+        body: Body,
+        row: Rows,
+        constants: "_Constants",
+        course: Course,
+        flags: Flags,
+    ) -> tuple[Course, Flags]:
         """What rows with a body do, in all lanes."""
 
-        def of_lane(numbers, course):
+        def of_lane(numbers, course, flags):
             s = self.travelers.of(numbers)
             bodies = Bodies(
                 s,
                 constants.levels,
                 constants.settings,
                 self.form.watched,
+                self.form.pieces,
                 lambda a: self._solver(s, a),
                 self.inputs,
             )
-            return bodies.of(body)(row, course)
+            return bodies.of(body)(row, course, flags)
 
-        return self.travelers.each(of_lane)(constants.numbers, course)
+        return self.travelers.each(of_lane)(constants.numbers, course, flags)
 
     def _solver(self, s: Structure, a: int) -> Solver:
         if self.solver is not None:
@@ -235,21 +248,23 @@ def _row(constants: "_Constants", k: Int[Array, ""]) -> Rows:
     return jax.tree_util.tree_map(lambda x: x[place], constants.rows)
 
 
-def _departed(t, q: Float[Array, " d"], ends, C: int, form: Form) -> Course:
+def _departed(
+    t, q: Float[Array, " d"], ends, C: int, form: Form
+) -> tuple[Course, Flags]:
     """The course of a lane where it begins, with C columns."""
-    zero, d = jnp.zeros_like(t), len(q)
-    return Course(
+    d = len(q)
+    course = Course(
         t=t,
         y=jnp.concatenate([q[None], jnp.eye(C, d)]),
         rate=jnp.zeros(d),
         begin=t,
         delay=jnp.zeros(C),
         ends=ends,
-        before=Watched.unknown(t, form.watched),
-        error=zero,
-        last=zero,
-        left=jnp.asarray(False),
     )
+    t = jax.lax.stop_gradient(t)
+    zero = jnp.zeros_like(t)
+    before = Watched.unknown(t, form.watched)
+    return course, Flags(before, error=zero, last=zero, left=jnp.asarray(False))
 
 
 class _Constants(NamedTuple):
@@ -271,7 +286,9 @@ class _State(NamedTuple):
     begun: "_Begun"
 
 
-def _passage(state: _State, form: Form, columns: bool, many: bool) -> Passage:
+def _passage(
+    state: _State, flags: Flags, form: Form, columns: bool, many: bool
+) -> Passage:
     """What has been passed at the end."""
     (course, begun), K = state, form.pieces
     # (Columns begin anew with each piece: those before are the factors.)
@@ -289,9 +306,9 @@ def _passage(state: _State, form: Form, columns: bool, many: bool) -> Passage:
         last(begun.rate[:K]),
         jnp.swapaxes(last(factors), -1, -2),
         course.delay,
-        course.error,
-        course.last,
-        course.left,
+        flags.error,
+        flags.last,
+        flags.left,
     )
 
 
