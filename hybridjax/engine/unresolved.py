@@ -22,7 +22,7 @@ from .settings import ROUNDING, Settings
 
 # Words of `jax_compat.suddenness`. Beside poles values fall as the inverse, or its square, of the
 # distance, which few points in a step see, unless the program has powers beyond squares.
-_POLES = frozenset(["pole"])
+POLES = frozenset(["pole"])
 # Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
 # poles only. Fewer: short pulses are missed. More: time.
 _PIECES = 64
@@ -122,7 +122,7 @@ def _passing(
     s = path.structure
     n = s.dims[a]
     m = n * (1 + s.nu)
-    only_poles = may_have_pulses(s, a) <= _POLES
+    only_poles = may_have_pulses(s, a) <= POLES
     samples = _samples(s.method(a), only_poles, linear)
     with_guards = bool(may_be_sudden(s, a, _guards))
     parts = []
@@ -276,7 +276,7 @@ def values_at(
     """The field of chart a at points and its derivatives by the inputs; if so asked, the `guards`
     and whether their predicates hold, too."""
 
-    lanes = kernels.POINTS if may_have_pulses(s, a) <= _POLES else kernels.WIDE
+    lanes = kernels.POINTS if may_have_pulses(s, a) <= POLES else kernels.WIDE
 
     def at(x):
         point = (x[:, 0], x[:, 1:].T, u[:, None])
@@ -301,7 +301,7 @@ def may_have_pulses(s: Structure, a: int) -> frozenset[str]:
 
 def may_jump(s: Structure, a: int) -> bool:
     """Test whether the field of chart a may jump."""
-    return bool(may_be_sudden(s, a, Structure.field) - _POLES)
+    return bool(may_be_sudden(s, a, Structure.field) - POLES)
 
 
 def _guards(s: Structure, a: int, *point: Any) -> Any:

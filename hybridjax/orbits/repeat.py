@@ -22,7 +22,7 @@ from ..engine.arrays import Array
 from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, Travelers, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
-from ..engine.unresolved import may_have_pulses
+from ..engine.unresolved import POLES, may_have_pulses
 from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
@@ -94,12 +94,12 @@ class Route(NamedTuple):
 def has_route(map: ReturnMap) -> bool:
     """Test whether the flags of a route tell all that may happen beside it: not whether a cycle of
     several turns closes sooner, a scheduled event has become enabled, or a field has a pulse that
-    is shorter than a step."""
+    is shorter than a step. (A pulse at a pole reaches the nodes of the two integrations.)"""
     s = map.structure
     scheduled = [x for x in s.transitions if isinstance(x.guard, Scheduled)]
     if map.multiplicity > 1 or any(x.enabled is not None for x in scheduled):
         return False
-    return not any(may_have_pulses(s, a) for a in range(len(s.charts)))
+    return not any(may_have_pulses(s, a) - POLES for a in range(len(s.charts)))
 
 
 def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
