@@ -277,29 +277,48 @@ def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def _root(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+def _solved(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
     return _corrected(maps, form, plan, q, ends)
 
 
-@_root.def_jvp
-def _root_jvp(primals, tangents):
-    """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp; nothing else of the result has derivatives."""
+@_solved.def_jvp
+def _solved_jvp(primals, tangents):
+    """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
+
+    The derivative of a turn is taken twice, in a loop that is compiled once: first where q stands,
+    for dP/dp, then where it moves.
+    """
     maps, form, plan, *_ = primals
-    found = _root(*primals)
-    q, ends = found.q, found.passage.ends
-    _, moved = _at_fixed_state(maps, tangents[0], form, plan, q, ends)
-    passage, _ = turn(maps, form, plan, q, ends)
-    _, step, *_ = maps.each(_newton, passage.factors, moved, q)
+    by_maps = _without_settings(tangents[0])
+    found = _solved(*primals)
+    q, factors = found.q, found.passage.factors
+    ends = jax.lax.stop_gradient(found.passage.ends)
+
+    def around(maps, q):
+        return turn(maps, form, plan, q, ends)
+
+    def along(by_q, _):
+        _, (by_passage, moved) = eqx.filter_jvp(around, (maps, q), (by_maps, by_q))
+        _, step, *_ = maps.each(_newton, factors, moved, q)
+        return by_q + step, by_passage
+
+    by_q, by_passages = jax.lax.scan(along, jnp.zeros_like(q), length=2)
+    by_passage = jax.tree_util.tree_map(lambda x: x[-1], by_passages)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
-    return found, nothing._replace(q=step)
+    return found, nothing._replace(q=by_q, passage=by_passage)
+
+
+def _without_settings(by_maps: Any) -> Any:
+    """Derivatives of maps, whose settings have none."""
+    fixed = jax.tree_util.tree_map(lambda _: None, by_maps.map.settings)
+    return eqx.tree_at(
+        lambda x: x.map.settings, by_maps, fixed, is_leaf=lambda x: x is None
+    )
 
 
 def _at_fixed_state(maps: Maps, by_maps: Any, form: Form, plan: Plan, q, ends):
     """Derivatives of the time at the end of a turn from q, and of P(q) - q."""
-    fixed = jax.tree_util.tree_map(lambda _: None, maps.map.settings)
-    by_maps = eqx.tree_at(
-        lambda x: x.map.settings, by_maps, fixed, is_leaf=lambda x: x is None
-    )
+    by_maps = _without_settings(by_maps)
 
     def end(maps):
         passage, residual = turn(maps, form, plan, q, ends, columns=False)
@@ -347,9 +366,7 @@ def correct(
         return _corrected(maps, form, plan, q, ends)
     if derivatives == "first":
         return _root_and_period(maps, form, plan, still(q), still(ends))
-    found = _root(maps, form, plan, still(q), still(ends))
-    passage, _ = turn(maps, form, plan, found.q, still(found.passage.ends))
-    return found._replace(passage=passage)
+    return _solved(maps, form, plan, still(q), still(ends))
 
 
 def factors_across(

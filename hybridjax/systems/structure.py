@@ -26,9 +26,10 @@ from jaxtyping import Int
 from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.call import once_in_call
-from .._core.compilation import kernel
+from .._core.compilation import identity, kernel
 from .._core.executor import Array, is_hidden
 from .._core.lanes import PerLane, by_lane, one_lane, shared
+from .._core.meaning import program_digest
 from .._core.memo import Memory
 from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError
@@ -150,6 +151,7 @@ class ByName(dict):
 
 _kinds = Memory()
 _all_clocks = Memory()
+_clocks_of_programs: dict[tuple, np.ndarray] = {}
 
 
 @jax.tree_util.register_pytree_node_class
@@ -402,7 +404,17 @@ class Structure:
         for the next tick. Clocks of other formulas may tick at the same time, such as
         `Scheduled(T)` and `Scheduled(T, duty * T)` at duty 0, and each then leads to an event.
         """
-        return _all_clocks.recall(self.source, None, self._clocks)
+        return _all_clocks.recall(self.source, None, self._clocks_of_program)
+
+    def _clocks_of_program(self) -> Int[np.ndarray, " G"]:
+        system = one_lane(self.source)
+        if not program_digest(system):
+            return self._clocks()
+        # (Systems with the same programs share them, whatever their numbers.)
+        program = identity(system)
+        if program not in _clocks_of_programs:
+            _clocks_of_programs[program] = self._clocks()
+        return _clocks_of_programs[program]
 
     def _clocks(self) -> Int[np.ndarray, " G"]:
         numbers = np.full(len(self.transitions), -1)
