@@ -243,6 +243,7 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "findings")
         self.require_current()
+        self._require_period()
         return verdict(self).findings
 
     @property
@@ -250,6 +251,7 @@ class LimitCycle(eqx.Module):
         """Names of transitions out of charts of the cycle that do not happen on it."""
         _require_values(self, "not_reached")
         self.require_current()
+        self._require_period()
         return verdict(self).not_reached
 
     @property
