@@ -231,7 +231,8 @@ def together(
     turn begins.
 
     **Arguments:** `codes`, negative for no event, and `times`, of the events in order; `rivals`,
-    transitions that were due at these, too, negative for none; `begin`, times at which the turns begin, minus infinity for one that begins with no event.
+    transitions that were due at these, too, negative for none; `begin`, times at which the turns
+    begin, minus infinity for one that begins with no event.
     """
     row, column = np.nonzero(codes >= 0)
     time = times[row, column]
