@@ -373,6 +373,7 @@ CASES: dict[str, Callable[[], Case]] = {
         "r",
         (28.0, 60.0),
         {"section": hj.Crossing("z", "rising", 27.0), "multiplicity": 2},
+        ends=(OVER, "touches its section (z rising) tangentially"),
         marks=None,
     ),
     "Brusselator": lambda: Case(
