@@ -365,7 +365,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "Duffing, force": lambda: Case(
         m.Duffing(rate=1.5, amplitude=0.2),
         "amplitude",
-        (0.1, 2.0),
+        (0.1, 4.0),
         marks=[("fold", np.nan), ("fold", np.nan)],
     ),
     "Lorenz": lambda: Case(
@@ -373,6 +373,7 @@ CASES: dict[str, Callable[[], Case]] = {
         "r",
         (28.0, 60.0),
         {"section": hj.Crossing("z", "rising", 27.0), "multiplicity": 2},
+        ends=(OVER, "touches its section (z rising) tangentially"),
         marks=None,
     ),
     "Brusselator": lambda: Case(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.executor import cond, namespace, put
 from .._core.lanes import put_rows
 from ..systems.structure import Kind, Member, Structure
-from ..systems.transition import SAME_TIME, Scheduled
+from ..systems.transition import SAME_TIME, TOGETHER, Scheduled
 from . import kernels
 from .arrays import Array, Index, Inputs, Mask, Padded, Times
 from .lanes import Lanes, for_each_chart, needed, only
@@ -86,6 +86,35 @@ def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
     """
     late = SAME_TIME * span + ROUNDING * abs(t)
     return watched.value[:-1] < -late * abs(watched.rate[:-1])
+
+
+def rival_of(
+    s: Structure, lanes: Lanes, watched: Watch, u: Inputs, fired: Index, span: Times
+) -> Index:
+    """The guards (by index; -1: none) that come to zero where the events `fired` happen, too.
+
+    If the reset of an event puts the other guard away from zero, only one of the two happens, and
+    rounding has decided which.
+
+    **Arguments:** `lanes`, `watched`: before the resets.
+    """
+    xp = namespace(fired)
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
+    other = (np.arange(len(s.transitions))[:, None] != fired) & (fired >= 0)
+    by_guard = (s.clocks < 0)[:, None]
+    falls = (xp.abs(value) <= TOGETHER * span * xp.abs(rate)) & (rate < 0)
+    due = lanes.armed & other & by_guard & falls
+
+    def first_enabled():
+        which = xp.full_like(fired, -1)
+        for g in range(len(s.transitions)):
+            rival = xp.where(due[g] & (which < 0), np.int32(g), np.int32(-1))
+            holds = enabled(s, lanes.t, lanes.q, u, rival)
+            which = xp.where(holds & (rival >= 0), rival, which)
+        return which
+
+    return cond(due.any(), first_enabled, lambda: xp.full_like(fired, -1))
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:

@@ -146,6 +146,9 @@ class Tape(NamedTuple):
     at_once: Bool[Array, "R L"]
     """Whether the move is an event at once, whose guard was beyond zero: its time is that of the
     event before."""
+    rival: Int[Array, "R L"]
+    """Another transition (by index; negative: none) whose armed guard is at zero, too, where the
+    move ends in an event: neighbors may meet it first."""
 
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
@@ -162,7 +165,8 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     code = xp.full((rows, L), IDLE, xp.int32)
     chart = xp.zeros((rows, L), xp.int32)
     at_once = xp.zeros((rows, L), bool)
-    return Tape(times(), code, times(), states(), states(), chart, at_once)
+    rival = xp.full((rows, L), -1, xp.int32)
+    return Tape(times(), code, times(), states(), states(), chart, at_once, rival)
 
 
 def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:

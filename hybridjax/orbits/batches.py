@@ -227,14 +227,15 @@ class Tiles(NamedTuple):
 
         def events(turned):
             anchor, expected, turn = jax.tree_util.tree_map(np.asarray, turned)
-            codes, times = (x.reshape(len(x), -1) for x in (turn.codes, turn.times))
+            of_events = turn.codes, turn.times, turn.rivals
+            codes, times, rivals = (x.reshape(len(x), -1) for x in of_events)
             at_event = isinstance(self.map.base, AtEvent)
             begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
-            coincide = together(codes, times, begin, turn.period)
+            coincide = together(codes, times, rivals, begin, turn.period)
             return (
                 anchor,
                 expected,
-                turn._replace(codes=None, times=None),
+                turn._replace(codes=None, times=None, rivals=None),
                 front(codes),
                 coincide,
             )

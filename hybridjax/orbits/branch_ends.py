@@ -47,6 +47,8 @@ class End(NamedTuple):
 
 def explained(cycle: LimitCycle, result: Result) -> End:
     """The cause of the end of a branch after a cycle, where the next turn had a result."""
+    if result == Result.EQUILIBRIUM:
+        return _shrunk(cycle) or End(result, result.message)
     if result not in _UNCLEAR:
         return End(result, result.message)
     visits = visits_of(cycle)

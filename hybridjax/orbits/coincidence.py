@@ -44,13 +44,15 @@ class Coincidence(NamedTuple):
 
     time: float
     orders: tuple[tuple[str, ...], ...]
-    """The names of the events, in every order in which all of them can happen."""
+    """The names of the events, in every order in which they can happen. (One may not happen in some
+    order, if the reset of another puts its guard away from zero.)"""
     derivatives: tuple[Float[np.ndarray, "m n"], ...]
     """For each order, the derivative of the state after all events with respect to the state
     before them, at the same time (a product of saltation matrices). It holds for neighbors of the
     cycle that reach the events in this order."""
     commute: bool
-    """Whether all orders lead to the same state, with the same derivative."""
+    """Whether all orders lead through as many events to the same state, with the same
+    derivative."""
 
 
 class _Order(NamedTuple):
@@ -92,29 +94,27 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
         group = rows[first:after].tolist()
         events = path.event[group].tolist()
         missed = _missed(cycle.structure, events, float(times[first]), period)
-        count = len({*events, *missed})
-        if count < 2:
+        missed |= _rivals(path, group[0], events, period)
+        if len({*events, *missed}) < 2:
             continue
         before_last = range(group[0], group[-1])
         in_order = all(_follows_at_once(path, k, period) for k in before_last)
-        if count == len(events) and in_order:
+        if in_order and not missed:
             groups.append(None)
         else:
-            groups.append(_coincidence(cycle, path, group[0], count))
+            groups.append(_coincidence(cycle, path, group[0]))
     return groups
 
 
-def _coincidence(
-    cycle: LimitCycle, path: Trajectory, k: int, count: int
-) -> Coincidence:
-    """The group of so many events of which event k of a path is the first."""
+def _coincidence(cycle: LimitCycle, path: Trajectory, k: int) -> Coincidence:
+    """The group of events of which event k of a path is the first."""
     s = cycle.structure
     t = float(path.t[k])
     a = int(path.chart[k - 1])
     n = s.dims[a]
     before = _Order((), a, path.before[k, :n], np.eye(n))
     due = 10 * TOGETHER * float(cycle.period)
-    orders = list(_orders(s, t, before, count, due))
+    orders = list(_orders(s, t, before, due))
     names = tuple(
         tuple(s.transitions[g].name for g in order.events) for order in orders
     )
@@ -178,7 +178,7 @@ def events_of(turn: Turn) -> list[tuple[int, float]]:
 
 def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
     """Two transitions of a turn, by index, that are due at the same time; the turn may have passed
-    over a scheduled one."""
+    over one of them."""
     s = map.structure
     period = float(turn.period)
     events = events_of(turn)
@@ -191,6 +191,10 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
         by_clock = s.clocks[g] >= 0 and s.clocks[other] >= 0
         if later - t <= TOGETHER * period and not by_clock:
             return g, other
+    codes = np.ravel(np.asarray(turn.codes))
+    rivals = np.ravel(np.asarray(turn.rivals))
+    for k in np.flatnonzero((codes >= 0) & (rivals >= 0)):
+        return int(codes[k]), int(rivals[k])
     for g, t in events:
         for other in _missed(s, [g], t, period):
             return g, other
@@ -200,8 +204,8 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
 def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
     """Test whether two events of a turn coincide whose order may be another one beside it; also in
     programs, where their orders are not compared."""
-    codes, times, at_once = (
-        stop_gradient(x.ravel()) for x in (tape.code, tape.t, tape.at_once)
+    codes, times, at_once, rivals = (
+        stop_gradient(x.ravel()) for x in (tape.code, tape.t, tape.at_once, tape.rival)
     )
     xp = namespace(times)
     times = xp.where(codes >= 0, times, xp.inf)
@@ -212,27 +216,30 @@ def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
     by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
     close = times[1:] <= times[:-1] + TOGETHER * stop_gradient(period)
     fixed = at_once[1:] | (by_clock[1:] & by_clock[:-1])
-    return (close & (codes[1:] >= 0) & ~fixed).any()
+    both_happen = (close & (codes[1:] >= 0) & ~fixed).any()
+    return both_happen | (rivals >= 0).any()
 
 
 def together(
     codes: Int[np.ndarray, "S R"],
     times: Float[np.ndarray, "S R"],
+    rivals: Int[np.ndarray, "S R"],
     begin: Float[np.ndarray, " S"],
     period: Float[np.ndarray, " S"],
 ) -> Bool[np.ndarray, " S"]:
     """The turns, among many, in which two events coincide, or an event and the one with which the
     turn begins.
 
-    **Arguments:** `codes`, negative for no event, and `times`, of the events in order; `begin`,
-    times at which the turns begin, minus infinity for one that begins with no event.
+    **Arguments:** `codes`, negative for no event, and `times`, of the events in order; `rivals`,
+    transitions that were due at these, too, negative for none; `begin`, times at which the turns
+    begin, minus infinity for one that begins with no event.
     """
     row, column = np.nonzero(codes >= 0)
     time = times[row, column]
     is_first = np.diff(row, prepend=-1) > 0
     before = np.where(is_first, begin[row], np.roll(time, 1))
     close = time - before <= TOGETHER * period[row]
-    out = np.zeros(len(codes), bool)
+    out = (rivals >= 0).any(axis=1)
     out[row[close]] = True
     return out
 
@@ -254,6 +261,26 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
     }
 
 
+def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[int]:
+    """The guards that fall to zero where event k of a path happens, and are none of these events:
+    those of `Tape.rival`."""
+    s = path.structure
+    a = int(path.chart[k - 1])
+    n = s.dims[a]
+    times = path.t[[k - 1, k]]
+    states = np.stack([path.after[k - 1, :n], path.before[k, :n]])
+    u = np.zeros((s.nu, 1))
+    found = set()
+    for g in s.guards(a):
+        event = jump(s, g, times, states, u)
+        close = TOGETHER * period * np.abs(event.rate)
+        falls = event.level[0] > close[0] and event.rate[1] < 0
+        holds = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u).all()
+        if g not in events and falls and abs(event.level[1]) <= close[1] and holds:
+            found.add(g)
+    return found
+
+
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     """True if scheduled event g happens at t."""
     schedule = cast(Scheduled, s.transitions[g].guard)
@@ -261,9 +288,10 @@ def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
 
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:
-    """True if all orders lead from chart a to the same state, with the same derivative."""
-    # (Where there is a single order, an event does not happen in the other.)
-    if len(orders) < 2 or len({order.chart for order in orders}) > 1:
+    """True if all orders lead from chart a through as many events to the same state, with the same
+    derivative."""
+    ends = {(order.chart, len(order.events)) for order in orders}
+    if len(orders) < 2 or len(ends) > 1:
         return False
     m, n = orders[0].derivative.shape
     rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
@@ -271,13 +299,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     return bool(np.max(apart) < SAME)
 
 
-def _orders(
-    s: Structure, t: float, before: _Order, left: int, due: float
-) -> Iterator[_Order]:
-    """All orders in which `left` more events can happen at once."""
-    if not left:
-        yield before
-        return
+def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Order]:
+    """All orders in which events can happen at once after those before, until none is due."""
     a = before.chart
     q = before.state[None]
     u = np.zeros((s.nu, 1))
@@ -288,6 +311,7 @@ def _orders(
         for g in s.schedules(a)
         if _scheduled_at(s, g, t, due) and s.clocks[g] not in happened
     ]
+    is_last = True
     for g in [*scheduled, *s.guards(a)]:
         if g in before.events:
             continue
@@ -302,7 +326,10 @@ def _orders(
         b = s.chart_index(s.transitions[g].target)
         events = (*before.events, g)
         order = _Order(events, b, event.after[0], saltation @ before.derivative)
-        yield from _orders(s, t, order, left - 1, due)
+        is_last = False
+        yield from _orders(s, t, order, due)
+    if is_last and before.events:
+        yield before
 
 
 def check_begin(map: ReturnMap) -> None:

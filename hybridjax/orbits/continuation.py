@@ -264,9 +264,9 @@ def _branch(
     high = int(min(bad[bad > start], default=len(points)))
     begin, end = ends
     if low > 0:
-        begin = _refused(points[low].value, cycles[low - 1])
+        begin = _refused(points[low].value, points[low - 1], cycles[low - 1])
     if high < len(points):
-        end = _refused(points[high - 1].value, cycles[high])
+        end = _refused(points[high - 1].value, points[high], cycles[high])
     if (low, high) != (0, len(points)):
         points = points[low:high]
         cycles = _stack(curve, points)
@@ -281,8 +281,10 @@ def _branch(
     return Branch(curve.parameter, values, cycles, marked, (begin, end))
 
 
-def _refused(value: float, cycle: LimitCycle) -> BranchEnd:
-    """The end of a branch before a cycle that its checks refuse."""
+def _refused(value: float, point: Point, cycle: LimitCycle) -> BranchEnd:
+    """The end of a branch before the cycle of a point that its checks refuse."""
+    # (That one has no period.)
+    cycle = dataclasses.replace(cycle, period=point.turn.period)
     texts = [finding.text for finding in verdict(cycle).refused]
     result = Result(int(cycle.result))
     return BranchEnd(value, result, " ".join(texts[:1]) or result.message)
@@ -290,7 +292,8 @@ def _refused(value: float, cycle: LimitCycle) -> BranchEnd:
 
 def _explained(cycle: LimitCycle, end: BranchEnd) -> BranchEnd:
     """The end of a branch after a cycle, with its cause."""
-    if end.result == Result.NOT_VERIFIED:  # (Linearizations fail near a grazing.)
+    # (Linearizations fail near a grazing, and a cycle that is only rounding closes after any time.)
+    if end.result in (Result.NOT_VERIFIED, Result.EXTRA_TURNS):
         cause = explained(cycle, Result.NOT_CONVERGED)
         known = cause.message != Result.NOT_CONVERGED.message
         return BranchEnd(end.value, *cause) if known else end

@@ -29,6 +29,10 @@ _ROUNDING = 1e-8
 # The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
 # move shorten the steps. Larger: steps are longer than the orbit.
 _LEAST_RANGE = 0.02
+# A cycle without events is an equilibrium from this part of the range of the first cycle on.
+# Smaller: rounding errors, relative to the cycle, turn the branch around near a Hopf point (a
+# fold), and are seen in its multipliers. Larger: the branch ends before the Hopf point.
+_SHRUNK = 1e-3
 
 
 @dataclasses.dataclass
@@ -114,6 +118,10 @@ class Curve:
         self.map = dataclasses.replace(map, settings=settings)
         self.sequence = _rotated(cycle.event_sequence)
         self.value = float(parameter_of(cycle.system, parameter))
+        self.least_range = SAME
+        if not self.sequence:
+            first_ranges = self._ranges(to_host(cycle.legs))
+            self.least_range = max(SAME, _SHRUNK * float(np.max(first_ranges)))
 
     def system_at(self, value: float) -> HybridSystem:
         # (JAX compiles a conversion for a number of NumPy, and none for an array.)
@@ -247,12 +255,16 @@ class Curve:
             return Result.EXTRA_TURNS
         return None
 
+    def _ranges(self, legs: Lanes) -> Float[np.ndarray, " d"]:
+        """The range of each state over the beginnings of pieces, in sizes of the states."""
+        scale = np.asarray(self.map.scale)
+        return np.ptp(legs.q / scale[legs.chart].T, axis=1)
+
     def _settled(self, point: Point) -> Point | Result:
         """The point with a tangent, and sizes by the range of each state on the cycle."""
-        legs = point.turn.legs
         scale = np.asarray(self.map.scale)
-        ranges = np.ptp(legs.q / scale[legs.chart].T, axis=1)
-        if self.map.base is not None and np.max(ranges) <= SAME:
+        ranges = self._ranges(point.turn.legs)
+        if self.map.base is not None and np.max(ranges) <= self.least_range:
             return Result.EQUILIBRIUM
         sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)
         point = dataclasses.replace(point, size=np.append(sizes, self.span))

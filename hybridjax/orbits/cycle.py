@@ -137,6 +137,12 @@ class LimitCycle(eqx.Module):
                 "system raises an error that says what to do."
             )
 
+    def _require_period(self) -> None:
+        """**Raises:** `DefinitionError` for one of many cycles whose search failed: it has no
+        period along which it could be checked."""
+        if not np.isfinite(float(self.period)):
+            self.require_found()
+
     @property
     def structure(self) -> Structure:
         """The system in its normal form, with indices of charts and transitions. (It is computed at
@@ -243,6 +249,7 @@ class LimitCycle(eqx.Module):
         """
         _require_values(self, "findings")
         self.require_current()
+        self._require_period()
         return verdict(self).findings
 
     @property
@@ -250,6 +257,7 @@ class LimitCycle(eqx.Module):
         """Names of transitions out of charts of the cycle that do not happen on it."""
         _require_values(self, "not_reached")
         self.require_current()
+        self._require_period()
         return verdict(self).not_reached
 
     @property

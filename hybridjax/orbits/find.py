@@ -350,8 +350,8 @@ def _found_later(
     request: _Request, map: ReturnMap, failed: LimitCycle
 ) -> tuple[tuple[LimitCycle, Turn] | None, str]:
     """The cycle, and its turn, that is found from where the flow leads from a guess whose own
-    search has failed (the flow may lead to a stable one); None for none. A sentence on a flow that
-    fails, for the message."""
+    search has failed (the flow may lead to a stable one, or to one on which events coincide); None
+    for none. A sentence on a flow that fails, for the message."""
     for periods in _times_later(failed, request.known):
         say(f"the same after {periods} periods")
         try:
@@ -361,7 +361,7 @@ def _found_later(
         except ComputationError as error:
             fault = f" From the guess the flow leads to no cycle either: {error}"
             return None, fault
-        if int(cycle.result) in _FOUND:
+        if int(cycle.result) in (*_FOUND, Result.COINCIDENCE):
             return (cycle, turn), ""
     return None, ""
 

@@ -345,7 +345,9 @@ def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
         if len(rows) and events:
             times = solver.ends(path)[rows][:, : len(events)]
             codes = np.tile(np.array(events), (len(rows), 1))
-            out[rows] = together(codes, times, begin[rows], cycles.period[rows])
+            none = np.full(codes.shape, -1)
+            period = cycles.period[rows]
+            out[rows] = together(codes, times, none, begin[rows], period)
     return out
 
 

@@ -104,6 +104,8 @@ class Turn(NamedTuple):
     """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
     times: Float[Array, "K R"]
     """Times of these events. (None in sweeps.)"""
+    rivals: Int[Array, "K R"]
+    """Transitions that were due at these events, too (see `Tape`). (None in sweeps.)"""
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
     meetings: Int[Array, ""]
@@ -258,7 +260,7 @@ class ReturnMap(eqx.Module):
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
-            steps = Tape(tape.h, tape.code, tape.t, None, None, None, tape.at_once)
+            steps = tape._replace(before=None, after=None, chart=None)
             return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
 
         if on_host(q):  # (all pieces are linearized together)
@@ -299,10 +301,9 @@ class ReturnMap(eqx.Module):
         distance = (
             xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
         )
-        times, meetings = (
-            each(xp.moveaxis(tapes.t, -1, 0)),
-            self._meetings(lanes, codes),
-        )
+        times = each(xp.moveaxis(tapes.t, -1, 0))
+        rivals = each(xp.moveaxis(tapes.rival, -1, 0))
+        meetings = self._meetings(lanes, codes)
         legs = jax.tree_util.tree_map(
             lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs
         )
@@ -314,6 +315,7 @@ class ReturnMap(eqx.Module):
             factors,
             codes,
             times,
+            rivals,
             distance,
             meetings,
             record,

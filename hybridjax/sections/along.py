@@ -57,7 +57,8 @@ def flow_along(
     M = before.shape[1]
     states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
     at_once = np.zeros(len(h), bool)
-    rows = h, code, walk.t[1:], states, walk.q[:, 1:], chart[1:], at_once
+    rival = np.full(len(h), -1)
+    rows = h, code, walk.t[1:], states, walk.q[:, 1:], chart[1:], at_once, rival
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, legs)
     none = np.zeros(len(event), np.int32)
     flow = legs, Moved(ends, none, none, none), tape

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
+from hybridjax.orbits import newton
 
 from ..toys import Field, toy
 
@@ -91,6 +92,54 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
         exact = charged(duty) * np.exp(-(time - duty))
     assert_allclose(cycle.state["x"], exact, atol=1e-11)
     assert_allclose(cycle.multipliers, [np.exp(-1)], rtol=1e-9)
+
+
+BESIDE_FULL = (1 - 2.0**-40, 1 - 2.0**-53, 1.0, 1 + 2.0**-52)
+
+
+@pytest.mark.parametrize("by_rough_turns", [True, False])
+@pytest.mark.parametrize("chart, ramp", [("on", 0.2), ("on", 0.9), ("off", 0.9)])
+def test_full_duty_is_refused_by_name_from_any_guess(
+    chart, ramp, by_rough_turns, monkeypatch
+):
+    """Also where rounding puts the tick first, which sets the ramp back before the comparator
+    trips: beside it, a later tick comes too late for that."""
+    if not by_rough_turns:
+        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
+    guess = hj.Guess(chart, (0.3, ramp), time=0.9)
+    for duty in BESIDE_FULL:
+        with pytest.raises(hj.ComputationError, match="'trip'.* coincide"):
+            hj.find_limit_cycle(Converter(duty), guess)
+
+
+def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
+    cycle = hj.find_limit_cycle(Converter(1.05), hj.Guess("on", (0.3, 0.2), time=0.9))
+    failed = hj.find_limit_cycle(Converter(1.0), cycle, throw=False)
+    (group,) = hj.coincidences(failed)
+    assert set(group.orders) == {("tick on",), ("trip", "tick")}
+    duties = np.array([0.95, *BESIDE_FULL, 1.1])
+    batch = hj.find_limit_cycles([Converter(float(x)) for x in duties], cycle)
+    assert_array_equal(batch.ok, [True, *[False] * len(BESIDE_FULL), True])
+    result = jax.jit(
+        jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
+    )
+    is_found = result(jnp.asarray(duties)) == hj.Result.OK
+    assert_array_equal(is_found, [*[False] * len(BESIDE_FULL), False, True])
+
+
+def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_before():
+    """On the known cycle its guard is positive by so little that its sign is only rounding."""
+    begin = hj.Guess("on", (0.3, 0.2), time=0.9)
+    cycle = hj.find_limit_cycle(Converter(1 + 5e-8), begin)
+
+    @jax.jit
+    def found(duty):
+        near = hj.find_limit_cycle(Converter(duty), cycle)
+        return near.anchor.q[0, 0], near.result
+
+    state, result = found(0.93)
+    exact = 1 + (at_tick(0.93) - 1) * np.exp(-0.9)
+    assert result != hj.Result.OK or state == pytest.approx(exact, abs=1e-10)
 
 
 def test_schedules_whose_order_is_not_defined():

@@ -394,3 +394,29 @@ def test_the_border_of_continuous_conduction():
         assert end.result == hj.Result.EVENT_ORDER
         assert words in end.message
         assert_allclose(end.value, border, rtol=1e-4)
+
+
+class Brusselator(hj.HybridSystem):
+    """A chemical oscillator, with a Hopf point at b = 2, from which on its cycle grows."""
+
+    b: hj.Parameter = hj.parameter(2.02)
+
+    def charts(self):
+        def rates(t, q, u):
+            x, y = q
+            return 1 - (self.b + 1) * x + x**2 * y, self.b * x - x**2 * y
+
+        return {"all": Field(("x", "y"), rates)}
+
+
+@pytest.mark.slow
+def test_a_branch_that_its_checks_cut_has_a_cause():
+    """A cycle that is smaller than the errors of the checks closes after any time."""
+    guess = hj.Guess("all", (1.0, 2.3))
+    section = hj.Crossing("x", "rising", 1.0)
+    cycle = hj.find_limit_cycle(Brusselator(), guess, section=section)
+    branch = hj.continuation(cycle, "b", (1.99, 2.03), step=0.5)
+    begin, end = branch.ends
+    assert_allclose([begin.value, end.value], [2.0, 2.03], rtol=1e-6)
+    assert not branch.points
+    assert "shrinks to an equilibrium" in begin.message

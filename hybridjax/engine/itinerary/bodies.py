@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from ...systems.structure import Member, Structure
-from ...systems.transition import SAME_TIME, Scheduled
+from ...systems.transition import SAME_TIME, TOGETHER, Scheduled
 from ..arrays import Array
 from ..settings import Settings
 from ..target import AbstractLevels
@@ -174,6 +174,7 @@ class Bodies:
         elif not body.at_once:
             late = _newton(now, row.target)
             delay = self._delay(a, row, course, q, now)
+        has_rival = self._has_rival(row, *_still((course.begin, now)))
         t, q = course.t + late, q + field * late
         after = s.reset(member, t, q, u)
         onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
@@ -190,7 +191,7 @@ class Bodies:
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
         moved = course._replace(t=t, y=y)
         unknown = Watched.unknown(_still(t), self.width)
-        left = flags.left | self._has_tick(a, moved)
+        left = flags.left | has_rival | self._has_tick(a, moved)
         flags = flags._replace(before=unknown, left=left)
         return self._arrived(row, moved, flags, late, delay)
 
@@ -333,6 +334,14 @@ class Bodies:
         return (other | unknown | returns | enabled).any() | self._misses(
             row, before, now
         )
+
+    def _has_rival(self, row: Rows, begin, now: Watched) -> Bool[Array, ""]:
+        """Test whether another function falls to zero where an event happens, so that it may come
+        first (see `Tape.rival`)."""
+        other = (row.signs > 0) & (jnp.arange(self.width) != row.target)
+        close = TOGETHER * (now.t - begin) * jnp.abs(now.rate)
+        falls = (now.rate < 0) & (now.value <= close)
+        return (other & falls & now.enabled).any()
 
     def _misses(self, row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
         """Test whether the function at whose zero a leg ends does not fall to it. (The row of its

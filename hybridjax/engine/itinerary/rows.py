@@ -328,14 +328,19 @@ def _rows_of_leg(
 
 def _is_certain(s: Structure, leg: _Leg) -> bool:
     """Test whether rows can tell if the event of a leg is still due: not if it comes after no time,
-    unless it happens at once, with its guard beyond zero."""
+    unless it happens at once, with its guard beyond zero; and not if another guard falls to zero
+    there, so that its sign is unknown."""
     if leg.code < 0:
         return True
+    guards = s.guards(leg.chart)
+    for place, g in enumerate(guards):
+        if g != leg.code and leg.begins[-1, place] > 0 and leg.ends[-1, place] == 0:
+            return False
     if not leg.at_once:
         return bool(leg.times[-1] > leg.times[0])
     if _is_scheduled(s, leg.code):
         return False
-    return bool(leg.ends[-1, s.guards(leg.chart).index(leg.code)] < 0)
+    return bool(leg.ends[-1, guards.index(leg.code)] < 0)
 
 
 def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:

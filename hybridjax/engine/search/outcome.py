@@ -18,6 +18,7 @@ from ..events import (
     guard_noise,
     keep_pace,
     rearm,
+    rival_of,
     width,
     with_schedules,
 )
@@ -66,7 +67,8 @@ def without_events(
         i=state.i + 1,
     )
     at_once = xp.zeros_like(active)
-    return end, Tape(moved, code, t, new.q, new.q, lanes.chart, at_once)
+    rival = xp.full(active.shape, -1, xp.int32)
+    return end, Tape(moved, code, t, new.q, new.q, lanes.chart, at_once, rival)
 
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
@@ -137,7 +139,9 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     code = xp.where(fired >= 0, fired, code)
     code = xp.where(level, ARRIVE_LEVEL, code).astype(xp.int32)
     at_once = aim.at_once & (fired >= 0)
-    return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once)
+    before = lanes._replace(t=t, q=new.q)
+    rival = rival_of(s, before, new.watched, task.u, fired, task.span)
+    return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once, rival)
 
 
 def _after(
