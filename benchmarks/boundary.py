@@ -33,8 +33,8 @@ def words(
 
 
 def records(
-    data: hj.Record | Sequence[hj.Record],
-    order: Order | hj.LDTP,
+    data: hj.experiments.Record | Sequence[hj.experiments.Record],
+    order: Order | hj.linear.LDTP,
     *,
     overhang: Index | None = None,
     start: Literal["free", "cycle"] = "free",
@@ -47,7 +47,7 @@ def array(u: Annotated[Numbers, Reals("S n nu")]): ...
 
 def cases() -> dict[str, tuple[Callable, tuple, dict]]:
     """What is called, and with what."""
-    record = hj.Record(np.ones((64, 1)), np.ones((64, 2)), n_sections=8)
+    record = hj.experiments.Record(np.ones((64, 1)), np.ones((64, 2)), n_sections=8)
     options = {"overhang": 3, "start": "cycle", "check": True}
     sizes = {"y": 1.0, "v": 2.0, "q": 3.0}
     return {
@@ -82,20 +82,24 @@ def calls() -> dict[str, tuple[Callable, tuple, dict]]:
     y = np.asarray(model.simulate(u)) + 1e-3 * rng.normal(
         size=(len(u), len(model.outputs))
     )
-    record = hj.Record(u, y, n_sections=model.n_sections)
+    record = hj.experiments.Record(u, y, n_sections=model.n_sections)
     hopper = hj.models.VerticalHopper()
     cycle = hj.find_limit_cycle(hopper)
     return {
-        "LDTP.simulate, 1200 samples": (hj.LDTP.simulate, (model, u), {}),
+        "LDTP.simulate, 1200 samples": (hj.linear.LDTP.simulate, (model, u), {}),
         "LDTP.htf, 10 frequencies": (
-            hj.LDTP.htf,
+            hj.linear.LDTP.htf,
             (model, np.linspace(0.1, 0.9, 10)),
             {},
         ),
         "fit_series, 200 cycles": (hj.fit_series, (record, 2), {}),
         "validate, 200 cycles": (hj.validate, (model, record), {}),
         "find_limit_cycle, hopper": (hj.find_limit_cycle, (hopper, cycle), {}),
-        "place_sections, 8": (hj.place_sections, (cycle, hj.ClockPhase(8)), {}),
+        "place_sections, 8": (
+            hj.sections.place_sections,
+            (cycle, hj.ClockPhase(8)),
+            {},
+        ),
     }
 
 

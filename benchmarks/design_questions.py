@@ -24,14 +24,14 @@ _ASIDE = 1e-4
 
 
 def measured(
-    data, design: hj.Design, noise: dict[str, float], harmonics, rng
-) -> hj.HTF:
+    data, design: hj.experiments.Design, noise: dict[str, float], harmonics, rng
+) -> hj.linear.HTF:
     """HTFs from data with noise, whose variance is known."""
     std = np.array(list(noise.values()))
     noisy = hj.experiments.add_noise(data, std=std, seed=int(rng.integers(2**31)))
     htf = hj.estimate_htf(noisy, harmonics, variance="auto")
     each = design.expected_variance()[:, None, :] * std[:, None] ** 2
-    return hj.HTF(
+    return hj.linear.HTF(
         htf.f,
         htf.H,
         htf.harmonics,
@@ -90,11 +90,14 @@ def parameters(family, draws: int) -> None:
             std = {k: scale * x for k, x in noise.items()}
             htf = measured(data[rng.integers(len(data))], design, std, HARMONICS, rng)
             fit = hj.fit_model(
-                system, hj.ObservedHTF(htf, sections), SPRING, guess=family.cycle
+                system,
+                hj.fitting.ObservedHTF(htf, sections),
+                SPRING,
+                guess=family.cycle,
             )
             return np.asarray(fit.values) / truth - 1
 
-        errors = hj.monte_carlo(error, draws, seed=3).value.values
+        errors = hj.scale.monte_carlo(error, draws, seed=3).value.values
         clean = error(np.random.default_rng(0), scale=1e-3)
         found.append(rms(np.linalg.norm(errors, axis=1)))
         family.show(f"parameters.{name}.rms_error", found[-1])
@@ -135,7 +138,7 @@ def deviation(family, draws: int) -> None:
             error[f"{name}.seconds"] = time.process_time() - begin
         return {name: float(x) for name, x in error.items()}
 
-    found = hj.monte_carlo(one, draws, seed=5)
+    found = hj.scale.monte_carlo(one, draws, seed=5)
     error = {x: rms(found[x].values) for x in ("numerators", "ldtp", "together")}
     bound = {
         "numerators": np.linalg.norm(free.usual_standard_errors),
@@ -156,7 +159,10 @@ def deviation(family, draws: int) -> None:
 
 
 def physical(
-    family, design: hj.Design, noise: dict[str, float], free: tuple[str, ...]
+    family,
+    design: hj.experiments.Design,
+    noise: dict[str, float],
+    free: tuple[str, ...],
 ) -> float:
     """Bound of the multiplier for whoever knows the equations, but not these parameters."""
     htf = family.model.htf(design.frequencies, HARMONICS)
@@ -164,7 +170,7 @@ def physical(
         design.expected_variance()[:, None, :]
         * np.array(list(noise.values()))[:, None] ** 2
     )
-    htf = hj.HTF(
+    htf = hj.linear.HTF(
         htf.f,
         htf.H,
         HARMONICS,
@@ -173,8 +179,11 @@ def physical(
         OUTPUTS,
         variance=np.broadcast_to(each, htf.H.shape),
     )
-    system, observed = family.cycle.system, hj.ObservedHTF(htf, family.placed.family)
-    seen = hj.identifiability(system, observed, free, guess=family.cycle)
+    system, observed = (
+        family.cycle.system,
+        hj.fitting.ObservedHTF(htf, family.placed.family),
+    )
+    seen = hj.fitting.identifiability(system, observed, free, guess=family.cycle)
     slopes = []
     for name in free:
         values = [float(getattr(system, name)) * (1 + x) for x in (-_ASIDE, _ASIDE)]

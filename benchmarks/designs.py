@@ -60,13 +60,15 @@ class Family:
 
     def __init__(self, name: str, cycle, definition):
         self.name, self.cycle = name, cycle
-        self.placed = hj.place_sections(cycle, definition)
+        self.placed = hj.sections.place_sections(cycle, definition)
         self.model = hj.linearize(cycle, self.placed, OUTPUTS)
 
     def show(self, name: str, value: float) -> None:
         print(f"designs.{self.name}.{name} {value:.4g}", flush=True)
 
-    def recorded(self, design: hj.Design, seed: int = 1) -> list[hj.ExperimentData]:
+    def recorded(
+        self, design: hj.experiments.Design, seed: int = 1
+    ) -> list[hj.experiments.ExperimentData]:
         """Without noise, for some draws of the phases."""
         drawn = [design.realizations(1, seed=seed + k) for k in range(PHASES)]
         return [
@@ -74,7 +76,7 @@ class Family:
             for one in drawn
         ]
 
-    def noise(self, data: hj.ExperimentData) -> dict[str, float]:
+    def noise(self, data: hj.experiments.ExperimentData) -> dict[str, float]:
         """20 dB below the outputs."""
         rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
         return dict(zip(OUTPUTS, 0.1 * rms, strict=True))
@@ -87,7 +89,9 @@ def rms_error(family: Family, fit, draws: int, seed: int) -> float:
     def error(rng):
         return fit(rng).compare(truth).error[0]
 
-    return float(np.sqrt(np.mean(hj.monte_carlo(error, draws, seed).value.values ** 2)))
+    return float(
+        np.sqrt(np.mean(hj.scale.monte_carlo(error, draws, seed).value.values ** 2))
+    )
 
 
 def bounds(family: Family, draws: int) -> None:
@@ -222,7 +226,7 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", default=("isochron", "kinematic"))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name in options.families:
         family = Family(name, cycle, sections()[name])

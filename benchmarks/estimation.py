@@ -53,7 +53,7 @@ class Family:
 
     def __init__(self, name: str, cycle, definition):
         self.name, self.cycle = name, cycle
-        self.placed = hj.place_sections(cycle, definition)
+        self.placed = hj.sections.place_sections(cycle, definition)
         self.model = hj.linearize(cycle, self.placed, OUTPUTS)
 
     def run(self, design, **options):
@@ -78,7 +78,9 @@ def periodic(family: Family) -> None:
     """Nothing is random here but the design."""
     full, odd = hj.multisine(), hj.multisine(periods=128, lines="odd")
     for rms in (0.002, 0.02, 0.06):
-        family.report(f"paper.{rms}", family.run(hj.paper_design().scaled(rms)))
+        family.report(
+            f"paper.{rms}", family.run(hj.experiments.paper_design().scaled(rms))
+        )
         for name, design in (("full", full), ("odd", odd)):
             for label, start in (("predicted", "periodic"), ("steady", "steady")):
                 data = family.run(design.scaled(rms), start=start)
@@ -112,7 +114,7 @@ def interpolated(data, degree: int):
         w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True)
     )
     y = np.fft.ifft(Y - transient, axis=1).real
-    return hj.ExperimentData(
+    return hj.experiments.ExperimentData(
         data.u, y, n_sections=N, periods=data.periods, outputs=OUTPUTS
     )
 
@@ -155,7 +157,7 @@ def discs(draws: int = 200_000) -> None:
                 ("size", None),
                 ("shape", roundness[None, :, None, None]),
             ):
-                quantile = np.asarray(hj.Scatter(freedom, shape).quantile(0.95))
+                quantile = np.asarray(hj.linear.Scatter(freedom, shape).quantile(0.95))
                 radii.append(np.sqrt(np.ravel(quantile) * power / count / (count - 1)))
                 inside = np.mean(np.abs(mean) <= radii[-1])
                 print(f"estimation.discs.{count}.{kind}.{name} {inside:.4f}")
@@ -189,7 +191,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
             ],
         }
 
-    found = hj.monte_carlo(draw, runs, seed)
+    found = hj.scale.monte_carlo(draw, runs, seed)
     name = f"coverage.{rms}.{each}_realizations"
     hits = found["disc"].sum("draw").values
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
@@ -218,7 +220,7 @@ def main() -> None:
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     if "crest" not in options.skip:
         crest()
     if "discs" not in options.skip:

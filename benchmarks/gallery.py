@@ -32,7 +32,9 @@ PERIODS = 32
 NAMES = [*CASES, "branches"]
 
 
-def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
+def compute(
+    case: Case,
+) -> tuple[hj.orbits.LimitCycle, hj.linear.HTF, hj.linear.HTF | None]:
     """The cycle, the exact HTF, and its estimate."""
     cycle = hj.find_limit_cycle(
         case.system,
@@ -42,7 +44,7 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
         conserved=case.conserved,
         max_period=case.max_period,
     )
-    placed = hj.place_sections(cycle, case.sections)
+    placed = hj.sections.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
@@ -74,7 +76,10 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
 
 
 def numbers(
-    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None
+    case: Case,
+    cycle: hj.orbits.LimitCycle,
+    exact: hj.linear.HTF,
+    estimate: hj.linear.HTF | None,
 ) -> dict:
     """What the table says."""
     multipliers = cycle.multipliers
@@ -97,7 +102,11 @@ def numbers(
 
 
 def draw(
-    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path
+    case: Case,
+    cycle: hj.orbits.LimitCycle,
+    exact: hj.linear.HTF,
+    estimate: hj.linear.HTF | None,
+    path: Path,
 ):
     """The cycle (of one that is rest: its multipliers), and |H_m| beside it; of a walker, a turn
     before."""
@@ -134,7 +143,7 @@ def draw(
         save(path, figure)
 
 
-def sticks(case: Case, cycle: hj.LimitCycle, ax) -> None:
+def sticks(case: Case, cycle: hj.orbits.LimitCycle, ax) -> None:
     """One turn of a walker at equal times, lighter where it is earlier, up to the touchdown (not to
     the exchange of its legs)."""
     links = len(case.sticks[0][0])

@@ -67,7 +67,7 @@ class Identification(Family):
 
 
 def paper(family: Identification) -> None:
-    data = family.run(hj.paper_design())
+    data = family.run(hj.experiments.paper_design())
     estimate = hj.estimate_htf(data)
     family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
     rational, H = hj.identify.fit_rational(estimate), np.asarray(estimate[0])[..., 0]
@@ -80,7 +80,7 @@ def paper(family: Identification) -> None:
             family.show(
                 f"paper.{name}.{output}", np.nanmin(abs(multipliers - family.true))
             )
-    some = hj.ExperimentData(
+    some = hj.experiments.ExperimentData(
         data.u[:20],
         data.y[:20],
         n_sections=N,
@@ -115,7 +115,7 @@ def noise(family: Identification, seeds: int) -> None:
         variance = variance * design.expected_variance()[:, None, :]
         bound = hj.identify.multiplier_bound(
             family.model,
-            hj.HTF(
+            hj.linear.HTF(
                 exact.f,
                 exact.H,
                 BAND,
@@ -149,7 +149,7 @@ def white(family: Identification, draws: int) -> None:
     data = family.run(u, start="cycle", discard=0)
 
     def one(s, y):
-        return hj.Record(
+        return hj.experiments.Record(
             data.u[s], y[s], n_sections=N, inputs=data.inputs, outputs=OUTPUTS
         )
 
@@ -185,7 +185,7 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
         return {"H": estimate.H, "variance": estimate.variance, "freedom": freedom}
 
     def fitted(H, variance, freedom):
-        htf = hj.HTF(
+        htf = hj.linear.HTF(
             mean.f,
             H,
             chosen,
@@ -193,11 +193,11 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
             mean.inputs,
             mean.outputs,
             variance=variance,
-            scatter=hj.Scatter(freedom),
+            scatter=hj.linear.Scatter(freedom),
         )
         return hj.fit_multipliers(htf, 2)
 
-    found = hj.monte_carlo(draw, runs)
+    found = hj.scale.monte_carlo(draw, runs)
     freedom = float(found.freedom[0])
     fits = [
         fitted(H, variance, freedom)
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         family = Identification(name, cycle, definition)

@@ -39,7 +39,7 @@ def results(case: Case) -> dict[str, np.ndarray]:
         for x in ("section", "multiplicity", "conserved", "max_period")
     }
     cycle = hj.find_limit_cycle(case.system, case.guess, **options)
-    placed = hj.place_sections(cycle, case.sections)
+    placed = hj.sections.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     design = hj.multisine(
         placed.n_sections,

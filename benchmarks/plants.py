@@ -54,7 +54,7 @@ def cpu(work, *arguments):
 
 def overhead(cycles=84, experiments=80):
     """Time of the package beside that of the plant, in one process; and of two processes."""
-    design = hj.paper_design(seed=0)
+    design = hj.experiments.paper_design(seed=0)
     u = design.inputs(cycles)[:experiments]
     for family in FAMILIES:
         cycle = hj.plants.settle(Timed(), family, OUTPUTS)

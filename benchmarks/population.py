@@ -39,7 +39,7 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
     rng = np.random.default_rng(0)
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sections = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
-    response = hj.response_function(cycle, sections, OUTPUTS)
+    response = hj.experiments.response_function(cycle, sections, OUTPUTS)
     run = eqx.filter_jit(
         eqx.filter_vmap(lambda hopper, u: response(u[None], system=hopper).y)
     )
@@ -47,7 +47,9 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
     for first in range(0, subjects, chunk):
         k, b = (value * (1 + 0.04 * rng.normal(size=chunk)) for value in (10.0, 5.0))
         hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-        true = np.asarray(hj.find_limit_cycles(hoppers, guess=cycle).multipliers)[:, 0]
+        true = np.asarray(
+            hj.orbits.find_limit_cycles(hoppers, guess=cycle).multipliers
+        )[:, 0]
         u = 0.03 * rng.normal(size=(chunk, LONGEST * N, 1))
         y = np.asarray(jax.block_until_ready(run(hoppers, u) - run(hoppers, 0 * u)))[
             :, 0
@@ -77,7 +79,7 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
 
 
 def fitted(u, y, strides):
-    record = hj.Record(
+    record = hj.experiments.Record(
         u[: strides * N],
         y[: strides * N],
         n_sections=N,

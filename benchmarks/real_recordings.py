@@ -212,11 +212,11 @@ def robots():
     print(data, looked, sep="\n")
     try:
         hj.recordings.hold_out(data, 1)
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         print("to hold a quarter out:", error)
     try:
         hj.fit_series(data, 1, check=False)
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         print("to fit all of it:", error)
     data = hj.recordings.section_data(
         recording,
@@ -247,7 +247,7 @@ def robot_layout(seeds=40, multiplier=0.6):
                 "width": float(np.abs(fit.ellipse(0) - fit.multipliers[0]).max()),
             }
 
-        found = hj.monte_carlo(one, seeds)
+        found = hj.scale.monte_carlo(one, seeds)
         off = found.value.values - multiplier
         print(
             f"{label:12s} mean {found.value.values.mean():.3f}, rms error "
@@ -278,7 +278,7 @@ def in_loop(model, cycles, gain, rng, noise=0.3):
         x = A[n % N] @ x + u[-1][0] + 0.5 * rng.normal(size=d)
     u, y = np.array(u[10 * N :]), np.array(y[10 * N :])
     y = y + noise * rng.normal(size=y.shape)
-    return hj.Record(u, y, n_sections=N, drift=np.inf)
+    return hj.experiments.Record(u, y, n_sections=N, drift=np.inf)
 
 
 def variability():
@@ -322,7 +322,7 @@ def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
             held = (low <= np.array(multipliers)) & (np.array(multipliers) <= high)
             return {"modulus": modulus, "held": held.astype(float)}
 
-        mean = hj.monte_carlo(one, seeds).mean("draw")
+        mean = hj.scale.monte_carlo(one, seeds).mean("draw")
         modulus, held = mean.modulus.values[:, 0], 100 * mean.held.values
         print(
             f"noise of {noise:.1f} of each output: by instruments {modulus[0]:.3f}, held in "
@@ -404,7 +404,7 @@ def phase_model(seeds=10, seconds=3, trials=20):
                 "excess": found.excess,
             }
 
-        found = hj.monte_carlo(one, seeds)
+        found = hj.scale.monte_carlo(one, seeds)
         off = found.off.values
         rms, bias = (
             np.sqrt(np.mean(off**2, axis=(0, 2))),

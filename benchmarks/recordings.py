@@ -141,7 +141,7 @@ def coverage(
             for name in phases
         }
 
-    found = hj.monte_carlo(some, draws // chunk)
+    found = hj.scale.monte_carlo(some, draws // chunk)
     for name in phases:
         print(
             f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}",
@@ -263,7 +263,7 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
                     n_sections=n_sections,
                     order=2,
                 )
-            except hj.DefinitionError as error:
+            except hj.errors.DefinitionError as error:
                 verdict.append("refused")
                 causes[str(error)] = None
                 continue
@@ -405,7 +405,7 @@ def walks(
             "reach": np.array(reach),
         }
 
-    found = hj.monte_carlo(one, draws)
+    found = hj.scale.monte_carlo(one, draws)
     print(
         f"{label} (multipliers {true}): rms error {rms(found.error.values):.1e}, 95 % regions "
         f"reach {found.reach.values.mean(axis=0)}, all held in {int(found.held.sum())}/{draws}",

@@ -62,7 +62,7 @@ estimate
 names = ("m", "M", "k", "b", "l0", "a", "g")
 wrong = hj.models.VerticalHopper(m=1.15, M=1.8, k=11.0, b=4.3, l0=2.2, a=18.0, g=2.1)
 fit = hj.fit_model(
-    wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4
+    wrong, hj.fitting.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4
 )
 fit
 
@@ -199,7 +199,7 @@ law = Law(jnp.asarray(5.0), small)
 guess = hj.find_limit_cycle(
     Hopper(damping=law), hj.Guess("stance", (1.965, 1.876), 0.5)
 )
-response = hj.response_function(guess, phases, OUTPUTS)
+response = hj.experiments.response_function(guess, phases, OUTPUTS)
 numbers, rest = eqx.partition(law, eqx.is_inexact_array)
 begin, back = jax.flatten_util.ravel_pytree(numbers)
 

@@ -29,7 +29,7 @@ cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 phase = hj.ClockPhase(8, anchor=hj.Crossing("vM", "falling"))
 plant = hj.linearize(cycle, phase, ("yM", "vM"))
 ones = np.ones((8, 1, 1))
-controller = hj.LDTP(
+controller = hj.linear.LDTP(
     0.6 * ones,
     ones * [[0.3, 0.8]],
     ones,
@@ -61,7 +61,7 @@ data = hj.run_experiments(
     feedback=controller,
     process_noise=hj.experiments.ProcessNoise(2e-3),
 )
-measured = hj.ExperimentData(
+measured = hj.experiments.ExperimentData(
     np.concatenate([data.u[..., :1], references], axis=2),
     data.y + references[..., 1:],
     n_sections=8,

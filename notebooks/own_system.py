@@ -223,7 +223,7 @@ class Forgetful(Robot):
 def attempt(action):
     try:
         action()
-    except hj.HybridJaxError as error:
+    except hj.errors.HybridJaxError as error:
         print(f"{type(error).__name__}: {error}\n")
 
 

@@ -144,7 +144,9 @@ families = {
         anchor=apex,
     ),
 }
-placed = {name: hj.place_sections(cycle, family) for name, family in families.items()}
+placed = {
+    name: hj.sections.place_sections(cycle, family) for name, family in families.items()
+}
 axes = hj.plot.cycle(
     cycle, "yM", "vM", sections=placed["kinematic"], perturbed=trajectory
 )
@@ -178,7 +180,7 @@ for name, model in models.items():
 # design.
 
 # %%
-design = hj.paper_design(SECTIONS, PERIODS, experiments=EXPERIMENTS, seed=0)
+design = hj.experiments.paper_design(SECTIONS, PERIODS, experiments=EXPERIMENTS, seed=0)
 print(design)
 print(hj.multisine(SECTIONS, PERIODS, seed=0))
 

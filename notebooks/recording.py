@@ -177,7 +177,7 @@ found = hj.identify_recording(
     recording, angle, inputs="u", outputs=("yM", "vM"), order=2
 )
 with tempfile.TemporaryDirectory() as folder:
-    page = hj.write_report(Path(folder) / "results", found)
+    page = hj.recordings.write_report(Path(folder) / "results", found)
     print(
         sorted(path.name for path in page.parent.iterdir()),
         page.stat().st_size // 1000,

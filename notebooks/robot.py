@@ -91,7 +91,7 @@ figure = hj.plot.section_data(strides)
 # %%
 try:
     hj.fit_series(strides, order=1)
-except hj.DefinitionError as error:
+except hj.errors.DefinitionError as error:
     print(error)
 
 # %% [markdown]

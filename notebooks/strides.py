@@ -125,7 +125,7 @@ noisy = hj.experiments.add_noise(walk, snr=20)
 y = noisy.y[0].copy()
 y[1000:1100] = np.nan  # a hundred samples were lost
 series = hj.fit_series(
-    hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2
+    hj.experiments.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2
 )
 series
 
@@ -139,7 +139,7 @@ print(f"error {np.max(np.abs(series.multipliers - truth)):.2g}")
 # than 90 %.
 
 # %%
-test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
+test = hj.experiments.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
 report = hj.validate(series.model, test)
 report
 

@@ -53,13 +53,17 @@ def _costs(show, case, options) -> dict[str, float]:
         lambda: hj.find_limit_cycle(model), options.repeat
     )
     costs = {"cycle.first": compiling + seconds.wall, "cycle.cpu": seconds.cpu}
-    placed = hj.place_sections(cycle, sections)
+    placed = hj.sections.place_sections(cycle, sections)
     count, cycles = (16, 4) if options.quick else (EXPERIMENTS, CYCLES)
     u = amplitude * np.random.default_rng(0).standard_normal(
         (count, cycles * SECTIONS, 1)
     )
     batched._LARGE = 0
-    how = {"discard": 0, "accuracy": ACCURACY, "execution": hj.Execution(workers=1)}
+    how = {
+        "discard": 0,
+        "accuracy": ACCURACY,
+        "execution": hj.scale.Execution(workers=1),
+    }
     _, _, seconds = first_and_later(
         lambda: hj.run_experiments(cycle, placed, u, output, **how), options.repeat
     )

@@ -59,7 +59,7 @@ class Result(enum.IntEnum):
     PULSE_PASSED = (
         17,
         "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
-        "and end it by transitions (`hj.Scheduled` at known times)",
+        "and end it by transitions (`hj.systems.Scheduled` at known times)",
     )
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
     GUARD_BEYOND = (

@@ -29,7 +29,7 @@ from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.families import ClockPhase, KinematicPhase
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 from .paper_report import OUTPUTS, summarize, table

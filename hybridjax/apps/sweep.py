@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import DefinitionError
 from ..plot.look import save_and_close
 from ..plot.over_parameters import sweep as plot_sweep
-from ..scale.sweep import sweep
+from ..scale.sweeps import sweep
 
 
 def run(options: Any) -> int:

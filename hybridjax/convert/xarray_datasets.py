@@ -18,7 +18,7 @@ from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
 from ..io import KINDS, Saved
 from ..linear.ldtp import LDTP
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording

@@ -5,4 +5,5 @@ from .goals import (
     Parameters as Parameters,
 )
 from .limits import Distortion as Distortion, Limits as Limits
+from .optimize import OptimalDesign as OptimalDesign
 from .study import Study as Study

@@ -26,7 +26,7 @@ from ..linear.algebra import Matrices, static_gain
 from ..linear.ldtp import LDTP, Gain
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.structure import Outputs

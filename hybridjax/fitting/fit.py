@@ -68,7 +68,7 @@ def fit_model(
     the data do not identify, and the result lists these.
 
     ```python
-    fit = hj.fit_model(hopper, hj.ObservedHTF(estimate, sections), ("M", "k", "b"), guesses=4)
+    fit = hj.fit_model(hopper, hj.fitting.ObservedHTF(estimate, sections), ("M", "k", "b"), guesses=4)
     ```
 
     **Arguments:**

@@ -26,7 +26,7 @@ from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import last_turn
 from ..sections.families import AbstractSections, FamilyLike, as_family
-from ..sections.linearize import Delayed, Delays, linearize
+from ..sections.linearization import Delayed, Delays, linearize
 from ..sections.place import observed_at, place_sections
 
 
@@ -45,7 +45,7 @@ class AbstractObservation(eqx.Module):
     have no derivative where two of them coincide:
 
     ```python
-    class ObservedMultipliers(hj.AbstractObservation):
+    class ObservedMultipliers(hj.fitting.AbstractObservation):
         measured: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
@@ -68,7 +68,7 @@ class AbstractObservation(eqx.Module):
         `cycle.factors` are NaN, because computing them would triple the compile time. Functions
         that need concrete values raise an error, such as `cycle.multipliers`. Linearize the cycle
         instead: `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()`
-        or `hj.spectral_radius(model)`.
+        or `hj.fitting.spectral_radius(model)`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.

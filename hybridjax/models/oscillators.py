@@ -183,7 +183,7 @@ class BeltOscillator(HybridSystem):
 
     States: extension `x` of the spring and speed `v`. Dry friction decreases with the speed
     relative to the belt. On the belt (chart "sticks") both sides push towards the same speed
-    (`hj.sliding`). After sticking, the block always leaves the belt at x = friction / k, so that
+    (`hj.systems.sliding`). After sticking, the block always leaves the belt at x = friction / k, so that
     all multipliers are zero. Input `u` is a force.
 
     R. I. Leine, D. H. van Campen, A. de Kraker, L. van den Steen, Stick-slip vibrations induced by

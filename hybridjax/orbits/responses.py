@@ -153,7 +153,7 @@ class Responses(eqx.Module):
     """Responses of a limit cycle to brief pushes, at every phase (see `LimitCycle.responses`).
 
     Phase 0 is the anchor of the cycle. At an event, responses are those right after it. In a chart
-    of sliding (`hj.sliding`), a push off the surface is followed by the return to it.
+    of sliding (`hj.systems.sliding`), a push off the surface is followed by the return to it.
 
     **Fields:**
 

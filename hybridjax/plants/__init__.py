@@ -1,6 +1,6 @@
 """Simulators of other packages, identified by experiments."""
 
-from .._core.public import attach
+from .._names import attach
 
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -3,5 +3,5 @@ from .adapters import (
     GymnasiumPlant as GymnasiumPlant,
     MuJoCoPlant as MuJoCoPlant,
 )
-from .cycle import SettledCycle as SettledCycle, settle as settle
+from .cycle import Returns as Returns, SettledCycle as SettledCycle, settle as settle
 from .drive import Plant as Plant

@@ -368,12 +368,12 @@ class SettledCycle:
 
         **Arguments:**
 
-        - `draw`: function of the signals by name that returns a `hj.Drawing`, written with JAX.
+        - `draw`: function of the signals by name that returns a `hj.systems.Drawing`, written with JAX.
           Default: none, the signals are drawn over time.
         - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
 
         **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises a
-        `hj.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
+        `hj.errors.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
 
         **Raises:** any other error of the plant.
         """

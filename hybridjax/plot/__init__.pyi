@@ -7,13 +7,20 @@ from .data import (
     validation as validation,
 )
 from .designs import spectrum as spectrum, strides as strides
+from .explorer import Explorer as Explorer
 from .frequency import (
     bode as bode,
     bodes as bodes,
     harmonics as harmonics,
     magnitude as magnitude,
 )
-from .look import COLORS as COLORS, PAGE as PAGE, save as save, style as style
+from .look import (
+    COLORS as COLORS,
+    PAGE as PAGE,
+    Plot as Plot,
+    save as save,
+    style as style,
+)
 from .motion import Motion as Motion, animate as animate
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep

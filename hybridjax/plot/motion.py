@@ -23,7 +23,7 @@ from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.placed import PlacedSections
@@ -185,7 +185,7 @@ def animate(
     **Arguments:**
 
     - `motion`: a limit cycle, a trajectory, or a branch, of which each frame is a cycle at another
-        value of the parameter. Where `hj.Quotient(half_period=)` halves a cycle, both halves are
+        value of the parameter. Where `hj.systems.Quotient(half_period=)` halves a cycle, both halves are
         drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.

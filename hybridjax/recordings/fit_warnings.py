@@ -20,7 +20,7 @@ from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
-from ..identify.validate import Validation
+from ..identify.validation import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE
 

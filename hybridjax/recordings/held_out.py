@@ -15,7 +15,7 @@ from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem, TooFewCycles
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, total_least_squares
-from ..identify.validate import Validation, can_be_compared, validate
+from ..identify.validation import Validation, can_be_compared, validate
 from .data import SectionData
 from .findings import untried_orders
 

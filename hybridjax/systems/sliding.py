@@ -43,7 +43,7 @@ def sliding(
 
     def parts(self):
         sides = {"ahead": Slips(self, 1.0), "behind": Slips(self, -1.0)}
-        return hj.sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+        return hj.systems.sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
     ```
 
     Let a and b be the rates of h in the fields f_a (where h > 0) and f_b (where h < 0). A state

@@ -19,7 +19,7 @@ def model():
     x = np.ones((8, 2))
     v = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     C = np.stack([x, v], axis=1)
-    return hj.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
+    return hj.linear.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
 
 
 @pytest.fixture(scope="session")

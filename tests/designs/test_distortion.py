@@ -40,7 +40,11 @@ class Quadratic(hj.HybridSystem):
         def reset(t, q, u):
             return (0.6 * q[0] + u[0] + self.b * q[0] ** 2,)
 
-        return (hj.Transition("tick", "rest", "rest", hj.Scheduled(1.0), reset=reset),)
+        return (
+            hj.Transition(
+                "tick", "rest", "rest", hj.systems.Scheduled(1.0), reset=reset
+            ),
+        )
 
     def outputs(self):
         return (hj.Output("z", lambda t, q, u: q[0] + u[0] ** 2),)
@@ -72,8 +76,8 @@ def two_charts():
         "two": Field(("x", "v"), two_rates),
     }
     transitions = (
-        hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
-        hj.Transition("down", "two", "one", hj.Scheduled(1.0, 0.5), reset=down),
+        hj.Transition("up", "one", "two", hj.systems.Scheduled(1.0), reset=up),
+        hj.Transition("down", "two", "one", hj.systems.Scheduled(1.0, 0.5), reset=down),
     )
     return toy(
         charts, transitions, 1.0, (hj.Output("z", shown),), inputs=("push", "pull")
@@ -199,7 +203,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     the square of the input, too."""
     cycle, sections, _ = quadratic
     amplitude = 0.01
-    design = hj.Design.from_lines(
+    design = hj.experiments.Design.from_lines(
         [[f]], amplitude, 0.4, n_sections=4, periods=8, inputs="u"
     )
     cosines = Candidates.of(design)
@@ -286,7 +290,7 @@ def test_without_distortion(quadratic):
     linear = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
     with pytest.raises(
-        hj.DefinitionError, match="moves no signal of `limit`: limit the input"
+        hj.errors.DefinitionError, match="moves no signal of `limit`: limit the input"
     ):
         hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
     both = Limits(rms={"u": 0.01}, distortion=linear)
@@ -298,11 +302,11 @@ def test_without_distortion(quadratic):
 
 def test_bad_distortions(quadratic):
     cycle, sections, model = quadratic
-    twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
+    twice = hj.linear.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
         (sections, "differ in H_0 .to x, by 50%"),
     ):
         limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.optimal_design(twice, hj.multisine(4, periods=16), limit=limit)

@@ -30,7 +30,7 @@ def model():
     rng = np.random.default_rng(1)
     B = rng.normal(size=(N, 2, 1))
     C = rng.normal(size=(N, 1, 2))
-    return hj.LDTP(A, B, C)
+    return hj.linear.LDTP(A, B, C)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_multipliers_keep_the_numbers_of_the_model():
     """Three multipliers, the first of which no input excites."""
     A = np.diag([0.9, 0.6, 0.3])
     ones = np.array([0.0, 1.0, 1.0])
-    model = hj.LDTP(
+    model = hj.linear.LDTP(
         np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3))
     )
     usual = hj.multisine(2, 32, band=(0, 1))
@@ -95,13 +95,15 @@ def test_multipliers_keep_the_numbers_of_the_model():
 
     assert plan(1).names == ("0.6",)
     assert plan(2).names == ("0.3",)
-    with pytest.raises(hj.DefinitionError, match=r"no input excites.*multiplier 0\.9"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"no input excites.*multiplier 0\.9"
+    ):
         plan(0)
 
 
 def test_bad_goals(model, usual):
     close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
-    double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
+    double = hj.linear.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
     M = hj.designs.Multipliers
     walker = hj.models.SimplestWalker()
     at = hj.AtEvent("heelstrike")
@@ -113,7 +115,7 @@ def test_bad_goals(model, usual):
     )
     for system, goal, message in cases:
         design = usual if system.n_sections == N else hj.multisine(2, 32, band=(0, 1))
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.optimal_design(system, design, goal=goal, noise=NOISE)
 
 
@@ -131,7 +133,7 @@ def with_angle(angle):
     )
     B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])
     C = np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])
-    return hj.LDTP(A, B[:, :, None], C[:, None])
+    return hj.linear.LDTP(A, B[:, :, None], C[:, None])
 
 
 def variance(model, design):
@@ -185,13 +187,13 @@ def test_limits_hold_for_each_of_several_models(three):
 def test_several_models_that_do_not_fit_together(three):
     usual = hj.multisine(N, 32, band=(0, 2))
     with pytest.raises(
-        hj.DefinitionError, match="model 1 and model 0 have different n_sections"
+        hj.errors.DefinitionError, match="model 1 and model 0 have different n_sections"
     ):
         hj.optimal_design([three[0], hj.testing.synthetic_ldtp()], usual)
     unstable = dataclasses.replace(three[1], A=1.1 * three[1].A)
-    with pytest.raises(hj.DefinitionError, match="model 1 is unstable"):
+    with pytest.raises(hj.errors.DefinitionError, match="model 1 is unstable"):
         hj.optimal_design([three[0], unstable], usual)
-    with pytest.raises(hj.DefinitionError, match="not an empty list"):
+    with pytest.raises(hj.errors.DefinitionError, match="not an empty list"):
         hj.optimal_design([], usual)
 
 
@@ -224,8 +226,10 @@ def test_physical_parameters():
     exact = model.htf(usual.frequencies, harmonics)
     H = exact.H[:, :, :1]
     variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], H.shape)
-    htf = hj.HTF(exact.f, H, harmonics, 8, exact.inputs, "x", variance=variance)
-    observed = hj.ObservedHTF(htf, sections)
-    S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
+    htf = hj.linear.HTF(exact.f, H, harmonics, 8, exact.inputs, "x", variance=variance)
+    observed = hj.fitting.ObservedHTF(htf, sections)
+    S = hj.fitting.identifiability(
+        cycle.system, observed, free, guess=cycle
+    ).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
     assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -118,14 +118,14 @@ def test_repeated_windows_count(model, first):
 
 def test_an_order_that_is_too_low_is_named(model, first):
     study = hj.designs.Study(first, 1, 1e-5)
-    with pytest.raises(hj.DefinitionError, match="show more than 1 multipliers"):
+    with pytest.raises(hj.errors.DefinitionError, match="show more than 1 multipliers"):
         for k in range(4):
             study = study.add(measured(model, study.design, seed=k))
 
 
 def test_bad_data(model, first):
     with pytest.raises(
-        hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
+        hj.errors.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
     ):
         hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
     study = hj.designs.Study(first, 2, 1e-4)
@@ -135,7 +135,7 @@ def test_bad_data(model, first):
         (dict(result=[3] * len(data.u)), "no experiment ran to its end \\(0/8 ok"),
         (dict(n_sections=4), "have different n_sections: 4 and 8"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             study.add(data).add(dataclasses.replace(data, **change))
 
 
@@ -148,7 +148,9 @@ def from_the_cycle(model, first):
 
 def test_what_is_left_of_the_start_is_refused(model, first, from_the_cycle):
     study = hj.designs.Study(first, 2, 1e-3)
-    with pytest.raises(hj.DefinitionError, match="of the start's transient is left"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="of the start's transient is left"
+    ):
         study.add(from_the_cycle)
     found = study.add(hj.identify.remove_transient(from_the_cycle, 2).data)
     assert found.fit.contains(model.multipliers, 0.999).all()
@@ -196,7 +198,7 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     rng = np.random.default_rng(seed)
     y = y + noise * rng.normal(size=(S, *y.shape))
     u = np.zeros((S, len(cycle), 1))
-    return hj.ExperimentData(u, y, n_sections=N, periods=P)
+    return hj.experiments.ExperimentData(u, y, n_sections=N, periods=P)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +214,9 @@ def test_a_transient_in_the_window_is_refused(before, repeats, left):
     data = records(size, before=before, repeats=repeats)
     no_noise = np.zeros(2)
     refuse_transient(data, repeats, MULTIPLIERS, no_noise, 1.05 * size * left)
-    with pytest.raises(hj.DefinitionError, match=f"after {before} discarded cycles"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=f"after {before} discarded cycles"
+    ):
         refuse_transient(data, repeats, MULTIPLIERS, no_noise, 0.95 * size * left)
     refuse_transient(records(1.0, before=0), 1, MULTIPLIERS, no_noise, 0.0)
 
@@ -225,5 +229,5 @@ def test_noise_is_no_transient():
     size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)
-        with pytest.raises(hj.DefinitionError, match="transient is left"):
+        with pytest.raises(hj.errors.DefinitionError, match="transient is left"):
             refuse_transient(records(size, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)

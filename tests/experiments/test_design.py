@@ -44,10 +44,10 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     excited = [j for j in range(top + 1) if lines == "two-phase" or not is_half[j]]
     if not excited:
         with pytest.raises(
-            hj.DefinitionError, match="take more periods or a wider band"
+            hj.errors.DefinitionError, match="take more periods or a wider band"
         ):
             hj.multisine(**arguments, seed=seed)
-        with pytest.raises(hj.DefinitionError, match="must increase in"):
+        with pytest.raises(hj.errors.DefinitionError, match="must increase in"):
             hj.multisine(N, P, band=(1.0, 0.5))
         return
     phases = {}
@@ -63,7 +63,7 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     smallest = hj.multisine(**arguments, seed=seed)
     assert smallest.experiments == needed
     if needed > 1:
-        with pytest.raises(hj.DefinitionError, match=f"must be {needed} to "):
+        with pytest.raises(hj.errors.DefinitionError, match=f"must be {needed} to "):
             hj.multisine(**arguments, seed=seed, experiments=needed - 1)
 
     largest = nu * sum(phases.values())
@@ -88,7 +88,7 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
 
 
 def test_the_numbers_of_the_paper():
-    paper = hj.paper_design()
+    paper = hj.experiments.paper_design()
     smallest = hj.multisine()
     both = hj.multisine(lines="two-phase")
     assert len(paper.frequencies) == len(smallest.frequencies) == 620
@@ -101,10 +101,10 @@ def test_the_numbers_of_the_paper():
     assert both.experiments == 21
     assert "80 experiments of 64 periods" in repr(paper)
     assert "620, 0.01562" in repr(paper)
-    with pytest.raises(hj.DefinitionError, match="must be 20 to 620"):
+    with pytest.raises(hj.errors.DefinitionError, match="must be 20 to 620"):
         hj.multisine(experiments=19)
     with pytest.raises(
-        hj.DefinitionError, match="take `periods` that 3 does not divide"
+        hj.errors.DefinitionError, match="take `periods` that 3 does not divide"
     ):
         hj.multisine(
             periods=12, band=(0, 2.0), lines="all", experiments=9, division="sum-free"
@@ -149,20 +149,24 @@ BAD = {
 
 @pytest.mark.parametrize("message", BAD)
 def test_designs_that_break_a_rule_name_what_breaks_it(message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.Design.from_lines(BAD[message], n_sections=8, periods=8)
+    with pytest.raises(hj.errors.DefinitionError, match=message):
+        hj.experiments.Design.from_lines(BAD[message], n_sections=8, periods=8)
 
 
 def test_half_integers_by_hand():
-    twice = hj.Design.from_lines(
+    twice = hj.experiments.Design.from_lines(
         [[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8
     )
     assert twice.experiments == 2
-    hj.Design.from_lines(
+    hj.experiments.Design.from_lines(
         [[0.0, 0.5], [4.0, 0.5]], 0.1, [[0, 0], [0, 1]], n_sections=8, periods=8
     )
-    with pytest.raises(hj.DefinitionError, match="f = 0 is zero at every section"):
-        hj.Design.from_lines([[0.0]], 0.1, np.pi / 2, n_sections=8, periods=8)
+    with pytest.raises(
+        hj.errors.DefinitionError, match="f = 0 is zero at every section"
+    ):
+        hj.experiments.Design.from_lines(
+            [[0.0]], 0.1, np.pi / 2, n_sections=8, periods=8
+        )
 
 
 @pytest.mark.parametrize(
@@ -205,7 +209,7 @@ def test_even_products_miss_the_lines(options, count):
 def test_several_inputs(division):
     n_inputs = 3
     n_lines = 12
-    model = hj.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, n_inputs))
+    model = hj.linear.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, n_inputs))
     design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=n_inputs, division=division)
     assert design.experiments == n_inputs * 4
     assert len(design.frequencies) == n_lines
@@ -238,7 +242,9 @@ def test_crest_factors():
     assert random.crest_factors().mean() > 2.9
     assert low.crest_factors().max() < 2.3
     orthogonal = hj.multisine(4, 8, (0, 2), inputs=2, division="orthogonal")
-    with pytest.raises(hj.DefinitionError, match="no phase of this design is free"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="no phase of this design is free"
+    ):
         hj.experiments.optimize_phases(orthogonal)
 
 
@@ -251,13 +257,13 @@ def test_phases_that_are_not_random_have_no_variance_of_distortion(hopper):
         for experiment in range(6):
             lines.append(np.array(lines_of(low, experiment)) / 32)
             phases.append(low.phase[low.experiment == experiment])
-    twice = hj.Design.from_lines(lines, 0.01, phases, periods=32)
+    twice = hj.experiments.Design.from_lines(lines, 0.01, phases, periods=32)
     data = hj.experiments.simulate_experiments(
         hopper, twice, start="periodic", discard=32
     )
     noisy = hj.experiments.add_noise(data, snr=20)
     with pytest.raises(
-        hj.DefinitionError, match=r"the phases are not random \(12 of 12"
+        hj.errors.DefinitionError, match=r"the phases are not random \(12 of 12"
     ):
         hj.estimate_htf(noisy, 0, repeats=2, variance="total")
     estimate = hj.estimate_htf(noisy, 0, repeats=2)
@@ -284,9 +290,9 @@ def test_realizations_pairs_and_scales():
     scaled = design.scaled(0.3).inputs()
     rms = np.sqrt(np.mean(scaled**2, axis=1))
     assert_allclose(rms, 0.3)
-    with pytest.raises(hj.DefinitionError):
+    with pytest.raises(hj.errors.DefinitionError):
         design.scaled(0.0)
-    with pytest.raises(hj.DefinitionError):
+    with pytest.raises(hj.errors.DefinitionError):
         design.realizations(0)
 
 
@@ -296,7 +302,9 @@ def test_expected_variance_is_that_of_the_estimate():
     u = design.realizations(400).inputs()
     rng = np.random.default_rng(0)
     y = rng.normal(size=(*u.shape[:2], 1))
-    estimate = hj.estimate_htf(hj.ExperimentData(u, y, n_sections=4, periods=8), 0)
+    estimate = hj.estimate_htf(
+        hj.experiments.ExperimentData(u, y, n_sections=4, periods=8), 0
+    )
     expected = design.expected_variance()[:, 0] / 400
     assert_allclose(np.mean(estimate.variance), expected.mean(), rtol=0.02)
 
@@ -307,7 +315,7 @@ def test_inputs_in_another_order_are_refused():
     inputs = ("u1", "u0")
     design = hj.multisine(model.n_sections, periods=4, inputs=inputs)
     with pytest.raises(
-        hj.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"
+        hj.errors.DefinitionError, match="different orders of inputs: .'u1', 'u0'. and"
     ):
         hj.experiments.simulate_experiments(model, design)
     other = hj.multisine(model.n_sections, periods=4, inputs=("force", "torque"))

@@ -11,13 +11,13 @@ from ..conftest import no_compilation
 
 
 DESIGN = hj.multisine(4, 3, (0, 1.2), 0.05, seed=1)
-ALONE = hj.Execution(workers=1)
+ALONE = hj.scale.Execution(workers=1)
 
 
 @pytest.fixture(scope="module")
 def placed(vanderpol_cycle):
     sections = hj.KinematicPhase(4, position="x", velocity="v")
-    return hj.place_sections(vanderpol_cycle, sections)
+    return hj.sections.place_sections(vanderpol_cycle, sections)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_steady_start_that_is_not_there_is_named(run, monkeypatch):
         * np.array([0.0, 1.0, 0.0])[:, None, None]
     )
     with pytest.raises(
-        hj.ComputationError, match="experiment 1: no periodic response was found"
+        hj.errors.ComputationError, match="experiment 1: no periodic response was found"
     ):
         run(u, start="steady")
 
@@ -89,7 +89,7 @@ def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, 
     rng = np.random.default_rng(0)
     sizes = ((4, 1, 1), (4, 1, 2), (4, 1, 1), (4, 1, 2))
     A, B, C, D = [0.3 * rng.normal(size=size) for size in sizes]
-    controller = hj.LDTP(A, B, C, D, inputs=model.outputs, outputs=model.inputs)
+    controller = hj.linear.LDTP(A, B, C, D, inputs=model.outputs, outputs=model.inputs)
     loop = model.feedback(controller)
     reference = 1e-3 * DESIGN.inputs(6)
     data = run(reference, discard=0, feedback=controller)

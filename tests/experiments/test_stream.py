@@ -22,7 +22,7 @@ pytest.importorskip("zarr")
 COUNT = 12
 DESIGN = hj.multisine(8, 8, (0, 4.0), 0.001, experiments=COUNT)
 OUTPUTS = ("x", "v")
-BATCH = {"execution": hj.Execution(batch=5)}
+BATCH = {"execution": hj.scale.Execution(batch=5)}
 NOISE = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
 stream = hj.experiments.stream_experiments
 
@@ -31,7 +31,7 @@ stream = hj.experiments.stream_experiments
 def arguments():
     cycle = hj.find_limit_cycle(hj.models.Duffing())
     family = hj.ClockPhase(8, anchor=hj.Crossing("x", "falling"))
-    return cycle, hj.place_sections(cycle, family), DESIGN, OUTPUTS
+    return cycle, hj.sections.place_sections(cycle, family), DESIGN, OUTPUTS
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
     assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
-            hj.DefinitionError, match="a slice of consecutive experiments"
+            hj.errors.DefinitionError, match="a slice of consecutive experiments"
         ):
             DESIGN.inputs(experiments=wrong)
 
@@ -84,7 +84,7 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
 def test_workers_and_batches_change_nothing(arguments, whole):
     def run(workers=1):
         return hj.run_experiments(
-            *arguments, execution=hj.Execution(batch=5, workers=workers)
+            *arguments, execution=hj.scale.Execution(batch=5, workers=workers)
         )
 
     with no_compilation(after=run):
@@ -97,7 +97,7 @@ def test_workers_and_batches_change_nothing(arguments, whole):
 def test_batches_are_alike_and_keep_all_workers_busy():
     for S in (1, 20, 80, 1000, 1001, 99_999):
         for workers in (1, 2, 7, 64):
-            divided = divide(S, hj.Execution(workers=workers))
+            divided = divide(S, hj.scale.Execution(workers=workers))
             size = divided.batch
             used = divided.workers
             assert 1 <= used <= workers
@@ -107,8 +107,8 @@ def test_batches_are_alike_and_keep_all_workers_busy():
             if S >= 64 * workers:  # every worker has about the same to do
                 assert used == workers
                 assert number * size < 1.2 * S
-    assert divide(1000, hj.Execution(256, 8)) == hj.Execution(256, 4)
-    assert divide(80, hj.Execution(workers=2)) == hj.Execution(40, 2)
+    assert divide(1000, hj.scale.Execution(256, 8)) == hj.scale.Execution(256, 4)
+    assert divide(80, hj.scale.Execution(workers=2)) == hj.scale.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(made, whole):
@@ -130,7 +130,7 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
     (tmp_path / "records.zarr/y/c/1/0/0").unlink()
     assert stored.missing() == [1]
-    with pytest.raises(hj.DefinitionError, match="1 of 3 chunks .* are missing"):
+    with pytest.raises(hj.errors.DefinitionError, match="1 of 3 chunks .* are missing"):
         hj.estimate_htf(stored)
     rotten = tmp_path / "records.zarr/u/c/2/0/0"
     content = bytearray(rotten.read_bytes())
@@ -149,7 +149,7 @@ def test_a_store_without_what_it_began_with_is_refused(lost, stored, tmp_path):
     """(Zarr reads a chunk that is not there as zeros.)"""
     path = tmp_path / "records.zarr" / lost
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(hj.DefinitionError, match="holds no experiments"):
+    with pytest.raises(hj.errors.DefinitionError, match="holds no experiments"):
         StoredExperiments(stored.address)
 
 
@@ -179,7 +179,7 @@ def test_other_experiments_are_refused(made, arguments):
         call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
         options = {name: call.pop(name) for name in [*call] if hasattr(Options, name)}
         with pytest.raises(
-            hj.DefinitionError, match=f"holds other results: .*{difference}"
+            hj.errors.DefinitionError, match=f"holds other results: .*{difference}"
         ):
             stream(**call, options=Options(**options), store=made.address)
 
@@ -204,22 +204,23 @@ def test_another_process_can_run_a_piece(arguments, start):
 def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
     whole, arguments, tmp_path
 ):
-    other = hj.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
+    other = hj.experiments.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
     good = np.cos(2 * np.pi * n / 64 * 3)
     high = np.cos(2 * np.pi * n / 64 * 19)
     good, bad = (
-        hj.ExperimentData(u, u, n_sections=4, periods=16) for u in (good, good + high)
+        hj.experiments.ExperimentData(u, u, n_sections=4, periods=16)
+        for u in (good, good + high)
     )
     for parts, message in (
         ([whole, other], "`data` have different sections, periods or signals"),
         ([], "not an empty list"),
         ([good, good, bad], "experiment 2: f = "),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.estimate_htf(parts)
-    with pytest.raises(hj.DefinitionError, match="holds no experiments"):
+    with pytest.raises(hj.errors.DefinitionError, match="holds no experiments"):
         StoredExperiments(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(hj.DefinitionError, match="file"):
+    with pytest.raises(hj.errors.DefinitionError, match="file"):
         stream(*arguments, store=tmp_path / "file")

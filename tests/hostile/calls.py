@@ -26,9 +26,9 @@ def positional(function):
 
 def scale(t):
     yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
-    yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
-    yield hj.Points, dict(values={"x": [1.0]})
-    yield hj.Points.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
+    yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
+    yield hj.scale.Points, dict(values={"x": [1.0]})
+    yield hj.scale.Points.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
 
 
 def systems(t):
@@ -41,13 +41,13 @@ def systems(t):
     yield hj.Output("z", flow).in_chart, dict(name="plane")
     ends = dict(name="hit", source="flow", target="flow", guard=flow)
     yield hj.Transition, ends | dict(direction="falling", reset=flow)
-    yield hj.Scheduled, dict(period=1.0, offset=0.0)
+    yield hj.systems.Scheduled, dict(period=1.0, offset=0.0)
     yield hj.parameter, dict(default=1.0)
     yield hj.models.VerticalHopper, dict(k=10.0)
     yield hj.models.BouncingChain, dict(n=2)
-    yield hj.enable_progress, dict(enabled=False)
-    yield hj.enable_compilation_cache, dict(folder=None)
-    yield hj.Settings, dict(rtol=1e-09, atol=1e-09)
+    yield hj.scale.enable_progress, dict(enabled=False)
+    yield hj.scale.enable_compilation_cache, dict(folder=None)
+    yield hj.orbits.Settings, dict(rtol=1e-09, atol=1e-09)
     begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
     yield hj.simulate, dict(system=t.system) | begin
 
@@ -60,17 +60,17 @@ def sections(t):
         n_sections=8, position="x", velocity="y", center=(0.0, 0.0), scale=(1.0, 1.0)
     )
     yield hj.KinematicPhase, turn
-    yield hj.SectionList, dict(items=[APEX])
-    yield hj.place_sections, dict(cycle=t.cycle, sections=PHASE)
+    yield hj.sections.SectionList, dict(items=[APEX])
+    yield hj.sections.place_sections, dict(cycle=t.cycle, sections=PHASE)
     yield t.placed.observe, dict(outputs=STATES)
     yield hj.linearize, dict(cycle=t.cycle, sections=t.placed, outputs=STATES)
-    yield hj.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
+    yield hj.sections.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
     yield t.map, dict(q=t.map.fixed_point)
 
 
 def cycles(t):
     yield hj.find_limit_cycle, dict(system=t.system, guess=t.cycle)
-    yield hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
+    yield hj.orbits.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
     yield t.cycles.__getitem__, dict(i=0)
     yield (
         hj.continuation,
@@ -94,9 +94,9 @@ def linear(t):
     B = np.asarray(t.model.B)
     C = np.asarray(t.model.C)
     D = np.asarray(t.model.D)
-    yield hj.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
+    yield hj.linear.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
     square = [np.eye(2)] * 3
-    yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
+    yield hj.linear.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
     u = np.ones((12, 2))
     for name in ("states", "simulate"):
         yield getattr(t.model, name), dict(u=u)
@@ -111,18 +111,20 @@ def linear(t):
     f = np.asarray(t.estimate.f)
     H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
-    scatter = hj.Scatter(f, size)
+    scatter = hj.linear.Scatter(f, size)
     errors = dict(
-        variance=size, noise_variance=size, scatter=hj.Scatter(np.ones(len(f)), size)
+        variance=size,
+        noise_variance=size,
+        scatter=hj.linear.Scatter(np.ones(len(f)), size),
     )
-    yield hj.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
-    yield hj.Scatter, dict(freedom=f, roundness=size)
+    yield hj.linear.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
+    yield hj.linear.Scatter, dict(freedom=f, roundness=size)
     yield scatter.quantile, dict(level=0.9)
     yield scatter.sources, dict(f=f)
     lines = np.arange(12) / 4 + 0.125
     signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
     gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
-    still = hj.LDTP(
+    still = hj.linear.LDTP(
         np.zeros((6, 1, 1)), 0 * gain[:, :1], 0 * gain[:, :, :1], gain, **signals
     )
     yield t.model.htf(lines).feedback, dict(controller=still.htf(lines))
@@ -139,15 +141,15 @@ def designs(t):
     lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield (
-        hj.paper_design,
+        hj.experiments.paper_design,
         dict(n_sections=20, periods=16, experiments=40, division="random"),
     )
     cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
-    yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
+    yield hj.experiments.Design.from_lines, cosines | dict(n_sections=6, periods=16)
     good = {
         name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__
     }
-    yield hj.Design, good
+    yield hj.experiments.Design, good
     yield t.design.scaled, dict(rms=1.0)
     yield t.design.realizations, dict(count=2)
     yield hj.experiments.optimize_phases, dict(design=t.design)
@@ -159,7 +161,7 @@ def experiments(t):
     yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield (
-        hj.response_function,
+        hj.experiments.response_function,
         {name: to_run[name] for name in ("cycle", "sections", "outputs")},
     )
     yield t.response, dict(u=np.zeros((1, 8, 1)))
@@ -167,9 +169,9 @@ def experiments(t):
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
     y = np.ones(t.data.y.shape)
-    yield hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
+    yield hj.experiments.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
     one = t.record
-    yield hj.Record, dict(u=one.u, y=one.y, n_sections=6)
+    yield hj.experiments.Record, dict(u=one.u, y=one.y, n_sections=6)
     yield one.part, dict(first=0, stop=12)
 
 
@@ -206,17 +208,24 @@ def series(t):
 def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     yield hj.fit_model, both
-    yield hj.identifiability, both
-    yield hj.spectral_radius, dict(model=t.model)
-    yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
-    yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
+    yield hj.fitting.identifiability, both
+    yield hj.fitting.spectral_radius, dict(model=t.model)
+    yield hj.fitting.ObservedHTF, dict(htf=t.htf, sections=PHASE)
+    yield hj.fitting.ObservedSeries, dict(data=t.series, sections=PHASE)
     seen = dict(
         outputs=STATES, values=np.ones((4, 2)), times=np.arange(4.0), period=1.0
     )
-    yield hj.ObservedCycle, dict(sections=PHASE) | seen
-    yield hj.ObservedCycle.of, dict(cycle=t.cycle, sections=PHASE, outputs=STATES)
+    yield hj.fitting.ObservedCycle, dict(sections=PHASE) | seen
+    yield (
+        hj.fitting.ObservedCycle.of,
+        dict(cycle=t.cycle, sections=PHASE, outputs=STATES),
+    )
     for name in ("ObservedCycle", "ObservedHTF"):
-        made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
+        made = (
+            t.observed
+            if name == "ObservedCycle"
+            else hj.fitting.ObservedHTF(t.htf, PHASE)
+        )
         for method in ("residuals", "prepare"):
             yield getattr(made, method), dict(cycle=t.cycle)
 
@@ -324,7 +333,7 @@ def testing(t):
 def files(t):
     yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
-    yield hj.write_report, dict(folder="report", result=t.found)
+    yield hj.recordings.write_report, dict(folder="report", result=t.found)
 
 
 def conversions(t):
@@ -366,8 +375,8 @@ def rhythms(t):
     def surface(time, q):
         return q[0]
 
-    yield hj.sliding, dict(charts=charts, surface=surface)
-    yield hj.coincidences, dict(cycle=t.cycle)
+    yield hj.systems.sliding, dict(charts=charts, surface=surface)
+    yield hj.orbits.coincidences, dict(cycle=t.cycle)
     about = dict(recording=t.recording, phase=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(curve=t.beats)
@@ -383,7 +392,7 @@ def without_arguments(t):
     data = t.data
     design = t.design
     for call in (
-        hj.Execution,
+        hj.scale.Execution,
         hj.designs.Multipliers,
         hj.experiments.Options,
         natural.interval,

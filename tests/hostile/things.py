@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.orbits.continuation import Branch, BranchEnd
+from hybridjax.orbits.branches import Branch, BranchEnd
 
 from ..toys import many
 
@@ -23,20 +23,22 @@ GOAL = hj.designs.Multipliers(harmonics=0)
 def repeated(t):
     u = np.concatenate([t.data.u, t.data.u], axis=1)
     y = np.concatenate([t.data.y, t.data.y], axis=1)
-    return hj.ExperimentData(u, y, n_sections=6, periods=16, result=t.data.result)
+    return hj.experiments.ExperimentData(
+        u, y, n_sections=6, periods=16, result=t.data.result
+    )
 
 
 def record(t):
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = np.asarray(t.model.simulate(u))
     rng = np.random.default_rng(1)
-    return hj.Record(u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6)
+    return hj.experiments.Record(u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6)
 
 
 def run(t, u):
     y = np.stack([t.model.simulate(x) for x in u])
     noise = 1e-3 * np.random.default_rng(2).normal(size=y.shape)
-    return hj.ExperimentData(u, y + noise, n_sections=6, periods=16)
+    return hj.experiments.ExperimentData(u, y + noise, n_sections=6, periods=16)
 
 
 def recording(t):
@@ -60,7 +62,8 @@ def section_data(t, inputs, **options):
 
 def branch(t):
     ends = [
-        BranchEnd(mu, hj.Result.OK, "end of the parameter range") for mu in (0.1, 0.2)
+        BranchEnd(mu, hj.errors.Result.OK, "end of the parameter range")
+        for mu in (0.1, 0.2)
     ]
     return Branch("mu", np.array([0.1, 0.2]), t.cycles, (), tuple(ends))
 
@@ -129,9 +132,9 @@ MAKE = {
     "cycle": lambda t: hj.find_limit_cycle(t.system),
     "cycles": lambda t: many(t.cycle, 2),
     "branch": branch,
-    "placed": lambda t: hj.place_sections(t.cycle, PHASE),
-    "map": lambda t: hj.section_map(t.cycle, t.placed, 0, 1),
-    "response": lambda t: hj.response_function(t.cycle, t.placed, NAMES),
+    "placed": lambda t: hj.sections.place_sections(t.cycle, PHASE),
+    "map": lambda t: hj.sections.section_map(t.cycle, t.placed, 0, 1),
+    "response": lambda t: hj.experiments.response_function(t.cycle, t.placed, NAMES),
     "trajectory": lambda t: t.cycle.trajectory(),
     "model": lambda t: hj.testing.synthetic_ldtp(),
     "design": lambda t: hj.multisine(6, 16, band=(0, 3.0), inputs=2),
@@ -150,7 +153,7 @@ MAKE = {
     ),
     "structured": lambda t: hj.fit_multipliers(t.estimate, 2, overhang=6),
     "plan": lambda t: hj.optimal_design(t.model, t.design, goal=CURVE),
-    "decaying": lambda t: hj.LDTP(
+    "decaying": lambda t: hj.linear.LDTP(
         np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1))
     ),
     "block": lambda t: hj.experiments.add_noise(
@@ -181,7 +184,7 @@ MAKE = {
     "series": lambda t: hj.experiments.simulate_experiments(
         hj.linearize(t.cycle, PHASE, NAMES), t.one_input
     ),
-    "observed": lambda t: hj.ObservedCycle.of(t.cycle, PHASE, NAMES),
+    "observed": lambda t: hj.fitting.ObservedCycle.of(t.cycle, PHASE, NAMES),
     "plot": plot,
 }
 

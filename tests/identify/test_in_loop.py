@@ -22,7 +22,7 @@ def plant():
     turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
 
 
 GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
@@ -49,7 +49,7 @@ def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
     u, y = run(model, r, 0 * r, rng, **options)
-    return hj.Record(
+    return hj.experiments.Record(
         np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
     )
 
@@ -64,12 +64,14 @@ def experiments(model, seed, count, noise=0.0, discard=30, together=False):
     inputs = np.concatenate(
         [u[..., None], z * [1, 1e-9]], axis=2
     )  # (a unit of its own)
-    return hj.ExperimentData(inputs, y[..., None], n_sections=N, periods=8, inputs=SEEN)
+    return hj.experiments.ExperimentData(
+        inputs, y[..., None], n_sections=N, periods=8, inputs=SEEN
+    )
 
 
 def controller():
     zero = np.zeros((N, 1, 1))
-    return hj.LDTP(zero, zero, zero, GAIN, inputs="y", outputs="u")
+    return hj.linear.LDTP(zero, zero, zero, GAIN, inputs="y", outputs="u")
 
 
 def test_plant_and_controller_of_exact_data(plant):
@@ -94,7 +96,7 @@ def test_plant_and_controller_of_exact_data(plant):
     closed = hj.fit_multipliers(loop.closed, 2, check=False)
     assert closed.compare(exact.multipliers).max_error < 1e-8
     data = experiments(plant, 0, 2)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
     )
     one = hj.identify.loop(data, at_input="r")
@@ -108,7 +110,7 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     u, y = run(plant, r, 0 * r, np.random.default_rng(0))
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
     inputs = np.stack([u, r], axis=2)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r")
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
@@ -166,7 +168,7 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
     assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
     with pytest.raises(
-        hj.DefinitionError, match="the reference determines 2 multipliers, not 3"
+        hj.errors.DefinitionError, match="the reference determines 2 multipliers, not 3"
     ):
         hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
@@ -179,7 +181,9 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     rng, root = np.random.default_rng(1), np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
-    data = series(hj.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0)
+    data = series(
+        hj.linear.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0
+    )
     (low,) = hj.fit_series(data, 2, reference="r").findings
     assert "3 gives other" in low.text
     assert not hj.fit_series(data, 3, reference="r").findings
@@ -190,7 +194,7 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     held = []
     for seed in range(8):
         data = series(plant, seed, noise=1.0)
-        data = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u")
+        data = hj.experiments.Record(data.u[:, :1], data.y, n_sections=N, inputs="u")
         fit = hj.fit_ldtp(data, 2, noise="innovations")
         assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
@@ -200,7 +204,7 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
-    data = hj.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    data = hj.experiments.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
     assert not hj.fit_series(data, 2, check=False).findings
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
@@ -218,21 +222,25 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         None
     ]  # (a statistic of -5e-4, by rounding)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
-    data = hj.Record(np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r"))
+    data = hj.experiments.Record(
+        np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
+    )
     assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
     data = series(plant, 5, noise=0.5, waits=True, through=1.0)
-    with pytest.raises(hj.DefinitionError, match="tells the two directions apart"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="tells the two directions apart"
+    ):
         hj.fit_ldtp(data, 2, reference="r")
 
 
 def test_a_plant_that_is_stable_in_its_loop_only():
     # x[n + 1] = 1.2 x + u, u = r - 0.9 y
     one = np.ones((N, 1, 1))
-    plant = hj.LDTP(1.2 * one, one, one)
+    plant = hj.linear.LDTP(1.2 * one, one, one)
     r, e = np.random.default_rng(0).normal(size=(2, N * 400))
     x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
     y = x + 0.3 * e
-    data = hj.Record(
+    data = hj.experiments.Record(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
     )
     for fit in (
@@ -249,7 +257,7 @@ def test_residuals_tell_of_the_loop(plant):
     true = hj.validate(fit, late, reference="r")
     assert true.independent and true.white  # (of other strides)
     # (the ratio of y to u is no model of the plant, and the reference shows it)
-    alone = hj.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
+    alone = hj.experiments.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
     biased = hj.fit_series(alone, 2, check=False)
     assert not hj.validate(biased, late, reference="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
@@ -261,34 +269,42 @@ def test_residuals_tell_of_the_loop(plant):
         assert (
             feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3
         ) == answers
-    unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
+    unstable = hj.linear.LDTP(
+        1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1))
+    )
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
-    with pytest.raises(hj.DefinitionError, match="grows without bound: validate"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="grows without bound: validate"
+    ):
         hj.validate(unstable, late, reference="r")
 
 
 def test_what_does_not_fit_is_refused(plant):
     data, record = experiments(plant, 0, 2), series(plant, 0)
-    refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
+    refused = lambda text: pytest.raises(hj.errors.DefinitionError, match=text)  # noqa: E731
     with refused("there is no input 'q'; inputs are u, r, d"):
         hj.estimate_htf(data, reference="q")
     with refused("2 inputs of the plant need as many references"):
         hj.estimate_htf(data, reference="r")
     with refused("all inputs are references"):
         hj.fit_ldtp(record, 2, reference=("u", "r"))
-    same = hj.Record(record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r"))
+    same = hj.experiments.Record(
+        record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r")
+    )
     with refused("u and r are equal"):
         hj.fit_ldtp(same, 2, reference="r")
     shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
     with refused("u and r are equal"):
         hj.identify.loop(
-            hj.ExperimentData(data.u[..., [1, 1]], data.y, **shape), at_input="r"
+            hj.experiments.ExperimentData(data.u[..., [1, 1]], data.y, **shape),
+            at_input="r",
         )
     with refused("name those that enter at the plant's input"):
         hj.identify.loop(data)
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
         hj.estimate_htf(
-            hj.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape), reference="r"
+            hj.experiments.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape),
+            reference="r",
         )
     with refused("`reference`, `noise` and `start` are for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")

@@ -123,7 +123,7 @@ def test_derivatives_are_those_of_jax(model, errors):
 def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
     fit = hj.fit_ldtp(htf, shaken(model, np.random.default_rng(1)))
-    assert fit.result == hj.Result.OK and "too few dimensions" not in repr(fit)
+    assert fit.result == hj.errors.Result.OK and "too few dimensions" not in repr(fit)
     assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1).findings)
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
@@ -185,7 +185,7 @@ def test_errors_are_as_small_as_the_bound(model, exact):
 
 def test_with_one_section_the_bound_is_that_of_free_numerators():
     """Then both have as many unknowns, and describe the same systems."""
-    one = hj.LDTP(
+    one = hj.linear.LDTP(
         [[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]]
     )
     f = np.linspace(0.02, 0.48, 30)

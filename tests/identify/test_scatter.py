@@ -17,7 +17,7 @@ LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 def model():
     rng = np.random.default_rng(0)
     A = 0.6 * rng.normal(size=(N, 2, 2))
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
+    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
 def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
@@ -74,7 +74,7 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     residuals = np.sqrt(shares) * (error - mean)
     square, turned = (np.abs(residuals) ** 2).sum(axis=0), (residuals**2).sum(axis=0)
     shape = roundness(square, turned, np.full(runs, 1.0 * R))[None, :, None, None]
-    scatter = hj.Scatter(np.full(runs, R - 1.0), shape)
+    scatter = hj.linear.Scatter(np.full(runs, R - 1.0), shape)
     for level in (0.5, 0.8, 0.95, 0.99):
         square = np.asarray(scatter.quantile(level))[0, :, 0, 0] * variance
         inside = np.abs(mean) ** 2 <= square
@@ -103,7 +103,9 @@ def test_the_parts_of_the_variance(model):
 def test_distortion_is_what_noise_is_not(model):
     """y = linear + cube of the input: realizations scatter, repeated periods do not."""
     data = realized(model, 20, 2)
-    bent = hj.ExperimentData(data.u, data.y + 5 * data.u**3, n_sections=N, periods=P)
+    bent = hj.experiments.ExperimentData(
+        data.u, data.y + 5 * data.u**3, n_sections=N, periods=P
+    )
     estimate = hj.estimate_htf(bent, (0,), repeats=2)
     assert np.all(estimate.noise_variance < 1e-25) and np.all(estimate.variance > 1e-8)
     exact = model.htf(estimate.f, 0)[0]
@@ -114,7 +116,9 @@ def test_distortion_is_what_noise_is_not(model):
 def test_sums_of_parts_are_those_of_the_whole(model):
     data = realized(model, 4, 2, noise=0.1)
     parts = [
-        hj.ExperimentData(data.u[k : k + 4], data.y[k : k + 4], n_sections=N, periods=P)
+        hj.experiments.ExperimentData(
+            data.u[k : k + 4], data.y[k : k + 4], n_sections=N, periods=P
+        )
         for k in range(0, 16, 4)
     ]
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
@@ -127,8 +131,10 @@ def test_sums_of_parts_are_those_of_the_whole(model):
 def test_a_failed_realization_leaves_the_others(model):
     data = realized(model, 2, noise=0.1)
     result = np.zeros(len(data.u), int)
-    result[0] = hj.Result.BLOW_UP
-    data = hj.ExperimentData(data.u, data.y, n_sections=N, periods=P, result=result)
+    result[0] = hj.errors.Result.BLOW_UP
+    data = hj.experiments.ExperimentData(
+        data.u, data.y, n_sections=N, periods=P, result=result
+    )
     estimate = hj.estimate_htf(data)
     lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
     ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
@@ -137,7 +143,8 @@ def test_a_failed_realization_leaves_the_others(model):
         estimate.scatter.freedom, np.where(lost, (~lost).sum(), 1)
     )
     with pytest.raises(
-        hj.DefinitionError, match="single realization, as at f = .* does not show"
+        hj.errors.DefinitionError,
+        match="single realization, as at f = .* does not show",
     ):
         hj.estimate_htf(data, variance="total")
 
@@ -145,10 +152,14 @@ def test_a_failed_realization_leaves_the_others(model):
 def test_pairs_cancel_even_distortion(model):
     design = LINES.realizations(3).with_negatives()
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
-    bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P)
+    bent = hj.experiments.ExperimentData(
+        data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P
+    )
     estimate = hj.estimate_htf(bent.odd_part())
     assert estimate.error(model.htf(estimate.f)).max() < 1e-12
-    with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="experiments 0 and 1 are no pair"
+    ):
         realized(model, 2).odd_part()
 
 
@@ -162,9 +173,10 @@ def test_noise_by_its_ratio(model):
 def test_repeated_phases_show_no_distortion(model):
     data = realized(model, 1, noise=0.1)
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
-    with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
+    with pytest.raises(hj.errors.DefinitionError, match="repeat the same phases"):
         hj.estimate_htf(
-            hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total"
+            hj.experiments.ExperimentData(*twice, n_sections=N, periods=P),
+            variance="total",
         )
 
 
@@ -190,7 +202,7 @@ def test_fits_know_of_estimated_variances(model):
     variance = 0.1 * np.random.default_rng(1).gamma(4, size=H.shape)
     fits = [
         hj.fit_ldtp(
-            hj.HTF(
+            hj.linear.HTF(
                 exact.f,
                 H + np.sqrt(0.2) * (drawn[0] + 1j * drawn[1]),
                 exact.harmonics,
@@ -203,7 +215,7 @@ def test_fits_know_of_estimated_variances(model):
             ),
             2,
         )
-        for scatter in (hj.Scatter(np.full(31, x)) for x in (4.0, 1e9))
+        for scatter in (hj.linear.Scatter(np.full(31, x)) for x in (4.0, 1e9))
     ]
     level = fits[0].cost / fits[0].dof
     ratio = fits[0].covariance / fits[1].covariance

@@ -29,7 +29,7 @@ def noisy(htf, variance, rng, correlation=0.0):
 
 
 def with_variance(htf, H, variance, freedom=None):
-    scatter = None if freedom is None else hj.Scatter(freedom)
+    scatter = None if freedom is None else hj.linear.Scatter(freedom)
     return dataclasses.replace(htf, H=H, variance=variance, scatter=scatter)
 
 

@@ -15,24 +15,29 @@ F = np.arange(1, 20) / 20
 def an_htf(**more):
     rng = np.random.default_rng(0)
     H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
-    return hj.HTF(F, H, (-1, 0, 1), 4, **more)
+    return hj.linear.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
 @pytest.fixture(scope="module")
 def htf():
     rng = np.random.default_rng(1)
     size = rng.uniform(1, 2, (3, len(F), 2, 1))
-    scatter = hj.Scatter(np.full(len(F), 4.0), size)
+    scatter = hj.linear.Scatter(np.full(len(F), 4.0), size)
     return an_htf(variance=2 * size, noise_variance=size, scatter=scatter)
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
     expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
-    plain = an_htf(variance=htf.variance, scatter=hj.Scatter(htf.scatter.freedom))
+    plain = an_htf(
+        variance=htf.variance, scatter=hj.linear.Scatter(htf.scatter.freedom)
+    )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
     level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
     expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
-    for radius in (hj.HTF.confidence_radius, jax.jit(hj.HTF.confidence_radius)):
+    for radius in (
+        hj.linear.HTF.confidence_radius,
+        jax.jit(hj.linear.HTF.confidence_radius),
+    ):
         assert_allclose(radius(htf), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
     assert_allclose(

@@ -14,7 +14,7 @@ SMALL = [2.05187165619280217e-9, 1.16996080957107642e-15]
 @pytest.fixture(scope="module")
 def placed():
     cycle = hj.find_limit_cycle(hj.models.HopperPair())
-    return hj.place_sections(cycle, hj.ClockPhase(16, anchor=0.5))
+    return hj.sections.place_sections(cycle, hj.ClockPhase(16, anchor=0.5))
 
 
 @pytest.mark.slow

@@ -85,9 +85,9 @@ def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     assert np.array_equal(data.y, again.y)
     assert data.ok.all()
     assert np.abs(data.y).max() > 1e-3
-    with pytest.raises(hj.DefinitionError, match="whose state can be set"):
+    with pytest.raises(hj.errors.DefinitionError, match="whose state can be set"):
         cycle.perturbed_returns()
-    with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
+    with pytest.raises(hj.errors.DefinitionError, match="no real variable 'z'"):
         hj.plants.FMUPlant(fmu, "u", ("z",), dt=0.05)
 
 
@@ -131,7 +131,7 @@ def ground():
 def test_mujoco_continues_from_its_state(ground):
     """On soft ground the paper's hopper settles near its cycle on hard ground."""
     hard = hj.find_limit_cycle(hj.models.VerticalHopper())
-    at = hj.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
+    at = hj.sections.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
     error = np.abs(ground.cycle_outputs - np.asarray(at.observe(("yM", "vM")))).max()
     assert error < 0.05
     plant = ground.plant
@@ -219,7 +219,7 @@ def test_a_walker_in_mujoco():
     push = np.zeros((44, 1))
     push[3] = -200.0
     falls = cycle.trajectory(u=push)
-    assert falls.result == hj.Result.PLANT_STOPPED
+    assert falls.result == hj.errors.Result.PLANT_STOPPED
     assert 1 < falls.t[-1] < 3
 
 

@@ -80,7 +80,7 @@ def test_sections_at_events():
 
 def test_a_motion_is_recorded_up_to_a_fall(circle):
     def picture(z):
-        return hj.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
+        return hj.systems.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
 
     motion = circle.trajectory(picture)
     t, x = motion("x")
@@ -95,12 +95,16 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     class Falls(Circle):
         def step(self, u, duration):
             if u[0] > 1:
-                raise hj.ComputationError("fell") if u[0] == 2 else ZeroDivisionError
+                raise (
+                    hj.errors.ComputationError("fell")
+                    if u[0] == 2
+                    else ZeroDivisionError
+                )
             return super().step(u, duration)
 
     cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
     fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
-    assert fall.result == hj.Result.PLANT_STOPPED
+    assert fall.result == hj.errors.Result.PLANT_STOPPED
     error = abs(fall.t[-1] - math.pi / 2)
     assert error < 1e-8
     with pytest.raises(ZeroDivisionError):  # a mistake in the plant is no fall
@@ -140,7 +144,7 @@ def test_failures_are_named_and_the_others_go_on():
         "",
     )
     assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
-    assert (data.result[1:8] == 7 * [hj.Result.PLANT_STOPPED]).all()
+    assert (data.result[1:8] == 7 * [hj.errors.Result.PLANT_STOPPED]).all()
     assert np.isfinite(data.y[[0, 8]]).all()
     assert np.isnan(data.y[1, data.failed_at[1] :]).all()
     assert "#1: section" in data.summary(9)
@@ -188,26 +192,26 @@ def test_what_does_not_fit_is_refused(circle):
             "use KinematicPhase",
         ),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.plants.settle(Circle(), sections, "x")
-    with pytest.raises(hj.DefinitionError, match="no output 'z'"):
+    with pytest.raises(hj.errors.DefinitionError, match="no output 'z'"):
         hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "z")
 
     class Slow(Circle):
         rate = 0.01
 
-    with pytest.raises(hj.ComputationError, match="has not settled"):
+    with pytest.raises(hj.errors.ComputationError, match="has not settled"):
         hj.plants.settle(Slow(), ANGLE, "x", cycles=8)
 
     class Forgetful(Circle):
         def step(self, u, duration):  # (`get_state` lacks the number of steps)
             return super().step([0.05 * math.sin(0.03 * self.steps)], duration)
 
-    with pytest.raises(hj.DefinitionError, match="does not continue as before"):
+    with pytest.raises(hj.errors.DefinitionError, match="does not continue as before"):
         hj.plants.settle(Forgetful(), ANGLE, "x", cycles=20)
-    with pytest.raises(hj.DefinitionError, match="as `get_state` returns it"):
+    with pytest.raises(hj.errors.DefinitionError, match="as `get_state` returns it"):
         hj.plants.settle(Circle(), ANGLE, "x", guess=(1.0, 0.0, 0.0))
-    with pytest.raises(hj.DefinitionError, match="no coordinate 'z'"):
+    with pytest.raises(hj.errors.DefinitionError, match="no coordinate 'z'"):
         circle.perturbed_returns("z")
 
 

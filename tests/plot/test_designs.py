@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 import hybridjax as hj
 
 
-MODEL = hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
 USUAL = hj.multisine(4, 16, band=(0, 2.0))
 GOAL = hj.designs.Multipliers(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
@@ -35,7 +35,7 @@ def test_the_spectrum_of_a_design(plan):
     legend = [text.get_text() for text in below.get_legend().get_texts()]
     assert legend == ["equal amplitudes", "optimal"]
     with pytest.raises(
-        hj.DefinitionError, match="not the one that the plan was made for"
+        hj.errors.DefinitionError, match="not the one that the plan was made for"
     ):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
@@ -57,5 +57,5 @@ def test_what_strides_buy(plan):
     log_error = np.interp(of_usual, np.log(strides), np.log(errors))
     expected = np.linalg.norm(plan.usual_standard_errors)
     assert np.exp(log_error) == pytest.approx(expected)
-    with pytest.raises(hj.DefinitionError, match="without a block"):
+    with pytest.raises(hj.errors.DefinitionError, match="without a block"):
         hj.plot.strides(plan, {"here": study})

@@ -49,7 +49,7 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
         from_htf = draw(estimate, exact).ax.lines
         for line, expected in zip(from_model, from_htf, strict=True):
             assert_allclose(line.get_xydata(), expected.get_xydata(), rtol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="model alone"):
+    with pytest.raises(hj.errors.DefinitionError, match="model alone"):
         hj.plot.bode(hopper)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
@@ -94,7 +94,7 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
-    swapped = hj.HTF(
+    swapped = hj.linear.HTF(
         exact.f,
         exact.H[..., ::-1, ::-1],
         0,
@@ -103,7 +103,7 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         exact.outputs[::-1],
         "exact",
     )
-    renamed = hj.HTF(
+    renamed = hj.linear.HTF(
         exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact"
     )
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
@@ -113,7 +113,7 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         assert_array_equal(first.get_ydata(), second.get_ydata())
     fit = hj.identify.fit_rational(exact, input=1)
     with pytest.raises(
-        hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
+        hj.errors.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
         hj.plot.bode(exact, fits=fit, input=0)
 
@@ -154,7 +154,7 @@ def test_bodes(estimate, exact, rational):
     figure = hj.plot.bodes(families, fits={"b": rational}).figure
     measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
     assert measured == [4, 4]
-    with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
+    with pytest.raises(hj.errors.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bodes(families, fits={"c": rational})
 
 
@@ -214,7 +214,7 @@ def test_poles_and_zeros(rational):
         assert_array_equal(poles[:, 1], rational.poles[i].imag)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
-    with pytest.raises(hj.DefinitionError, match="one or more fits"):
+    with pytest.raises(hj.errors.DefinitionError, match="one or more fits"):
         hj.plot.poles_zeros({})
 
 
@@ -231,7 +231,7 @@ def test_experiment(hopper):
     assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
     assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
-    with pytest.raises(hj.DefinitionError, match="no experiment 99"):
+    with pytest.raises(hj.errors.DefinitionError, match="no experiment 99"):
         hj.plot.experiment(data, 99)
 
 
@@ -248,7 +248,7 @@ def test_saved_in_several_formats(tmp_path):
     assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
-    with pytest.raises(hj.DefinitionError, match="x.bmp': formats are png"):
+    with pytest.raises(hj.errors.DefinitionError, match="x.bmp': formats are png"):
         hj.plot.save(tmp_path / "x.bmp", plot)
 
 
@@ -284,7 +284,9 @@ def found(hopper):
     y = np.asarray(hopper.simulate(u))
     rng = np.random.default_rng(1)
     y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
-    return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
+    return hj.validate(
+        hopper, hj.experiments.Record(u, y, n_sections=32, outputs=("yM", "vM"))
+    )
 
 
 def test_validation_draws_signals_and_correlations(found):

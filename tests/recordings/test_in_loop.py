@@ -71,6 +71,6 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     data = hj.Recording(
         recording["time"], {k: x for k, x in recording.items() if k != "time"}
     )
-    with pytest.raises(hj.DefinitionError, match="must name other signals"):
+    with pytest.raises(hj.errors.DefinitionError, match="must name other signals"):
         names = {"inputs": "u", "outputs": "x", "reference": "u"}
         hj.identify_recording(data, hj.Crossing("clock", "rising"), **names)

@@ -170,10 +170,13 @@ def test_an_order_that_is_too_low_is_named():
     assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
     constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
     with pytest.raises(
-        hj.DefinitionError, match="no trial has samples of all .*x does not change"
+        hj.errors.DefinitionError,
+        match="no trial has samples of all .*x does not change",
     ):
         hj.identify_recording(constant, TOP, **names)
-    with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="'f' is in `inputs` and in `outputs`"
+    ):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
     assert f"since {text} more, or take 21 sections." in untried.advice.findings[1].text
@@ -232,6 +235,6 @@ def test_none_is_silently_wrong(hopper_cycle, mishap):
         dirty = mishandle(trials, mishap, input="u", outputs=outputs, event="apex")
         names = {"inputs": "u", "outputs": outputs, "n_sections": 16}
         found = hj.identify_recording(dirty, phase, order=2, **names)
-    except hj.DefinitionError:
+    except hj.errors.DefinitionError:
         return
     assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()

@@ -189,7 +189,7 @@ def test_plans_agree_with_closed_forms():
     y = 1 + 0.2 * RNG.normal(size=12)
     people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
     with pytest.raises(
-        hj.DefinitionError, match="subjects differ in 'gain' by no more than"
+        hj.errors.DefinitionError, match="subjects differ in 'gain' by no more than"
     ):
         study(y, np.ones(12), strides=np.full(12, 100)).allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
@@ -300,7 +300,7 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     }.items(),
 )
 def test_refusals(sentence, call):
-    with pytest.raises(hj.DefinitionError, match=sentence):
+    with pytest.raises(hj.errors.DefinitionError, match=sentence):
         call()
 
 

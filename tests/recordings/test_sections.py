@@ -45,16 +45,19 @@ def test_a_circle(wave):
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
     assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
-    with pytest.raises(hj.DefinitionError, match="different n_sections: 16 and 8"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="different n_sections: 16 and 8"
+    ):
         sample(wave, n_sections=16)
     with pytest.raises(
-        hj.DefinitionError, match="events alone determine no multipliers"
+        hj.errors.DefinitionError, match="events alone determine no multipliers"
     ):
         sample(wave, inputs=(), outputs=())
     for phase in (CIRCLE, hj.Crossing("v", "rising")):
         for call in (sample, hj.recordings.estimate_phase):
             with pytest.raises(
-                hj.DefinitionError, match="`bandwidth` removes the rhythm of 1 Hz"
+                hj.errors.DefinitionError,
+                match="`bandwidth` removes the rhythm of 1 Hz",
             ):
                 call(wave, phase, bandwidth=0.9)
     assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
@@ -65,7 +68,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
     t, z = trial.time, np.exp(2j * np.pi * trial.time)
     for inputs in ((), "force"):
         with pytest.raises(
-            hj.DefinitionError, match="^x is the same in all cycles, but for round"
+            hj.errors.DefinitionError,
+            match="^x is the same in all cycles, but for round",
         ):
             exact = hj.Recording(
                 t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag}
@@ -80,7 +84,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             [rhythm, hj.Recording(t, {"clock": np.sin(rate * t)})]
         )
         with pytest.raises(
-            hj.DefinitionError, match="deviate only by rounding and interpolation"
+            hj.errors.DefinitionError,
+            match="deviate only by rounding and interpolation",
         ):
             sample(both, hj.Crossing("clock", "rising"), inputs="force", timing="clock")
     for step, few in ((13, True), (5, False)):
@@ -189,7 +194,7 @@ def test_slow_drift_is_taken_out(wave):
             "numbers of trials: 0 and 1",
         ),
     ]:
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)
 
 
@@ -207,7 +212,7 @@ def test_designs_as_tables(tmp_path, wave):
         (None, "both the period and the rate"),
         (15.9, "must be 16 or more"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.recordings.write_design(
                 tmp_path / "time.csv", design, period=0.5, rate=rate
             )
@@ -225,7 +230,9 @@ def test_designs_as_tables(tmp_path, wave):
     np.testing.assert_allclose(
         u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9
     )
-    with pytest.raises(hj.DefinitionError, match="different numbers of trials: 1 and "):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="different numbers of trials: 1 and "
+    ):
         hj.recordings.add_command(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
     assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
@@ -340,7 +347,7 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
         np.array([5.0, 7.0, 11.0, 13.0]),
     )
     columns = (x[:, None, None] for x in (b, c))
-    model = hj.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
+    model = hj.linear.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
     zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
     times = np.cumsum(np.tile(np.roll(steps, 1), 60))
@@ -357,7 +364,10 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     for _ in range(60):
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
-        record, cycle = hj.Record(u, y, n_sections=N, **about), np.zeros((N, 1))
+        record, cycle = (
+            hj.experiments.Record(u, y, n_sections=N, **about),
+            np.zeros((N, 1)),
+        )
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
         found = impulse_responses(
             hj.fit_series(record, 1, check=False), data, 4, width=0.0

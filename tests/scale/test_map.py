@@ -21,7 +21,7 @@ pytest.importorskip("xarray")
 pytest.importorskip("zarr")
 
 # In pieces of four.
-FOUR = hj.Execution(batch=4)
+FOUR = hj.scale.Execution(batch=4)
 OVER = {"slope": np.array([0.075, 0.08, 0.09]), "spokes": np.array([8.0, 8.5, 9.0])}
 WANT = ("period", "spectral_radius", "state", "multipliers", "residual")
 
@@ -95,20 +95,22 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
         return hj.sweep(system, over, store=store, **options | change)
 
     run()
-    with pytest.raises(hj.DefinitionError, match=r"`over.slope` is not the same"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"`over.slope` is not the same"
+    ):
         run(over=small | {"slope": np.array([0.071, 0.08])})
     with pytest.raises(
-        hj.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
+        hj.errors.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
     ):
         run(hj.models.RimlessWheel(rate=1.1))
     with pytest.raises(
-        hj.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"
+        hj.errors.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"
     ):
         run(want="period")
     shutil.rmtree(store)
     store.mkdir()
     (store / "mine.txt").write_text("")
-    with pytest.raises(hj.DefinitionError, match="is no store of results"):
+    with pytest.raises(hj.errors.DefinitionError, match="is no store of results"):
         run()
 
 
@@ -122,7 +124,7 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
 
     def twice(cycle):
         if float(cycle.system.slope) > 0.08:
-            raise hj.ComputationError("too steep")
+            raise hj.errors.ComputationError("too steep")
         return jnp.stack([cycle.period, cycle.trajectory(2.0).t[-1]])
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
@@ -137,7 +139,7 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
         (lambda x: x, "a function of parameters that returns one"),
         (lambda x, y: x, "needs `y`: give it an axis"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.sweep(wrong, {"x": [1.0]}, guess=wheel)
 
 
@@ -182,7 +184,7 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
     k = jnp.array([8.0, 10.0, 13.0, 13.0, 0.0])
     b = jnp.array([3.0, 5.0, 7.0, 3.0, 5.0])
     hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-    found = hj.find_limit_cycles(hoppers, hopper_cycle)
+    found = hj.orbits.find_limit_cycles(hoppers, hopper_cycle)
     for i in range(4):
         cycle = found[i]
         alone = hj.find_limit_cycle(cycle.system, cycle)
@@ -200,7 +202,7 @@ def test_without_a_clock_and_in_waves(wheel):
     much shorter than the guess's that the flow from one impact passes the next."""
     slopes = np.linspace(0.08, 0.16, 11)
     systems = [hj.models.RimlessWheel(slope=x) for x in slopes]
-    found = hj.find_limit_cycles(systems, wheel, execution=FOUR)
+    found = hj.orbits.find_limit_cycles(systems, wheel, execution=FOUR)
     assert found.ok.all()
     assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
@@ -212,12 +214,14 @@ def test_systems_that_are_alike_or_undefined(wheel):
     """Neither takes the others down with it."""
     slopes = jnp.array([0.08] * 9 + [np.nan, 0.08])
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
-    found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
+    found = hj.orbits.find_limit_cycles(wheels, wheel, execution=FOUR)
     assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all()
     assert np.isfinite(found.multipliers[:9]).all()
     assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
-    assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
+    assert hj.orbits.find_limit_cycles(
+        [found[0].system] * 6, wheel, execution=FOUR
+    ).ok.all()
 
 
 def test_a_guess_with_too_long_a_period(wheel):

@@ -83,7 +83,7 @@ def sweep(
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
     - `over`: values of each parameter by name, of which all combinations are taken; or
-        `hj.Points`.
+        `hj.scale.Points`.
     - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
         chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
         functions of a `LimitCycle`, kept under their names, that return a number or an array of
