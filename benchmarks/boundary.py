@@ -33,10 +33,10 @@ def words(
 
 
 def records(
-    data: hj.experiments.Record | Sequence[hj.experiments.Record],
+    data: hj.experiments.SectionSeries | Sequence[hj.experiments.SectionSeries],
     order: Order | hj.linear.LDTP,
     *,
-    overhang: Index | None = None,
+    extra_lags: Index | None = None,
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
 ): ...
@@ -47,8 +47,10 @@ def array(u: Annotated[Numbers, Reals("S n nu")]): ...
 
 def cases() -> dict[str, tuple[Callable, tuple, dict]]:
     """What is called, and with what."""
-    record = hj.experiments.Record(np.ones((64, 1)), np.ones((64, 2)), n_sections=8)
-    options = {"overhang": 3, "start": "cycle", "check": True}
+    record = hj.experiments.SectionSeries(
+        np.ones((64, 1)), np.ones((64, 2)), n_sections=8
+    )
+    options = {"extra_lags": 3, "start": "cycle", "check": True}
     sizes = {"y": 1.0, "v": 2.0, "q": 3.0}
     return {
         "one integer": (count, (32,), {}),
@@ -82,7 +84,7 @@ def calls() -> dict[str, tuple[Callable, tuple, dict]]:
     y = np.asarray(model.simulate(u)) + 1e-3 * rng.normal(
         size=(len(u), len(model.outputs))
     )
-    record = hj.experiments.Record(u, y, n_sections=model.n_sections)
+    record = hj.experiments.SectionSeries(u, y, n_sections=model.n_sections)
     hopper = hj.models.VerticalHopper()
     cycle = hj.find_limit_cycle(hopper)
     return {

@@ -9,7 +9,7 @@ variances that realizations show (`htf`) and without (`htf_plain`), and `fit_ser
   as at the opposite one.
 - `sensor`: measurement noise with a correlation time of half a cycle.
 - `drift`: white measurement noise, and a drift of each output with a correlation time of 30 cycles,
-  five times as large. `fit_series` is also told of it (`Record(drift=20)`).
+  five times as large. `fit_series` is also told of it (`SectionSeries(drift=20)`).
 
 Printed, as `name value` lines: rms error, rms of the standard errors (`said`), how many of the
 regions held the true multipliers (`held`), and `p` of the binomial test of 95 %; `doubted`: how
@@ -51,8 +51,8 @@ def with_noise(
     )
 
 
-def told_of_drift(record: hj.experiments.Record) -> hj.experiments.Record:
-    return hj.experiments.Record(
+def told_of_drift(record: hj.experiments.SectionSeries) -> hj.experiments.SectionSeries:
+    return hj.experiments.SectionSeries(
         record.u,
         record.y,
         n_sections=N,

@@ -33,8 +33,8 @@ def experiments(
     cycle: hj.orbits.LimitCycle, settling: int = 20
 ) -> hj.experiments.ExperimentData:
     """Experiments without noise."""
-    design = hj.multisine(N, 16, band=(0, N / 2)).scaled(0.001).realizations(4)
-    u = design.inputs(design.periods + settling)
+    design = hj.multisine(N, 16, frequencies=(0, N / 2)).scaled(0.001).realizations(4)
+    u = design.signals(design.periods + settling)
     late, early = (round(x * N * FINE) for x in DELAY)
     held = np.repeat(u, FINE, axis=1)
     held = np.concatenate([np.zeros((len(u), late, 1)), held], axis=1)[

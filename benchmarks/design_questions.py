@@ -32,7 +32,7 @@ def measured(
     htf = hj.estimate_htf(noisy, harmonics, variance="auto")
     each = design.expected_variance()[:, None, :] * std[:, None] ** 2
     return hj.linear.HTF(
-        htf.f,
+        htf.frequencies,
         htf.H,
         htf.harmonics,
         htf.n_sections,
@@ -50,8 +50,8 @@ def goals(family, draws: int) -> None:
     """Bounds of other goals and with a limit of peaks; 620 lines."""
     design = hj.designs
     asked = {
-        "fit_ldtp": design.Multipliers(estimator="fit_ldtp", harmonics=HARMONICS),
-        "response": design.FrequencyResponse((0.1, 1.0), harmonics=HARMONICS),
+        "fit_ldtp": design.MultiplierGoal(estimator="fit_ldtp", harmonics=HARMONICS),
+        "response": design.ResponseGoal((0.1, 1.0), harmonics=HARMONICS),
     }
     for limit in ("input", "output"):
         for name, goal in asked.items():
@@ -76,7 +76,7 @@ def parameters(family, draws: int) -> None:
     before = family.recorded(usual)
     noise = family.noise(before[0])
     sections = family.placed.family
-    goal = hj.designs.Parameters(family.cycle, sections, SPRING, harmonics=HARMONICS)
+    goal = hj.designs.ParameterGoal(family.cycle, sections, SPRING, harmonics=HARMONICS)
     plan = hj.optimal_design(family.model, usual, goal=goal, noise=noise)
     system = family.cycle.system
     truth = np.array([float(getattr(system, name)) for name in SPRING])
@@ -115,7 +115,7 @@ def deviation(family, draws: int) -> None:
     noise = family.noise(before[0])
     about = {"limit": "output", "noise": noise}
     free = hj.optimal_design(family.model, usual, **about)
-    goal = hj.designs.Multipliers(estimator="fit_ldtp")
+    goal = hj.designs.MultiplierGoal(estimator="fit_ldtp")
     plan = hj.optimal_design(family.model, usual, goal=goal, **about)
     N, truth = family.model.n_sections, family.model.multipliers
     minimal = realized(np.asarray(family.model.impulse_response(4 * N + 1)))
@@ -133,7 +133,7 @@ def deviation(family, draws: int) -> None:
         ):
             htf = measured(data[k], design, noise, range(-N // 2, N // 2), rng)
             begin = time.process_time()
-            fit = hj.fit_ldtp(htf, start)
+            fit = hj.fit_ldtp(htf, initial=start)
             error[name] = np.abs(fit.multipliers - truth[0]).min()
             error[f"{name}.seconds"] = time.process_time() - begin
         return {name: float(x) for name, x in error.items()}
@@ -171,7 +171,7 @@ def physical(
         * np.array(list(noise.values()))[:, None] ** 2
     )
     htf = hj.linear.HTF(
-        htf.f,
+        htf.frequencies,
         htf.H,
         HARMONICS,
         htf.n_sections,

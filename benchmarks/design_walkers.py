@@ -123,7 +123,7 @@ class Laboratory:
         htf = hj.estimate_htf(data, (-2, -1, 0, 1, 2), variance="auto")
         each = design.expected_variance()[:, None, :] * self.variance(std)[:, None]
         return hj.linear.HTF(
-            htf.f,
+            htf.frequencies,
             htf.H,
             htf.harmonics,
             N,
@@ -155,7 +155,7 @@ def walkers(draws: int) -> None:
         noise = dict(
             zip(walker.outputs, np.sqrt(lab.variance(std)).tolist(), strict=True)
         )
-        goal = hj.designs.Multipliers(which=0)
+        goal = hj.designs.MultiplierGoal(which=0)
         plan = hj.optimal_design(lab.model, usual, goal=goal, noise=noise)
         everything = hj.optimal_design(lab.model, usual, noise=noise)
         found = [lab.rms_error(design, std, draws) for design in (usual, plan.design)]

@@ -10,10 +10,10 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 - `known`: rms errors of draws with new noise, four draws of the phases; the model is known. The
   input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise. `strong`: the
   same for a rms of 0.02 and 0.1.
-- `nothing`: from nothing, by `hj.designs.Study`, which is asked for a standard error of 5e-5: 640
-  strides of equal amplitudes, then designs made from what was measured, until it stops. The noise
-  is not known either. All strides are counted, and compared with those of equal amplitudes whose
-  bound is the rms error that was reached.
+- `nothing`: from nothing, by `hj.designs.SequentialDesign`, which is asked for a standard error of
+  5e-5: 640 strides of equal amplitudes, then designs made from what was measured, until it stops.
+  The noise is not known either. All strides are counted, and compared with those of equal
+  amplitudes whose bound is the rms error that was reached.
 - `stopping`: of the same studies, how many regions of 95 % held the true multipliers at the time of
   stopping, the p-value of that number, and the standard error that was asked for, said and true.
 - `goals`: bounds of other goals, of both limits: multipliers by `fit_ldtp`, the harmonic transfer
@@ -109,7 +109,7 @@ def bounds(family: Family, draws: int) -> None:
             )
         family.show(f"bound.{limit}.cpu_seconds", seconds)
     noise = {"yM": 6e-6, "vM": 1.2e-5}
-    usual = (hj.multisine().scaled(RMS), hj.multisine(band=(0, 2)).scaled(RMS))
+    usual = (hj.multisine().scaled(RMS), hj.multisine(frequencies=(0, 2)).scaled(RMS))
     plan, slow = (hj.optimal_design(family.model, x, noise=noise) for x in usual)
     as_much = slow.usual_criterion * usual[1].cycles(0)
     family.show("bound.slow.saved", as_much / (plan.criterion * plan.design.cycles(0)))
@@ -144,10 +144,10 @@ def known(family: Family, draws: int, rms: float = RMS, row: str = "known") -> N
 
 def study(
     family: Family, rng, first, begun, noise: dict[str, float]
-) -> hj.designs.Study:
+) -> hj.designs.SequentialDesign:
     """One, from nothing to its end; `begun`: responses to the first blocks, without noise."""
     k = int(rng.integers(PHASES))
-    found = hj.designs.Study(
+    found = hj.designs.SequentialDesign(
         first[k], order=2, standard_error=PRECISION, seed=int(rng.integers(999))
     )
     data = begun[k]

@@ -51,7 +51,7 @@ cycles = timed(
 )
 print("mean modulus", np.abs(np.asarray(cycles.multipliers)).mean())
 response = hj.experiments.response_function(cycle, phase, ("yM", "vM"))
-u = design.inputs(cycles=84)[:1]
+u = design.signals(cycles=84)[:1]
 gradient = eqx.filter_jit(
     eqx.filter_grad(lambda s: jnp.mean(response(u, system=s).y ** 2))
 )

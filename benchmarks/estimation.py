@@ -15,7 +15,7 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
 - `crest`: crest factors of signals of 31 lines.
 - `discs`: how often 95 % discs about means of some complex errors hold zero. Errors are normal, of
   constant modulus (`constant`), or sums of both, with the rms of the normal part relative to the
-  other. Discs of `size` look at the size of the scatter alone, those of `shape` are
+  other. Discs of `size` look at the size of the variance_dof alone, those of `shape` are
   `HTF.confidence_radius`; `wider` is the ratio of their mean radii.
 - `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % regions of H_0, H_1 and H_-1 at ten fixed frequencies
@@ -63,7 +63,7 @@ class Family:
 
     def report(self, name: str, data) -> None:
         estimate = hj.estimate_htf(data, HARMONICS)
-        exact = self.model.htf(estimate.f, HARMONICS)
+        exact = self.model.htf(estimate.frequencies, HARMONICS)
         error = np.abs(estimate.H - exact.H).max(axis=(1, 3))
         own = np.abs(exact.H).max(axis=(1, 3))
         for k, output in enumerate(OUTPUTS):
@@ -137,7 +137,7 @@ def discs(draws: int = 200_000) -> None:
         "1": (1, 1),
     }
     for count in (2, 3, 4, 6, 8, 16):
-        freedom = np.full(draws, count - 1.0)
+        dof = np.full(draws, count - 1.0)
         for kind, (constant, noise) in kinds.items():
             error = constant * np.exp(2j * np.pi * rng.random((count, draws)))
             error += (
@@ -157,7 +157,7 @@ def discs(draws: int = 200_000) -> None:
                 ("size", None),
                 ("shape", roundness[None, :, None, None]),
             ):
-                quantile = np.asarray(hj.linear.Scatter(freedom, shape).quantile(0.95))
+                quantile = np.asarray(hj.linear.VarianceDof(dof, shape).quantile(0.95))
                 radii.append(np.sqrt(np.ravel(quantile) * power / count / (count - 1)))
                 inside = np.mean(np.abs(mean) <= radii[-1])
                 print(f"estimation.discs.{count}.{kind}.{name} {inside:.4f}")
@@ -177,7 +177,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         )
 
     truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1))
-    rows = [int(np.argmin(np.abs(truth.f - x))) for x in chosen]
+    rows = [int(np.argmin(np.abs(truth.frequencies - x))) for x in chosen]
 
     def draw(rng):
         phases, noise = rng.integers(2**31, size=2).tolist()

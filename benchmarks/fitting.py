@@ -49,7 +49,7 @@ class HTFs:
         real, imag = np.random.default_rng(seed).normal(size=(2, *self.std.shape))
         H = np.asarray(self.exact.H) + self.std * (real + 1j * imag) / np.sqrt(2)
         noisy = hj.linear.HTF(
-            self.exact.f,
+            self.exact.frequencies,
             H,
             self.exact.harmonics,
             SECTIONS.n_sections,

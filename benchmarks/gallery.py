@@ -50,7 +50,7 @@ def compute(
     design = hj.multisine(
         N,
         PERIODS,
-        band=(0, min(4.0, N / 2)),
+        frequencies=(0, min(4.0, N / 2)),
         amplitude=case.amplitude or 1.0,
         lines="odd",
         inputs=case.system.inputs,
@@ -70,7 +70,7 @@ def compute(
         estimate = hj.estimate_htf(
             data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2]
         )
-    f = np.unique(design.f) if estimate is None else estimate.f
+    f = np.unique(design.frequency) if estimate is None else estimate.frequencies
     harmonics = HARMONICS if estimate is None else estimate.harmonics
     return cycle, model.htf(f, harmonics=harmonics), estimate
 

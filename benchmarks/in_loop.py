@@ -11,8 +11,8 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
   `without.covered`: without the reference, and with D free. `series.*`: of
   `fit_series(reference="r")`.
 - `plant.covered`, `plant.p`, `controller.*`: how often the 95 % discs of HTFs hold the truth, of
-  `hj.identify.loop` with two references, and noise of a fifth of r in what the controller does;
-  the p-value is that of their mean over draws (t test).
+  `hj.identify.estimate_loop` with two references, and noise of a fifth of r in what the controller
+  does; the p-value is that of their mean over draws (t test).
 - `seconds.*`: CPU seconds of fits.
 - with `--random 20`: `short_gait.*`, errors of the multiplier 4.00386 of the simplest walker's
   short gait, from nonlinear experiments in a loop that stabilizes it; and of random plants (2 to 5
@@ -92,13 +92,13 @@ def sizes(model: hj.linear.LDTP) -> np.ndarray:
 
 def draw(
     model: hj.linear.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator
-) -> hj.experiments.Record:
+) -> hj.experiments.SectionSeries:
     n, left = N * (STRIDES + BEFORE), slice(N * BEFORE, None)
     r, w = rng.normal(size=(2, 1, n, 1))
     e = sensor * rng.normal(size=(1, n, 2))
     u, y = respond(model, r, 0 * e, size * w, e)
     z = np.concatenate([u, r], axis=2)[0, left]
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         z, y[0, left], n_sections=N, inputs=("u", "r"), outputs=model.outputs
     )
 
@@ -107,7 +107,7 @@ def bound(
     model: hj.linear.LDTP,
     size: float,
     sensor: np.ndarray,
-    records: list[hj.experiments.Record],
+    records: list[hj.experiments.SectionSeries],
 ) -> float:
     """Of the first multiplier, from the information of the predictions in some records."""
     B = np.concatenate(
@@ -142,7 +142,7 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
     dims = np.asarray(model.dims)
     record("series", lambda: hj.fit_series(data, 2, check=False, reference="r"))
     record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
-    alone = hj.experiments.Record(
+    alone = hj.experiments.SectionSeries(
         data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs
     )
     record("without", lambda: hj.fit_ldtp(alone, dims, noise="innovations"))
@@ -152,7 +152,7 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
 def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
     """Return the shares of discs of HTFs that hold the truth."""
     both = design.realizations(6, seed=int(rng.integers(1 << 31)))
-    z = both.inputs(both.periods + BEFORE)
+    z = both.signals(both.periods + BEFORE)
     w, e = (
         rng.normal(size=(*z.shape[:2], 1)),
         sensor * rng.normal(size=(*z.shape[:2], 2)),
@@ -169,7 +169,7 @@ def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
         outputs=model.outputs,
         inputs=("u", "r", "d0", "d1"),
     )
-    loop = hj.identify.loop(data, at_input="r", at_output=("d0", "d1"))
+    loop = hj.identify.estimate_loop(data, at_input="r", at_output=("d0", "d1"))
     return {
         name: float((np.abs(htf.H - truths[name]) <= htf.confidence_radius()).mean())
         for name, htf in (("plant", loop.plant), ("controller", loop.controller))
@@ -216,7 +216,7 @@ def in_a_loop(
     noise: float,
     strides: int,
     sensor=None,
-) -> hj.experiments.Record:
+) -> hj.experiments.SectionSeries:
     """Return a record with a white reference and white noise of process and sensors."""
     sensor = noise / 5 if sensor is None else sensor
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
@@ -231,7 +231,7 @@ def in_a_loop(
     names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(
         f"r{j}" for j in range(r.shape[1])
     )
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names
     )
 
@@ -288,7 +288,7 @@ def few_outputs(k: int) -> hj.linear.LDTP:
 
 def noisy(
     model: hj.linear.LDTP, kind: str, rng
-) -> tuple[hj.experiments.Record, tuple[str, ...] | None]:
+) -> tuple[hj.experiments.SectionSeries, tuple[str, ...] | None]:
     """Return 300 cycles of a random plant, and the names of its references."""
     (N, ny, _), nu = model.C.shape, model.B.shape[2]
     gain = rng.normal(size=(N, nu, ny)) * (kind == "loop")
@@ -302,12 +302,12 @@ def noisy(
     x = data.y / size
     bent = 10 ** rng.uniform(-2, -0.5) * (0.7 * x**2 + 0.3 * x**3) * (kind == "bent")
     drift = np.inf if kind == "bent" else None  # (even powers have a mean)
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         data.u[:, :nu], data.y + size * bent, n_sections=N, drift=drift
     ), None
 
 
-def bent_hopper(count: int, seed: int) -> list[hj.experiments.Record]:
+def bent_hopper(count: int, seed: int) -> list[hj.experiments.SectionSeries]:
     """Return 300 strides each, at amplitudes at which half a percent to half is distortion."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
@@ -320,7 +320,8 @@ def bent_hopper(count: int, seed: int) -> list[hj.experiments.Record]:
         size=data.y.shape
     )
     return [
-        hj.experiments.Record(u[k], y[k], n_sections=N) for k in np.flatnonzero(data.ok)
+        hj.experiments.SectionSeries(u[k], y[k], n_sections=N)
+        for k in np.flatnonzero(data.ok)
     ]
 
 
@@ -383,7 +384,10 @@ def too_low(first: int, count: int) -> None:
 def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
     """Return CPU seconds of `identify_recording`: of a plant in its loop by the reference, and of
     the loop itself, from the reference as its input (the least of three calls)."""
-    n, r = strides * rate, hj.testing.random_force(strides + 1, rate, 8.0, seed=1)[:, 0]
+    n, r = (
+        strides * rate,
+        hj.experiments.random_input(strides + 1, rate, 8.0, seed=1)[:, 0],
+    )
     t, x, u, y = np.arange(n) / rate, np.zeros(2), np.zeros(n), np.zeros((2, n))
     noise = np.random.default_rng(0).normal(size=(2, n))
     for i in range(n):  # x'' + 2 x' + (30 + 8 cos 2 pi t) x = u
@@ -419,7 +423,9 @@ def short_gait() -> dict[str, float]:
     phase = hj.sections.SectionList([strike, *levels])
     exact = hj.linearize(cycle, phase, outputs)
     model = realized(np.asarray(exact.impulse_response(40)))
-    design = hj.multisine(4, periods=8, band=(0, 2), amplitude=1e-6).realizations(3)
+    design = hj.multisine(
+        4, periods=8, frequencies=(0, 2), amplitude=1e-6
+    ).realizations(3)
     data = hj.run_experiments(
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30
     )
@@ -493,7 +499,13 @@ def main() -> None:
         )
         show(f"{name}.seconds", np.median(found[f"{name}.seconds"]))
     design = hj.multisine(
-        N, 8, band=(0, N / 2), inputs=3, division="orthogonal", amplitude=1.0, seed=1
+        N,
+        8,
+        frequencies=(0, N / 2),
+        inputs=3,
+        division="orthogonal",
+        amplitude=1.0,
+        seed=1,
     )
     gain = hj.linear.LDTP(
         np.zeros((N, 1, 1)),

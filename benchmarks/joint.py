@@ -39,7 +39,7 @@ def with_variances(model: hj.linear.LDTP, snr: float) -> hj.linear.HTF:
     exact = model.htf(design.frequencies)
     each = 4 * sigma[:, None] ** 2 / (N * design.periods * design.amplitude[0] ** 2)
     return hj.linear.HTF(
-        exact.f,
+        exact.frequencies,
         exact.H,
         exact.harmonics,
         N,
@@ -63,7 +63,7 @@ def one(
     start = realized_htf(draw, dims)
     start = eqx.tree_at(lambda model: model.D, start, 0 * start.D)  # (and stays so)
     began = time.process_time()
-    fit = hj.fit_ldtp(draw, start)
+    fit = hj.fit_ldtp(draw, initial=start)
     seconds = time.process_time() - began
     free = hj.fit_multipliers(draw.select(range(-4, 5)), 2)
     return {

@@ -47,7 +47,7 @@ def results(case: Case) -> dict[str, np.ndarray]:
         amplitude=case.amplitude or 1e-5,
         inputs=case.system.inputs,
     )
-    u = design.inputs(cycles=4)[:2]
+    u = design.signals(cycles=4)[:2]
     data = hj.run_experiments(cycle, placed, u, case.output, start="cycle", discard=0)
     q, y = np.asarray(placed.lanes.q), np.nan_to_num(data.y)
     return {

@@ -80,13 +80,13 @@ def truth(
 
 def draw(
     plant: hj.linear.LDTP, noise: hj.linear.LDTP, rng: np.random.Generator
-) -> hj.experiments.Record:
+) -> hj.experiments.SectionSeries:
     n, before = 6 * CYCLES, 6 * 20
     u = rng.normal(size=(n + before, 2))
     y = np.asarray(plant.simulate(u)) + np.asarray(
         noise.simulate(rng.normal(size=(len(u), 3)))
     )
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         u[before:], y[before:], n_sections=6, outputs=plant.outputs
     )
 
@@ -126,7 +126,9 @@ def innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 def bound(
-    joint: hj.linear.LDTP, noise: hj.linear.LDTP, records: list[hj.experiments.Record]
+    joint: hj.linear.LDTP,
+    noise: hj.linear.LDTP,
+    records: list[hj.experiments.SectionSeries],
 ) -> float:
     """Of the first multiplier, from the information in some records."""
     K, S = innovations(PeriodicModel.of(noise, np.ones(2)))

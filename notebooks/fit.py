@@ -47,7 +47,7 @@ cycle = hj.find_limit_cycle(truth)
 apex = hj.Crossing("vM", "falling")
 sections = hj.ClockPhase(SECTIONS, anchor=apex)
 design = hj.multisine(
-    SECTIONS, periods=16, band=(0, 3.0), amplitude=0.02, seed=0
+    SECTIONS, periods=16, frequencies=(0, 3.0), amplitude=0.02, seed=0
 ).realizations(4)
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
 data = hj.experiments.add_noise(data, snr=20, seed=0)
@@ -99,11 +99,11 @@ with hj.plot.style():
     figure, panels = pyplot.subplots(
         2, 3, figsize=(hj.plot.PAGE, 3.6), layout="constrained", sharex=True
     )
-    order = np.argsort(np.asarray(estimate.f))
+    order = np.argsort(np.asarray(estimate.frequencies))
     for row, output in enumerate(OUTPUTS):
         for axes, m in zip(panels[row], (-1, 0, 1), strict=True):
             axes.plot(
-                estimate.f[order],
+                estimate.frequencies[order],
                 np.abs(estimate[m][order, row, 0]),
                 ".",
                 ms=3,

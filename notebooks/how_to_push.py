@@ -56,7 +56,7 @@ def laboratory(design):
 
 # %%
 first = hj.multisine(32, periods=32, lines="odd").scaled(rms=force)
-study = hj.designs.Study(first, order=2, standard_error=asked)
+study = hj.designs.SequentialDesign(first, order=2, standard_error=asked)
 study
 
 # %%
@@ -116,7 +116,7 @@ study.fit.compare(cycle.multipliers)
 
 # %%
 block = study.design
-u = block.inputs()
+u = block.signals()
 print(
     f"{len(u)} experiments of {block.periods} strides, rms {np.sqrt(np.mean(u**2)):.2g} N,"
 )

@@ -48,9 +48,9 @@ print(np.abs(plant.multipliers), np.abs(closed.multipliers))
 
 # %%
 design = hj.multisine(
-    8, 16, band=(0, 4), inputs=3, division="orthogonal", amplitude=1e-3, seed=1
+    8, 16, frequencies=(0, 4), inputs=3, division="orthogonal", amplitude=1e-3, seed=1
 ).realizations(4)
-references = design.inputs(36)
+references = design.signals(36)
 references[..., 1:] *= [0.05, 0.2]  # (m and m/s for N)
 answers = np.stack([controller.simulate(x) for x in references[..., 1:]])
 data = hj.run_experiments(
@@ -76,9 +76,9 @@ measured = hj.experiments.ExperimentData(
 # The broad pale lines are exact, the thin ones are estimates with bands of 95 %.
 
 # %%
-loop = hj.identify.loop(measured, at_input="r", at_output=("d0", "d1"))
+loop = hj.identify.estimate_loop(measured, at_input="r", at_output=("d0", "d1"))
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
-f = loop.plant.f
+f = loop.plant.frequencies
 panels = {
     "plant": (loop.plant, plant.htf(f), 1, 0),
     "plant with its controller": (loop.closed, closed.htf(f), 1, 0),

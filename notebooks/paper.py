@@ -207,7 +207,9 @@ figure = hj.plot.experiment(data["kinematic"], 0)
 
 # %%
 estimates = {name: hj.estimate_htf(d) for name, d in data.items()}
-exact = {name: models[name].htf(estimate.f) for name, estimate in estimates.items()}
+exact = {
+    name: models[name].htf(estimate.frequencies) for name, estimate in estimates.items()
+}
 for name in families:
     errors = estimates[name].harmonic_errors(exact[name])
     print(f"{name}: error of H_0 (of max|H_0|) {np.asarray(errors[SECTIONS // 2])}")
@@ -281,7 +283,7 @@ for mass in (2.0, 1.9, 1.8):
 # %%
 estimate, model = estimates["isochron"], models["isochron"]
 n = np.arange(PERIODS * SECTIONS)
-lines = np.asarray(estimate.f)[[3, 40, 55]]
+lines = np.asarray(estimate.frequencies)[[3, 40, 55]]
 u = 0.01 * sum(np.cos(2 * np.pi * f * n / SECTIONS + f) for f in lines)[:, None]
 predicted = estimate.predict(u)
 linear = model.simulate(u, model.periodic_state(u, PERIODS))

@@ -91,7 +91,7 @@ plant = hj.plants.MuJoCoPlant(
 # equal times.
 
 # %%
-cycle = hj.plants.settle(plant, hj.ClockPhase(8), ("x_rate", "pitch"), cycles=40)
+cycle = hj.plants.find_cycle(plant, hj.ClockPhase(8), ("x_rate", "pitch"), cycles=40)
 print(cycle)
 
 
@@ -176,7 +176,7 @@ plt.show()
 # to two thirds. Larger pushes give a biased estimate, because the walker is not linear:
 
 # %%
-strong = cycle.run_experiments(10 * design.inputs(40), discard=24)
+strong = cycle.run_experiments(10 * design.signals(40), discard=24)
 print(hj.fit_multipliers(hj.estimate_htf(strong), order=2))
 
 # %% [markdown]

@@ -90,10 +90,11 @@ with hj.plot.style():
 #
 # ## The best hopper of a given height
 #
-# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
-# $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its gradient,
-# and that of the apex height, are computed through the limit cycle and its events, in forward mode,
-# because there are only two parameters. The optimizer is one of scipy, for losses with constraints.
+# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number
+# $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its
+# gradient, and that of the apex height, are computed through the limit cycle and its events, in
+# forward mode, because there are only two parameters. The optimizer is one of scipy, for losses
+# with constraints.
 
 # %%
 WANTED = 2.3  # height of the body at the apex, in meters

@@ -63,7 +63,7 @@ def test_reproduce_writes_its_results(results):
         model, fit = (
             hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
         )
-        assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
+        assert_allclose(model.htf(exact.frequencies).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
 

@@ -113,7 +113,7 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     fewer = convert.from_xarray(part)
     assert fewer.harmonics == (-1, 0)
     assert fewer.inputs == ("u",)
-    assert len(fewer.f) == 2
+    assert len(fewer.frequencies) == 2
 
 
 def test_a_dataset_of_a_recording_knows_units_and_events():
@@ -163,7 +163,7 @@ def test_section_data(wave):
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
     crossing = hj.Crossing("v", "falling")
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         wave, crossing, inputs="f", outputs="x", n_sections=8
     )
     dataset = convert.to_xarray(data)
@@ -192,7 +192,7 @@ def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     table = convert.to_pandas(H)
-    row = table.loc[-1, H.f[1].item(), "y", "w"]
+    row = table.loc[-1, H.frequencies[1].item(), "y", "w"]
     value = complex(H[-1][1, 0, 1])
     assert tuple(row) == (value.real, value.imag, np.abs(value))
     assert np.asarray(H).tobytes() == H.H.tobytes()
@@ -202,7 +202,7 @@ def test_tables_of_fits(model):
     pytest.importorskip("pandas")
     rng = np.random.default_rng(3)
     u = rng.normal(size=(60 * N, 2))
-    record = hj.experiments.Record(u, model.simulate(u), n_sections=N)
+    record = hj.experiments.SectionSeries(u, model.simulate(u), n_sections=N)
     fit = hj.fit_series(record, order=1)
     table = convert.to_pandas(fit)
     multipliers = table["real"] + 1j * table["imaginary"]

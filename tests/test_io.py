@@ -67,16 +67,20 @@ def ldtp():
 
 @pytest.fixture(scope="module")
 def things(ldtp, htf):
-    design = hj.multisine(n_sections=2, periods=16, band=(0, 1.0), inputs=ldtp.inputs)
+    design = hj.multisine(
+        n_sections=2, periods=16, frequencies=(0, 1.0), inputs=ldtp.inputs
+    )
     data = hj.experiments.simulate_experiments(ldtp, design)
     estimate = hj.estimate_htf(data)
     plain = hj.linear.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
     fits = (
         hj.identify.fit_rational(estimate),
-        hj.fit_multipliers(estimate, ldtp, overhang=2),
+        hj.fit_multipliers(estimate, ldtp, extra_lags=2),
     )
-    record = hj.experiments.Record(data.u[0], data.y[0], n_sections=2, first_section=1)
-    series = hj.fit_series(data, ldtp, overhang=2)
+    record = hj.experiments.SectionSeries(
+        data.u[0], data.y[0], n_sections=2, first_section=1
+    )
+    series = hj.fit_series(data, ldtp, extra_lags=2)
     y = np.ones((2, 6, 1))
     y[1, 3:] = np.nan
     failed = hj.experiments.ExperimentData(
@@ -109,7 +113,12 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
             hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing
         )
     dataset = hj.convert.to_xarray(htf)
-    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    assert dataset["variance_dof.roundness"].dims == (
+        "harmonic",
+        "f",
+        "output",
+        "input",
+    )
 
 
 @settings(max_examples=15)

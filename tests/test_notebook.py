@@ -120,7 +120,7 @@ def population(found):
 def in_the_loop(found):
     for fit in (found.fit, found.series):
         assert fit.contains(found.cycle.multipliers, 0.999).all()
-    truth = found.controller.htf(found.f).H
+    truth = found.controller.htf(found.frequencies).H
     held = (
         np.abs(found.loop.controller.H - truth)
         <= found.loop.controller.confidence_radius()

@@ -40,7 +40,7 @@ def shown(thing):
 
 @pytest.fixture(scope="module")
 def hopper_data(kinematic_ldtp):
-    design = hj.multisine(periods=16, band=(0, 4.0))
+    design = hj.multisine(periods=16, frequencies=(0, 4.0))
     return hj.experiments.simulate_experiments(kinematic_ldtp, design)
 
 
@@ -100,7 +100,7 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
 def test_definitions_print_as_they_are_written():
     written = [
         "ClockPhase(n_sections=8, anchor=0.25)",
-        "Crossing(function='vM', direction='falling', value=0)",
+        "Crossing(signal='vM', direction='falling', value=0)",
         "AtEvent(name='touchdown')",
         "Guess(chart='stance', state=(2, 1.9), time=0.5)",
         "Settings(rtol=1e-09, atol=1e-12, max_steps=99)",
@@ -169,7 +169,7 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     signals = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}
     events = {"<hit>": [1.0]}
     recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording, APEX, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
     )
     f = np.linspace(0.05, 5, 300)
@@ -200,7 +200,7 @@ def test_fits_show_standard_errors():
     rng = np.random.default_rng(0)
     u = rng.normal(size=(600, 1))
     y = np.asarray(model.simulate(u)) + 1e-2 * rng.normal(size=(600, 2))
-    record = hj.experiments.Record(
+    record = hj.experiments.SectionSeries(
         u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs
     )
     fit = hj.fit_series(record, order=2)

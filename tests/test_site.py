@@ -50,7 +50,7 @@ GIVEN = UNCHECKED["made by this package"] | {
     "FindingWarning",
     "LDTP",
     "PrecisionError",
-    "SettledCycle",
+    "PlantCycle",
     "StoredExperiments",
 }
 

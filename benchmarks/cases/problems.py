@@ -147,7 +147,7 @@ def problem(model: str, family: str, quick: bool = False) -> Problem:
     """80 experiments of 84 cycles with the paper's multisines; `quick`, 16 of 24 cycles."""
     experiments, cycles = (16, 24) if quick else (80, 84)
     placed = hj.sections.place_sections(cycle(model), sections(model, family))
-    u = hj.experiments.paper_design().inputs(84)[:experiments, : N * cycles]
+    u = hj.experiments.paper_design().signals(84)[:experiments, : N * cycles]
     return Problem(f"{model}.{family}", placed, OUTPUTS[model], u)
 
 

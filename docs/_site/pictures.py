@@ -38,11 +38,11 @@ def draw() -> dict[str, Plot]:
     sections = hj.sections.place_sections(cycle, hj.ClockPhase(32, anchor=APEX))
     model = hj.linearize(cycle, sections, outputs=("yM", "vM"))
     first = hj.multisine(32, periods=32, lines="odd").scaled(rms=0.001)
-    force = hj.testing.random_force(100, 500, 8.0, rms=0.0205, seed=0)
+    force = hj.experiments.random_input(100, 500, 8.0, rms=0.0205, seed=0)
     recording = hj.testing.simulate_recording(
         cycle, force[None], ("yM", "vM"), rate=500
     )
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording, APEX, inputs="u", outputs=("yM", "vM"), n_sections=16
     )
     fit = hj.fit_series(data, order=2)

@@ -37,7 +37,7 @@ class Result(enum.IntEnum):
         12,
         "the cycle closes sooner, or meets its section more often, than asked",
     )
-    COINCIDENCE = (
+    SIMULTANEOUS = (
         13,
         "two events coincide on the cycle: trajectories near it may meet them in either order",
     )

@@ -293,7 +293,7 @@ def _add_sweep(commands) -> None:
         help="a system, its class, or a function of parameters that gives one",
     )
     add(
-        "--over",
+        "--values",
         required=True,
         action="append",
         type=_axis,
@@ -301,7 +301,7 @@ def _add_sweep(commands) -> None:
         help="values of a parameter, evenly spaced; may be repeated",
     )
     add(
-        "--want",
+        "--quantities",
         type=_names,
         default=("spectral_radius", "period"),
         metavar="NAMES",

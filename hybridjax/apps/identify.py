@@ -91,7 +91,7 @@ def steps_of(
         sections = AtEvent(options.event)
     identify = functools.partial(
         identify_recording,
-        phase=sections,
+        sections=sections,
         inputs=options.input,
         outputs=options.outputs,
         n_sections=options.sections,
@@ -169,7 +169,7 @@ def write_results(
     (folder / "figures").mkdir()
     data = result.data
     # 240 frequencies, up to the edge of the band that the inputs excited.
-    edge = min(max(result.advice.band), data.n_sections / 2)
+    edge = min(max(result.diagnosis.bandwidths), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(result, htf):
@@ -253,11 +253,11 @@ def summarize(result: Identification) -> dict[str, Any]:
         "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
         "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": complex_pairs(result.advice.plain),
+        "multipliers_of_plain_regression": complex_pairs(result.diagnosis.plain),
         "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
-        "input_band": list(result.advice.band),
-        "warnings": list(map(repr, result.advice.findings)),
+        "input_band": list(result.diagnosis.bandwidths),
+        "warnings": list(map(repr, result.diagnosis.findings)),
     }
 
 
@@ -266,7 +266,7 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
     shown = [m for m in (0, 1, -1) if m in htf.harmonics]
     yield (
         "multipliers",
-        plot.multipliers(result.fit, {"plain regression": result.advice.plain}),
+        plot.multipliers(result.fit, {"plain regression": result.diagnosis.plain}),
     )
     yield "validation", plot.validation(result.held_out.validation)
     yield "impulse_responses", plot.impulse_responses(result.responses)
@@ -283,7 +283,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data = result.data
     recording = result.recording
-    warnings = result.advice.findings
+    warnings = result.diagnosis.findings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.reference
     if loop:
@@ -292,7 +292,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         method = "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
-    expected = zip(result.advice.strides, result.advice.expected, strict=True)
+    expected = zip(result.diagnosis.strides, result.diagnosis.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",

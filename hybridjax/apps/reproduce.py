@@ -108,7 +108,8 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
         experiments=protocol.experiments,
     )
     _log(
-        begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies"
+        begin,
+        f"design: {design.experiments} experiments, {len(design.frequency)} frequencies",
     )
     cycle = find_limit_cycle(VerticalHopper())
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)

@@ -108,7 +108,7 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     outputs = [f"{y}[{m}]" for m, y in pairs]
     inputs = list(map(str, thing.inputs))
     H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
-    frequencies = 2 * np.pi * np.asarray(thing.f) / period
+    frequencies = 2 * np.pi * np.asarray(thing.frequencies) / period
     return package("control").FrequencyResponseData(
         H, frequencies, inputs=inputs, outputs=outputs, sysname="HTF"
     )

@@ -35,7 +35,7 @@ _AXES = {
     "n": "sample",
     "N": "section",
     "M": "harmonic",
-    "F": "f",
+    "F": "frequency",
     "ny": "output",
     "nu": "input",
     "d": "multiplier",
@@ -55,9 +55,9 @@ _COORDINATES = {"input": "inputs", "output": "outputs", "harmonic": "harmonics"}
 def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> Any:
     """Return an `xarray.Dataset` with named dimensions, coordinates, and units.
 
-    - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, f, output,
-      input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment, sample,
-      input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
+    - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, frequency,
+      output, input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment,
+      sample, input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
       `output_unit` beside them.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
@@ -112,8 +112,8 @@ def from_xarray(dataset: Any) -> Saved:
                 units = dataset[f"{dimension}_unit"].values
                 static[field] = tuple(map(Signal, static[field], map(str, units)))
         names = set(dataset.data_vars)
-        if "f" in dataset.coords:
-            names.add("f")
+        if "frequency" in dataset.coords:
+            names.add("frequencies")
         arrays = {}
         for name in map(str, names):
             array = dataset[name].transpose(*_axes(kind, name))

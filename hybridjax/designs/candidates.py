@@ -58,8 +58,8 @@ class Candidates(NamedTuple):
         half = is_half_integer(design.line, design.periods)
         if half.any():
             raise DefinitionError(
-                f"f = {design.f[half][0]:g} is a multiple of 1/2: use a `design` without such "
-                "lines."
+                f"f = {design.frequency[half][0]:g} is a multiple of 1/2: use a `design` without "
+                "such lines."
             )
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
@@ -223,7 +223,7 @@ def measured_htfs(
 
 
 @checked
-def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
+def draw_models(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
     """Draw stable models from the confidence region of an estimate, for `optimal_design`.
 
     The draws are Gaussian with the covariance of the fit; those with a multiplier of modulus one or

@@ -264,10 +264,10 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
         )
         phase[lines] = optimize_phases(single, seed).phase
     design = dataclasses.replace(design, phase=phase)
-    highest = np.abs(design.inputs()).max(axis=1)
+    highest = np.abs(design.signals()).max(axis=1)
     factor = np.ones_like(highest)
     for name, most in peak.items():
-        i = design.input_names.index(name)
+        i = design.inputs.index(name)
         factor[:, i] = most / np.maximum(highest[:, i], most)
     amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
     return dataclasses.replace(design, amplitude=amplitude)
@@ -311,7 +311,7 @@ class Products(NamedTuple):
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""
         if phases:
-            second = self.quadratic.second_order(design.inputs())
+            second = self.quadratic.second_order(design.signals())
             return np.sqrt(np.mean(second**2, axis=(0, 1)))
         power = self.cosines.powers_in(design)
         squares = np.einsum("ek,okl,el->o", power, self.expected, power, optimize=True)

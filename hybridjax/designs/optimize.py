@@ -29,7 +29,7 @@ from .candidates import (
 )
 from .criteria import criterion_of
 from .criterion import Criterion
-from .goals import Goal, Multipliers
+from .goals import Goal, MultiplierGoal
 from .limits import (
     Limit,
     PowerLimits,
@@ -271,12 +271,12 @@ def optimal_design(
     **Arguments:**
 
     - `model`: the system, exact or estimated; or a `StructuredFit`, whose fitted harmonics give the
-      deviations of outputs. Several models (`hj.designs.draws` of an estimate) make the design
-      robust, see `robust`; the limits hold for each.
+      deviations of outputs. Several models (`hj.designs.draw_models` of an estimate) make the
+      design robust, see `robust`; the limits hold for each.
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
-    - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
-      `FrequencyResponse`. Default: `"multipliers"`.
+    - `goal`: `"multipliers"`, or one of `hj.designs`: `MultiplierGoal`, `ParameterGoal`,
+      `ResponseGoal`. Default: `"multipliers"`.
     - `limit`: largest rms values over all experiments, by name of inputs or outputs (deviations
       from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
       `hj.designs.Limits`, which also limits peaks, rates, strides and distortion.
@@ -321,7 +321,7 @@ def optimal_design(
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
     usual_rms = rms_of(squares, shown, usual_power)
-    goal = Multipliers() if isinstance(goal, str) else goal
+    goal = MultiplierGoal() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
     criterion = criterion_of(goal, models, cosines, errors, usual_power, robust)
 
@@ -370,4 +370,4 @@ def _check_alike(models: list[Model], design: Design) -> None:
                 "`model.feedback(controller)`."
             )
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
-    require_equal("design and model", "inputs", design.input_names, first.inputs)
+    require_equal("design and model", "inputs", design.inputs, first.inputs)

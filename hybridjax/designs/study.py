@@ -20,7 +20,7 @@ from ..experiments.design.design import Design
 from ..identify.multipliers import StructuredFit
 from ..identify.weights import are_alike
 from .candidates import Candidates
-from .goals import Multipliers
+from .goals import MultiplierGoal
 from .limits import Limit, as_limits
 from .optimize import OptimalDesign, optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
@@ -46,12 +46,12 @@ class History(NamedTuple):
 
 
 @checked
-class Study(eqx.Module):
+class SequentialDesign(eqx.Module):
     r"""A sequence of experiments that starts without a model, and ends at a requested precision.
 
     ```python
-    study = hj.designs.Study(hj.multisine(lines="odd").scaled(0.001), order=2, standard_error=1e-4)
-    while not study.done:
+    study = hj.designs.SequentialDesign(hj.multisine(lines="odd").scaled(0.001), order=2,
+    standard_error=1e-4) while not study.done:
         data = hj.run_experiments(cycle, sections, study.design, outputs, start="steady")
         study = study.add(data)     # in a laboratory: hj.identify.remove_transient(data).data
     print(study)
@@ -97,7 +97,7 @@ class Study(eqx.Module):
     first: Design
     order: Order = eqx.field(static=True)
     standard_error: Positive = eqx.field(static=True)
-    goal: Multipliers = eqx.field(default_factory=Multipliers, kw_only=True)
+    goal: MultiplierGoal = eqx.field(default_factory=MultiplierGoal, kw_only=True)
     limit: Limit = eqx.field(default="input", kw_only=True)
     outputs: OptionalNames = eqx.field(static=True, default=(), kw_only=True)
     seed: Seed = eqx.field(static=True, default=0, kw_only=True)
@@ -106,7 +106,7 @@ class Study(eqx.Module):
     def __check_init__(self):
         first = self.first
         goal = self.goal
-        if len(first.input_names) > 1:
+        if len(first.inputs) > 1:
             raise DefinitionError(
                 "`first` must have a single input: study one at a time."
             )
@@ -120,9 +120,9 @@ class Study(eqx.Module):
             raise DefinitionError(
                 "a study ends at `standard_error`: leave strides out of `limit`."
             )
-        limits.require_inputs(first.input_names)
+        limits.require_inputs(first.inputs)
         named = limits.rms
-        signals = (*first.input_names, *self.outputs)
+        signals = (*first.inputs, *self.outputs)
         if not isinstance(named, str):
             require_among(
                 "signal", named, signals, "`limit` (`outputs` names those to come): "
@@ -184,9 +184,9 @@ class Study(eqx.Module):
             return self.first.realizations(1, seed=self.seed + self.blocks)
         return self.plan.design
 
-    @working("Study.add")
+    @working("SequentialDesign.add")
     @one_blas_thread()
-    def add(self, data: ExperimentData, *, repeats: Count = 1) -> "Study":
+    def add(self, data: ExperimentData, *, repeats: Count = 1) -> "SequentialDesign":
         """Return the study with one more block, its estimate and its next design.
 
         **Arguments:** `data`: the responses to `design`, or to other inputs of the same lines (from
@@ -280,14 +280,20 @@ class Study(eqx.Module):
             rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
             rows.append(f"  {self.fit.show_multipliers()}")
             rows += [f"  {x}" for x in self._outlook().splitlines()]
-        return "\n".join([f"Study({self._state()})", *rows])
+        return "\n".join([f"SequentialDesign({self._state()})", *rows])
 
     def _repr_html_(self) -> str:
         if self.fit is None:
-            return card("Study", self._state())
+            return card("SequentialDesign", self._state())
         multipliers = multiplier_table(self.fit.multipliers, self.fit.standard_errors)
         strides = table(("strides", "standard errors"), self._rows())
-        return card("Study", self._state(), multipliers, strides, text(self._outlook()))
+        return card(
+            "SequentialDesign",
+            self._state(),
+            multipliers,
+            strides,
+            text(self._outlook()),
+        )
 
     def _state(self) -> str:
         wanted = f"standard error {self.standard_error:.2g} requested"
@@ -327,7 +333,9 @@ class Study(eqx.Module):
         return f"{comparison}\nnext: {design.experiments} experiments of {design.periods} periods"
 
 
-def _standard_errors(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
+def _standard_errors(
+    fit: StructuredFit, goal: MultiplierGoal
+) -> Float[np.ndarray, " g"]:
     """Return standard errors of the multipliers of a goal, those of a conjugate pair once."""
     z = np.asarray(fit.multipliers)
     if goal.which is None:

@@ -1,5 +1,6 @@
 from .data import ExperimentData as ExperimentData, Simulated as Simulated
 from .design.design import Design as Design
+from .design.filtered_noise import random_input as random_input
 from .design.multisine import (
     optimize_phases as optimize_phases,
     paper_design as paper_design,
@@ -10,7 +11,7 @@ from .noise import (
     add_noise as add_noise,
     simulate_experiments as simulate_experiments,
 )
-from .record import Record as Record
+from .record import SectionSeries as SectionSeries
 from .response import (
     Response as Response,
     ResponseFunction as ResponseFunction,

@@ -162,7 +162,7 @@ class Inputs:
     def part(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
         """Return the inputs of consecutive experiments."""
         if isinstance(self.source, Design):
-            return self.source.inputs(self.cycles, rows)
+            return self.source.signals(self.cycles, rows)
         return np.asarray(self.source[rows], float)
 
 

@@ -1,6 +1,6 @@
 from .fit import Fit as Fit
 from .joint.fit import LDTPFit as LDTPFit, ldtp_bound as ldtp_bound
-from .loops import Loop as Loop, loop as loop
+from .loops import Loop as Loop, estimate_loop as estimate_loop
 from .multiplier_estimate import (
     MultiplierComparison as MultiplierComparison,
     MultiplierEstimate as MultiplierEstimate,

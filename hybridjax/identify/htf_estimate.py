@@ -13,7 +13,7 @@ from .._core.boundary.kinds import Count, Probability, SignalNames
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
-from ..linear.htf import HTF, Scatter
+from ..linear.htf import HTF, VarianceDof
 from .descent import ROUNDING
 from .instrument import htf_by_reference
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
@@ -99,15 +99,15 @@ def estimate_htf(
         _require_total(why_not, sums.f[rows], lines.realizations)
     total = lines.noise
     noise = None
-    scatter = None
+    variance_dof = None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
         total = lines.total
         noise = lines.noise
         every = lines.realizations.sum()
-        freedom = np.where(lines.realizations < 1, every, lines.realizations)
-        scatter = Scatter(freedom.astype(float), _roundness(sums, rows, lines.H))
+        dof = np.where(lines.realizations < 1, every, lines.realizations)
+        variance_dof = VarianceDof(dof.astype(float), _roundness(sums, rows, lines.H))
     elif lines.noise is not None:
-        scatter = Scatter(sums.count[rows] * (repeats - 1.0))
+        variance_dof = VarianceDof(sums.count[rows] * (repeats - 1.0))
     return HTF(
         sums.f[rows],
         lines.H,
@@ -118,7 +118,7 @@ def estimate_htf(
         "estimate",
         variance=total,
         noise_variance=noise,
-        scatter=scatter,
+        variance_dof=variance_dof,
         power=lines.power,
     )
 
@@ -202,7 +202,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
 def _roundness(
     sums: SpectralSums, rows: Int[np.ndarray, " F"], H: Complex[np.ndarray, "M F ny nu"]
 ) -> Float[np.ndarray, "M F ny nu"] | None:
-    r"""Return `Scatter.roundness` of the residuals of realizations.
+    r"""Return `VarianceDof.roundness` of the residuals of realizations.
 
     None where inputs share experiments, lines are mirrored, or realizations are many. With the
     residuals $d_j = (Y_j - H U_j) \overline{U_j} / |U_j|$ of each input, $\sum_j |d_j|^2$ is the

@@ -46,7 +46,7 @@ class Loop(eqx.Module):
 
 
 @checked
-def loop(
+def estimate_loop(
     data: ExperimentData,
     *,
     at_input: SignalNames | None = None,
@@ -77,7 +77,7 @@ def loop(
     d = at_output or ()
     if not (r or d):
         raise DefinitionError(
-            "`loop` needs references: name those that enter at the plant's input "
+            "`estimate_loop` needs references: name those that enter at the plant's input "
             "(`at_input`), at its output (`at_output`), or both."
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)

@@ -73,12 +73,14 @@ class StructuredFit(FitWithoutModel):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     @checked
-    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
-        """Return the fitted HTFs at frequencies f (F,), cycles per period, inside the data's band.
+    def htf(
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> HTF:
+        """Return the fitted HTFs at `frequencies` (F,), cycles per period, inside the data's band.
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
         """
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         H = divided_by_chi(self.numerators, self.coefficients, f, N)
         htf = HTF(f, H, self.harmonics, N, self.inputs, self.outputs, "structured fit")
@@ -100,8 +102,8 @@ def fit_multipliers(
     htf: HTF,
     order: Order | LDTP,
     *,
-    overhang: Index | None = None,
-    errors: Literal["residuals", "variance"] = "residuals",
+    extra_lags: Index | None = None,
+    covariance: Literal["residuals", "variance"] = "residuals",
     check: bool = True,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
@@ -122,8 +124,8 @@ def fit_multipliers(
       (`htf.power`).
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
-    - `overhang`: degree of the numerators beyond d N. Default: N.
-    - `errors`: source of the covariance. `"residuals"`: the residuals at each frequency. This
+    - `extra_lags`: degree of the numerators beyond d N. Default: N.
+    - `covariance`: source of the covariance. `"residuals"`: the residuals at each frequency. This
       remains valid if the errors of different harmonics are dependent (process noise, distortion)
       or the variances are only approximate (White 1980). `"variance"`: the variances, which must
       then be correct. Default: `"residuals"`.
@@ -136,18 +138,18 @@ def fit_multipliers(
     """
     order = order.rank() if isinstance(order, LDTP) else order
     rms = weights.check_values(htf)
-    if errors == "variance" and htf.variance is None:
+    if covariance == "variance" and htf.variance is None:
         raise DefinitionError(
-            "errors='variance' needs HTFs with variances: take 'residuals'."
+            "covariance='variance' needs HTFs with variances: take 'residuals'."
         )
-    solution = _solve(htf, rms, order, overhang)
+    solution = _solve(htf, rms, order, extra_lags)
     groups = solution.groups
     c = solution.c
-    covariance, cost, dof = varpro.summarize(groups, c, errors)
+    spread, cost, dof = varpro.summarize(groups, c, covariance)
     numerators = varpro.unfold(
         htf, groups, [varpro.numerators_of(group, c) for group in groups]
     )
-    f = np.asarray(htf.f)
+    f = np.asarray(htf.frequencies)
     H = np.asarray(htf.H)
     misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
@@ -155,7 +157,7 @@ def fit_multipliers(
     exact = htf.variance is None and residual.max() < ROUNDING
 
     def ratios(k: int) -> NoiseRatios:
-        fitted = solution if k == order else _solve(htf, rms, k, overhang)
+        fitted = solution if k == order else _solve(htf, rms, k, extra_lags)
         return noise_ratios(fitted.groups, htf, fitted.c, exact)
 
     surplus = unsupported(ratios, order, check)
@@ -164,7 +166,7 @@ def fit_multipliers(
     fit = StructuredFit(
         multipliers_of(c),
         c,
-        *covariance,
+        *spread,
         residual,
         weights.neighbor_correlation(misfit / scale, H / scale, f),
         numerators,
@@ -184,7 +186,7 @@ def fit_multipliers(
         groups = varpro.group_htf(htf, solution.weight, size)
         start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
         c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
-        return c, lambda: varpro.summarize(groups, c, errors)[0]
+        return c, lambda: varpro.summarize(groups, c, covariance)[0]
 
     # One more multiplier, or a pair.
     higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]
@@ -207,10 +209,10 @@ class _Solution(NamedTuple):
 
 
 def _solve(
-    htf: HTF, rms: Float[np.ndarray, " ny"], order: int, overhang: int | None
+    htf: HTF, rms: Float[np.ndarray, " ny"], order: int, extra_lags: int | None
 ) -> _Solution:
     """Return the solution weighted by variances, or else by those that its residuals suggest."""
-    size = varpro.numerator_size(htf, order, overhang)
+    size = varpro.numerator_size(htf, order, extra_lags)
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)
     c, converged = varpro.maximum_likelihood(groups, order)
@@ -218,7 +220,9 @@ def _solve(
         return _Solution(groups, weight, size, c, converged)
     lines = weights.line_variances(htf)
     for _ in range(_REWEIGHTINGS):
-        variance = varpro.error_spectrum(groups, c, np.asarray(htf.f), lines, len(rms))
+        variance = varpro.error_spectrum(
+            groups, c, np.asarray(htf.frequencies), lines, len(rms)
+        )
         weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
         groups = varpro.group_htf(htf, weight, size)
         c, converged = varpro.maximum_likelihood(groups, order, c)
@@ -228,7 +232,7 @@ def _solve(
 @checked
 @one_blas_thread()
 def multiplier_bound(
-    model: LDTP, htf: HTF, overhang: Index | None = None
+    model: LDTP, htf: HTF, extra_lags: Index | None = None
 ) -> MultiplierEstimate:
     r"""Return the Cramer-Rao bound of the multipliers of a known model.
 
@@ -240,7 +244,7 @@ def multiplier_bound(
     **Arguments:**
 
     - `model`: the true system. `htf`: frequencies, harmonics and `variance`; its H is not used.
-    - `overhang`: degree of the numerators beyond d N. Default: N.
+    - `extra_lags`: degree of the numerators beyond d N. Default: N.
 
     **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;
     `standard_errors` are bounds of rms errors.
@@ -251,7 +255,7 @@ def multiplier_bound(
     exact = exact_htf(model, htf)
     multipliers = model.multipliers
     c = np.poly(multipliers).real[1:]
-    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), overhang), c)
+    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), extra_lags), c)
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
 
 
@@ -266,7 +270,9 @@ def exact_htf(model: LDTP, htf: HTF) -> HTF:
             "a bound needs HTFs with variances: estimate them from several realizations or "
             "windows (`repeats`)."
         )
-    return dataclasses.replace(model.htf(htf.f, htf.harmonics), variance=htf.variance)
+    return dataclasses.replace(
+        model.htf(htf.frequencies, htf.harmonics), variance=htf.variance
+    )
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
@@ -336,7 +342,7 @@ class OrderSelection(eqx.Module):
 @checked
 @one_blas_thread()
 def select_order(
-    htf: HTF, max_order: Order = 5, *, overhang: Index | None = None
+    htf: HTF, max_order: Order = 5, *, extra_lags: Index | None = None
 ) -> OrderSelection:
     r"""Compare numbers of multipliers, from none to `max_order`.
 
@@ -354,7 +360,7 @@ def select_order(
     **Raises:** `DefinitionError` as `fit_multipliers`.
     """
     rms = weights.check_values(htf)
-    size = varpro.numerator_size(htf, max_order, overhang)
+    size = varpro.numerator_size(htf, max_order, extra_lags)
     weight = weights.error_weights(htf, rms)
     largest = varpro.group_htf(htf, weight, size)
     noise = np.ones(len(rms))
@@ -403,7 +409,7 @@ def _left_over(
     for group in groups:
         residual = varpro.misfit_of(group, c).residual
         np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
-        np.add.at(number, group.channel[:, 0], group.freedom)
+        np.add.at(number, group.channel[:, 0], group.dof)
     return np.sqrt(square / number)
 
 
@@ -432,13 +438,13 @@ def noise_ratios(
 
     **Arguments:** `exact`: whether the noise is rounding, which differs by orders of magnitude.
     """
-    cost, freedom = varpro.cost_of(groups, c)
-    level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / freedom)
+    cost, dof = varpro.cost_of(groups, c)
+    level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / dof)
     whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
     values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2 / level
     if exact:
         values = values / _ROUNDING_VARIES
-    return values, tails * float(np.sqrt(2 / freedom))
+    return values, tails * float(np.sqrt(2 / dof))
 
 
 def unsupported(

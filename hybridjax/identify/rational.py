@@ -69,9 +69,9 @@ class RationalFit(eqx.Module):
     input: str = eqx.field(static=True)
 
     @checked
-    def htf(self, f: Scalar | Vector) -> HTF:
-        """Return the fitted functions at frequencies f (F,), cycles per period."""
-        f = np.atleast_1d(np.asarray(f, float))
+    def htf(self, frequencies: Scalar | Vector) -> HTF:
+        """Return the fitted functions at `frequencies` (F,), cycles per period."""
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         delay = np.exp(-2j * np.pi * f / N)
         polyval = np.polynomial.polynomial.polyval
@@ -165,7 +165,7 @@ def fit_rational(
             f"{len(H)} frequencies: take fewer poles, or measure more frequencies."
         )
     # The denominator of a system with one section.
-    f = np.asarray(htf.f) / htf.n_sections
+    f = np.asarray(htf.frequencies) / htf.n_sections
     fits = [
         _fit_one(f, H[:, row], f"H_0 of {htf.outputs[row]}", poles, zeros)
         for row in rows

@@ -14,7 +14,7 @@ from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
-from ..experiments.record import Record, RecordedData, uninterrupted_records
+from ..experiments.record import RecordedData, SectionSeries, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .descent import positive
 from .instrument import in_loop
@@ -38,7 +38,7 @@ _SAMPLES_PER_UNKNOWN = 3
 
 
 def can_be_compared(
-    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
+    model: LDTP | SeriesFit | Predictor, record: SectionSeries, free_start: bool
 ) -> bool:
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
     N = record.n_sections

@@ -5,7 +5,10 @@ from .branches import (
     BranchEnd as BranchEnd,
     BranchPoint as BranchPoint,
 )
-from .coincidence import Coincidence as Coincidence, coincidences as coincidences
+from .coincidence import (
+    SimultaneousEvents as SimultaneousEvents,
+    simultaneous_events as simultaneous_events,
+)
 from .cycle import LimitCycle as LimitCycle
 from .fluctuations import Fluctuations as Fluctuations
 from .limit_cycles import (

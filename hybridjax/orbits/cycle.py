@@ -322,7 +322,7 @@ class LimitCycle(eqx.Module):
 
     def htf(
         self,
-        f: Frequencies,
+        frequencies: Frequencies,
         harmonics: Harmonics = 0,
         outputs: OutputNames | None = None,
         inputs: SignalNames | None = None,
@@ -338,7 +338,7 @@ class LimitCycle(eqx.Module):
 
         **Arguments:**
 
-        - `f`: input frequencies, in cycles per period.
+        - `frequencies`: input frequencies, in cycles per period.
         - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all up
           to it. Default: 0.
         - `outputs`: names or `Output`s. Default: all states that every chart defines.

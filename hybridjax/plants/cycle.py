@@ -90,7 +90,7 @@ class _ReturnMap:
     three are known after `measure`.
     """
 
-    def __init__(self, cycle: "SettledCycle", names: SignalNames | None = None):
+    def __init__(self, cycle: "PlantCycle", names: SignalNames | None = None):
         plant = cycle.plant
         self.drive = cycle.drive
         if not self.drive.sets or self.drive.fixed:
@@ -218,8 +218,8 @@ def _resolved(
 
 @checked_methods
 @dataclasses.dataclass(frozen=True, eq=False)
-class SettledCycle:
-    """The limit cycle of a plant, as `hj.plants.settle` measures it.
+class PlantCycle:
+    """The limit cycle of a plant, as `hj.plants.find_cycle` measures it.
 
     **Fields:**
 
@@ -368,8 +368,8 @@ class SettledCycle:
 
         **Arguments:**
 
-        - `draw`: function of the signals by name that returns a `hj.systems.Drawing`, written with JAX.
-          Default: none, the signals are drawn over time.
+        - `draw`: function of the signals by name that returns a `hj.systems.Drawing`, written with
+          JAX. Default: none, the signals are drawn over time.
         - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
 
         **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises a
@@ -401,15 +401,15 @@ class SettledCycle:
 
     def __repr__(self) -> str:
         return folded(
-            f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
+            f"PlantCycle({type(self.plant).__name__}: period {self.period:.9g}, "
             f"{len(self.cycle_outputs)} sections, {listed(self.inputs)} -> "
             f"{listed(self.outputs)})"
         )
 
 
 @checked
-@working("settle")
-def settle(
+@working("find_cycle")
+def find_cycle(
     plant: Plant,
     sections: families.FamilyLike,
     outputs: SignalNames,
@@ -417,7 +417,7 @@ def settle(
     cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
     guess: Vector | None = None,
     seed: Seed = 0,
-) -> SettledCycle:
+) -> PlantCycle:
     """Let a plant run without inputs until it repeats itself, and locate sections on its cycle.
 
     **Arguments:**
@@ -432,7 +432,7 @@ def settle(
       the cycle, also an unstable one. Default: none, the plant settles.
     - `seed`: seed of `reset`. Default: 0.
 
-    **Returns:** a `SettledCycle`.
+    **Returns:** a `PlantCycle`.
 
     **Raises:** `DefinitionError` for unknown signals, for sections that need equations, and for a
     plant that does not continue from the state that it returned; `ComputationError` if the plant
@@ -463,7 +463,7 @@ def settle(
     return _measure(drive, family, 2, seed)
 
 
-def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
+def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> PlantCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
     plant = drive.plant
     points = list[At]()
@@ -488,7 +488,7 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
             )
     names = [drive.names[c] for c in columns]
     units = getattr(plant, "units", {})
-    return SettledCycle(
+    return PlantCycle(
         plant,
         family,
         inputs=Names(units=True, empty=True).take(plant.inputs),
@@ -548,11 +548,11 @@ def _is_of_a_signal(crossing: Any) -> bool:
 
 def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> Phase:
     names = drive.names
-    require_among("signal", [x.function for x in crossings], names, "Crossing: ")
+    require_among("signal", [x.signal for x in crossings], names, "Crossing: ")
     rows = []
     for x in crossings:
         sign = 1.0 if x.direction == "falling" else -1.0
-        rows.append((names.index(x.function), sign, float(x.value)))
+        rows.append((names.index(x.signal), sign, float(x.value)))
     return Phase(len(rows), crossings=rows)
 
 

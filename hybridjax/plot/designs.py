@@ -9,7 +9,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
 from ..designs.candidates import Model
 from ..designs.optimize import OptimalDesign
-from ..designs.study import Study
+from ..designs.study import SequentialDesign
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
 from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
@@ -61,7 +61,7 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
 @checked
 def strides(
     plan: OptimalDesign,
-    studies: Mapping[str, Study | Sequence[Study]] | None = None,
+    studies: Mapping[str, SequentialDesign | Sequence[SequentialDesign]] | None = None,
     *,
     ax: AxesLike | None = None,
 ) -> Plot:
@@ -79,7 +79,7 @@ def strides(
         panel = axes[0, 0]
         reached: list[float] = [plan.strides]
         for k, (label, given) in enumerate((studies or {}).items()):
-            several = [given] if isinstance(given, Study) else list(given)
+            several = [given] if isinstance(given, SequentialDesign) else list(given)
             color = CYCLE[k % len(CYCLE)]
             for number, study in enumerate(several):
                 if not study.blocks:

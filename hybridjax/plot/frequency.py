@@ -150,7 +150,7 @@ def bode(
     """
     drawn = _exact_first(htfs)
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
-    fitted = [fit.htf(drawn[-1].f) for fit in fits]
+    fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
     curves = _curves(drawn[0], outputs, input)
     for htf in fitted:
         if all(curve.input not in htf.inputs for curve in curves):
@@ -179,7 +179,7 @@ def bode(
         upper.set(yscale="log", ylabel=with_unit(f"$|{symbol}|$", same))
         lower.set(xlabel=FREQUENCY, ylabel=f"$\\angle {symbol}$ (degrees)")
         for panel in (upper, lower):
-            _frequency_limits(panel, np.sort(drawn[-1].f))
+            _frequency_limits(panel, np.sort(drawn[-1].frequencies))
         lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
         _legend(upper, drawn)
     return Plot(axes)
@@ -312,7 +312,7 @@ def _grid(
 
 
 def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
-    grids = [htf.f for htf in htfs if isinstance(htf, HTF)]
+    grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
         raise DefinitionError(
             "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`."
@@ -343,14 +343,14 @@ def _values(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
-    order = np.argsort(htf.f)
+    order = np.argsort(htf.frequencies)
     i = channel_index("output", output, htf.outputs)
     j = channel_index("input", input, htf.inputs)
     values = np.asarray(htf[m])[order, i, j]
     radius = None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
-    return np.asarray(htf.f)[order], values, radius
+    return np.asarray(htf.frequencies)[order], values, radius
 
 
 def _frequency_limits(ax: Axes, f) -> None:

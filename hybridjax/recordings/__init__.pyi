@@ -1,12 +1,13 @@
 from ..apps.identify import write_report as write_report
+from ..apps.subjects import SubjectStudy as SubjectStudy
 from .beats.response import (
     PhaseResponse as PhaseResponse,
     phase_response as phase_response,
 )
 from .data import SectionData as SectionData
-from .design_tables import add_command as add_command, write_design as write_design
+from .design_tables import attach_design as attach_design, write_design as write_design
 from .findings import Inspection as Inspection
-from .fit_warnings import Advice as Advice, advise as advise
+from .fit_warnings import Diagnosis as Diagnosis, diagnose as diagnose
 from .held_out import (
     HeldOut as HeldOut,
     choose_order as choose_order,
@@ -17,7 +18,7 @@ from .impulse import (
     ImpulseResponses as ImpulseResponses,
     impulse_responses as impulse_responses,
 )
-from .inspection.inspect import inspect as inspect
+from .inspection.inspect import check_recording as check_recording
 from .natural import (
     NaturalMultipliers as NaturalMultipliers,
     natural_multipliers as natural_multipliers,
@@ -27,4 +28,4 @@ from .phase_estimation import estimate_phase as estimate_phase
 from .population.maps import MapResult as MapResult, PopulationMaps as PopulationMaps
 from .population.population import Population as Population
 from .recording import Trial as Trial
-from .sampling import section_data as section_data
+from .sampling import sample_sections as sample_sections

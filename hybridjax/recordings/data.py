@@ -14,7 +14,7 @@ from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import folded
 from ..experiments.data import ExperimentData
-from ..experiments.record import Record, uninterrupted_records
+from ..experiments.record import SectionSeries, uninterrupted_records
 
 
 # Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
@@ -30,8 +30,8 @@ class SectionData(eqx.Module):
 
     **Fields:**
 
-    - `records`: `Record`s for `fit_series`, `validate`, ...: one for each uninterrupted stretch.
-      Samples in gaps are NaN, so that no equation reaches across one.
+    - `records`: `SectionSeries` for `fit_series`, `validate`, ...: one for each uninterrupted
+      stretch. Samples in gaps are NaN, so that no equation reaches across one.
     - `times`: for each record, the times at its sections. `trials`: for each, the index of its
       trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
@@ -42,7 +42,7 @@ class SectionData(eqx.Module):
       below 1.3 for noise.
     """
 
-    records: tuple[Record, ...]
+    records: tuple[SectionSeries, ...]
     times: tuple[Float[np.ndarray, " _"], ...]
     trials: tuple[int, ...] = eqx.field(static=True)
     cycle_inputs: Float[np.ndarray, "N nu"]
@@ -164,7 +164,7 @@ class SectionData(eqx.Module):
         return folded(summary + ")")
 
 
-def whole_cycles(record: Record) -> slice:
+def whole_cycles(record: SectionSeries) -> slice:
     """Return the samples of the whole cycles of a record, from section 0 on."""
     N = record.n_sections
     first = -record.first_section % N

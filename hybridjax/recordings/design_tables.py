@@ -47,7 +47,7 @@ def write_design(
         raise DefinitionError(
             "a table against time needs both the period and the rate."
         )
-    u = np.asarray(design.inputs(cycles or design.periods))
+    u = np.asarray(design.signals(cycles or design.periods))
     n = u.shape[1]
     N = design.n_sections
     if period is None or rate is None:
@@ -70,18 +70,18 @@ def write_design(
         open(new, "w", newline="", encoding="utf-8") as file,
     ):
         table = csv.writer(file)
-        table.writerow([*header, *design.input_names])
+        table.writerow([*header, *design.inputs])
         for experiment, inputs in enumerate(u):
             for row in np.concatenate([place, inputs], axis=1):
                 table.writerow([experiment, *(f"{x:.10g}" for x in row)])
 
 
 @checked
-def add_command(recording: Recording, phase: Phase, path: FilePath) -> Recording:
+def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recording:
     """Add the commanded inputs of hardware to a recording in which they were not measured.
 
     Experiment s was applied in trial s, from the first whole cycle on, and each value held from its
-    section to the next. Sample such inputs in the middle: `section_data(..., sampled="middle")`.
+    section to the next. Sample such inputs in the middle: `sample_sections(..., sampled="middle")`.
 
     **Arguments:** `path`: a table by phase that `write_design` wrote.
 

@@ -8,7 +8,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
 from .._core.findings import warn_of
 from ..errors import DefinitionError
-from ..experiments.record import Record, uninterrupted_records
+from ..experiments.record import SectionSeries, uninterrupted_records
 from ..identify.denominator import Covariance
 from ..identify.series.fit import SeriesFit, assemble, fit_series, missing_cycles
 from ..identify.series.linearization import linearize
@@ -45,7 +45,7 @@ class Split(NamedTuple):
     """Records to be fitted, prepared once for all fits, and records that are held out."""
 
     early: PreparedRecords
-    late: list[Record]
+    late: list[SectionSeries]
 
     def best_order(self, most: int = 4) -> tuple[int, str]:
         """Choose an order; see `choose_order`. Return it and, if it is the largest that could be

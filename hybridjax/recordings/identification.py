@@ -20,14 +20,14 @@ from ..identify.series.records import SLOW, PreparedRecords
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import untried_orders
-from .fit_warnings import Advice, advice_about, slow_sampling, undamped
+from .fit_warnings import Diagnosis, diagnosis_of, slow_sampling, undamped
 from .held_out import HeldOut, Split, split
 from .impulse import ImpulseResponses, impulse_responses
-from .inspection.inspect import inspect, inspect_cycles
+from .inspection.inspect import check_recording, inspect_cycles
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording
-from .sampling import DriftCycles, section_data, without_drift
+from .sampling import DriftCycles, sample_sections, without_drift
 from .smoothing import Bandwidth
 
 
@@ -58,7 +58,7 @@ class Identification(eqx.Module):
     held_out: HeldOut
     responses: ImpulseResponses
     curve: PhaseResponse | None
-    advice: Advice
+    diagnosis: Diagnosis
 
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]
@@ -68,7 +68,7 @@ class Identification(eqx.Module):
             repr(self.fit),
             *meaning,
             repr(self.held_out.validation),
-            repr(self.advice),
+            repr(self.diagnosis),
         ]
         return "\n".join(results)
 
@@ -77,7 +77,7 @@ class Identification(eqx.Module):
 @working("identify_recording")
 def identify_recording(
     recording: Recording,
-    phase: Phase | PhaseDefinition,
+    sections: Phase | PhaseDefinition,
     *,
     inputs: SignalNames,
     outputs: OptionalNames,
@@ -89,9 +89,9 @@ def identify_recording(
     reference: SignalNames | None = None,
 ) -> Identification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
-    reasons to doubt them. The recording is inspected first (`hj.recordings.inspect`).
+    reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
 
-    **Arguments:** those of `section_data`, and
+    **Arguments:** those of `sample_sections`, and
 
     - `order`: the number of multipliers. Default: the result of `choose_order`; in a loop, the most
       that the reference determines, up to 4.
@@ -102,19 +102,21 @@ def identify_recording(
       controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
-    `section_data` and `fit_series`; `PrecisionError` in single precision.
+    `sample_sections` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()
     say("inspection")
     outside = None if reference is None else tuple(reference)
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
-    inspection = inspect(recording, inputs=signals, outputs=outputs)
+    inspection = check_recording(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
     say("phase")
-    recording, phase = _phase_without_drift(inspection.recording, phase, outputs, drift)
+    recording, phase = _phase_without_drift(
+        inspection.recording, sections, outputs, drift
+    )
     say("data at the sections")
-    whole = section_data(
+    whole = sample_sections(
         recording,
         phase,
         inputs=signals,
@@ -149,8 +151,8 @@ def identify_recording(
     if _is_of_events_alone(data, phase):
         curve = phase_response(recording, phase, input=data.inputs[0])
         findings += curve.findings
-    advice = advice_about(data, prepared, fit, held_out.validation)
-    warn_of([*findings, *advice.findings])
+    diagnosis = diagnosis_of(data, prepared, fit, held_out.validation)
+    warn_of([*findings, *diagnosis.findings])
     findings = [*inspection.findings, *findings]
     return Identification(
         recording=recording,
@@ -161,7 +163,7 @@ def identify_recording(
         held_out=held_out,
         responses=impulse_responses(fit, data),
         curve=curve,
-        advice=advice.with_earlier([*findings, *slow_sampling(data)]),
+        diagnosis=diagnosis.with_earlier([*findings, *slow_sampling(data)]),
     )
 
 

@@ -216,7 +216,7 @@ class Recording(eqx.Module):
         that wraps, is not. A signal that crosses the level several times within a cycle, in noise,
         makes doubled events, which `estimate_phase` leaves out. Crossings in gaps that are longer
         than three samples, and than half a wavelength at the bandwidth, are unknown, and make no
-        events. Isolated spikes are ignored (see `section_data`).
+        events. Isolated spikes are ignored (see `sample_sections`).
 
         **Arguments:** `event`: its name. `crossing`: crossing of a signal, given by name.
         `bandwidth`: bandwidth in Hz of the smoothing spline whose crossings are taken. Default:

@@ -3,4 +3,4 @@ from .._core.compilation import enable_loop_kernels as enable_loop_kernels
 from .._core.execution import Execution as Execution
 from .._core.progress import enable_progress as enable_progress
 from .draws import monte_carlo as monte_carlo
-from .family import Points as Points
+from .family import SweepPoints as SweepPoints

@@ -4,7 +4,7 @@ from ..mechanics.mechanism import (
     Mechanism as Mechanism,
 )
 from .drawing import Drawing as Drawing
-from .quotient import Quotient as Quotient
-from .sliding import Sliding as Sliding, sliding as sliding
+from .quotient import Symmetric as Symmetric
 from .solver import Radau as Radau
+from .surfaces import FilippovParts as FilippovParts, filippov as filippov
 from .transition import Scheduled as Scheduled

@@ -23,12 +23,12 @@ from .varied import parameter_of, with_parameters
 
 
 @checked
-class Quotient(Derived):
+class Symmetric(Derived):
     """`system` modulo a symmetry. The symmetry is declared here, and the resets of `system` do not
     contain it.
 
     ```python
-    walker = Quotient(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},
+    walker = Symmetric(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},
                       translation=("x",))
     step = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
     ```
@@ -243,7 +243,7 @@ class Quotient(Derived):
             at = Guess(at.chart, at.state[:-1], at.state[-1])
         if not self.translation:
             return self.system, at
-        return Quotient(self.system, translation=self.translation), at
+        return Symmetric(self.system, translation=self.translation), at
 
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
@@ -366,12 +366,12 @@ def check_symmetry(
     system: HybridSystem, sizes: Any = None, along: str | None = None
 ) -> None:
     """Raise an error if functions, or with `along` their derivatives by this parameter, do not have
-    the symmetry that a `Quotient` states.
+    the symmetry that a `Symmetric` states.
 
     **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
     which states are small, states of 1 hide all but the highest powers.)
     """
-    if not isinstance(system, Quotient):
+    if not isinstance(system, Symmetric):
         return
     check_symmetry(system.system, None, along and along.removeprefix("system."))
     if not sizes:

@@ -592,7 +592,7 @@ class Both(hj.HybridSystem):
 
 class Uses:
     def __new__(cls):
-        return hj.systems.Quotient(Both(), swap={"left": "right"})
+        return hj.systems.Symmetric(Both(), swap={"left": "right"})
 """
 
 

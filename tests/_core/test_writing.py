@@ -155,7 +155,7 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     ]
 
 
-DESIGN = hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5))
+DESIGN = hj.multisine(n_sections=4, periods=4, frequencies=(0.25, 0.5))
 WRITERS = {
     "save": (lambda path: hj.save(path, DESIGN), "x.npz"),
     "write_design": (lambda path: hj.recordings.write_design(path, DESIGN), "x.csv"),

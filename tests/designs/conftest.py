@@ -30,13 +30,13 @@ def two():
 
 @pytest.fixture(scope="session")
 def two_usual(two):
-    return hj.multisine(6, 32, band=(0, 3), inputs=two.inputs)
+    return hj.multisine(6, 32, frequencies=(0, 3), inputs=two.inputs)
 
 
 @pytest.fixture(scope="session")
 def optimal_two(two, two_usual):
     """Plans for the two inputs, by default for multipliers of both."""
-    goal = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+    goal = hj.designs.MultiplierGoal(harmonics=(-1, 0, 1))
     default = {"goal": goal, "noise": TWO_NOISE, "limit": {"u0": 0.1, "u1": 0.05}}
     return lambda **options: hj.optimal_design(two, two_usual, **(default | options))
 

@@ -21,8 +21,8 @@ Distortion = hj.designs.Distortion
 KINEMATIC = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
 NOISE = {"yM": 6e-6, "vM": 1.2e-5}
-EXPERIMENTS = hj.multisine(8, periods=8, band=(0.0, 1.0))
-GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+EXPERIMENTS = hj.multisine(8, periods=8, frequencies=(0.0, 1.0))
+GOAL = hj.designs.MultiplierGoal(harmonics=(-1, 0, 1))
 
 
 class Quadratic(hj.HybridSystem):
@@ -123,7 +123,7 @@ def test_the_even_part_of_the_hopper(hopper_cycle):
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
     left = []
     for rms in (0.02, 0.04):
-        u = EXPERIMENTS.scaled(rms=rms).inputs()
+        u = EXPERIMENTS.scaled(rms=rms).signals()
         even = even_part(hopper_cycle, sections, u, OUTPUTS)
         wrong = even - quadratic.second_order(u)
         left.append(np.sqrt(np.mean(wrong**2) / np.mean(even**2)))
@@ -136,7 +136,7 @@ def test_without_a_clock(vanderpol_cycle):
     """Sections on which no time is kept, and the direction of the flow means nothing."""
     sections = hj.KinematicPhase(4, "x", "v", anchor=hj.Crossing("v", "falling"))
     quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
-    u = hj.multisine(4, periods=4, band=(0.0, 2.0)).scaled(rms=1e-3).inputs()
+    u = hj.multisine(4, periods=4, frequencies=(0.0, 2.0)).scaled(rms=1e-3).signals()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
     error = np.abs(even - quadratic.second_order(u)).max()
     assert error < 1e-4 * np.abs(even).max()
@@ -148,8 +148,8 @@ def test_two_inputs(two, inputs):
     """Inputs in any order; charts with one and two states; outputs that depend on the inputs."""
     cycle, sections, _ = two
     quadratic = second_order(cycle, sections, ("x", "z"), inputs)
-    everything = SHORT.inputs()
-    u = everything[:, :, [SHORT.input_names.index(name) for name in inputs]]
+    everything = SHORT.signals()
+    u = everything[:, :, [SHORT.inputs.index(name) for name in inputs]]
     of_system = np.zeros_like(everything)
     for k, name in enumerate(inputs):
         of_system[:, :, ("push", "pull").index(name)] = u[:, :, k]
@@ -179,7 +179,7 @@ def test_the_expected_size_with_two_inputs(two):
     count = 400
     _, form = products_of(two)
     drawn = SHORT.realizations(count)
-    outputs = form.quadratic.second_order(drawn.inputs())
+    outputs = form.quadratic.second_order(drawn.signals())
     require_mean_square(outputs, count, form.rms(SHORT) ** 2, 0.02)
 
 
@@ -191,7 +191,7 @@ def test_the_expected_size_of_gaussian_inputs(two):
     rng = np.random.default_rng(0)
     size = np.sqrt(rng.exponential(size=len(drawn.line)))
     drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
-    outputs = form.quadratic.second_order(drawn.inputs())
+    outputs = form.quadratic.second_order(drawn.signals())
     matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
     expected = [matrix @ power @ power for power in cosines.powers_in(SHORT)]
     require_mean_square(outputs, count, np.mean(expected, axis=0), 0.05)
@@ -217,7 +217,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     rms_of_x = np.sqrt(mean**2 + twice**2 / 2)
     assert found.rms(design)[0] == pytest.approx(rms_of_x, rel=1e-9)
     assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
-    u = design.inputs()
+    u = design.signals()
     x, z = found.quadratic.second_order(u)[0].T
     assert_allclose(z, x + u[0, :, 0] ** 2, atol=1e-15)
 
@@ -253,7 +253,7 @@ def test_designs_within_a_distortion(hopper_cycle):
 
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
-    outputs = quadratic.second_order(plan.design.inputs())
+    outputs = quadratic.second_order(plan.design.signals())
     rms = np.sqrt(np.mean(outputs**2, axis=(0, 1)))
     expected = [plan.rms[f"distortion of {name}"] for name in OUTPUTS]
     assert_allclose(rms, expected, rtol=0.1)
@@ -267,7 +267,7 @@ def test_beside_other_limits(quadratic):
     options = dict(noise={"x": 1e-4}, goal=GOAL)
     limit = Limits(peak={"u": 0.05}, distortion=distortion)
     peaked = hj.optimal_design(model, usual, limit=limit, **options)
-    assert np.abs(peaked.design.inputs()).max() <= 0.05 * (1 + 1e-9)
+    assert np.abs(peaked.design.signals()).max() <= 0.05 * (1 + 1e-9)
     assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
     assert peaked.certificate >= 1
     both = hj.optimal_design(

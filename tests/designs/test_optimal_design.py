@@ -80,7 +80,7 @@ def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
 
 def test_experiments_are_as_promised(plan, isochron_ldtp):
     """Power and deviations are those of the signals themselves, the same in all experiments."""
-    powers = np.mean(plan.design.inputs() ** 2, axis=(1, 2))
+    powers = np.mean(plan.design.signals() ** 2, axis=(1, 2))
     assert_allclose(powers, plan.rms["u"] ** 2, rtol=1e-3)
     data = hj.experiments.simulate_experiments(
         isochron_ldtp, plan.design, start="periodic"
@@ -120,7 +120,7 @@ def test_units_and_estimates(isochron_ldtp, usual):
         (b.certificate, b.criterion), rel=1e-6
     )
     fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
-    for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
+    for goal in ("multipliers", hj.designs.MultiplierGoal(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
         assert estimated.saved > 5
         assert estimated.certificate < 1.1

@@ -16,7 +16,7 @@ ASKED = 7e-5
 
 @pytest.fixture(scope="module")
 def first():
-    return hj.multisine(8, periods=32, lines="odd", band=(0, 4)).scaled(0.001)
+    return hj.multisine(8, periods=32, lines="odd", frequencies=(0, 4)).scaled(0.001)
 
 
 def measured(model, design, seed=0, factor=1.0):
@@ -30,7 +30,7 @@ def measured(model, design, seed=0, factor=1.0):
 @pytest.fixture(scope="module")
 def studies(model, first):
     """One, after each of its blocks."""
-    study = hj.designs.Study(first, order=2, standard_error=ASKED)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=ASKED)
     found = [study]
     while not study.done:
         data = measured(model, study.design, seed=len(found))
@@ -75,7 +75,7 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
 
 def test_too_much_noise_to_begin_with(model, first):
     """The first design is repeated with other phases."""
-    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=1e-3)
     lost = study.add(measured(model, first, factor=1e4))
     assert not lost.done
     assert np.isnan(lost.standard_errors).all()
@@ -95,7 +95,9 @@ def test_too_much_noise_to_begin_with(model, first):
     "goal", [dict(which=0), dict(part="modulus", harmonics=(-1, 0, 1))]
 )
 def test_goals(model, first, goal):
-    study = hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(**goal))
+    study = hj.designs.SequentialDesign(
+        first, 2, 1e-4, goal=hj.designs.MultiplierGoal(**goal)
+    )
     study = study.add(measured(model, first))
     assert study.standard_errors.shape == (1, 1)
     assert study.plan.saved > 3
@@ -108,7 +110,7 @@ def test_repeated_windows_count(model, first):
         model, first, discard=32, start="periodic"
     )
     noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
-    study = hj.designs.Study(first, 2, 1e-5)
+    study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
     assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
@@ -117,7 +119,7 @@ def test_repeated_windows_count(model, first):
 
 
 def test_an_order_that_is_too_low_is_named(model, first):
-    study = hj.designs.Study(first, 1, 1e-5)
+    study = hj.designs.SequentialDesign(first, 1, 1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="show more than 1 multipliers"):
         for k in range(4):
             study = study.add(measured(model, study.design, seed=k))
@@ -127,8 +129,8 @@ def test_bad_data(model, first):
     with pytest.raises(
         hj.errors.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
     ):
-        hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
-    study = hj.designs.Study(first, 2, 1e-4)
+        hj.designs.SequentialDesign(first, 2, 1e-4, limit={"nope": 1.0})
+    study = hj.designs.SequentialDesign(first, 2, 1e-4)
     data = measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),
@@ -147,7 +149,7 @@ def from_the_cycle(model, first):
 
 
 def test_what_is_left_of_the_start_is_refused(model, first, from_the_cycle):
-    study = hj.designs.Study(first, 2, 1e-3)
+    study = hj.designs.SequentialDesign(first, 2, 1e-3)
     with pytest.raises(
         hj.errors.DefinitionError, match="of the start's transient is left"
     ):
@@ -160,17 +162,17 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     """Where Student's intervals are half as wide again, a study is not done at the standard error
     that was asked, and the next block is longer by 1.5 squared, or as long as it may be."""
     data = measured(model, first)
-    error = hj.designs.Study(first, 2, 1.0).add(data).standard_errors[0, 0]
+    error = hj.designs.SequentialDesign(first, 2, 1.0).add(data).standard_errors[0, 0]
     # The scatter of few lines understates the error of a first block, but the noise level does not.
     plan = hj.optimal_design(model, first, noise=NOISE)
     assert error > 0.95 * np.linalg.norm(plan.usual_standard_errors)
     asked = 1.2 * error
-    assert hj.designs.Study(first, 2, asked).add(data).done
-    half = hj.designs.Study(first, 2, 0.4 * error).add(data)
+    assert hj.designs.SequentialDesign(first, 2, asked).add(data).done
+    half = hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
-    assert not hj.designs.Study(first, 2, asked).add(data).done
+    assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
     assert (
-        hj.designs.Study(first, 2, 0.4 * error).add(data).plan.strides
+        hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.strides
         > half.plan.strides
     )
 
@@ -182,7 +184,7 @@ MULTIPLIERS = np.array([0.8, 0.3 + 0j])
 
 
 def test_an_unstable_estimate_repeats_the_first_design(model, first):
-    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=1e-3)
     unstable = dataclasses.replace(model, A=1.05 * model.A)
     study = study.add(measured(unstable, first))
     assert "again, since the estimate is unstable" in repr(study)

@@ -186,7 +186,7 @@ def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
     period = np.log((1.5 - push) / 0.5)
     assert_allclose(cycle.period, period, rtol=1e-10)
     assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
-    assert hj.orbits.coincidences(cycle) == []
+    assert hj.orbits.simultaneous_events(cycle) == []
 
 
 class Kicked(hj.HybridSystem):
@@ -320,7 +320,7 @@ def test_programs_refuse_events_that_coincide():
     measured = result(jnp.array([0.95, 0.99, 1 - 1e-10]))
     assert_array_equal(
         measured,
-        [hj.errors.Result.OK, hj.errors.Result.OK, hj.errors.Result.COINCIDENCE],
+        [hj.errors.Result.OK, hj.errors.Result.OK, hj.errors.Result.SIMULTANEOUS],
     )
 
 

@@ -50,9 +50,14 @@ def test_harmonic_transfer_functions_compile_nothing():
         loop = model.feedback(np.eye(2)).inverse()
         size = np.ones(exact.H.shape)
         more = {"n_sections": SECTIONS, **ports}
-        scatter = hj.linear.Scatter(np.full(len(f), 4.0), size)
+        variance_dof = hj.linear.VarianceDof(np.full(len(f), 4.0), size)
         htf = hj.linear.HTF(
-            f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter
+            f,
+            exact.H,
+            exact.harmonics,
+            **more,
+            variance=size,
+            variance_dof=variance_dof,
         )
         print(htf @ exact, htf.feedback(exact).inverse(), (htf + exact)[0], loop)
         print(htf.error(exact), htf.select(1).confidence_radius())

@@ -11,7 +11,7 @@ from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
-DESIGN = hj.multisine(n_sections=4, periods=5, band=(0, 2.0), inputs=("a", "b"))
+DESIGN = hj.multisine(n_sections=4, periods=5, frequencies=(0, 2.0), inputs=("a", "b"))
 
 
 @pytest.fixture(scope="module")

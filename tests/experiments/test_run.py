@@ -87,7 +87,7 @@ def test_records_agree_with_scipy(family, design):
 
 def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, design):
     _, placed, _, data = family
-    u = design.inputs(CYCLES)
+    u = design.signals(CYCLES)
     u[17, 3 * N : 4 * N] = 60.0
     broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20, **BATCH)
     assert list(np.flatnonzero(~broken.ok)) == [17]
@@ -100,14 +100,14 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     assert np.all(np.isfinite(broken.y[17, :after]))
     assert np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
-    lost = design.f[design.experiment == 17]
-    assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
+    lost = design.frequency[design.experiment == 17]
+    assert_array_equal(estimate.frequencies, np.setdiff1d(design.frequencies, lost))
 
 
 def test_large_inputs_that_change_the_order_of_events_are_reported(
     hopper_cycle, placed_isochrons, design
 ):
-    u = design.inputs(CYCLES) * 100
+    u = design.signals(CYCLES) * 100
     data = hj.run_experiments(
         hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH
     )
@@ -128,7 +128,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     ("change", "message"),
     [
         (
-            dict(design=hj.multisine(16, band=(0, 7.0))),
+            dict(design=hj.multisine(16, frequencies=(0, 7.0))),
             "different n_sections: 16 and 32",
         ),
         (dict(design=np.zeros((2, 33, 1))), "periods x 32, 1"),
@@ -213,7 +213,7 @@ def test_sections_that_are_too_far_apart_for_the_steps_allowed(
 @pytest.mark.slow
 def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     family = hj.ClockPhase(8, anchor=hj.Crossing("v", "falling"))
-    design = hj.multisine(n_sections=8, periods=4, band=(0, 2.0))
+    design = hj.multisine(n_sections=8, periods=4, frequencies=(0, 2.0))
     with pytest.raises(
         hj.errors.DefinitionError,
         match=r"has no clock.*multiplier of exactly 1.*Kinemat",

@@ -57,14 +57,14 @@ def records(parts):
 
 
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
-    u = DESIGN.inputs(9)
-    parts = [DESIGN.inputs(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
+    u = DESIGN.signals(9)
+    parts = [DESIGN.signals(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
     assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
             hj.errors.DefinitionError, match="a slice of consecutive experiments"
         ):
-            DESIGN.inputs(experiments=wrong)
+            DESIGN.signals(experiments=wrong)
 
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
@@ -73,7 +73,7 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
     assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
     expected = hj.estimate_htf(whole)
-    assert_array_equal(estimate.f, expected.f)
+    assert_array_equal(estimate.frequencies, expected.frequencies)
     assert_allclose(estimate.H, expected.H, rtol=1e-9)
     noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
     parts = stream(*arguments, Options(**BATCH, **NOISE), chunk=5)

@@ -78,7 +78,7 @@ def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
     def gradient(system):
         cycle = hj.find_limit_cycle(system, hopper_cycle)
         model = hj.linearize(cycle, SECTIONS, OUTPUTS)
-        H = model.htf(hopper_htf.f, hopper_htf.harmonics).H * weights
+        H = model.htf(hopper_htf.frequencies, hopper_htf.harmonics).H * weights
         return (direction[0] * H.real + direction[1] * H.imag).sum()
 
     slopes = gradient(hopper_cycle.system)

@@ -27,8 +27,8 @@ def positional(function):
 def scale(t):
     yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
     yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
-    yield hj.scale.Points, dict(values={"x": [1.0]})
-    yield hj.scale.Points.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
+    yield hj.scale.SweepPoints, dict(values={"x": [1.0]})
+    yield hj.scale.SweepPoints.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
 
 
 def systems(t):
@@ -108,19 +108,19 @@ def linear(t):
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
-    f = np.asarray(t.estimate.f)
+    f = np.asarray(t.estimate.frequencies)
     H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
-    scatter = hj.linear.Scatter(f, size)
+    variance_dof = hj.linear.VarianceDof(f, size)
     errors = dict(
         variance=size,
         noise_variance=size,
-        scatter=hj.linear.Scatter(np.ones(len(f)), size),
+        variance_dof=hj.linear.VarianceDof(np.ones(len(f)), size),
     )
     yield hj.linear.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
-    yield hj.linear.Scatter, dict(freedom=f, roundness=size)
-    yield scatter.quantile, dict(level=0.9)
-    yield scatter.sources, dict(f=f)
+    yield hj.linear.VarianceDof, dict(dof=f, roundness=size)
+    yield variance_dof.quantile, dict(level=0.9)
+    yield variance_dof.sources, dict(f=f)
     lines = np.arange(12) / 4 + 0.125
     signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
     gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
@@ -171,25 +171,25 @@ def experiments(t):
     y = np.ones(t.data.y.shape)
     yield hj.experiments.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
     one = t.record
-    yield hj.experiments.Record, dict(u=one.u, y=one.y, n_sections=6)
+    yield hj.experiments.SectionSeries, dict(u=one.u, y=one.y, n_sections=6)
     yield one.part, dict(first=0, stop=12)
 
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield hj.identify.loop, dict(data=t.data, at_input=t.data.inputs[1])
+    yield hj.identify.estimate_loop, dict(data=t.data, at_input=t.data.inputs[1])
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2)
     yield hj.identify.fit_rational, dict(htf=t.estimate, output=0)
     yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])
-    yield hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6)
+    yield hj.fit_multipliers, dict(htf=t.estimate, order=2, extra_lags=6)
     yield t.structured.htf, dict(f=np.array([0.1, 0.2]))
     true = np.asarray(t.model.multipliers)
     yield t.structured.distance, dict(true=true)
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
     yield t.structured.interval, dict(level=0.9)
-    yield hj.select_order, dict(htf=t.estimate, overhang=6)
+    yield hj.select_order, dict(htf=t.estimate, extra_lags=6)
     yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
@@ -231,18 +231,21 @@ def fitting(t):
 
 
 def designs_data(t):
-    ask = hj.designs.Multipliers(harmonics=0, overhang=6)
+    ask = hj.designs.MultiplierGoal(harmonics=0, extra_lags=6)
     yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
-    yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
-    yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
+    yield hj.designs.ParameterGoal, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
+    yield hj.designs.ResponseGoal, dict(band=(0.1, 1.0))
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
     limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
     yield limits.require_inputs, dict(inputs=("u0",))
     yield limits.experiments, dict(design=t.design, cosines=4)
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
-    yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
+    yield (
+        hj.designs.SequentialDesign,
+        dict(first=t.one_input, order=1, standard_error=1.0),
+    )
     yield t.study.add, dict(data=t.block)
-    yield hj.designs.draws, dict(fit=t.joint, count=1)
+    yield hj.designs.draw_models, dict(fit=t.joint, count=1)
     yield t.plan.strides_for, dict(standard_error=1.0)
 
 
@@ -266,14 +269,14 @@ def recordings(t):
         outputs=("x", "v"),
         n_sections=2,
     )
-    yield hj.recordings.section_data, take
+    yield hj.recordings.sample_sections, take
     yield hj.identify_recording, take | dict(order=1)
     yield t.section_data.experiments, dict(periods=4)
     yield (
-        hj.recordings.inspect,
+        hj.recordings.check_recording,
         dict(recording=t.recording, inputs="f", outputs=("x", "v")),
     )
-    yield hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit)
+    yield hj.recordings.diagnose, dict(data=t.section_data, fit=t.found.fit)
     yield hj.recordings.choose_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
@@ -283,7 +286,7 @@ def recordings(t):
         dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
-    yield hj.recordings.add_command, table
+    yield hj.recordings.attach_design, table
     yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
     yield positional(hj.read_recording), dict(values="nope.csv")
 
@@ -308,7 +311,7 @@ def subjects(t):
 
 def plants(t):
     yield (
-        hj.plants.settle,
+        hj.plants.find_cycle,
         dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v")),
     )
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
@@ -321,8 +324,8 @@ def plants(t):
 
 
 def testing(t):
-    yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
-    yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
+    yield hj.testing.add_artifacts, dict(recording=t.recording, signals=("x",))
+    yield hj.experiments.random_input, dict(duration=10, rate=50, bandwidth=5)
     force = np.zeros((1, 50, 1))
     yield (
         hj.testing.simulate_recording,
@@ -375,8 +378,8 @@ def rhythms(t):
     def surface(time, q):
         return q[0]
 
-    yield hj.systems.sliding, dict(charts=charts, surface=surface)
-    yield hj.orbits.coincidences, dict(cycle=t.cycle)
+    yield hj.systems.filippov, dict(charts=charts, surface=surface)
+    yield hj.orbits.simultaneous_events, dict(cycle=t.cycle)
     about = dict(recording=t.recording, phase=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(curve=t.beats)
@@ -393,7 +396,7 @@ def without_arguments(t):
     design = t.design
     for call in (
         hj.scale.Execution,
-        hj.designs.Multipliers,
+        hj.designs.MultiplierGoal,
         hj.experiments.Options,
         natural.interval,
         t.trajectory,

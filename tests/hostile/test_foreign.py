@@ -123,7 +123,7 @@ def test_bandwidths_and_drifts_beyond_all_records():
     assert_allclose(*slopes, atol=2e-4)
     refused(
         "`drift` must be two cycles or more",
-        lambda: hj.experiments.Record(
+        lambda: hj.experiments.SectionSeries(
             np.ones((8, 1)), np.ones((8, 1)), n_sections=4, drift=1e-20
         ),
     )

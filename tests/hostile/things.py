@@ -16,8 +16,8 @@ TIME = np.linspace(0.0, 60.0, 2401)
 APEX = hj.Crossing("y", "falling")
 RISES = hj.Crossing("x", "rising")
 PHASE = hj.KinematicPhase(4, position="x", velocity="y", anchor=APEX)
-CURVE = hj.designs.Multipliers(harmonics=0, overhang=6)
-GOAL = hj.designs.Multipliers(harmonics=0)
+CURVE = hj.designs.MultiplierGoal(harmonics=0, extra_lags=6)
+GOAL = hj.designs.MultiplierGoal(harmonics=0)
 
 
 def repeated(t):
@@ -32,7 +32,9 @@ def record(t):
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = np.asarray(t.model.simulate(u))
     rng = np.random.default_rng(1)
-    return hj.experiments.Record(u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6)
+    return hj.experiments.SectionSeries(
+        u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6
+    )
 
 
 def run(t, u):
@@ -57,7 +59,7 @@ def recording(t):
 
 def section_data(t, inputs, **options):
     about = dict(inputs=inputs, outputs=("x", "v"), n_sections=2)
-    return hj.recordings.section_data(t.recording, t.phase, **about, **options)
+    return hj.recordings.sample_sections(t.recording, t.phase, **about, **options)
 
 
 def branch(t):
@@ -127,7 +129,7 @@ MAKE = {
     "population": population,
     "maps": maps,
     "plant": plant,
-    "settled": lambda t: hj.plants.settle(t.plant, hj.ClockPhase(4), ("x", "v")),
+    "settled": lambda t: hj.plants.find_cycle(t.plant, hj.ClockPhase(4), ("x", "v")),
     "system": lambda t: hj.models.HopfOscillator(),
     "cycle": lambda t: hj.find_limit_cycle(t.system),
     "cycles": lambda t: many(t.cycle, 2),
@@ -137,8 +139,8 @@ MAKE = {
     "response": lambda t: hj.experiments.response_function(t.cycle, t.placed, NAMES),
     "trajectory": lambda t: t.cycle.trajectory(),
     "model": lambda t: hj.testing.synthetic_ldtp(),
-    "design": lambda t: hj.multisine(6, 16, band=(0, 3.0), inputs=2),
-    "one_input": lambda t: hj.multisine(4, 16, band=(0, 2.0)),
+    "design": lambda t: hj.multisine(6, 16, frequencies=(0, 3.0), inputs=2),
+    "one_input": lambda t: hj.multisine(4, 16, frequencies=(0, 2.0)),
     "data": lambda t: hj.experiments.simulate_experiments(
         t.model, t.design, start="periodic"
     ),
@@ -147,11 +149,11 @@ MAKE = {
     "uncertain": lambda t: dataclasses.replace(
         t.estimate, variance=np.full(t.estimate.H.shape, 1e-6)
     ),
-    "exact": lambda t: t.model.htf(t.estimate.f, (-1, 0, 1)),
+    "exact": lambda t: t.model.htf(t.estimate.frequencies, (-1, 0, 1)),
     "rational": lambda t: hj.identify.fit_rational(
         t.estimate, output=0, poles=1, zeros=1
     ),
-    "structured": lambda t: hj.fit_multipliers(t.estimate, 2, overhang=6),
+    "structured": lambda t: hj.fit_multipliers(t.estimate, 2, extra_lags=6),
     "plan": lambda t: hj.optimal_design(t.model, t.design, goal=CURVE),
     "decaying": lambda t: hj.linear.LDTP(
         np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1))
@@ -160,13 +162,13 @@ MAKE = {
         hj.experiments.simulate_experiments(t.decaying, t.one_input, start="periodic"),
         snr=30,
     ),
-    "study": lambda t: hj.designs.Study(
+    "study": lambda t: hj.designs.SequentialDesign(
         t.one_input, order=1, standard_error=1e-9, goal=GOAL
     ),
     "studied": lambda t: t.study.add(t.block),
-    "joint": lambda t: hj.fit_ldtp(t.uncertain, t.model),
+    "joint": lambda t: hj.fit_ldtp(t.uncertain, initial=t.model),
     "record": record,
-    "driven": lambda t: hj.fit_ldtp(t.record, t.model, noise="innovations"),
+    "driven": lambda t: hj.fit_ldtp(t.record, initial=t.model, noise="innovations"),
     "fit": lambda t: hj.fit_series(t.record, 2),
     "validation": lambda t: hj.validate(t.fit, t.record),
     "run": lambda t: lambda u: run(t, u),

@@ -29,7 +29,7 @@ def recorded(plant, noise=0.1, cycles=300, drift=0.0):
     u = rng.normal(size=(N * cycles, 1))
     y = np.asarray(plant.simulate(u)) + noise * rng.normal(size=u.shape)
     slow = drift * np.linspace(-1, 1, len(y)) ** 3
-    return hj.experiments.Record(u, y + slow[:, None], n_sections=N)
+    return hj.experiments.SectionSeries(u, y + slow[:, None], n_sections=N)
 
 
 def uncertain(plant):
@@ -42,7 +42,11 @@ def uncertain(plant):
         size * np.sqrt(0.5) * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape))
     )
     return hj.linear.HTF(
-        exact.f, H + error, exact.harmonics, N, variance=np.full(H.shape, size**2)
+        exact.frequencies,
+        H + error,
+        exact.harmonics,
+        N,
+        variance=np.full(H.shape, size**2),
     )
 
 
@@ -132,7 +136,7 @@ def test_a_controller_is_a_finding(plant):
         signals.append((u, y))
         x = A[n] @ x + B[n] @ u
     u, y = np.swapaxes(signals, 0, 1)
-    data = hj.experiments.Record(u, y, n_sections=N, inputs="force")
+    data = hj.experiments.SectionSeries(u, y, n_sections=N, inputs="force")
     for fit in (hj.fit_series(data, 2, check=False), hj.fit_ldtp(data, 2, check=False)):
         assert "feedback" in causes(fit)
         text = next(f.text for f in fit.findings if f.cause == "feedback")

@@ -49,16 +49,16 @@ def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
     u, y = run(model, r, 0 * r, rng, **options)
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
     )
 
 
 def experiments(model, seed, count, noise=0.0, discard=30, together=False):
     design = hj.multisine(
-        N, 8, band=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
+        N, 8, frequencies=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
     )
-    z = design.realizations(count, seed).inputs(8 + discard)
+    z = design.realizations(count, seed).signals(8 + discard)
     r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
     u, y = run(model, r, d, np.random.default_rng(seed), noise)
     inputs = np.concatenate(
@@ -75,10 +75,10 @@ def controller():
 
 
 def test_plant_and_controller_of_exact_data(plant):
-    loop = hj.identify.loop(
+    loop = hj.identify.estimate_loop(
         experiments(plant, 0, 2, discard=200), at_input="r", at_output="d"
     )
-    f, exact = loop.plant.f, plant.feedback(GAIN)
+    f, exact = loop.plant.frequencies, plant.feedback(GAIN)
     assert len(f) == 12 and not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
@@ -90,7 +90,7 @@ def test_plant_and_controller_of_exact_data(plant):
     both = hj.estimate_htf(
         experiments(plant, 0, 2, 0, 200, together=True), reference=SEEN[1:]
     )
-    assert both.error(plant.htf(both.f)) < 1e-9
+    assert both.error(plant.htf(both.frequencies)) < 1e-9
     fit = hj.fit_multipliers(loop.plant, 2, check=False)  # (of exact data)
     assert fit.compare(plant.multipliers).max_error < 1e-8
     closed = hj.fit_multipliers(loop.closed, 2, check=False)
@@ -99,13 +99,15 @@ def test_plant_and_controller_of_exact_data(plant):
     data = hj.experiments.ExperimentData(
         data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
     )
-    one = hj.identify.loop(data, at_input="r")
+    one = hj.identify.estimate_loop(data, at_input="r")
     assert one.controller is None and "controller is not estimated" in repr(one)
 
 
 def test_faint_lines_of_a_reference_are_left_out(plant):
-    design = hj.multisine(N, 8, band=(0, N / 2), amplitude=1.0).realizations(6, 0)
-    r, faint = design.inputs(208)[..., 0], np.ones(8 * N)
+    design = hj.multisine(N, 8, frequencies=(0, N / 2), amplitude=1.0).realizations(
+        6, 0
+    )
+    r, faint = design.signals(208)[..., 0], np.ones(8 * N)
     faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0))
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
@@ -115,15 +117,21 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
         htf = hj.estimate_htf(data, reference="r", threshold=threshold)
-        assert len(htf.f) == lines and htf.error(plant.htf(htf.f)) < 1e-9
+        assert (
+            len(htf.frequencies) == lines
+            and htf.error(plant.htf(htf.frequencies)) < 1e-9
+        )
 
 
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     truth, held, regions = None, [], []
     for seed in range(20):
         data = experiments(plant, seed, 5, noise=0.5)
-        loop = hj.identify.loop(data, at_input="r", at_output="d")
-        truth = truth or (plant.htf(loop.plant.f), controller().htf(loop.plant.f))
+        loop = hj.identify.estimate_loop(data, at_input="r", at_output="d")
+        truth = truth or (
+            plant.htf(loop.plant.frequencies),
+            controller().htf(loop.plant.frequencies),
+        )
         for htf, true in zip((loop.plant, loop.controller), truth, strict=True):
             held.append(np.mean(np.abs(htf.H - true.H) <= htf.confidence_radius()))
         fit = hj.fit_multipliers(loop.plant, 2, check=False)
@@ -149,7 +157,7 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     for seed in range(30):
         fit = hj.fit_series(series(plant, seed, noise=0.7), 2, reference="r")
         held.append(fit.contains(plant.multipliers)[0])
-        htf = fit.htf(truth.f)
+        htf = fit.htf(truth.frequencies)
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
         few = hj.fit_series(
             series(plant, seed, 40, noise=0.5), 2, reference="r", check=False
@@ -194,7 +202,9 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     held = []
     for seed in range(8):
         data = series(plant, seed, noise=1.0)
-        data = hj.experiments.Record(data.u[:, :1], data.y, n_sections=N, inputs="u")
+        data = hj.experiments.SectionSeries(
+            data.u[:, :1], data.y, n_sections=N, inputs="u"
+        )
         fit = hj.fit_ldtp(data, 2, noise="innovations")
         assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
@@ -204,7 +214,7 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
-    data = hj.experiments.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    data = hj.experiments.SectionSeries(data.u[:, 1:], data.y, n_sections=N, inputs="r")
     assert not hj.fit_series(data, 2, check=False).findings
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
@@ -222,7 +232,7 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         None
     ]  # (a statistic of -5e-4, by rounding)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
-    data = hj.experiments.Record(
+    data = hj.experiments.SectionSeries(
         np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
     )
     assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
@@ -240,7 +250,7 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     r, e = np.random.default_rng(0).normal(size=(2, N * 400))
     x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
     y = x + 0.3 * e
-    data = hj.experiments.Record(
+    data = hj.experiments.SectionSeries(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
     )
     for fit in (
@@ -257,7 +267,9 @@ def test_residuals_tell_of_the_loop(plant):
     true = hj.validate(fit, late, reference="r")
     assert true.independent and true.white  # (of other strides)
     # (the ratio of y to u is no model of the plant, and the reference shows it)
-    alone = hj.experiments.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
+    alone = hj.experiments.SectionSeries(
+        early.u[:, :1], early.y, n_sections=N, inputs="u"
+    )
     biased = hj.fit_series(alone, 2, check=False)
     assert not hj.validate(biased, late, reference="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
@@ -288,19 +300,19 @@ def test_what_does_not_fit_is_refused(plant):
         hj.estimate_htf(data, reference="r")
     with refused("all inputs are references"):
         hj.fit_ldtp(record, 2, reference=("u", "r"))
-    same = hj.experiments.Record(
+    same = hj.experiments.SectionSeries(
         record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r")
     )
     with refused("u and r are equal"):
         hj.fit_ldtp(same, 2, reference="r")
     shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
     with refused("u and r are equal"):
-        hj.identify.loop(
+        hj.identify.estimate_loop(
             hj.experiments.ExperimentData(data.u[..., [1, 1]], data.y, **shape),
             at_input="r",
         )
     with refused("name those that enter at the plant's input"):
-        hj.identify.loop(data)
+        hj.identify.estimate_loop(data)
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
         hj.estimate_htf(
             hj.experiments.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape),

@@ -27,8 +27,8 @@ def test_any_system_is_identified_exactly(shape, seed):
     estimate = hj.estimate_htf(
         hj.experiments.simulate_experiments(model, design, start="periodic")
     )
-    assert_array_equal(estimate.f, design.frequencies)
-    exact = model.htf(estimate.f)
+    assert_array_equal(estimate.frequencies, design.frequencies)
+    exact = model.htf(estimate.frequencies)
     error = np.abs(estimate.H - exact.H).max()
     assert error < 1e-11 * np.abs(exact.H).max()
 
@@ -49,7 +49,7 @@ def test_repeated_frequencies_are_averaged_by_their_power():
     """With y = g u exactly for one experiment and 3 g u for the other."""
     lines = [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]]
     design = hj.experiments.Design.from_lines(*lines, n_sections=4, periods=4)
-    u = design.inputs(9)
+    u = design.signals(9)
     y = u * np.array([1.0, 3.0])[:, None, None]
     estimate = hj.estimate_htf(
         hj.experiments.ExperimentData(u, y, n_sections=4, periods=4)
@@ -71,10 +71,10 @@ def failed(data, experiments):
 def test_failed_experiments_are_left_out(paper_data, paper_estimate):
     design = hj.experiments.paper_design()
     data = failed(paper_data, [3, 70])
-    lost = np.sort(design.f[np.isin(design.experiment, [3, 70])])
+    lost = np.sort(design.frequency[np.isin(design.experiment, [3, 70])])
     estimate = hj.estimate_htf(data)
-    assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
-    kept = np.isin(paper_estimate.f, estimate.f)
+    assert_array_equal(estimate.frequencies, np.setdiff1d(design.frequencies, lost))
+    kept = np.isin(paper_estimate.frequencies, estimate.frequencies)
     assert_array_equal(estimate.H, paper_estimate.H[:, kept])
     with pytest.raises(
         hj.errors.DefinitionError, match="from 0 experiments \\(80 failed"
@@ -94,7 +94,7 @@ def record(*cosines, n_sections=8, periods=8, cycles=8):
 
 
 def test_half_integers_need_two_phases():
-    measured = hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).f
+    measured = hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).frequencies
     assert_array_equal(measured, [0.25])
     opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
     with pytest.raises(
@@ -104,4 +104,4 @@ def test_half_integers_need_two_phases():
     uneven = hj.estimate_htf(record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)]))
     assert_allclose(uneven[0], 1.0, atol=1e-13)
     assert_allclose(uneven[-3], 0.0, atol=1e-13)
-    assert_array_equal(uneven.scatter.freedom, 1)  # (of three for two unknowns)
+    assert_array_equal(uneven.variance_dof.dof, 1)  # (of three for two unknowns)

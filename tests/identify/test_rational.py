@@ -23,7 +23,7 @@ def rational(f, numerator, denominator, sections):
 def test_no_start_finds_a_better_fit(exact):
     """Against scipy's solver over all coefficients, from 20 random pairs of poles."""
     fit = hj.identify.fit_rational(exact, output="vM")
-    f, h = np.asarray(exact.f), np.asarray(exact[0])[:, 1, 0]
+    f, h = np.asarray(exact.frequencies), np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
         e = (h - rational(f, x[2:], [1, *x[:2]], 32)) / np.linalg.norm(h)

@@ -54,7 +54,7 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
         size=data.y.shape
     )
     fit = hj.fit_series(
-        hj.experiments.Record(data.u, y, n_sections=32, outputs=("yM", "vM")), 2
+        hj.experiments.SectionSeries(data.u, y, n_sections=32, outputs=("yM", "vM")), 2
     )
     model = fit.model
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))

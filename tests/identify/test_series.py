@@ -37,18 +37,18 @@ def record(model, samples, seed=0, noise=0.0, first_section=0, x0=None, **about)
     about |= dict(
         n_sections=model.n_sections, inputs=model.inputs, outputs=model.outputs
     )
-    return hj.experiments.Record(u, y, first_section=first_section, **about)
+    return hj.experiments.SectionSeries(u, y, first_section=first_section, **about)
 
 
 def with_outputs(data, y):
-    return hj.experiments.Record(
+    return hj.experiments.SectionSeries(
         data.u, y, n_sections=data.n_sections, drift=data.drift
     )
 
 
-def problem_of(data, order, overhang, free_start=True):
+def problem_of(data, order, extra_lags, free_start=True):
     return OutputErrorProblem.from_data(
-        PreparedRecords(data), order, overhang, free_start
+        PreparedRecords(data), order, extra_lags, free_start
     )
 
 
@@ -103,7 +103,7 @@ def test_inputs_before_the_start_act_through_all_lags():
 def test_outputs_that_depend_on_later_inputs(small):
     data, f = record(small, 400), np.array([0.1, 0.9])
     fit = hj.fit_series(
-        hj.experiments.Record(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
+        hj.experiments.SectionSeries(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
     )
     expected = np.roll(small.impulse_response(22), -2, axis=0)[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
@@ -169,7 +169,7 @@ def test_the_covariance_of_the_gradient_with_process_noise():
 
 def test_experiments_are_used_from_their_start(small):
     """The transient is information; failed experiments are left out; all data are records."""
-    design = hj.multisine(n_sections=4, periods=24, band=(0, 2.0))
+    design = hj.multisine(n_sections=4, periods=24, frequencies=(0, 2.0))
     data = hj.experiments.simulate_experiments(small, design, discard=0)
     y, result = np.array(data.y), np.zeros(len(data.y), int)
     y[-1], result[-1] = 1e3, hj.errors.Result.BLOW_UP
@@ -267,7 +267,7 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
         data = record(model, 400, noise=0.2)
         signals = (np.pad(x, ((late, 0), (0, 0))) for x in (data.u, data.y))
         fit = hj.fit_series(
-            hj.experiments.Record(*signals, n_sections=1), 2, check=False
+            hj.experiments.SectionSeries(*signals, n_sections=1), 2, check=False
         )
         assert late or not fit.findings
         monkeypatch.setattr("hybridjax.identify.series.records.SLOW", 1)
@@ -312,7 +312,7 @@ def test_bad_records(small, monkeypatch):
         "y0 is constant or missing": with_outputs(good, good.y * [0, 1] + [2, 0]),
         "the same sections, inputs": [
             good,
-            hj.experiments.Record(good.u, good.y, n_sections=5),
+            hj.experiments.SectionSeries(good.u, good.y, n_sections=5),
         ],
     }
     for message, data in cases.items():
@@ -341,7 +341,7 @@ def test_absolute_outputs_are_refused(small):
         (hj.validate, small, data),
         (hj.estimate_htf, data),
         (hj.fitting.ObservedSeries, data, hj.ClockPhase(4)),
-        (hj.designs.Study(hj.multisine(4, 8), 2, 0.1).add, data),
+        (hj.designs.SequentialDesign(hj.multisine(4, 8), 2, 0.1).add, data),
     ):
         with pytest.raises(hj.errors.DefinitionError, match="subtract the limit cycle"):
             door(*arguments)
@@ -358,7 +358,7 @@ def test_inputs_have_units_of_their_own(unit):
     )
     units = np.array([1, unit])
     fits = [
-        hj.fit_series(hj.experiments.Record(v, y, n_sections=4), 2)
+        hj.fit_series(hj.experiments.SectionSeries(v, y, n_sections=4), 2)
         for v in (u, u * units)
     ]
     htfs = [fit.htf([0.3]).H for fit in fits]
@@ -371,11 +371,15 @@ def test_inputs_have_units_of_their_own(unit):
         dataclasses.replace(data, u=data.u * units), 2
     ).data
     htf = hj.estimate_htf(data)
-    np.testing.assert_allclose(htf.f, design.frequencies)
-    np.testing.assert_allclose(htf.H * units, two_inputs.htf(htf.f).H, atol=1e-9)
+    np.testing.assert_allclose(htf.frequencies, design.frequencies)
+    np.testing.assert_allclose(
+        htf.H * units, two_inputs.htf(htf.frequencies).H, atol=1e-9
+    )
     with pytest.raises(hj.errors.DefinitionError, match="are no pair"):
         hj.experiments.ExperimentData(
             units * [u, [-1, 1] * u], [y, y], n_sections=4, periods=8
         ).odd_part()
     with pytest.raises(hj.errors.DefinitionError, match="u0, u1 cannot be told apart"):
-        hj.fit_series(hj.experiments.Record(u[:, :1] * units, y, n_sections=4), 2)
+        hj.fit_series(
+            hj.experiments.SectionSeries(u[:, :1] * units, y, n_sections=4), 2
+        )

@@ -34,5 +34,5 @@ def test_random_systems(shape, seed):
     fit = hj.fit_multipliers(htf, model)
     true = model.multipliers
     assert_allclose(fit.coefficients, np.poly(true).real[1:], atol=1e-8)
-    assert fit.htf(htf.f).error(htf).max() < 1e-8
+    assert fit.htf(htf.frequencies).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)

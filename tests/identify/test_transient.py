@@ -10,12 +10,12 @@ from ..linear.conftest import hopper as hopper
 
 @pytest.fixture(scope="module")
 def full():
-    return hj.multisine(periods=12, band=(0, 3.0))
+    return hj.multisine(periods=12, frequencies=(0, 3.0))
 
 
 def errors(model, data, harmonics=(-1, 0, 1)):
     estimate = hj.estimate_htf(data, harmonics)
-    exact = model.htf(estimate.f, harmonics)
+    exact = model.htf(estimate.frequencies, harmonics)
     return float(np.abs(estimate.H - exact.H).max() / np.abs(exact.H).max())
 
 
@@ -66,5 +66,5 @@ def test_failed_experiments_stay_out(hopper, full):
     assert np.isnan(fit.removed[2]).all()
     assert np.isfinite(fit.removed[3]).all()
     estimate = hj.estimate_htf(fit.data, 0)
-    error = np.abs(estimate[0] - hopper.htf(estimate.f, 0)[0]).max()
+    error = np.abs(estimate[0] - hopper.htf(estimate.frequencies, 0)[0]).max()
     assert error < 1e-9

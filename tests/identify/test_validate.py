@@ -22,7 +22,7 @@ def test_the_true_model_leaves_white_noise(small):
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
         other = record(small, 4 * 60, 100 + seed, 0.3)
-        for fit in (hj.fit_series(other, 2), hj.fit_ldtp(other, small)):
+        for fit in (hj.fit_series(other, 2), hj.fit_ldtp(other, initial=small)):
             found = hj.validate(fit, data)
             of_fits.append([found.whiteness, found.independence])
             correlations.append(found.cross_correlation)
@@ -60,7 +60,7 @@ def test_a_wrong_model_is_refused(small):
         hj.errors.DefinitionError, match="unstable plant grows without bound"
     ):
         hj.validate(eqx.tree_at(lambda m: m.A, small, 9 * small.A), data)
-    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, overhang=0, check=False)
+    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, extra_lags=0, check=False)
     assert not hj.validate(low, data).independent
 
 
@@ -93,14 +93,15 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
     drift = wave[:, None] * [1.0, -2.0]
     records = (
-        hj.experiments.Record(plain.u, plain.y + k * drift, **about) for k in (0, 1)
+        hj.experiments.SectionSeries(plain.u, plain.y + k * drift, **about)
+        for k in (0, 1)
     )
     still, moved = (hj.validate(small, x, start=start) for x in records)
     np.testing.assert_allclose(moved.noise, still.noise, rtol=1e-3)
     np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
     assert moved.white and moved.independent
     np.testing.assert_allclose(still.noise, 0.3, rtol=0.1)
-    unsaid = hj.experiments.Record(
+    unsaid = hj.experiments.SectionSeries(
         plain.u, plain.y + wave[:, None], **dict(about, drift=None)
     )
     assert not hj.validate(small, unsaid, start=start).white
@@ -122,7 +123,7 @@ def test_records_shorter_than_the_lags(small):
     with pytest.raises(hj.errors.DefinitionError, match="^u is zero or missing"):
         hj.validate(
             small,
-            hj.experiments.Record(
+            hj.experiments.SectionSeries(
                 0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs
             ),
         )
@@ -132,7 +133,7 @@ def test_records_shorter_than_the_lags(small):
 
 def test_nothing_is_simulated_beyond_the_known_inputs(small):
     data = record(small, 4 * 100, 0, 0.3)
-    ahead = hj.experiments.Record(
+    ahead = hj.experiments.SectionSeries(
         data.u, data.y, n_sections=4, outputs=data.outputs, lead=5
     )
     found = hj.validate(small, ahead)

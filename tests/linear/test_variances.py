@@ -22,17 +22,17 @@ def an_htf(**more):
 def htf():
     rng = np.random.default_rng(1)
     size = rng.uniform(1, 2, (3, len(F), 2, 1))
-    scatter = hj.linear.Scatter(np.full(len(F), 4.0), size)
-    return an_htf(variance=2 * size, noise_variance=size, scatter=scatter)
+    variance_dof = hj.linear.VarianceDof(np.full(len(F), 4.0), size)
+    return an_htf(variance=2 * size, noise_variance=size, variance_dof=variance_dof)
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
     expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
     plain = an_htf(
-        variance=htf.variance, scatter=hj.linear.Scatter(htf.scatter.freedom)
+        variance=htf.variance, variance_dof=hj.linear.VarianceDof(htf.variance_dof.dof)
     )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
-    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
+    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.variance_dof.roundness) - 1))
     expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
     for radius in (
         hj.linear.HTF.confidence_radius,
@@ -51,6 +51,6 @@ def test_variances_go_along(htf):
     one = htf.select((0, 1))
     assert_array_equal(one.variance, htf.variance[1:])
     assert_array_equal(one.noise_variance, htf.noise_variance[1:])
-    assert_array_equal(one.scatter.freedom, htf.scatter.freedom)
-    assert_array_equal(one.scatter.roundness, htf.scatter.roundness[1:])
+    assert_array_equal(one.variance_dof.dof, htf.variance_dof.dof)
+    assert_array_equal(one.variance_dof.roundness, htf.variance_dof.roundness[1:])
     assert an_htf().select(0).variance is None

@@ -106,8 +106,8 @@ def race():
 def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
     cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
-    assert cycle.result == hj.errors.Result.COINCIDENCE
-    (found,) = hj.orbits.coincidences(cycle)
+    assert cycle.result == hj.errors.Result.SIMULTANEOUS
+    (found,) = hj.orbits.simultaneous_events(cycle)
     assert found.time % 1.0 == pytest.approx(0.5)
     assert not found.commute
     exact = {
@@ -133,7 +133,7 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     begin = hj.find_limit_cycle(Balls(), BALLS)
     found = hj.orbits.find_limit_cycles(systems, begin)
     ok = hj.errors.Result.OK
-    not_ok = hj.errors.Result.COINCIDENCE
+    not_ok = hj.errors.Result.SIMULTANEOUS
     assert_array_equal(found.result, [ok, not_ok, not_ok])
     branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
     assert branch.cycles.result[0] == ok

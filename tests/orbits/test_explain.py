@@ -85,7 +85,7 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     if not by_rough_turns:
         monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
     cycle = hj.find_limit_cycle(Balls(), BALLS)
-    (both,) = hj.orbits.coincidences(cycle)
+    (both,) = hj.orbits.simultaneous_events(cycle)
     assert both.commute
     assert set(both.orders) == {
         ("impact0", "impact1"),
@@ -105,8 +105,8 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     ):
         hj.find_limit_cycle(system, begin)
     cycle = hj.find_limit_cycle(system, begin, throw=False)
-    assert cycle.result == hj.errors.Result.COINCIDENCE
-    (both,) = hj.orbits.coincidences(cycle)
+    assert cycle.result == hj.errors.Result.SIMULTANEOUS
+    (both,) = hj.orbits.simultaneous_events(cycle)
     assert not both.commute
 
     # The balls from half a tenth of a second before the impacts to as long after them.

@@ -8,8 +8,8 @@ import hybridjax as hj
 
 
 MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
-USUAL = hj.multisine(4, 16, band=(0, 2.0))
-GOAL = hj.designs.Multipliers(harmonics=0)
+USUAL = hj.multisine(4, 16, frequencies=(0, 2.0))
+GOAL = hj.designs.MultiplierGoal(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
 
 
@@ -41,7 +41,7 @@ def test_the_spectrum_of_a_design(plan):
 
 
 def test_what_strides_buy(plan):
-    study = hj.designs.Study(USUAL, 1, 1e-9, goal=GOAL)
+    study = hj.designs.SequentialDesign(USUAL, 1, 1e-9, goal=GOAL)
     data = hj.experiments.simulate_experiments(MODEL, USUAL, start="periodic")
     noisy = hj.experiments.add_noise(data, std=1e-3)
     studied = study.add(noisy)

@@ -74,7 +74,7 @@ def test_files_and_refusals(walk, tmp_path):
 def test_both_halves_of_a_cycle_are_drawn():
     duffing = hj.models.Duffing()
     half = hj.find_limit_cycle(
-        hj.systems.Quotient(duffing, flipped=("x", "v"), half_period=True)
+        hj.systems.Symmetric(duffing, flipped=("x", "v"), half_period=True)
     )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]

@@ -26,7 +26,7 @@ def test_magnitude_draws_the_values(estimate, exact):
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
-    assert_array_equal(drawn.get_xdata(), estimate.f)
+    assert_array_equal(drawn.get_xdata(), estimate.frequencies)
     assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
     assert (
         drawn.get_color()
@@ -84,7 +84,7 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
-    fitted = rational.htf(estimate.f).H[0, :, 0, 0]
+    fitted = rational.htf(estimate.frequencies).H[0, :, 0, 0]
     assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
     assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
@@ -95,7 +95,7 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
     swapped = hj.linear.HTF(
-        exact.f,
+        exact.frequencies,
         exact.H[..., ::-1, ::-1],
         0,
         exact.n_sections,
@@ -104,7 +104,13 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         "exact",
     )
     renamed = hj.linear.HTF(
-        exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact"
+        exact.frequencies,
+        exact.H,
+        0,
+        exact.n_sections,
+        ("r", "s"),
+        exact.outputs,
+        "exact",
     )
     for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
@@ -219,7 +225,7 @@ def test_poles_and_zeros(rational):
 
 
 def test_experiment(hopper):
-    design = hj.multisine(periods=4, band=(0, 2.0))
+    design = hj.multisine(periods=4, frequencies=(0, 2.0))
     data = hj.experiments.simulate_experiments(hopper, design, discard=2)
     figure = hj.plot.experiment(data, -1).figure
     assert [ax.get_ylabel() for ax in figure.axes] == [
@@ -285,7 +291,7 @@ def found(hopper):
     rng = np.random.default_rng(1)
     y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
     return hj.validate(
-        hopper, hj.experiments.Record(u, y, n_sections=32, outputs=("yM", "vM"))
+        hopper, hj.experiments.SectionSeries(u, y, n_sections=32, outputs=("yM", "vM"))
     )
 
 

@@ -124,7 +124,7 @@ def test_events_alone_are_identified(noisy, tmp_path):
     assert (
         hj.recordings.write_report(tmp_path, found).parent / "figures" / "curve.png"
     ).exists()
-    assert any("Resolution: the jitter" in repr(x) for x in found.advice.findings)
+    assert any("Resolution: the jitter" in repr(x) for x in found.diagnosis.findings)
 
 
 def test_what_is_refused(noisy):

@@ -33,7 +33,7 @@ def recording():
     rng = np.random.default_rng(1)
     n = 310 * RATE
     h = 1 / RATE
-    r, w = (hj.testing.random_force(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
+    r, w = (hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
     e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
     x = np.zeros(2)
     y = np.zeros((2, n))

@@ -24,7 +24,7 @@ CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(
 
 def sample(recording, phase=CIRCLE, **options):
     options = {"inputs": "f", "outputs": ("x", "v")} | options
-    return hj.recordings.section_data(recording, phase, **options)
+    return hj.recordings.sample_sections(recording, phase, **options)
 
 
 def test_a_circle(wave):
@@ -93,8 +93,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             t[::step], dict(zip(names, trial.values[::step].T, strict=True))
         )
         data = sample(thin, inputs="force")
-        advice = hj.recordings.advise(data, hj.fit_series(data, 1, check=False))
-        assert any(w.cause == "sampling" for w in advice.findings) == few
+        diagnosis = hj.recordings.diagnose(data, hj.fit_series(data, 1, check=False))
+        assert any(w.cause == "sampling" for w in diagnosis.findings) == few
 
 
 def test_gaps_are_masked_and_cut(wave):
@@ -123,7 +123,7 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     """They count where they can; what is left out is counted and said."""
     marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)
     dirty = mishandle(
-        hj.testing.spoil(marked, ("x", "v"), noise=1e-3),
+        hj.testing.add_artifacts(marked, ("x", "v"), noise=1e-3),
         misjudged(lost=0.05, doubled=0.05),
         input="force",
         outputs=("x", "v"),
@@ -199,7 +199,7 @@ def test_slow_drift_is_taken_out(wave):
 
 
 def test_designs_as_tables(tmp_path, wave):
-    design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
+    design = hj.multisine(n_sections=8, periods=16, frequencies=(0, 2.0))
     hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
     for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
         hj.recordings.write_design(
@@ -219,21 +219,21 @@ def test_designs_as_tables(tmp_path, wave):
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
-        hj.recordings.add_command(wave, phase, tmp_path / "time.csv")
+        hj.recordings.attach_design(wave, phase, tmp_path / "time.csv")
     lines = (tmp_path / "phase.csv").read_text().splitlines()
     (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
-    told = hj.recordings.add_command(wave, phase, tmp_path / "one.csv")
+    told = hj.recordings.attach_design(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
     section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
     u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(
-        u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9
+        u[first : first + 150], design.signals(19)[0, :150, 0], atol=1e-9
     )
     with pytest.raises(
         hj.errors.DefinitionError, match="different numbers of trials: 1 and "
     ):
-        hj.recordings.add_command(wave, phase, tmp_path / "phase.csv")
+        hj.recordings.attach_design(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
     assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
 
@@ -241,7 +241,7 @@ def test_designs_as_tables(tmp_path, wave):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
-    (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3).trials
+    (trial,) = hj.testing.add_artifacts(rhythm, ("x", "v"), noise=1e-3).trials
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
         table = np.column_stack([trial.time[rows], trial.values[rows]])
@@ -365,7 +365,7 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
         record, cycle = (
-            hj.experiments.Record(u, y, n_sections=N, **about),
+            hj.experiments.SectionSeries(u, y, n_sections=N, **about),
             np.zeros((N, 1)),
         )
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import hybridjax as hj
 from hybridjax.apps.cli import main
 from hybridjax.orbits import batches
-from hybridjax.scale.family import Points
+from hybridjax.scale.family import SweepPoints
 
 
 pytest.importorskip("xarray")
@@ -61,7 +61,7 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
 
 def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     """With so few spokes on so flat a slope, a wheel does not get over its next spoke."""
-    points = Points(
+    points = SweepPoints(
         {"slope": [0.075, 0.08, 0.03, 0.09], "spokes": [8.0, 8.5, 7.0, 9.0]}
     )
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
@@ -115,7 +115,7 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
 
 
 def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
-    points = Points(
+    points = SweepPoints(
         {"slope": [0.075, 0.09, 0.075, 0.09], "spokes": [8.0, 8.0, 9.0, 9.0]}
     )
 
@@ -145,7 +145,7 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
 
 def test_points_of_sobol_fill_the_box_and_are_always_the_same():
     ranges = {"k": (8.0, 13.0), "b": (3.0, 7.0)}
-    points = Points.sobol(ranges, 48, seed=3)
+    points = SweepPoints.sobol(ranges, 48, seed=3)
     for name, (low, high) in ranges.items():
         values = points.values[name]
         assert len(points) == 48
@@ -153,7 +153,7 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert values.max() <= high
         measured = np.histogram(values, 4, (low, high))[0].tolist()
         assert measured == (pytest.approx([12] * 4, abs=2))
-        assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
+        assert_array_equal(values, SweepPoints.sobol(ranges, 48, seed=3).values[name])
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):

@@ -142,7 +142,7 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
         way = hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force)
         ends.append(way.after[-1, 1])
     assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
-    for use in (lambda: response(DESIGN.inputs(cycles=1)), lambda: next(chunks)):
+    for use in (lambda: response(DESIGN.signals(cycles=1)), lambda: next(chunks)):
         with pytest.raises(
             hj.errors.DefinitionError,
             match="the field of chart 'air' of Slowed has changed since",
@@ -270,7 +270,7 @@ LATER = {
     ),
     "a response function": (
         lambda cycle: hj.experiments.response_function(cycle, PLACES, "x"),
-        lambda x: x(PUSHES.inputs(cycles=1)),
+        lambda x: x(PUSHES.signals(cycles=1)),
     ),
     "a campaign": (campaign, next),
     "experiments": (
@@ -326,7 +326,7 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     uses = {
         "Output 'speed' has changed since this response function was made": (
-            lambda: response(PUSHES.inputs(cycles=1))
+            lambda: response(PUSHES.signals(cycles=1))
         ),
         "Output 'speed' has changed since these experiments were planned": (
             lambda: next(chunks)

@@ -64,7 +64,7 @@ def field(drift, push):
     ],
 )
 def test_it_slides_or_crosses(push, end, chart):
-    parts = hj.systems.sliding(
+    parts = hj.systems.filippov(
         {"up": field(0.5, -1.0), "down": field(2.0, push)}, height
     )
     way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
@@ -74,4 +74,4 @@ def test_it_slides_or_crosses(push, end, chart):
 
 def test_what_cannot_be_put_together():
     with pytest.raises(hj.errors.DefinitionError, match="two charts"):
-        hj.systems.sliding({"up": field(0.0, 1.0)}, height)
+        hj.systems.filippov({"up": field(0.0, 1.0)}, height)

@@ -21,10 +21,10 @@ def small_htf(**names):
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
     assert units(kinematic_ldtp.outputs) == ["m", "m/s"]
     assert units(kinematic_ldtp.inputs) == ["N"]
-    design = hj.multisine(periods=16, band=(0, 4.0))
+    design = hj.multisine(periods=16, frequencies=(0, 4.0))
     data = hj.experiments.simulate_experiments(kinematic_ldtp, design, start="periodic")
     estimate = hj.estimate_htf(data)
-    fit = hj.fit_multipliers(estimate, 2, overhang=16)
+    fit = hj.fit_multipliers(estimate, 2, extra_lags=16)
     for thing in (
         data,
         data.records[0],

@@ -52,7 +52,8 @@ from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .realization import realized_htf
 
 
-Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
+Dimensions = Order | Annotated[Numbers, Integers("sections", sign="positive")]
+Guess = LDTP | Dimensions
 
 # Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
 # errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
@@ -124,15 +125,17 @@ class LDTPFit(MultiplierFit):
         return self._coordinates.size
 
     @checked
-    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
-        """Return the HTFs of the fitted model at frequencies f (F,), in cycles per period.
+    def htf(
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> HTF:
+        """Return the HTFs of the fitted model at `frequencies` (F,), in cycles per period.
 
         The variance is that of the fit, to first order. It is infinite for combinations that the
         data do not determine, e.g. at harmonics that were not fitted.
 
         **Arguments:** `harmonics`: Default: those that were fitted.
         """
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         if harmonics is None:
             harmonics = self.harmonics
@@ -149,9 +152,9 @@ class LDTPFit(MultiplierFit):
 
     @checked
     def noise_spectrum(
-        self, f: Scalar | Vector, harmonics: Harmonics | None = None
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
     ) -> Float[np.ndarray, "M F ny"]:
-        """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
+        """Return the spectrum of the fitted noise at the harmonics of `frequencies` (F,).
 
         White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
         variance of an H_m that is measured with a cosine of amplitude a in P periods is
@@ -167,7 +170,7 @@ class LDTPFit(MultiplierFit):
             raise DefinitionError(
                 "no noise is fitted to HTFs (`HTF.variance`): fit time series."
             )
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         return prediction.noise_spectrum(self.noise_model, f, harmonics)
 
     def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
@@ -212,7 +215,8 @@ class LDTPFit(MultiplierFit):
 @checked
 def fit_ldtp(
     data: HTF | RecordedData,
-    guess: Guess | None = None,
+    dims: Dimensions | None = None,
+    initial: LDTP | None = None,
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
@@ -247,13 +251,13 @@ def fit_ldtp(
     - `data`: estimated HTFs, with as many harmonics as possible: few harmonics determine few
       entries of the matrices. Without variances each output is weighted by its residuals. Or time
       series, as for `fit_series`.
-    - `guess`: dimensions of the state at each section (or one for all): the fit starts from
-      a realization of HTFs (states below the noise are left out by default, which may bias a
-      multiplier), and from a subspace method for time series, which need this. Alternatively, an
-      observable initial model with these dimensions; if its D is zero, D stays zero. Too few
-      dimensions bias the multipliers: compare `cost` with `dof` where variances are known;
-      for time series, see `findings`. The iteration finds a local minimum; the same checks reveal a
-      poor one.
+    - `dims`: dimensions of the state at each section, or one for all. The fit starts from a
+      realization of HTFs, and from a subspace method for time series, which need `dims`. Too few
+      dimensions bias the multipliers: compare `cost` with `dof` where variances are known; for time
+      series, see `findings`. The iteration finds a local minimum; the same checks reveal a poor
+      one. Default: states of HTFs above the noise, which may bias a multiplier.
+    - `initial`: an observable model to start from, in place of `dims`. If its D is zero, D stays
+      zero. Default: None.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
@@ -273,16 +277,22 @@ def fit_ldtp(
     a finding reports that a controller could cause the dependence. If the data do not determine
     D, the printed fit reports this.
 
-    **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
-    variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, outputs that do not respond to the inputs, or records with `lead`.
+    **Raises:** `DefinitionError` for both `dims` and `initial`, if data and initial model do not
+    fit together, for NaN in the HTFs, variances that are not positive, an unobservable initial
+    model, fewer numbers in the data than unknowns, outputs that do not respond to the inputs, or
+    records with `lead`.
     """
     require_x64()
     free_start = start == "free"
+    if dims is not None and initial is not None:
+        raise DefinitionError(
+            "fit_ldtp: `initial` has its own dimensions: give it or `dims`."
+        )
+    guess = dims if initial is None else initial
     if not isinstance(data, HTF):
         if guess is None:
             raise DefinitionError(
-                "fit_ldtp: give the dimensions of the state as `guess`, which time series need."
+                "fit_ldtp: give the dimensions of the state as `dims`, which time series need."
             )
         how = _How(noise == "innovations" or reference is not None, free_start, check)
         fit = _fit_to_records(data, guess, how, reference)
@@ -312,8 +322,8 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     scale = weights.check_values(htf)
     direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
-        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "guess"))
-    require_same("guess and data", guess, htf)
+        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "dims"))
+    require_same("initial model and data", guess, htf)
     problem = FrequencyProblem.of(htf, weights.error_weights(htf, scale), scale)
     model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
@@ -321,11 +331,11 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     if dof < 1:
         raise DefinitionError(
             f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns: give "
-            "more frequencies, or smaller `guess`."
+            "more frequencies, or smaller `dims`."
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
-            "`guess` has an infinite response at a frequency: give a stable one."
+            "`initial` has an infinite response at a frequency: give a stable one."
         )
     point, converged = descend(ModelPoint(problem, model, direct))
     if htf.variance is None:
@@ -465,7 +475,7 @@ def _fit_to_series(
     dof = _freedom_of(records, problem, model, direct)
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
-            "the responses of `guess` are infinite: give a stable model."
+            "the responses of `initial` are infinite: give a stable model."
         )
     start = ModelPoint(problem.reweighted(model), model, direct)
     point, converged = descend(start)
@@ -488,10 +498,10 @@ def _first_model(
     if isinstance(guess, PeriodicModel):
         return guess
     if isinstance(guess, LDTP):
-        require_same("guess and data", guess, records)
+        require_same("initial model and data", guess, records)
         errors = len(records.outputs) if how.innovations else 0
         return PeriodicModel.of(guess, records.scale, errors)
-    dims = given_dims(guess, records.n_sections, "guess") or []
+    dims = given_dims(guess, records.n_sections, "dims") or []
     return subspace_model(records, dims, how.innovations, direct)
 
 
@@ -584,7 +594,7 @@ def _about_point(fit: LDTPFit) -> tuple[Finding, ...]:
     if fit.cost > 2 * fit.dof or alike:
         text = (
             "errors are larger than their variances, or alike at neighboring frequencies: too few "
-            "dimensions, or a local minimum that another guess avoids."
+            "dimensions, or a local minimum that another `initial` model avoids."
         )
         findings.append(Finding("misfit", text))
     if not fit.determines_direct:
@@ -620,7 +630,9 @@ def _finished(
             _, deviation = weights.estimated_noise(weights.largest_misfit(data), unit)
             unit = deviation**2
         correlation = weights.neighbor_correlation(
-            problem.errors(model), problem.weight * problem.target, np.asarray(data.f)
+            problem.errors(model),
+            problem.weight * problem.target,
+            np.asarray(data.frequencies),
         )
     else:
         S = cast(SeriesProblem, point.problem).S
