@@ -113,7 +113,7 @@ def noise(family: Identification, seeds: int) -> None:
         # Of white noise; distortion comes on top.
         variance = np.mean(size, axis=0)[:, None] * 10 ** (-snr / 10)
         variance = variance * design.expected_variance()[:, None, :]
-        bound = hj.identify.multiplier_bound(
+        bound = hj.identify.cramer_rao(
             family.model,
             hj.linear.HTF(
                 exact.frequencies,

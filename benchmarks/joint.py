@@ -82,10 +82,8 @@ def family(name: str, model: hj.linear.LDTP, snr: float, draws: int) -> None:
 
     htf, true = with_variances(model, snr), np.asarray(model.multipliers)[:1]
     dims = minimal_dims(model)
-    free = hj.identify.multiplier_bound(
-        model, htf.select(range(-4, 5))
-    ).standard_errors[0]
-    joint = hj.identify.ldtp_bound(model, htf).standard_errors[0]
+    free = hj.identify.cramer_rao(model, htf.select(range(-4, 5))).standard_errors[0]
+    joint = hj.identify.cramer_rao(model, htf, estimator="fit_ldtp").standard_errors[0]
     show("bound.numerators", free)
     show("bound.ldtp", joint)
     show("strides", (free / joint) ** 2)

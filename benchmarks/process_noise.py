@@ -152,8 +152,8 @@ def one(plant, joint, noise, rng) -> dict[str, float]:
     free = hj.fit_series(data, 2, check=False)
     at = int(np.abs(fit.multipliers - true).argmin())
     checks = {
-        "fit": hj.validate(fit, other, level=0.05),
-        "simulated": hj.validate(plant, other, level=0.05),
+        "fit": hj.validate(fit, other, alpha=0.05),
+        "simulated": hj.validate(plant, other, alpha=0.05),
     }
     return {
         "ldtp": float(np.abs(fit.multipliers - true)[at]),

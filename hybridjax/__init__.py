@@ -1,4 +1,4 @@
-from ._names import attach
+from ._core.public import attach
 
 
 # The public names stand in `__init__.pyi`; each is imported when it is first used (PEP 562).

@@ -122,10 +122,8 @@ print(
 )
 print(f"peak {np.abs(u).max():.2g} N")
 folder = pathlib.Path(tempfile.mkdtemp())
-hj.recordings.write_design(
-    folder / "time.csv", block, period=float(cycle.period), rate=1000
-)
-hj.recordings.write_design(folder / "phase.csv", block)
+block.write(folder / "time.csv", period=float(cycle.period), rate=1000)
+block.write(folder / "phase.csv")
 for name in ("time.csv", "phase.csv"):
     with open(folder / name) as file:
         print(name, *(next(file).strip() for _ in range(4)), sep="\n  ")

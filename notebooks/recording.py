@@ -165,7 +165,7 @@ figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 # %%
 design = hj.multisine(periods=64, frequencies=(0, 8.0), lines="odd").scaled(rms=0.02)
 with tempfile.TemporaryDirectory() as folder:
-    hj.recordings.write_design(Path(folder) / "by_phase.csv", design)
+    design.write(Path(folder) / "by_phase.csv")
     print((Path(folder) / "by_phase.csv").read_text()[:120])
 
 # %% [markdown]
@@ -182,7 +182,7 @@ found = hj.identify_recording(
     recording, angle, inputs="u", outputs=("yM", "vM"), order=2
 )
 with tempfile.TemporaryDirectory() as folder:
-    page = hj.recordings.write_report(Path(folder) / "results", found)
+    page = found.write_report(Path(folder) / "results")
     print(
         sorted(path.name for path in page.parent.iterdir()),
         page.stat().st_size // 1000,

@@ -16,8 +16,8 @@ from .sessions import run_python
 ROOT = pathlib.Path(hybridjax.__file__).parent
 # Each entry imports only from entries before it, and from itself.
 LAYERS = (
-    "_names errors _core systems mechanics models linear engine orbits sections experiments identify "
-    "scale fitting designs recordings plants testing plot io convert apps __main__"
+    "errors _core systems mechanics models linear engine orbits sections experiments "
+    "identify scale fitting designs recordings plants testing plot io convert apps __main__"
 ).split()
 
 

@@ -108,22 +108,7 @@ def steps_of(
 def write_report(
     folder: FilePath, result: Identification, formats: Sequence[Format] = ("png",)
 ) -> Path:
-    """Write all results of a recording into a folder. They appear when all of them are ready.
-
-    - `report.html`: everything in one page that needs no other file.
-    - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
-      `cycle.csv`: the average cycle.
-    - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the numbers.
-    - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
-
-    Other files in the folder stay as they are. Results of an earlier report are replaced; a hidden
-    list in the folder holds their names.
-
-    **Returns:** the path of the page.
-
-    **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these names,
-    or the folder cannot be written.
-    """
+    """Write all results of a recording into a folder, see `Identification.write_report`."""
     with report_folder(folder, result.data.inputs, formats) as new:
         write_results(new, result, formats)
     return Path(folder) / PAGE

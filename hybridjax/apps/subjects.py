@@ -168,7 +168,7 @@ def identify_subjects(
     fails is named and does not stop the others. A later call continues an interrupted one: reports
     are kept unless files, options or the version have changed.
 
-    Files in `folder`: `SUBJECT-GROUP-CONDITION/` with the files of `hj.recordings.write_report`;
+    Files in `folder`: `SUBJECT-GROUP-CONDITION/` with the files of `Identification.write_report`;
     `subjects.csv`, a row for each report; `population.csv`, means and differences;
     `population.html`, the report for all.
 

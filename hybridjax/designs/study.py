@@ -177,7 +177,7 @@ class SequentialDesign(eqx.Module):
     @property
     def design(self) -> Design:
         """The next block: for `run_experiments`, or for hardware
-        (`hj.recordings.write_design`)."""
+        (`Design.write`)."""
         if self.fit is None:
             return self.first
         if self.plan is None:

@@ -1,6 +1,6 @@
 """Estimates beyond the usual: fits, their bounds and errors, models from measured responses."""
 
-from .._names import attach
+from .._core.public import attach
 
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

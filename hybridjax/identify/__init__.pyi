@@ -1,5 +1,6 @@
+from .bounds import cramer_rao as cramer_rao
 from .fit import Fit as Fit
-from .joint.fit import LDTPFit as LDTPFit, ldtp_bound as ldtp_bound
+from .joint.fit import LDTPFit as LDTPFit
 from .loops import Loop as Loop, estimate_loop as estimate_loop
 from .multiplier_estimate import (
     MultiplierComparison as MultiplierComparison,
@@ -8,7 +9,6 @@ from .multiplier_estimate import (
 from .multipliers import (
     OrderSelection as OrderSelection,
     StructuredFit as StructuredFit,
-    multiplier_bound as multiplier_bound,
 )
 from .rational import RationalFit as RationalFit, fit_rational as fit_rational
 from .series.fit import SeriesFit as SeriesFit

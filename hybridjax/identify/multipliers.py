@@ -9,7 +9,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.execution import one_blas_thread
@@ -25,7 +24,6 @@ from .descent import ROUNDING, Coefficients
 from .fit import not_converged
 from .multiplier_estimate import (
     FitWithoutModel,
-    MultiplierEstimate,
     RoughFit,
 )
 
@@ -89,9 +87,8 @@ class StructuredFit(FitWithoutModel):
     def _about(self) -> str:
         pairs = zip(self.outputs, self.residual, strict=True)
         misfit = ", ".join(f"{name} {x:.1e}" for name, x in pairs)
-        reduced = self.cost / self.dof
         return (
-            f"residual {misfit}; chi-square / degrees of freedom {reduced:.3g}; "
+            f"residual {misfit}; chi-square per degree of freedom {self.chi2_per_dof:.3g}; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )
 
@@ -227,52 +224,6 @@ def _solve(
         groups = varpro.group_htf(htf, weight, size)
         c, converged = varpro.maximum_likelihood(groups, order, c)
     return _Solution(groups, weight, size, c, converged)
-
-
-@checked
-@one_blas_thread()
-def multiplier_bound(
-    model: LDTP, htf: HTF, extra_lags: Index | None = None
-) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers of a known model.
-
-    The errors of the HTFs are independent, circular and Gaussian, and all numerators are unknown.
-    The bound is the inverse of $J^T J$ at the true values, where J is the derivative of the HTFs in
-    units of their standard deviations, projected orthogonally to all changes of the numerators. It
-    limits the accuracy that an experiment can reach, before the experiment.
-
-    **Arguments:**
-
-    - `model`: the true system. `htf`: frequencies, harmonics and `variance`; its H is not used.
-    - `extra_lags`: degree of the numerators beyond d N. Default: N.
-
-    **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;
-    `standard_errors` are bounds of rms errors.
-
-    **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
-    few frequencies to find the multipliers at all.
-    """
-    exact = exact_htf(model, htf)
-    multipliers = model.multipliers
-    c = np.poly(multipliers).real[1:]
-    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), extra_lags), c)
-    return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
-
-
-def exact_htf(model: LDTP, htf: HTF) -> HTF:
-    """Return the HTFs of a model with the frequencies, harmonics and variances of others.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    require_same("model and HTFs", model, htf)
-    if htf.variance is None:
-        raise DefinitionError(
-            "a bound needs HTFs with variances: estimate them from several realizations or "
-            "windows (`repeats`)."
-        )
-    return dataclasses.replace(
-        model.htf(htf.frequencies, htf.harmonics), variance=htf.variance
-    )
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;

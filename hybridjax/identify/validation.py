@@ -75,7 +75,7 @@ class Validation(eqx.Module):
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
       input, or of the reference of a loop: the model is wrong where it is small.
-    - `level`: significance level of both tests, for all outputs together.
+    - `alpha`: significance level of both tests, for all outputs together.
     - `visible` (ny,): the smallest misfit that the test of independence would detect in four of
       five such data: rms of the response to lagged inputs that the model lacks, relative to
       the rms of the simulated output. Smaller errors of a model pass.
@@ -98,7 +98,7 @@ class Validation(eqx.Module):
     cross_correlation: Float[np.ndarray, "N lags ny nu"]
     measured: Float[np.ndarray, "n ny"]
     simulated: Float[np.ndarray, "n ny"]
-    level: float = eqx.field(static=True)
+    alpha: float = eqx.field(static=True)
     first_section: int = eqx.field(static=True)
     left_out: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
@@ -108,18 +108,18 @@ class Validation(eqx.Module):
     @property
     def white(self) -> bool:
         """True if the residuals of all outputs may be white."""
-        return bool(np.min(self.whiteness) >= self.level / len(self.outputs))
+        return bool(np.min(self.whiteness) >= self.alpha / len(self.outputs))
 
     @property
     def independent(self) -> bool:
         """True if the residuals of all outputs may be independent of the inputs."""
-        return bool(np.min(self.independence) >= self.level / len(self.outputs))
+        return bool(np.min(self.independence) >= self.alpha / len(self.outputs))
 
     @property
     def unexplained(self) -> tuple[str, ...]:
         """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
         pairs = zip(self.outputs, self.no_better, strict=True)
-        return tuple(name for name, p in pairs if p > self.level / len(self.outputs))
+        return tuple(name for name, p in pairs if p > self.alpha / len(self.outputs))
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]
@@ -142,7 +142,7 @@ class Validation(eqx.Module):
         verdict = {True: "not rejected", False: "rejected"}
         rows.append(
             f"residuals: whiteness {verdict[self.white]}, independence of the input "
-            f"{verdict[self.independent]} (level {self.level:g})"
+            f"{verdict[self.independent]} (level {self.alpha:g})"
         )
         if self.left_out:
             rows.append(f"records too short to compare, left out: {self.left_out}")
@@ -170,7 +170,7 @@ def validate(
     data: RecordedData,
     *,
     start: Literal["free", "cycle"] = "free",
-    level: Probability = 0.01,
+    alpha: Probability = 0.01,
     reference: SignalNames | None = None,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
@@ -200,7 +200,7 @@ def validate(
       model always agrees too well.
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
-    - `level`: significance level of the tests. Default: 0.01.
+    - `alpha`: significance level of the tests. Default: 0.01.
     - `reference`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs, which respond to noise; `model` is that of the plant from these to the
       outputs. Residuals are tested for independence of the reference. Default: None.
@@ -255,7 +255,7 @@ def validate(
     late = np.where((grid.age >= lags)[..., None], error, np.nan)
     inputs = CycleGrid.from_records(list(itertools.compress(outside, kept))).u
     cross_correlation, independence, visible = independence_test(
-        inputs, late, lags, level / ny, roots
+        inputs, late, lags, alpha / ny, roots
     )
     rounding = is_exact(grid, error)  # (shows nothing)
     k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
@@ -274,7 +274,7 @@ def validate(
         cross_correlation=cross_correlation,
         measured=y[k].reshape(-1, ny)[shown],
         simulated=simulated[k].reshape(-1, ny)[shown],
-        level=level,
+        alpha=alpha,
         first_section=first,
         left_out=len(records) - len(compared),
         n_sections=N,

@@ -157,7 +157,7 @@ class HTF(eqx.Module):
         | None = None,
     ):
         require_x64()
-        self.frequencies, self.H = from_host((f, H.astype(complex)))
+        self.frequencies, self.H = from_host((frequencies, H.astype(complex)))
         self.harmonics = check_harmonics(harmonics, n_sections)
         shape = self.H.shape
         if shape[:2] != (len(self.harmonics), self.frequencies.shape[0]):

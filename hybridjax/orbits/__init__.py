@@ -1,6 +1,6 @@
 """Limit cycles, branches of them, trajectories, and responses to perturbations."""
 
-from .._names import attach
+from .._core.public import attach
 
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -1,6 +1,6 @@
 """Measured data: phase, section data, advice, designs for hardware."""
 
-from .._names import attach
+from .._core.public import attach
 
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -1,11 +1,10 @@
-from ..apps.identify import write_report as write_report
 from ..apps.subjects import SubjectStudy as SubjectStudy
 from .beats.response import (
     PhaseResponse as PhaseResponse,
     phase_response as phase_response,
 )
 from .data import SectionData as SectionData
-from .design_tables import attach_design as attach_design, write_design as write_design
+from .design_tables import attach_design as attach_design
 from .findings import Inspection as Inspection
 from .fit_warnings import Diagnosis as Diagnosis, diagnose as diagnose
 from .held_out import (

@@ -1,14 +1,22 @@
 """All steps from a recording to multipliers, in one call."""
 
+import importlib
 import itertools
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import equinox as eqx
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
+from .._core.boundary.kinds import (
+    FilePath,
+    OptionalNames,
+    Order,
+    SectionCount,
+    SignalNames,
+)
 from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
@@ -59,6 +67,29 @@ class Identification(eqx.Module):
     responses: ImpulseResponses
     curve: PhaseResponse | None
     diagnosis: Diagnosis
+
+    @checked
+    def write_report(self, folder: FilePath, formats: Sequence[str] = ("png",)) -> Path:
+        """Write all results into a folder. They appear when all of them are ready.
+
+        - `report.html`: everything in one page that needs no other file.
+        - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
+          `cycle.csv`: the average cycle.
+        - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the
+          numbers.
+        - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
+
+        Other files in the folder stay as they are. Results of an earlier report are replaced; a
+        hidden list in the folder holds their names.
+
+        **Returns:** the path of the page.
+
+        **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these
+        names, or the folder cannot be written.
+        """
+        # (Reports are made of figures, which are drawn above this layer.)
+        report = importlib.import_module("hybridjax.apps.identify")
+        return report.write_report(folder, self, formats)
 
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]

@@ -158,7 +158,7 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
 DESIGN = hj.multisine(n_sections=4, periods=4, frequencies=(0.25, 0.5))
 WRITERS = {
     "save": (lambda path: hj.save(path, DESIGN), "x.npz"),
-    "write_design": (lambda path: hj.recordings.write_design(path, DESIGN), "x.csv"),
+    "Design.write": (lambda path: DESIGN.write(path), "x.csv"),
     "plot.save": (lambda path: hj.plot.save(path, Figure()), "x.png"),
 }
 

@@ -59,18 +59,18 @@ def test_transfer_functions_in_a_band(model, usual):
 
 @pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
 def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
-    """Standard errors are those of `ldtp_bound`, which sums up all information; no other design is
+    """Standard errors are those of `cramer_rao`, which sums up all information; no other design is
     better than the certificate allows."""
     goal = hj.designs.MultiplierGoal(estimator="fit_ldtp", harmonics=harmonics)
     plan = optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
     assert plan.certificate < 1.03
-    bound = hj.identify.ldtp_bound(
-        two, expected_htf(two, plan.usual, TWO_NOISE, harmonics)
+    bound = hj.identify.cramer_rao(
+        two, expected_htf(two, plan.usual, TWO_NOISE, harmonics), estimator="fit_ldtp"
     )
     assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
     for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
-        bound = hj.identify.ldtp_bound(
-            two, expected_htf(two, other, TWO_NOISE, harmonics)
+        bound = hj.identify.cramer_rao(
+            two, expected_htf(two, other, TWO_NOISE, harmonics), estimator="fit_ldtp"
         )
         assert total_variance(bound) > plan.criterion / plan.certificate
     assert (
@@ -139,9 +139,9 @@ def with_angle(angle):
 
 
 def variance(model, design):
-    """Return that of the multipliers by `multiplier_bound`."""
+    """Return that of the multipliers by `cramer_rao`."""
     htf = expected_htf(model, design, NOISE, (-1, 0, 1))
-    return total_variance(hj.identify.multiplier_bound(model, htf))
+    return total_variance(hj.identify.cramer_rao(model, htf))
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,7 @@ def test_a_peak_that_nothing_exceeds_changes_nothing(optimal_two):
 
 
 def test_noise_that_differs_between_harmonics(two, optimal_two):
-    """Against `multiplier_bound`, which takes numerators out in another way."""
+    """Against `cramer_rao`, which takes numerators out in another way."""
 
     def red(std):
         return lambda f: std / np.sqrt(0.2 + f**2)
@@ -77,6 +77,6 @@ def test_noise_that_differs_between_harmonics(two, optimal_two):
     spectrum = np.stack(spectra, axis=2)[..., None]
     variance = spectrum * plan.usual.expected_variance()[:, None, :]
     uncertain = dataclasses.replace(htf, source="estimate", variance=variance)
-    bound = hj.identify.multiplier_bound(two, uncertain)
+    bound = hj.identify.cramer_rao(two, uncertain)
     total = np.trace(bound.multiplier_covariances[0])
     assert plan.usual_criterion == pytest.approx(total, rel=1e-6)

@@ -30,18 +30,18 @@ def plan(isochron_ldtp, usual):
 
 
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
-    """That of `multiplier_bound`; for any weights of H_m and H_{-m}."""
+    """That of `cramer_rao`; for any weights of H_m and H_{-m}."""
     for design, said in (
         (plan.usual, plan.usual_variances),
         (plan.design, plan.variances),
     ):
         htf = with_variance(isochron_ldtp, design)
-        bound = hj.identify.multiplier_bound(isochron_ldtp, htf)
+        bound = hj.identify.cramer_rao(isochron_ldtp, htf)
         assert_allclose(said, bound.standard_errors[:1] ** 2, rtol=2e-3)
         unequal = dataclasses.replace(
             htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T
         )
-        other = hj.identify.multiplier_bound(isochron_ldtp, unequal)
+        other = hj.identify.cramer_rao(isochron_ldtp, unequal)
         assert_allclose(other.covariance, bound.covariance, rtol=2e-3)
 
 

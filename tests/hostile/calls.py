@@ -25,7 +25,7 @@ def positional(function):
 
 
 def scale(t):
-    yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
+    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, guess=t.cycle)
     yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
     yield hj.scale.SweepPoints, dict(values={"x": [1.0]})
     yield hj.scale.SweepPoints.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
@@ -190,11 +190,14 @@ def estimates(t):
     yield t.structured.contains, dict(true=true)
     yield t.structured.interval, dict(level=0.9)
     yield hj.select_order, dict(htf=t.estimate, extra_lags=6)
-    yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
+    yield hj.identify.cramer_rao, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
     yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
-    yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
+    yield (
+        hj.identify.cramer_rao,
+        dict(estimator="fit_ldtp", model=t.model, htf=t.uncertain),
+    )
 
 
 def series(t):
@@ -287,7 +290,7 @@ def recordings(t):
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.attach_design, table
-    yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
+    yield t.one_input.write, dict(path="missing/d.csv")
     yield positional(hj.read_recording), dict(values="nope.csv")
 
 
@@ -336,7 +339,7 @@ def testing(t):
 def files(t):
     yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
-    yield hj.recordings.write_report, dict(folder="report", result=t.found)
+    yield t.found.write_report, dict(folder="report")
 
 
 def conversions(t):

@@ -103,7 +103,7 @@ SLOW = {
     "stream_experiments",
     "sweep",
     "monte_carlo",
-    "write_report",
+    "Identification.write_report",
     "ObservedCycle.prepare",
     "ObservedCycle.residuals",
     "ObservedHTF.prepare",

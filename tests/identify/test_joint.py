@@ -165,7 +165,7 @@ def test_undetermined_responses_have_infinite_variance():
 def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
     rng, draws = np.random.default_rng(3), 40
-    bound = hj.identify.ldtp_bound(model, exact)
+    bound = hj.identify.cramer_rao(model, exact, estimator="fit_ldtp")
     fits = [
         hj.fit_ldtp(noisy(exact, exact.variance, rng), initial=model)
         for _ in range(draws)
@@ -195,6 +195,6 @@ def test_with_one_section_the_bound_is_that_of_free_numerators():
     )
     f = np.linspace(0.02, 0.48, 30)
     htf = with_values(one.htf(f), one.htf(f).H, 1e-4)
-    free = hj.identify.multiplier_bound(one, htf, extra_lags=0)
-    joint = hj.identify.ldtp_bound(one, htf)
+    free = hj.identify.cramer_rao(one, htf, extra_lags=0)
+    joint = hj.identify.cramer_rao(one, htf, estimator="fit_ldtp")
     np.testing.assert_allclose(joint.covariance, free.covariance, rtol=1e-8)

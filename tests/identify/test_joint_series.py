@@ -209,8 +209,8 @@ def test_noise_that_drives_the_system_is_found(small):
     ratio = fit.noise_spectrum(f) / noise_spectrum(noise, f)
     assert np.abs(np.log(ratio)).max() < 0.6 and abs(np.log(ratio).mean()) < 0.1
     assert fit.contains(small.multipliers, 0.999).all()
-    assert hj.validate(fit, other, level=1e-3).white
-    assert not hj.validate(fit.model, other, level=1e-3).white
+    assert hj.validate(fit, other, alpha=1e-3).white
+    assert not hj.validate(fit.model, other, alpha=1e-3).white
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
     true, runs = model.multipliers, 60
-    bound = hj.identify.multiplier_bound(
+    bound = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
     draws = (
@@ -85,7 +85,7 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         fit = hj.fit_multipliers(with_variance(htf, data.H, rough, np.full(80, 2.0)), 2)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(model.multipliers).error[0] ** 2 for f in (fit, raw)]
-    bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance))
+    bound = hj.identify.cramer_rao(model, with_variance(htf, htf.H, variance))
     ratio = np.sqrt(square / 25) / bound.standard_errors[0]
     assert ratio[0] < 1.2 < ratio[1]
 
@@ -94,7 +94,7 @@ def test_without_variances_the_misfit_tells(small):
     """One output is a hundred times as noisy, which nobody said."""
     model, htf = small
     variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
-    said = hj.identify.multiplier_bound(
+    said = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
     data = noisy(htf, variance, np.random.default_rng(0))

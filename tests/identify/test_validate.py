@@ -74,7 +74,7 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         size = np.sqrt(np.mean(np.asarray(small.simulate(data.u))[:, 1] ** 2))
         found = hj.validate(small, data)
         data.y[:, 1] += found.visible[1] * size * hidden / np.sqrt(np.mean(hidden**2))
-        noticed += hj.validate(small, data).independence[1] < found.level / 2
+        noticed += hj.validate(small, data).independence[1] < found.alpha / 2
     assert covered(noticed, runs, 0.8)
     assert "detectable with 80 % power: " in repr(found)
     few, more = (

@@ -121,9 +121,7 @@ def test_events_alone_are_identified(noisy, tmp_path):
     assert (
         found.fit.outputs == ("duration",) and np.isfinite(found.fit.numerators).all()
     )
-    assert (
-        hj.recordings.write_report(tmp_path, found).parent / "figures" / "curve.png"
-    ).exists()
+    assert (found.write_report(tmp_path).parent / "figures" / "curve.png").exists()
     assert any("Resolution: the jitter" in repr(x) for x in found.diagnosis.findings)
 
 

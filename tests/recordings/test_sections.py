@@ -200,11 +200,9 @@ def test_slow_drift_is_taken_out(wave):
 
 def test_designs_as_tables(tmp_path, wave):
     design = hj.multisine(n_sections=8, periods=16, frequencies=(0, 2.0))
-    hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
+    design.write(tmp_path / "phase.csv", cycles=19)
     for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
-        hj.recordings.write_design(
-            tmp_path / "time.csv", design, period=period, rate=100
-        )
+        design.write(tmp_path / "time.csv", period=period, rate=100)
         assert (tmp_path / "time.csv").read_text().count(
             "\n"
         ) - 1 == design.experiments * rows
@@ -213,9 +211,7 @@ def test_designs_as_tables(tmp_path, wave):
         (15.9, "must be 16 or more"),
     ):
         with pytest.raises(hj.errors.DefinitionError, match=message):
-            hj.recordings.write_design(
-                tmp_path / "time.csv", design, period=0.5, rate=rate
-            )
+            design.write(tmp_path / "time.csv", period=0.5, rate=rate)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import Annotated
 
 import equinox as eqx
@@ -24,6 +25,7 @@ from ..._core.boundary.kinds import (
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
+from .tables import write_table
 
 
 InputNames = Count | SignalNames
@@ -243,6 +245,31 @@ class Design(eqx.Module):
         spectrum[experiment - first, line, channel] = value
         one = np.fft.irfft(spectrum, n=length, axis=1)
         return one[:, np.arange(cycles * self.n_sections) % length]
+
+    def write(
+        self,
+        path: kinds.FilePath,
+        *,
+        cycles: PeriodCount | None = None,
+        period: kinds.Positive | None = None,
+        rate: kinds.Positive | None = None,
+    ) -> None:
+        """Write the signals of all experiments to a CSV file, for hardware that plays them.
+
+        - Without `period`, for hardware that triggers on phase: a row for each section, with the
+          columns `experiment`, `cycle`, `section`, `phase` and the inputs, which are held until the
+          next section (zero-order hold).
+        - With `period` and `rate`, for other hardware: a row for each sample, with `experiment`,
+          `time` and the inputs.
+
+        **Arguments:** `cycles`: cycles of each experiment. Default: its periods P. `period`: period
+        of the cycle in seconds. `rate`: samples per second.
+
+        **Raises:** `DefinitionError` for a period without a rate, a rate with less than one sample
+        for each section, and a file that cannot be written.
+        """
+        u = self.signals(cycles)
+        write_table(Path(path), self.inputs, u, self.n_sections, period, rate)
 
     def scaled(self, rms: kinds.Positive) -> "Design":
         """Return the design with amplitudes multiplied so that every signal has this rms value.

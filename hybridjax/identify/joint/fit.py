@@ -28,15 +28,14 @@ from ..denominator import Covariance, multipliers_of
 from ..descent import Spread
 from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
-from ..multipliers import exact_htf
+from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..periodic import (
     LocalCoordinates,
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,
 )
-from ..realization import default_horizon, given_dims, realized
+from ..realization import given_dims
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import (
@@ -206,7 +205,7 @@ class LDTPFit(MultiplierFit):
         return bool(np.isfinite(self._spread.variance(slopes)).all())
 
     def _about(self) -> str:
-        about = f"chi-square {self.cost:.6g} with {self.dof:.0f} degrees of freedom"
+        about = f"chi-square per degree of freedom {self.chi2_per_dof:.3g} (dof {self.dof:.0f})"
         if self.noise is not None:
             about = f"errors one step ahead {signal_values(self.outputs, self.noise)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
@@ -231,7 +230,7 @@ def fit_ldtp(
 
     over all frequencies, harmonics, outputs and inputs. `fit_multipliers` gives each of the
     transfer functions a numerator of its own; here they follow from fewer unknowns, and the
-    standard errors of multipliers are smaller (`hj.identify.ldtp_bound` returns them).
+    standard errors of multipliers are smaller (`hj.identify.cramer_rao` returns them).
 
     For *time series*, with Gaussian one-step prediction errors e,
 
@@ -656,33 +655,3 @@ def _finished(
         _scale=scale,
     )
     return dataclasses.replace(fit, findings=_about_point(fit))
-
-
-@checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
-
-    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
-    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
-    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
-
-    **Arguments:**
-
-    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
-      harmonics and `variance` of the experiment; H is not used.
-
-    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    exact = exact_htf(model, htf)
-    lags = 2 * default_horizon(model.n_sections) + 1
-    minimal = realized(np.asarray(model.impulse_response(lags)))
-    scale = weights.check_values(exact)
-    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
-    direct = bool(np.asarray(model.D).any())
-    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
-    c, slopes = characteristic_slopes(coordinates)
-    spread = problem.linearize(coordinates).spread()
-    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)
