@@ -6,10 +6,10 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
 `--draws` draws:
 
 - `bound`: Cramer-Rao bound of the plant's first multiplier, for 300 strides of the loop.
-- `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(reference="r")`:
+- `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(references="r")`:
   rms error, how often its 95 % region holds the true multiplier, p-value of 95 % (binomial test).
   `without.covered`: without the reference, and with D free. `series.*`: of
-  `fit_series(reference="r")`.
+  `fit_series(references="r")`.
 - `plant.covered`, `plant.p`, `controller.*`: how often the 95 % discs of HTFs hold the truth, of
   `hj.identify.estimate_loop` with two references, and noise of a fifth of r in what the controller
   does; the p-value is that of their mean over draws (t test).
@@ -140,8 +140,8 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
         results[f"{name}.covered"] = float(fit.contains(true).all())
 
     dims = np.asarray(model.dims)
-    record("series", lambda: hj.fit_series(data, 2, check=False, reference="r"))
-    record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
+    record("series", lambda: hj.fit_series(data, 2, check=False, references="r"))
+    record("ldtp", lambda: hj.fit_ldtp(data, dims, references="r"))
     alone = hj.experiments.SectionSeries(
         data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs
     )
@@ -245,7 +245,7 @@ def random_loops(first: int, count: int) -> dict[str, int]:
         data = in_a_loop(model, gain, rng, 0.5, 400)
         try:
             fit = hj.fit_ldtp(
-                data, len(model.multipliers), reference=data.inputs[gain.shape[1] :]
+                data, len(model.multipliers), references=data.inputs[gain.shape[1] :]
             )
         except hj.errors.DefinitionError:
             counts["reported"] += 1
@@ -348,7 +348,7 @@ def too_low(first: int, count: int) -> None:
         for order in range(2, len(true) + 1):
             try:
                 began = time.process_time()
-                fit = hj.fit_series(data, order, reference=reference)
+                fit = hj.fit_series(data, order, references=reference)
                 whole = time.process_time() - began
                 with (
                     mock.patch.object(
@@ -357,7 +357,7 @@ def too_low(first: int, count: int) -> None:
                     mock.patch.object(series_fit, "_about_drift", lambda *_: []),
                 ):
                     began = time.process_time()
-                    hj.fit_series(data, order, reference=reference)
+                    hj.fit_series(data, order, references=reference)
                     seconds[kind] += [whole, time.process_time() - began]
             except hj.errors.DefinitionError:
                 continue
@@ -397,7 +397,7 @@ def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
         x = np.array([x[0] + v / rate, v])
     signals = {"u": u, "r": r[:n], "x": y[0], "v": y[1], "clock": np.cos(2 * np.pi * t)}
     recording, section = hj.Recording(t, signals), hj.Crossing("clock", "rising")
-    ways = {"with": dict(inputs="u", reference="r"), "without": dict(inputs="r")}
+    ways = {"with": dict(inputs="u", references="r"), "without": dict(inputs="r")}
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for name, way in 3 * list(ways.items()):
         began = time.process_time()
@@ -429,13 +429,13 @@ def short_gait() -> dict[str, float]:
     data = hj.run_experiments(
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30
     )
-    htf = hj.estimate_htf(data, reference="r")
+    htf = hj.estimate_htf(data, references="r")
     noisy = hj.experiments.add_noise(data, std=0.001 * data.y.std(axis=(0, 1)), seed=1)
     fits = {
         "htf": hj.fit_multipliers(htf, 2, check=False),
-        "series": hj.fit_series(data, 2, reference="r"),
-        "ldtp": hj.fit_ldtp(data, model.dims, reference="r"),
-        "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, reference="r"),
+        "series": hj.fit_series(data, 2, references="r"),
+        "ldtp": hj.fit_ldtp(data, model.dims, references="r"),
+        "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, references="r"),
     }
     return {
         x: float(fit.compare(cycle.multipliers).max_error) for x, fit in fits.items()

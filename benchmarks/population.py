@@ -296,7 +296,7 @@ def command(
                 rows.append(f"{s}_{k}.csv,S{s},{'young' if s % 2 else 'old'}")
         (folder / "subjects.csv").write_text("\n".join(rows) + "\n")
         options = (
-            "--input u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
+            "--inputs u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
         )
         line = [
             sys.executable,

@@ -433,7 +433,7 @@ def size(trials=10, minutes=10, rate=1000):
             "hybridjax",
             "identify",
             *files,
-            "--input",
+            "--inputs",
             "force",
         ]
         command += [

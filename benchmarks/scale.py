@@ -280,9 +280,8 @@ def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
     def store(S: int):
         design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
-        options = hj.experiments.Options(discard=4)
-        records = hj.experiments.stream_experiments(
-            cycle, placed, design, outputs, options, store=folder / f"{S}.zarr"
+        records = hj.run_experiments(
+            cycle, placed, design, outputs, discard=4, store=folder / f"{S}.zarr"
         )
         wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
         show(f"experiments.{S}.run_cpu_seconds", cpu)

@@ -21,7 +21,7 @@ from .apps.subjects import identify_subjects as identify_subjects
 from .designs.optimize import optimal_design as optimal_design
 from .engine.trajectory import simulate as simulate
 from .experiments.design.multisine import multisine as multisine
-from .experiments.run import run_experiments as run_experiments
+from .experiments.stored import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp

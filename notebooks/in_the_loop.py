@@ -98,5 +98,5 @@ for ax, (title, (estimate, exact, output, source)) in zip(
 # %%
 fit = hj.fit_multipliers(loop.plant, 2)
 print(cycle.multipliers, fit, sep="\n")
-series = hj.fit_series(data, 2, reference="r")
+series = hj.fit_series(data, 2, references="r")
 print(series)

@@ -172,8 +172,8 @@ with tempfile.TemporaryDirectory() as folder:
 # ## All of it in one command
 #
 # ```
-# hybridjax identify trial1.csv trial2.csv --input force --outputs yM,vM --phase yM,vM --out results
-# ```
+# hybridjax identify trial1.csv trial2.csv --inputs force --outputs yM,vM --phase yM,vM --out
+# results ```
 #
 # does the same and writes a report of one page. From Python:
 

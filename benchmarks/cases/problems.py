@@ -18,7 +18,7 @@ from peers.errors import Unavailable
 import hybridjax as hj
 from hybridjax.experiments import run as batched
 from hybridjax.experiments.response import course, flow_batch
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 from hybridjax.sections.placed import PlacedSections
 from hybridjax.systems.system import own_fields
 
@@ -89,7 +89,7 @@ class Problem:
 
     def response(self, accuracy: float = 1e-9) -> tuple:
         """Arguments of `program`: what `run` gives to it."""
-        options = Options(discard=0, accuracy=accuracy)
+        options = RunOptions(discard=0, accuracy=accuracy)
         prepared = prepare(self.cycle, self.placed, self.u, self.outputs, options)
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]

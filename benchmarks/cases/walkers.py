@@ -10,7 +10,7 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax.experiments import run as batched
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 
 from .problems import first_and_later
 
@@ -67,7 +67,9 @@ def _costs(show, case, options) -> dict[str, float]:
     _, _, seconds = first_and_later(
         lambda: hj.run_experiments(cycle, placed, u, output, **how), options.repeat
     )
-    prepared = prepare(cycle, placed, u, output, Options(discard=0, accuracy=ACCURACY))
+    prepared = prepare(
+        cycle, placed, u, output, RunOptions(discard=0, accuracy=ACCURACY)
+    )
     s, chart = placed.structure(), np.asarray(placed.lanes.chart)
     steps = np.ceil(np.asarray(placed.duration) / np.asarray(prepared.stepping.plan.h))
     stages = [len(s.method(a).c) for a in chart]

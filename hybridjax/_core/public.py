@@ -15,8 +15,77 @@ from typing import Any
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
-# Names, arguments and attributes that became others before version 0.2, and those now.
-_RENAMED: dict[str, str] = {}
+# Names that became others before version 0.2, and those now.
+_NAMES = {
+    "Advice": "hj.recordings.Diagnosis",
+    "FrequencyResponse": "hj.designs.ResponseGoal",
+    "Options": "hj.run_experiments(..., start=, discard=, ...)",
+    "Multipliers": "hj.designs.MultiplierGoal",
+    "Parameters": "hj.designs.ParameterGoal",
+    "Points": "hj.scale.SweepPoints",
+    "Quotient": "hj.systems.Symmetric",
+    "Record": "hj.experiments.SectionSeries",
+    "Scatter": "hj.linear.VarianceDof",
+    "SettledCycle": "hj.plants.PlantCycle",
+    "Study": "hj.designs.SequentialDesign",
+    "add_command": "hj.recordings.attach_design",
+    "advise": "hj.recordings.diagnose",
+    "coincidences": "hj.orbits.simultaneous_events",
+    "draws": "hj.designs.draw_models",
+    "inspect": "hj.recordings.check_recording",
+    "ldtp_bound": "hj.identify.cramer_rao(model, htf, estimator='fit_ldtp')",
+    "loop": "hj.identify.estimate_loop",
+    "multiplier_bound": "hj.identify.cramer_rao",
+    "random_force": "hj.experiments.random_input",
+    "section_data": "hj.recordings.sample_sections",
+    "settle": "hj.plants.find_cycle",
+    "sliding": "hj.systems.filippov",
+    "stream_experiments": "hj.run_experiments(..., chunk=, store=)",
+    "spoil": "hj.testing.add_artifacts",
+    "write_design": "design.write(path)",
+    "write_report": "result.write_report(folder)",
+}
+# Arguments of functions and attributes of classes that became others, and those now.
+_WORDS = {
+    "Crossing.function": "signal",
+    "Design.f": "frequency",
+    "Design.inputs": "inputs",
+    "Diagnosis.band": "bandwidths",
+    "Diagnosis.warnings": "findings",
+    "HTF.f": "frequencies",
+    "HTF.scatter": "variance_dof",
+    "Identification.advice": "diagnosis",
+    "MultiplierGoal.overhang": "extra_lags",
+    "ParameterGoal.wanted": "quantities",
+    "PhaseResponse.freedom": "dof",
+    "Population.freedom": "dof",
+    "ResponseGoal.band": "frequencies",
+    "ResponseGoal.wanted": "quantities",
+    "SeriesFit.reference": "references",
+    "Validation.level": "alpha",
+    "VarianceDof.freedom": "dof",
+    "continuation.values": "range",
+    "estimate_htf.reference": "references",
+    "estimate_phase.definition": "sections",
+    "fit_ldtp.guess": "dims` or `initial",
+    "fit_ldtp.reference": "references",
+    "fit_multipliers.errors": "covariance",
+    "fit_multipliers.overhang": "extra_lags",
+    "fit_series.overhang": "extra_lags",
+    "fit_series.reference": "references",
+    "htf.f": "frequencies",
+    "identify_recording.phase": "sections",
+    "identify_recording.reference": "references",
+    "multisine.band": "frequencies",
+    "noise_spectrum.f": "frequencies",
+    "phase_response.phase": "sections",
+    "sample_sections.phase": "sections",
+    "select_order.overhang": "extra_lags",
+    "sweep.over": "values",
+    "sweep.want": "quantities",
+    "validate.level": "alpha",
+    "validate.reference": "references",
+}
 
 
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
@@ -44,7 +113,7 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     """Return one line that leads from a name that a namespace does not have to the one that is
     meant."""
     asked = package.replace("hybridjax", "hj", 1) + f".{name}"
-    place = _RENAMED.get(name, place_of(name))
+    place = _NAMES.get(name, place_of(name))
     if place is not None:
         return f"{asked} is {place}"
     text = f"module {package!r} has no attribute {name!r}"
@@ -74,9 +143,10 @@ def places() -> dict[str, str]:
     return found
 
 
-def renamed(owner: str, word: str) -> str | None:
-    """Return what became of an argument of a function, or of an attribute of a class."""
-    return _RENAMED.get(f"{owner}.{word}")
+def about_word(owner: str, word: str) -> str | None:
+    """Return one line about an earlier argument of a function, or attribute of a class."""
+    word_now = _WORDS.get(f"{owner.rpartition('.')[2]}.{word}")
+    return word_now and f"`{word}` of {owner} is `{word_now}`"
 
 
 def _homes(stub: pathlib.Path) -> dict[str, str]:

@@ -63,7 +63,7 @@ _CAPTIONS = {
 def run(options: Any) -> bool:
     """Identify, print and write a report, from the options of the command; whether the fit has
     converged."""
-    with report_folder(options.out, options.input, options.formats) as folder:
+    with report_folder(options.out, options.inputs, options.formats) as folder:
         signals, identify = steps_of(options)
         recording = read_recording(*options.files, time=options.time, signals=signals)
         print(recording)
@@ -78,7 +78,7 @@ def steps_of(
     options: Any,
 ) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
     """Return the names of the signals to be read, and the function that identifies a recording."""
-    named = (*options.input, *options.reference, *options.outputs)
+    named = (*options.inputs, *options.references, *options.outputs)
     named += options.phase or (options.crossing or ())[:1]
     if options.phase is not None:
         position, velocity = options.phase
@@ -92,14 +92,14 @@ def steps_of(
     identify = functools.partial(
         identify_recording,
         sections=sections,
-        inputs=options.input,
+        inputs=options.inputs,
         outputs=options.outputs,
         n_sections=options.sections,
         order=options.order,
         bandwidth=options.bandwidth,
         timing=options.timing,
         drift=options.drift,
-        reference=options.reference or None,
+        references=options.references or None,
     )
     return tuple(dict.fromkeys(named)), identify
 
@@ -223,7 +223,7 @@ def summarize(result: Identification) -> dict[str, Any]:
         "notes": [finding.text for finding in result.recording.findings],
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
-        "references": list(fit.reference),
+        "references": list(fit.references),
         "outputs": list(data.outputs),
         "sections": data.n_sections,
         "cycles": round(data.cycles, 2),
@@ -270,7 +270,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
     recording = result.recording
     warnings = result.diagnosis.findings
     trials = escape(", ".join(t.name for t in recording.trials))
-    loop = result.fit.reference
+    loop = result.fit.references
     if loop:
         method = f"instrumental variables of {escape(listed(loop))}"
     else:

@@ -18,7 +18,7 @@ from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
-from ..experiments.run import run_experiments
+from ..experiments.stored import run_experiments
 from ..identify.htf_estimate import estimate_htf
 from ..identify.multipliers import StructuredFit, fit_multipliers
 from ..identify.rational import RationalFit, fit_rational

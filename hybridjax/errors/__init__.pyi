@@ -1,6 +1,4 @@
-from .._core.findings import Finding as Finding
-from .._core.results import Result as Result
-from .exceptions import (
+from .._core.exceptions import (
     ComputationError as ComputationError,
     DefinitionError as DefinitionError,
     FileFormatError as FileFormatError,
@@ -8,3 +6,5 @@ from .exceptions import (
     HybridJaxError as HybridJaxError,
     PrecisionError as PrecisionError,
 )
+from .._core.findings import Finding as Finding
+from .._core.results import Result as Result

@@ -17,8 +17,4 @@ from .response import (
     ResponseFunction as ResponseFunction,
     response_function as response_function,
 )
-from .run import Options as Options
-from .stored import (
-    StoredExperiments as StoredExperiments,
-    stream_experiments as stream_experiments,
-)
+from .stored import StoredExperiments as StoredExperiments

@@ -97,7 +97,7 @@ class ObservedHTF(AbstractObservation):
     delays if `free` contains "input_delay" or "output_delay".
     """
 
-    f: Float[Array, " F"]
+    frequencies: Float[Array, " F"]
     H: Complex[Array, "M F ny nu"]
     harmonics: tuple[int, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -117,7 +117,7 @@ class ObservedHTF(AbstractObservation):
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
         self.delay = None if delay is None else jnp.asarray(delay, float)
-        self.f = htf.f
+        self.frequencies = htf.frequencies
         self.H = htf.H
         self.sections = as_family(sections)
         self.harmonics = htf.harmonics
@@ -131,9 +131,9 @@ class ObservedHTF(AbstractObservation):
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         where = cycle, self.sections, self.outputs, self.inputs
         if self.delay is None:
-            H = linearize(*where).htf(self.f, self.harmonics).H
+            H = linearize(*where).htf(self.frequencies, self.harmonics).H
         else:
-            H = Delayed.of(*where, self.delay).htf(self.f, self.harmonics)
+            H = Delayed.of(*where, self.delay).htf(self.frequencies, self.harmonics)
         return _real(H, self.H, self.weights)
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":

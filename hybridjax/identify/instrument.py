@@ -52,7 +52,7 @@ class Roles(NamedTuple):
     ) -> "Roles":
         """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
         `fewest` or more. Default: as many as the others."""
-        require_among("input", reference, names, "`reference`: ")
+        require_among("input", reference, names, "`references`: ")
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
@@ -100,7 +100,7 @@ def require_loop(
     for i, k in itertools.product(roles.inputs, roles.references):
         if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
             raise DefinitionError(
-                f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
+                f"{names[i]} and {names[k]} are equal: there is no loop, leave `references` out."
             )
 
 
@@ -211,7 +211,7 @@ def excited_classes(
     raise DefinitionError(
         f"the reference excites too little: at f = {best / sums.setup.periods:g} + integers it "
         f"tells {apart} of {len(r)} components apart. Excite all lines up to N/2, or use "
-        "`fit_ldtp(reference=)`."
+        "`fit_ldtp(references=)`."
     )
 
 

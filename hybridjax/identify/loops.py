@@ -58,7 +58,7 @@ def estimate_loop(
     The plant is estimated from references that are added to its input u, the controller from
     references that are added to the measured output y. Both kinds may act in the same experiments
     or in different ones: the response to references of the other kind is subtracted. Variances are
-    of first order, see `estimate_htf` with `reference`. `hj.fit_multipliers` and `hj.fit_ldtp`
+    of first order, see `estimate_htf` with `references`. `hj.fit_multipliers` and `hj.fit_ldtp`
     accept the HTFs, also those of unstable plants.
 
     **Arguments:**

@@ -19,8 +19,8 @@ from ..linear.htf import HTF
 from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
 from .variable_projection import (
+    FittedResponse,
     HTFGroup,
-    Response,
     equal_weights,
     late_columns,
     numerators_of,
@@ -218,7 +218,9 @@ def _fit_one(
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
     powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
-    response = Response((0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5))
+    response = FittedResponse(
+        (0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5)
+    )
     (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [response])
     linearize = functools.partial(residuals_of, [group])
     ends = []

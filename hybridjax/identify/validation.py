@@ -171,7 +171,7 @@ def validate(
     *,
     start: Literal["free", "cycle"] = "free",
     alpha: Probability = 0.01,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
 
@@ -201,7 +201,7 @@ def validate(
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
     - `alpha`: significance level of the tests. Default: 0.01.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs, which respond to noise; `model` is that of the plant from these to the
       outputs. Residuals are tested for independence of the reference. Default: None.
 
@@ -213,8 +213,8 @@ def validate(
     tested: LDTP | SeriesFit | Predictor = _tested(model)
     records = uninterrupted_records(data)
     outside = records
-    if reference is not None:
-        records, outside = in_loop(data, reference)
+    if references is not None:
+        records, outside = in_loop(data, references)
     require_same("model and data", model, records[0])
     kept = [can_be_compared(tested, record, free_start) for record in records]
     compared = list(itertools.compress(records, kept))
@@ -244,7 +244,7 @@ def validate(
     predicts = isinstance(model, LDTPFit) and model.predictor is not None
     if not predicts and (np.abs(model.multipliers) >= 1).any():
         finite = np.isfinite(simulated[grid.inside]).all()
-        if reference is not None or not finite:
+        if references is not None or not finite:
             raise DefinitionError(
                 "the simulation of an unstable plant grows without bound: validate "
                 "`fit_ldtp(series)`."

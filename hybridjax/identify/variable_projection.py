@@ -293,7 +293,7 @@ def grouped(htf: HTF, order: int, extra_lags: int | None) -> list[HTFGroup]:
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
 
-class Response(NamedTuple):
+class FittedResponse(NamedTuple):
     """A combination of entries of HTFs whose numerator solves a problem of its own."""
 
     harmonic: tuple[int, int]
@@ -326,7 +326,7 @@ def group_htf(
         "single": turned,
         "double": np.concatenate([turned, conjugate]),
     }
-    responses: dict[str, list[Response]] = {kind: [] for kind in matrices}
+    responses: dict[str, list[FittedResponse]] = {kind: [] for kind in matrices}
     row_of = {m % N: row for row, m in enumerate(htf.harmonics)}
     for m, row in row_of.items():
         other = row_of.get(-m % N, -1)
@@ -345,7 +345,7 @@ def group_htf(
 
 def _responses_of(
     htf: HTF, weight: Float[np.ndarray, "M F ny nu"], row: int, other: int
-) -> Iterator[tuple[str, Response]]:
+) -> Iterator[tuple[str, FittedResponse]]:
     """Iterate over the responses of a harmonic and the opposite one, with their kinds."""
     H = np.asarray(htf.H)
     half = np.sqrt(0.5)
@@ -357,19 +357,19 @@ def _responses_of(
         h = H[row][at]
         g = H[other][at]
         if other == row:
-            yield "real", Response((row, -1), 1.0, channel, h, w[at])
+            yield "real", FittedResponse((row, -1), 1.0, channel, h, w[at])
         elif other < 0:
-            yield "single", Response((row, -1), 1.0, channel, h, w[at])
+            yield "single", FittedResponse((row, -1), 1.0, channel, h, w[at])
         elif alike[channel]:
             pair = (row, other)
             total = half * (h + g)
             difference = half / 1j * (h - g)
-            yield "real", Response(pair, half, channel, total, w[at])
-            yield "real", Response(pair, 1j * half, channel, difference, w[at])
+            yield "real", FittedResponse(pair, half, channel, total, w[at])
+            yield "real", FittedResponse(pair, 1j * half, channel, difference, w[at])
         else:
             values = np.concatenate([h, g])
             both = np.concatenate([w[at], v[at]])
-            yield "double", Response((row, other), 1.0, channel, values, both)
+            yield "double", FittedResponse((row, other), 1.0, channel, values, both)
 
 
 def equal_weights(
@@ -377,7 +377,7 @@ def equal_weights(
     sources: Int[np.ndarray, " F"],
     size: int,
     matrix: Complex[np.ndarray, "E u"],
-    responses: list[Response],
+    responses: list[FittedResponse],
 ) -> list[HTFGroup]:
     """Return responses whose numerators solve the same problem, one group for each weight.
 

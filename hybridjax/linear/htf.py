@@ -60,11 +60,12 @@ class VarianceDof(eqx.Module):
         self.shared = shared
         self.dof, self.roundness = from_host((dof, roundness))
 
-    def sources(self, f: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
+    def sources(self, frequencies: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
         """Return the index of the noise from which the errors of each line stem."""
         if not self.shared:
-            return np.arange(len(f))
-        return np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
+            return np.arange(len(frequencies))
+        distance = np.minimum(frequencies % 1, -frequencies % 1)
+        return np.unique(np.round(distance, 9), return_inverse=True)[1]
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.

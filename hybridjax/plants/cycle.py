@@ -30,7 +30,7 @@ from ..orbits.crossing import Crossing
 from ..sections import families
 from ..systems import chart, system
 from ..systems.structure import Structure
-from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
+from .drive import At, Drive, Plant, PlantPhase, Trial, resume, run_all
 
 
 Draw = Callable[[Any], Any]
@@ -524,7 +524,7 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
         )
 
 
-def _bound(drive: Drive, family: Any, turns: float) -> Phase:
+def _bound(drive: Drive, family: Any, turns: float) -> PlantPhase:
     """Return the sections as a plant is taken to them. An angle first makes so many turns."""
     period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
@@ -533,7 +533,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     anchor: Any = getattr(family, "anchor", None)
     is_number = not isinstance(anchor, Crossing)
     if is_number and period is not None and type(family) is families.ClockPhase:
-        return Phase(family.n_sections, period, float(anchor) * period)
+        return PlantPhase(family.n_sections, period, float(anchor) * period)
     if is_number and type(family) is families.KinematicPhase:
         return _by_angle(drive, family, float(anchor), turns)
     raise DefinitionError(
@@ -546,19 +546,19 @@ def _is_of_a_signal(crossing: Any) -> bool:
     return isinstance(getattr(crossing, "function", None), str) and not crossing.charts
 
 
-def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> Phase:
+def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> PlantPhase:
     names = drive.names
     require_among("signal", [x.signal for x in crossings], names, "Crossing: ")
     rows = []
     for x in crossings:
         sign = 1.0 if x.direction == "falling" else -1.0
         rows.append((names.index(x.signal), sign, float(x.value)))
-    return Phase(len(rows), crossings=rows)
+    return PlantPhase(len(rows), crossings=rows)
 
 
 def _by_angle(
     drive: Drive, family: families.KinematicPhase, anchor: float, turns: float
-) -> Phase:
+) -> PlantPhase:
     """Sections by the angle of two signals, whose sense so many turns show."""
     pair = family.position, family.velocity
     require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
@@ -566,7 +566,7 @@ def _by_angle(
     center = np.zeros(2) if family.center is None else np.asarray(family.center)
     scale = np.ones(2) if family.scale is None else np.asarray(family.scale)
     axes = zip(columns, center.tolist(), scale.tolist(), strict=True)
-    phase = Phase(family.n_sections, axes=list(axes))
+    phase = PlantPhase(family.n_sections, axes=list(axes))
     phase.begin(drive.t, drive.z)
     began = phase.turns
     while abs(phase.turns - began) < turns:

@@ -88,6 +88,7 @@ class SectionData(eqx.Module):
         size = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0))
         return size[:nu], size[nu:]
 
+    @checked
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
         columns = [self.inputs.index(name) for name in names]
@@ -103,6 +104,7 @@ class SectionData(eqx.Module):
             spikes=(*of_inputs, *of_outputs),
         )
 
+    @checked
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
         records = tuple(replace(r, drift=float(cycles)) for r in self.records)

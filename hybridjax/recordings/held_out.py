@@ -99,11 +99,11 @@ class Split(NamedTuple):
             f"sections: record {-(-4 * missing // 3)} more{fewer}."
         )
 
-    def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
+    def fit(self, order: int, references: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
         try:
-            fit = fit_series(self.early, order, check=False, reference=reference)
-            return HeldOut(fit, validate(fit, self.late, reference=reference))
+            fit = fit_series(self.early, order, check=False, references=references)
+            return HeldOut(fit, validate(fit, self.late, references=references))
         except DefinitionError as error:
             hint = "A quarter is held out: `fit_series` fits all, without a test."
             raise DefinitionError(f"{error} {hint}") from error

@@ -117,7 +117,7 @@ def identify_recording(
     bandwidth: Bandwidth | None = None,
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> Identification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
@@ -129,7 +129,7 @@ def identify_recording(
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
-    - `reference`: signals that enter a control loop from outside, at least as many as inputs. The
+    - `references`: signals that enter a control loop from outside, at least as many as inputs. The
       controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
@@ -137,7 +137,7 @@ def identify_recording(
     """
     require_x64()
     say("inspection")
-    outside = None if reference is None else tuple(reference)
+    outside = None if references is None else tuple(references)
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
     inspection = check_recording(recording, inputs=signals, outputs=outputs)
@@ -175,7 +175,7 @@ def identify_recording(
     say("fit to all")
     prepared = PreparedRecords(data, free_start=True)
     fit = fit_series(
-        prepared if outside is None else whole, order, check=False, reference=outside
+        prepared if outside is None else whole, order, check=False, references=outside
     )
     findings += undamped(data, fit)
     curve = None
@@ -205,12 +205,12 @@ def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:
     return data.outputs == ("duration",) and len(data.inputs) == 1 and of_events
 
 
-def _require_outside(reference: Sequence[str], signals: Sequence[str]) -> None:
+def _require_outside(references: Sequence[str], signals: Sequence[str]) -> None:
     """**Raises:** `DefinitionError` for a reference that is an input or an output."""
-    inside = [name for name in reference if name in signals]
+    inside = [name for name in references if name in signals]
     if inside:
         raise DefinitionError(
-            "`reference` must name other signals than `inputs` and `outputs`, not "
+            "`references` must name other signals than `inputs` and `outputs`, not "
             f"{listed(inside)}."
         )
 
@@ -266,14 +266,14 @@ def _order(
 def _order_in_loop(
     order: int | None,
     data: SectionData,
-    reference: Sequence[str],
+    references: Sequence[str],
 ) -> tuple[int, list[Finding]]:
     """Return the largest order that the reference determines, or the given one, and doubts about
     it."""
     if order is None:
-        best, obstacle = best_order(data, reference, most=4)
+        best, obstacle = best_order(data, references, most=4)
         return best, untried_orders(best, obstacle)
-    best, _ = best_order(data, reference, most=order + 2)
+    best, _ = best_order(data, references, most=order + 2)
     if best <= order:
         return order, []
     return order, [

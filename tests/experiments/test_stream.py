@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
 from hybridjax._core.pieces.store import Blocks
-from hybridjax.experiments import Options, StoredExperiments
-from hybridjax.experiments.run import divide, prepare
+from hybridjax.experiments import StoredExperiments
+from hybridjax.experiments.run import RunOptions, divide, prepare
 from hybridjax.experiments.stored import ExperimentJob
 
 from ..conftest import no_compilation
@@ -24,7 +24,6 @@ DESIGN = hj.multisine(8, 8, (0, 4.0), 0.001, experiments=COUNT)
 OUTPUTS = ("x", "v")
 BATCH = {"execution": hj.scale.Execution(batch=5)}
 NOISE = {"process_noise": hj.experiments.ProcessNoise(1e-3)}
-stream = hj.experiments.stream_experiments
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +41,7 @@ def whole(arguments):
 @pytest.fixture(scope="module")
 def made(arguments, tmp_path_factory):
     folder = tmp_path_factory.mktemp("stores") / "records.zarr"
-    return stream(*arguments, Options(**BATCH), store=folder, chunk=5)
+    return hj.run_experiments(*arguments, **BATCH, store=folder, chunk=5)
 
 
 @pytest.fixture
@@ -68,7 +67,7 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
-    parts = list(stream(*arguments, Options(**BATCH), chunk=5))
+    parts = list(hj.run_experiments(*arguments, **BATCH, chunk=5))
     assert [len(part.u) for part in parts] == [5, 5, 2]
     assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
@@ -76,7 +75,7 @@ def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, who
     assert_array_equal(estimate.frequencies, expected.frequencies)
     assert_allclose(estimate.H, expected.H, rtol=1e-9)
     noisy = hj.run_experiments(*arguments, **BATCH, **NOISE)
-    parts = stream(*arguments, Options(**BATCH, **NOISE), chunk=5)
+    parts = hj.run_experiments(*arguments, **BATCH, **NOISE, chunk=5)
     assert_array_equal(records(parts), noisy.y)
     assert (noisy.y != whole.y).any()
 
@@ -139,7 +138,7 @@ def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_pa
     with pytest.raises(hj.errors.FileFormatError, match="piece 2 .* is damaged in `u`"):
         stored[2]
     before = (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns
-    again = stream(*arguments, Options(**BATCH), store=stored.address, chunk=5)
+    again = hj.run_experiments(*arguments, **BATCH, store=stored.address, chunk=5)
     assert_array_equal(records(again), whole.y)
     assert (tmp_path / "records.zarr/y/c/0/0/0").stat().st_mtime_ns == before
 
@@ -177,11 +176,10 @@ def test_other_experiments_are_refused(made, arguments):
     names = ("cycle", "sections", "design", "outputs")
     for change, difference in cases:
         call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
-        options = {name: call.pop(name) for name in [*call] if hasattr(Options, name)}
         with pytest.raises(
             hj.errors.DefinitionError, match=f"holds other results: .*{difference}"
         ):
-            stream(**call, options=Options(**options), store=made.address)
+            hj.run_experiments(**call, store=made.address)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +188,7 @@ def test_other_experiments_are_refused(made, arguments):
 def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
-    options = Options(start=start, discard=8)
+    options = RunOptions(start=start, discard=8)
     job = ExperimentJob(prepare(*arguments, options, 2), Blocks((COUNT,), (2,)))
     _, layout = job.begin()
     sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))

@@ -120,7 +120,7 @@ def linear(t):
     yield hj.linear.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
     yield hj.linear.VarianceDof, dict(dof=f, roundness=size)
     yield variance_dof.quantile, dict(level=0.9)
-    yield variance_dof.sources, dict(f=f)
+    yield variance_dof.sources, dict(frequencies=f)
     lines = np.arange(12) / 4 + 0.125
     signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
     gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
@@ -138,7 +138,7 @@ def linear(t):
 
 
 def designs(t):
-    lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
+    lines = dict(n_sections=6, periods=16, frequencies=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield (
         hj.experiments.paper_design,
@@ -158,7 +158,6 @@ def designs(t):
 def experiments(t):
     to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
     yield hj.run_experiments, to_run
-    yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield (
         hj.experiments.response_function,
@@ -400,7 +399,6 @@ def without_arguments(t):
     for call in (
         hj.scale.Execution,
         hj.designs.MultiplierGoal,
-        hj.experiments.Options,
         natural.interval,
         t.trajectory,
         t.trajectory.dense,

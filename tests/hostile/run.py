@@ -100,7 +100,6 @@ SLOW = {
     "section_map",
     "simulate",
     "simulate_recording",
-    "stream_experiments",
     "sweep",
     "monte_carlo",
     "Identification.write_report",

@@ -88,7 +88,7 @@ def test_plant_and_controller_of_exact_data(plant):
     entered[loop.closed.harmonics.index(0)] += 1
     np.testing.assert_allclose(loop.sensitivity.H, entered, atol=1e-9)
     both = hj.estimate_htf(
-        experiments(plant, 0, 2, 0, 200, together=True), reference=SEEN[1:]
+        experiments(plant, 0, 2, 0, 200, together=True), references=SEEN[1:]
     )
     assert both.error(plant.htf(both.frequencies)) < 1e-9
     fit = hj.fit_multipliers(loop.plant, 2, check=False)  # (of exact data)
@@ -116,7 +116,7 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
         inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r")
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
-        htf = hj.estimate_htf(data, reference="r", threshold=threshold)
+        htf = hj.estimate_htf(data, references="r", threshold=threshold)
         assert (
             len(htf.frequencies) == lines
             and htf.error(plant.htf(htf.frequencies)) < 1e-9
@@ -143,7 +143,7 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
 @pytest.mark.slow
 def test_regions_of_series_hold_in_the_loop(plant):
     fits = (
-        hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20)
+        hj.fit_ldtp(series(plant, k, noise=0.5), 2, references="r") for k in range(20)
     )
     assert (
         sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16
@@ -151,16 +151,16 @@ def test_regions_of_series_hold_in_the_loop(plant):
 
 
 def test_instruments_of_series_hold_in_the_loop(plant):
-    fit = hj.fit_series(series(plant, 0), 2, reference="r")
+    fit = hj.fit_series(series(plant, 0), 2, references="r")
     assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
     held, discs, off, truth = [], [], [], plant.htf(np.arange(1, 9) / 4)
     for seed in range(30):
-        fit = hj.fit_series(series(plant, seed, noise=0.7), 2, reference="r")
+        fit = hj.fit_series(series(plant, seed, noise=0.7), 2, references="r")
         held.append(fit.contains(plant.multipliers)[0])
         htf = fit.htf(truth.frequencies)
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
         few = hj.fit_series(
-            series(plant, seed, 40, noise=0.5), 2, reference="r", check=False
+            series(plant, seed, 40, noise=0.5), 2, references="r", check=False
         )
         off.append(
             abs(few.multipliers[0] - plant.multipliers[0]) / few.standard_errors[0]
@@ -174,11 +174,11 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
     moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
-    assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
+    assert hj.fit_series(moved, 2, references="r").standard_errors[0] < 0.2
     with pytest.raises(
         hj.errors.DefinitionError, match="the reference determines 2 multipliers, not 3"
     ):
-        hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
+        hj.fit_series(series(plant, 0, noise=0.7), 3, references="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
     assert (
         "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
@@ -192,9 +192,9 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     data = series(
         hj.linear.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0
     )
-    (low,) = hj.fit_series(data, 2, reference="r").findings
+    (low,) = hj.fit_series(data, 2, references="r").findings
     assert "3 gives other" in low.text
-    assert not hj.fit_series(data, 3, reference="r").findings
+    assert not hj.fit_series(data, 3, references="r").findings
 
 
 @pytest.mark.slow
@@ -224,7 +224,7 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
         noise = 0.1 * np.random.default_rng(0).normal(size=data.y.shape)
         moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
-        fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, reference="r")
+        fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
         assert bool(np.asarray(fit.model.D).any()) == bool(through)
         np.testing.assert_allclose(fit.model.D, through, atol=0.1)
         assert fit.contains(plant.multipliers, 0.999).all()
@@ -235,12 +235,12 @@ def test_whether_outputs_answer_at_once_is_found(plant):
     data = hj.experiments.SectionSeries(
         np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
     )
-    assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
+    assert "not determine D" in repr(hj.fit_ldtp(data, 2, references="r", check=False))
     data = series(plant, 5, noise=0.5, waits=True, through=1.0)
     with pytest.raises(
         hj.errors.DefinitionError, match="tells the two directions apart"
     ):
-        hj.fit_ldtp(data, 2, reference="r")
+        hj.fit_ldtp(data, 2, references="r")
 
 
 def test_a_plant_that_is_stable_in_its_loop_only():
@@ -254,8 +254,8 @@ def test_a_plant_that_is_stable_in_its_loop_only():
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
     )
     for fit in (
-        hj.fit_ldtp(data, 1, reference="r"),
-        hj.fit_series(data, 1, reference="r"),
+        hj.fit_ldtp(data, 1, references="r"),
+        hj.fit_series(data, 1, references="r"),
     ):
         assert fit.contains(plant.multipliers, 0.999).all()
         assert abs(fit.multipliers[0] - 1.2**N) < 0.1
@@ -263,15 +263,15 @@ def test_a_plant_that_is_stable_in_its_loop_only():
 
 def test_residuals_tell_of_the_loop(plant):
     early, late = (series(plant, seed, noise=0.5) for seed in (5, 6))
-    fit = hj.fit_ldtp(early, 2, reference="r")
-    true = hj.validate(fit, late, reference="r")
+    fit = hj.fit_ldtp(early, 2, references="r")
+    true = hj.validate(fit, late, references="r")
     assert true.independent and true.white  # (of other strides)
     # (the ratio of y to u is no model of the plant, and the reference shows it)
     alone = hj.experiments.SectionSeries(
         early.u[:, :1], early.y, n_sections=N, inputs="u"
     )
     biased = hj.fit_series(alone, 2, check=False)
-    assert not hj.validate(biased, late, reference="r").independent
+    assert not hj.validate(biased, late, references="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
     for record, answers in (alone, True), (driven, False):
         fit, grid = (
@@ -288,23 +288,23 @@ def test_residuals_tell_of_the_loop(plant):
     with pytest.raises(
         hj.errors.DefinitionError, match="grows without bound: validate"
     ):
-        hj.validate(unstable, late, reference="r")
+        hj.validate(unstable, late, references="r")
 
 
 def test_what_does_not_fit_is_refused(plant):
     data, record = experiments(plant, 0, 2), series(plant, 0)
     refused = lambda text: pytest.raises(hj.errors.DefinitionError, match=text)  # noqa: E731
     with refused("there is no input 'q'; inputs are u, r, d"):
-        hj.estimate_htf(data, reference="q")
+        hj.estimate_htf(data, references="q")
     with refused("2 inputs of the plant need as many references"):
-        hj.estimate_htf(data, reference="r")
+        hj.estimate_htf(data, references="r")
     with refused("all inputs are references"):
-        hj.fit_ldtp(record, 2, reference=("u", "r"))
+        hj.fit_ldtp(record, 2, references=("u", "r"))
     same = hj.experiments.SectionSeries(
         record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r")
     )
     with refused("u and r are equal"):
-        hj.fit_ldtp(same, 2, reference="r")
+        hj.fit_ldtp(same, 2, references="r")
     shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
     with refused("u and r are equal"):
         hj.identify.estimate_loop(
@@ -316,7 +316,7 @@ def test_what_does_not_fit_is_refused(plant):
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
         hj.estimate_htf(
             hj.experiments.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape),
-            reference="r",
+            references="r",
         )
     with refused("`reference`, `noise` and `start` are for time series"):
-        hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")
+        hj.fit_ldtp(plant.htf([0.3]), 2, references="r")

@@ -56,7 +56,7 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     out = str(tmp_path / "o")
     np.savez(trial, **recording)
     options = (
-        "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
+        "--inputs u --references r --outputs x,v --crossing clock:rising --sections 16"
     )
     with pytest.warns(FindingWarning):
         assert not main(["identify", trial, *options.split(), "--out", out])

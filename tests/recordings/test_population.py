@@ -332,7 +332,7 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     # The figures of single reports are tested elsewhere and take long.
     monkeypatch.setattr(subjects, "write_results", write_numbers)
     monkeypatch.chdir(tmp_path)
-    options = "--input force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
+    options = "--inputs force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out
     assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace(

@@ -255,7 +255,7 @@ def files(tmp_path_factory, rhythm):
 def identify(files, out, *more):
     trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
     options = [
-        "--input",
+        "--inputs",
         "force",
         "--outputs",
         "x,v",

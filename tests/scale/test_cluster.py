@@ -232,10 +232,11 @@ def experiments():
 
 @pytest.mark.slow
 def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
-    call = {"options": hj.experiments.Options(discard=2), "chunk": 2}
-    stream = hj.experiments.stream_experiments
-    stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
-    alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
+    call = {"discard": 2, "chunk": 2}
+    stored = hj.run_experiments(
+        *experiments, store=tmp_path / "a.zarr", client=client, **call
+    )
+    alone = hj.run_experiments(*experiments, store=tmp_path / "b.zarr", **call)
     assert len(stored) == 3
     assert stored.missing() == []
     for mine, theirs in zip(alone, stored, strict=True):

@@ -33,7 +33,7 @@ def wheel():
 
 @pytest.fixture(scope="module")
 def options(wheel):
-    return {"want": WANT, "guess": wheel, "chunk": 4}
+    return {"quantities": WANT, "guess": wheel, "chunk": 4}
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +104,10 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
     ):
         run(hj.models.RimlessWheel(rate=1.1))
     with pytest.raises(
-        hj.errors.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"
+        hj.errors.DefinitionError,
+        match=r"`quantities` is \['period', .*, not \['period'\]",
     ):
-        run(want="period")
+        run(quantities="period")
     shutil.rmtree(store)
     store.mkdir()
     (store / "mine.txt").write_text("")
@@ -162,15 +163,21 @@ def test_sweep_draws_a_map(tmp_path, capsys):
     )
     model = f"{tmp_path}/my_wheel.py:Mine"
     out = str(tmp_path / "map.zarr")
-    axes = ["--over", "slope=0.075:0.09:2", "--over", "spokes=8:9:2"]
-    assert main(["sweep", model, *axes, "--want", "spectral_radius", "--out", out]) == 0
+    axes = ["--values", "slope=0.075:0.09:2", "--values", "spokes=8:9:2"]
+    assert (
+        main(["sweep", model, *axes, "--quantities", "spectral_radius", "--out", out])
+        == 0
+    )
     assert "4 of 4 points have a limit cycle" in capsys.readouterr().out
     assert (tmp_path / "map-spectral_radius.png").stat().st_size > 5_000
     for wrong, says in (
-        ([model, "--over", "slop=0:1:2"], "there is no parameter 'slop'"),
+        ([model, "--values", "slop=0:1:2"], "there is no parameter 'slop'"),
         ([model.replace("my_", "no_"), *axes], "there is no file"),
         ([model, *axes, *axes], "has two axes"),
-        ([model, *axes, "--want", "period"], "holds other results: its `want`"),
+        (
+            [model, *axes, "--quantities", "period"],
+            "holds other results: its `quantities`",
+        ),
     ):
         with pytest.raises(SystemExit, match=says):
             main(["sweep", *wrong, "--out", out])

@@ -131,7 +131,7 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
     )
     assert len(cycle.trajectory().t) > 2  # another solver is no other code
     response = hj.experiments.response_function(cycle, SECTIONS, "x")
-    chunks = hj.experiments.stream_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
+    chunks = hj.run_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
 
     def force(t):
         return DRAG * jnp.cos(t)
@@ -231,7 +231,7 @@ PLACES = hj.ClockPhase(2)
 
 
 def campaign(cycle):
-    return hj.experiments.stream_experiments(cycle, PLACES, PUSHES, "x", chunk=1)
+    return hj.run_experiments(cycle, PLACES, PUSHES, "x", chunk=1)
 
 
 # Objects that are made of a cycle, and a later call.
@@ -320,7 +320,7 @@ def test_each_later_call_names_what_has_changed(name, swinging, monkeypatch):
 def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypatch):
     level = hj.Crossing(lambda t, q: q[0] - 0.001 * GAIN, "rising")
     response = hj.experiments.response_function(swinging, PLACES, SPEED)
-    chunks = hj.experiments.stream_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
+    chunks = hj.run_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
     placed = hj.sections.place_sections(swinging, hj.ClockPhase(2, anchor=level))
     before = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
     monkeypatch.setitem(globals(), "GAIN", 2.0)

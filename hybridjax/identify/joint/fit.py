@@ -84,11 +84,11 @@ class LDTPFit(MultiplierFit):
       noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
       ahead.
     - `findings`: "feedback" for inputs of time series that a controller makes, or may make (not
-      with a `reference`); "drift" if drift of the outputs of time series (in the first 1000 cycles)
-      gives multipliers outside of each other's confidence regions; "left over" if residuals depend
-      on the inputs, or "misfit" if they are larger than their variances, or alike at neighboring
-      frequencies: the dimensions are too few, or the iteration found a local minimum; "order" if
-      one dimension less explains the data; "undetermined"; "no convergence".
+      with a `references`); "drift" if drift of the outputs of time series (in the first 1000
+      cycles) gives multipliers outside of each other's confidence regions; "left over" if residuals
+      depend on the inputs, or "misfit" if they are larger than their variances, or alike at
+      neighboring frequencies: the dimensions are too few, or the iteration found a local minimum;
+      "order" if one dimension less explains the data; "undetermined"; "no convergence".
     """
 
     model: LDTP
@@ -220,7 +220,7 @@ def fit_ldtp(
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
@@ -264,7 +264,7 @@ def fit_ldtp(
       "innovations"), and to test whether one dimension less explains the data as well, whether
       residuals of time series depend on the inputs, and whether drift explains the multipliers;
       `findings`, and warnings (`FindingWarning`), then say so. Default: True.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs. The plant from these to the outputs is fitted with innovations; it may be
       unstable. The fit is consistent if D is zero at sections where the controller responds without
       delay, which the response of the outputs to the reference shows. If the reference was not
@@ -293,14 +293,14 @@ def fit_ldtp(
             raise DefinitionError(
                 "fit_ldtp: give the dimensions of the state as `dims`, which time series need."
             )
-        how = _How(noise == "innovations" or reference is not None, free_start, check)
-        fit = _fit_to_records(data, guess, how, reference)
-    elif reference is None and noise == "output" and free_start:
+        how = _How(noise == "innovations" or references is not None, free_start, check)
+        fit = _fit_to_records(data, guess, how, references)
+    elif references is None and noise == "output" and free_start:
         fit = _fit_to_htf(data, guess, check)
     else:
         raise DefinitionError(
-            "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
-            "leave these arguments out (and pass `reference` to `estimate_htf`)."
+            "`references`, `noise` and `start` are for time series: give the data, not HTFs, or "
+            "leave these arguments out (and pass `references` to `estimate_htf`)."
         )
     if check:
         warn_of(fit.findings)
@@ -357,12 +357,12 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
 
 
 def _fit_to_records(
-    data: RecordedData, guess: Guess, how: _How, reference: SignalNames | None
+    data: RecordedData, guess: Guess, how: _How, references: SignalNames | None
 ) -> LDTPFit:
     """Return a fit to time series, with the findings of its residuals."""
     drive = None
-    if reference is not None:
-        data, drive = in_loop(data, reference)
+    if references is not None:
+        data, drive = in_loop(data, references)
     records = PreparedRecords(data, how.free_start)
     outside = records if drive is None else PreparedRecords(drive, how.free_start)
     chosen = isinstance(guess, LDTP)

@@ -73,7 +73,7 @@ from .residuals import about_answers
 from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
-_BIASED = "the fit is biased; name their `reference`"
+_BIASED = "the fit is biased; name their `references`"
 
 
 class SeriesFit(MultiplierFit):
@@ -96,7 +96,7 @@ class SeriesFit(MultiplierFit):
     - `noise` (ny,): standard deviation of the residuals.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
+    - `references`: signals that enter the loop from outside. With a references, `noise` is the
       standard deviation of $\chi y$.
     - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
       more multiplier or two, give multipliers outside of each other's confidence regions;
@@ -112,7 +112,7 @@ class SeriesFit(MultiplierFit):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
-    reference: tuple[str, ...] = eqx.field(static=True, default=())
+    references: tuple[str, ...] = eqx.field(static=True, default=())
 
     @remembered
     def model(self) -> LDTP:
@@ -177,7 +177,9 @@ class SeriesFit(MultiplierFit):
         return HTF(f, H, harmonics, N, *names, "series fit", variance=variance)
 
     def _about(self) -> str:
-        loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
+        loop = (
+            f"in a loop, by {', '.join(self.references)}; " if self.references else ""
+        )
         return (
             f"{loop}noise {signal_values(self.outputs, self.noise)}; "
             f"{self.n_sections} sections, {self.numerators.shape[1]} lags"
@@ -231,7 +233,7 @@ def fit_series(
     extra_lags: Index | None = None,
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
@@ -253,7 +255,7 @@ def fit_series(
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `findings` as warnings (`FindingWarning`). Default: True.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` has no
       effect: the first cycles of each record are not used. Default: None.
@@ -263,10 +265,10 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    if reference is None:
+    if references is None:
         fit = _fit_open_loop(data, order, extra_lags, start == "free", check)
     else:
-        fit = _fit_in_loop(data, order, extra_lags, reference, check)
+        fit = _fit_in_loop(data, order, extra_lags, references, check)
     if check:
         warn_of(fit.findings, wrappers=2)
     return fit
@@ -276,10 +278,10 @@ def _fit_in_loop(
     data: RecordedData,
     order: int,
     extra_lags: int | None,
-    reference: SignalNames,
+    references: SignalNames,
     check: bool,
 ) -> SeriesFit:
-    plant, drive = in_loop(data, reference)
+    plant, drive = in_loop(data, references)
     fit = SeriesFit(**LoopEquations(plant, drive, order, extra_lags).fit(check))
     fewer = max(extra_lags - plant[0].n_sections, 0) if extra_lags else 0
     higher = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]

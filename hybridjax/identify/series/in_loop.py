@@ -96,7 +96,7 @@ class Solution(NamedTuple):
 
 
 def best_order(
-    data: RecordedData, reference: Sequence[str], most: int
+    data: RecordedData, references: Sequence[str], most: int
 ) -> tuple[int, str]:
     """Return the largest number of multipliers, up to `most`, that the references determine, and
     the obstacle to a larger number, if there was one."""
@@ -104,7 +104,7 @@ def best_order(
     for order in range(most, 1, -1):
         # Too few cycles for so many: a finding shows the text.
         try:
-            solution = LoopEquations(*in_loop(data, reference), order, None).solution
+            solution = LoopEquations(*in_loop(data, references), order, None).solution
         except DefinitionError as error:
             obstacle = str(error)
             continue
@@ -126,7 +126,7 @@ class LoopEquations:
     ):
         self.records = PreparedRecords(plant)
         self.order = order
-        self.reference = drive[0].inputs
+        self.references = drive[0].inputs
         self.grid = self.records.whole()
         N = self.records.n_sections
         z = predicted(plant, drive, order)
@@ -202,7 +202,7 @@ class LoopEquations:
             dof=float(sum(x.dof for x in self.sections) * ny - len(c)),
             result=int(Result.OK),
             **self.records.about,
-            reference=self.reference,
+            references=self.references,
         )
 
     def coefficients(self) -> RoughFit:
