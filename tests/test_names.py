@@ -102,9 +102,9 @@ ONE_WORD = {
     "definition": "sections",
     "doubt": "findings",
     "f": "frequencies",
-    "dof": "dof",
+    "freedom": "dof",
     "input_names": "inputs",
-    "extra_lags": "extra_lags",
+    "overhang": "extra_lags",
     "over": "values",
     "scatter": "variance_dof",
     "significance": "alpha",
@@ -158,9 +158,9 @@ def test_level_is_a_coverage_and_alpha_a_significance():
 @pytest.mark.parametrize(
     ("asked", "line"),
     [
-        (lambda: hj.orbits.Settings, "hj.orbits.Settings is hj.orbits.Settings"),
+        (lambda: hj.Settings, "hj.Settings is hj.orbits.Settings"),
         (lambda: hj.SeriesFit, "hj.SeriesFit is hj.identify.SeriesFit"),
-        (lambda: hj.orbits.simultaneous_events, "hj.orbits.simultaneous_events is hj.orbits.simultaneous_events"),
+        (lambda: hj.coincidences, "hj.coincidences is hj.orbits.simultaneous_events"),
         (lambda: hj.orbits.continuation, "hj.orbits.continuation is hj.continuation"),
         (lambda: hj.sections.linearize, "hj.sections.linearize is hj.linearize"),
         (lambda: hj.errors.simulate, "hj.errors.simulate is hj.simulate"),
@@ -168,7 +168,7 @@ def test_level_is_a_coverage_and_alpha_a_significance():
             lambda: hj.experiments.run_experiments,
             "hj.experiments.run_experiments is hj.run_experiments",
         ),
-        (lambda: hj.multisine(4, periods=4).frequencies, "`f` of Design is `frequency`"),
+        (lambda: hj.multisine(4, periods=4).f, "`f` of Design is `frequency`"),
         (
             lambda: hj.Crossing("x", "falling").function,
             "`function` of Crossing is `signal`",
@@ -185,12 +185,12 @@ def test_other_names_lead_to_those_now(asked, line):
 
 def test_earlier_arguments_lead_to_those_now():
     with pytest.raises(TypeError, match="^`band` of multisine is `frequencies`$"):
-        hj.multisine(4, periods=4, frequencies=(0.0, 1.0))
+        hj.multisine(4, periods=4, band=(0.0, 1.0))
     system = hj.linear.LDTP(
         np.full((1, 1, 1), 0.5), np.ones((1, 1, 1)), np.ones((1, 1, 1))
     )
     with pytest.raises(TypeError, match=r"^`f` of LDTP.htf is `frequencies`$"):
-        system.htf(frequencies=[0.1])
+        system.htf(f=[0.1])
 
 
 def test_the_table_of_earlier_names_leads_to_what_exists():

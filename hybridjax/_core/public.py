@@ -19,8 +19,8 @@ _ROOT = pathlib.Path(__file__).parents[1]
 _NAMES = {
     "Advice": "hj.recordings.Diagnosis",
     "FrequencyResponse": "hj.designs.ResponseGoal",
-    "Options": "hj.run_experiments(..., start=, discard=, ...)",
     "Multipliers": "hj.designs.MultiplierGoal",
+    "Options": "hj.run_experiments(..., start=, discard=, ...)",
     "Parameters": "hj.designs.ParameterGoal",
     "Points": "hj.scale.SweepPoints",
     "Quotient": "hj.systems.Symmetric",
@@ -40,8 +40,8 @@ _NAMES = {
     "section_data": "hj.recordings.sample_sections",
     "settle": "hj.plants.find_cycle",
     "sliding": "hj.systems.filippov",
-    "stream_experiments": "hj.run_experiments(..., chunk=, store=)",
     "spoil": "hj.testing.add_artifacts",
+    "stream_experiments": "hj.run_experiments(..., chunk=, store=)",
     "write_design": "design.write(path)",
     "write_report": "result.write_report(folder)",
 }
@@ -49,7 +49,7 @@ _NAMES = {
 _WORDS = {
     "Crossing.function": "signal",
     "Design.f": "frequency",
-    "Design.inputs": "inputs",
+    "Design.input_names": "inputs",
     "Diagnosis.band": "bandwidths",
     "Diagnosis.warnings": "findings",
     "HTF.f": "frequencies",
