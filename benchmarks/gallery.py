@@ -126,7 +126,7 @@ def draw(
         else:
             hj.plot.cycle(cycle, *case.plane, ax=left)
         htfs = [exact] if estimate is None else [estimate, exact]
-        hj.plot.magnitude(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
+        hj.plot.htf(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
         lowest = min(
             np.min(line.get_ydata(), initial=np.inf) for line in right.get_lines()
         )

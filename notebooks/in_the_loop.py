@@ -87,7 +87,7 @@ panels = {
 for ax, (title, (estimate, exact, output, source)) in zip(
     axes, panels.items(), strict=True
 ):
-    hj.plot.magnitude(
+    hj.plot.htf(
         estimate, exact, output=output, input=source, harmonics=(0,), decades=2, ax=ax
     )
     ax.set_title(title)

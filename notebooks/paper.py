@@ -219,7 +219,7 @@ for name in families:
     )
 
 pairs = {name: (estimates[name], exact[name]) for name in families}
-figure = hj.plot.harmonics(pairs)
+figure = hj.plot.htf(pairs)
 
 # %% [markdown]
 # ## Parametric fits (Sec. VI-C3)
@@ -239,7 +239,7 @@ for name, fit in rational.items():
         print(
             f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}"
         )
-figure = hj.plot.bodes(pairs, fits=rational)
+figure = hj.plot.bode(pairs, fits=rational)
 
 # %% [markdown]
 # All harmonics and outputs together have one denominator in $z^{-N}$, whose roots are the

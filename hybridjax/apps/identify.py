@@ -257,7 +257,10 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
     yield "impulse_responses", plot.impulse_responses(result.responses)
     for i, suffix in enumerate(_suffixes(htf.inputs)):
         yield f"bode{suffix}", plot.bode(htf, input=i)
-        yield f"harmonics{suffix}", plot.harmonics({"": htf}, shown, input=i, decades=3)
+        yield (
+            f"harmonics{suffix}",
+            plot.htf({"": htf}, harmonics=shown, input=i, decades=3),
+        )
     yield "phase", plot.phase(result.phase)
     yield "sections", plot.section_data(result.data)
     if result.curve is not None:

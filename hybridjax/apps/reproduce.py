@@ -199,8 +199,8 @@ def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> It
         }
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
     rational = {name: family.rational for name, family in families.items()}
-    yield "fig3_harmonics", plot.harmonics(pairs, (0, 1, -1, 2, -2))
-    yield "fig4_bode", plot.bodes(pairs, fits=rational)
+    yield "fig3_harmonics", plot.htf(pairs, harmonics=(0, 1, -1, 2, -2))
+    yield "fig4_bode", plot.bode(pairs, fits=rational)
     yield "multipliers", plot.multipliers(cycle, estimates)
     yield "poles_zeros", plot.poles_zeros(rational)
 

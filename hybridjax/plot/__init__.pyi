@@ -8,12 +8,7 @@ from .data import (
 )
 from .designs import spectrum as spectrum, strides as strides
 from .explorer import Explorer as Explorer
-from .frequency import (
-    bode as bode,
-    bodes as bodes,
-    harmonics as harmonics,
-    magnitude as magnitude,
-)
+from .frequency import bode as bode, htf as htf
 from .look import (
     COLORS as COLORS,
     PAGE as PAGE,

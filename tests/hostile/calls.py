@@ -354,9 +354,9 @@ def conversions(t):
 def plots(t):
     plot = hj.plot
     yield positional(plot.bode), dict(values=t.estimate)
-    yield plot.bodes, dict(families={"a": t.estimate})
-    yield plot.harmonics, dict(families={"a": t.estimate})
-    yield positional(plot.magnitude), dict(values=t.estimate)
+    yield positional(plot.bode), dict(values={"a": t.estimate})
+    yield positional(plot.htf), dict(values={"a": t.estimate})
+    yield positional(plot.htf), dict(values=t.estimate)
     yield plot.spectrum, dict(plan=t.plan, model=t.model)
     yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)

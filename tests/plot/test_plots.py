@@ -22,7 +22,7 @@ def labeled(ax):
 
 
 def test_magnitude_draws_the_values(estimate, exact):
-    ax = hj.plot.magnitude(estimate, exact, output="vM").ax
+    ax = hj.plot.htf(estimate, exact, output="vM").ax
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
@@ -42,9 +42,9 @@ def test_magnitude_draws_the_values(estimate, exact):
 
 def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
     def harmonics(*given):
-        return hj.plot.harmonics({"a": given})
+        return hj.plot.htf({"a": given})
 
-    for draw in (hj.plot.magnitude, hj.plot.bode, harmonics):
+    for draw in (hj.plot.htf, hj.plot.bode, harmonics):
         from_model = draw(estimate, hopper).ax.lines
         from_htf = draw(estimate, exact).ax.lines
         for line, expected in zip(from_model, from_htf, strict=True):
@@ -56,7 +56,7 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
     families = {"isochron": (estimate, exact), "again": exact}
-    figure = hj.plot.harmonics(families).figure
+    figure = hj.plot.htf(families).figure
     assert isinstance(figure, Figure)
     upper_left, upper_right, lower_left, lower_right = figure.axes
     assert upper_left.get_title() == "isochron"
@@ -112,7 +112,7 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         exact.outputs,
         "exact",
     )
-    for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
+    for draw, shown in ((hj.plot.htf, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
         assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
@@ -125,11 +125,11 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
 
 
 def bodes(*given, **options):
-    return hj.plot.bodes({"a": given}, **options)
+    return hj.plot.bode({"a": given}, **options)
 
 
 def harmonics(*given, **options):
-    return hj.plot.harmonics({"a": given}, **options)
+    return hj.plot.htf({"a": given}, **options)
 
 
 @pytest.fixture
@@ -157,11 +157,11 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
 
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
-    figure = hj.plot.bodes(families, fits={"b": rational}).figure
+    figure = hj.plot.bode(families, fits={"b": rational}).figure
     measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
     assert measured == [4, 4]
     with pytest.raises(hj.errors.DefinitionError, match="`fits`: there is no name 'c'"):
-        hj.plot.bodes(families, fits={"c": rational})
+        hj.plot.bode(families, fits={"c": rational})
 
 
 # The complex plane
@@ -175,7 +175,7 @@ def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
     assert len(fitted) == len(two_inputs.outputs)
 
 
-@pytest.mark.parametrize("draw", [hj.plot.magnitude, harmonics])
+@pytest.mark.parametrize("draw", [hj.plot.htf, harmonics])
 def test_the_name_of_a_single_input_is_on_the_axis(draw, two_inputs):
     output = two_inputs.outputs[0]
     first, second = two_inputs.inputs
@@ -267,13 +267,13 @@ def test_a_crowd_of_multipliers_has_no_inset():
 
 def test_bands_hold_the_values(estimate):
     """Where there is a variance; the phase is drawn where it is known."""
-    assert not hj.plot.magnitude(estimate).ax.collections
+    assert not hj.plot.htf(estimate).ax.collections
     variance = np.full(estimate.H.shape, 1e-6)
     sure = dataclasses.replace(estimate, variance=variance)
     radius = float(sure.confidence_radius().max())
     modulus = np.abs(sure[0][:, 0, 0])
 
-    (band,) = hj.plot.magnitude(sure, harmonics=(0,), output="yM").ax.collections
+    (band,) = hj.plot.htf(sure, harmonics=(0,), output="yM").ax.collections
     heights = band.get_paths()[0].vertices[:, 1]
     assert_allclose(heights.max(), modulus.max() + radius)
 
