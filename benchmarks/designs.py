@@ -175,7 +175,7 @@ def studies(family: Family, draws: int) -> np.ndarray:
         error = done.fit.compare(truth).error[0]
         held = bool(done.fit.contains(truth)[0])
         rows.append(
-            (done.strides[-1], done.blocks, error, held, done.standard_errors[-1, 0])
+            (done.cycles[-1], done.blocks, error, held, done.standard_errors[-1, 0])
         )
     return np.array(rows)
 

@@ -89,12 +89,12 @@ study.plan
 # as requested, or the budget is spent.
 
 # %%
-while not study.done and study.strides[-1] + study.design.cycles(0) <= budget:
+while not study.done and study.cycles[-1] + study.design.cycles(0) <= budget:
     study = study.add(laboratory(study.design))
 study
 
 # %%
-hj.plot.strides(study.plan, {"this study": study})
+hj.plot.standard_errors(study.plan, {"this study": study})
 
 # %% [markdown]
 # ## Comparison with the truth

@@ -131,7 +131,7 @@ diagnosis = hj.recordings.diagnose(data, fit)
 diagnosis
 
 # %%
-for strides, errors in zip(diagnosis.strides, diagnosis.expected, strict=True):
+for strides, errors in zip(diagnosis.cycles, diagnosis.expected, strict=True):
     print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
 axes = hj.plot.multipliers(fit, {"plain regression": diagnosis.plain})
 

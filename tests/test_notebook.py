@@ -47,7 +47,7 @@ def test_the_executed_notebook_has_the_code_of_its_source(name):
 
 def how_to_push(found):
     assert found.study.done
-    assert found.study.strides[-1] <= found.budget
+    assert found.study.cycles[-1] <= found.budget
     assert found.study.fit.contains(found.cycle.multipliers, 0.999).all()
 
 

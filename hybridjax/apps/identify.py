@@ -280,7 +280,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         method = "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
-    expected = zip(result.diagnosis.strides, result.diagnosis.expected, strict=True)
+    expected = zip(result.diagnosis.cycles, result.diagnosis.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",

@@ -45,7 +45,7 @@ class Candidates(NamedTuple):
     """Index of the input."""
     periods: int
     n_sections: int
-    strides: int
+    cycles: int
     """T, periods of all experiments together."""
 
     @classmethod
@@ -208,7 +208,7 @@ def measured_htfs(
         members = np.flatnonzero(cosines.channel == i)
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
-        samples = cosines.n_sections * cosines.strides
+        samples = cosines.n_sections * cosines.cycles
         variance: Any = 2 * spectrum[..., None] / samples
         H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
         larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0

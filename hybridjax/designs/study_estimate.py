@@ -43,7 +43,7 @@ class Block(NamedTuple):
     htf: HTF
     """Responses to one cosine each, in one experiment each, with the variances for white noise of
     variance 1 on each sample."""
-    strides: int
+    cycles: int
     """All cycles of the records, with those that are discarded."""
 
 

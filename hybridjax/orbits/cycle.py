@@ -307,18 +307,18 @@ class LimitCycle(eqx.Module):
         return responses(self._checked(), modes)
 
     def asymptotic_phase(
-        self, chart: str, state: Annotated[Numbers, Reals("n")], turns: Count = 1000
+        self, chart: str, state: Annotated[Numbers, Reals("n")], cycles: Count = 1000
     ) -> float:
         """The phase, in cycles, of the state on the cycle that a state off it approaches. It flows
         until it meets the section near the anchor, where phases are linear.
 
         **Arguments:** `chart`, `state`: as of `simulate`; in a chart of sliding, on its surface.
-        `turns`: largest number of crossings of the section. Default: 1000.
+        `cycles`: largest number of crossings of the section. Default: 1000.
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
         a state that does not reach the cycle.
         """
-        return asymptotic_phase(self._checked(), chart, np.asarray(state), turns)
+        return asymptotic_phase(self._checked(), chart, np.asarray(state), cycles)
 
     def htf(
         self,

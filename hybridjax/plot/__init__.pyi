@@ -6,7 +6,7 @@ from .data import (
     section_data as section_data,
     validation as validation,
 )
-from .designs import spectrum as spectrum, strides as strides
+from .designs import spectrum as spectrum, standard_errors as standard_errors
 from .explorer import Explorer as Explorer
 from .frequency import bode as bode, htf as htf
 from .look import (

@@ -57,14 +57,14 @@ class Diagnosis(eqx.Module):
     - `findings` about the data and the fit; none if there is no reason for doubt.
     - `plain` (d,): the multipliers from plain regression (ARX).
     - `bandwidths`: for each input the frequency (cycles per period) up to which it had power.
-    - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
-      so many strides like these would give.
+    - `cycles`: numbers of cycles. `expected` (k, d): the standard errors of the multipliers that
+      so many cycles like these would give.
     """
 
     findings: tuple[Finding, ...]
     plain: Multipliers
     bandwidths: tuple[float, ...] = eqx.field(static=True)
-    strides: tuple[int, ...] = eqx.field(static=True)
+    cycles: tuple[int, ...] = eqx.field(static=True)
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
@@ -126,15 +126,15 @@ def diagnosis_of(
         *_about_samples(data),
     )
     # Variances decrease with the number of strides beyond that of the unknowns.
-    strides = (100, 300, 1000, 3000)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
+    cycles = (100, 300, 1000, 3000)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in cycles], float)
     with np.errstate(divide="ignore"):
         smaller = np.sqrt(max(sampled - unknowns, 1) / later)
     return Diagnosis(
         findings=findings,
         plain=plain,
         band=tuple(band),
-        strides=strides,
+        cycles=cycles,
         expected=fit.standard_errors * smaller[:, None],
     )
 

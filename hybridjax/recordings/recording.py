@@ -359,11 +359,11 @@ def signal_of(crossing: Crossing) -> str:
 
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
-    if not isinstance(crossing.function, str) or crossing.charts is not None:
+    if not isinstance(crossing.signal, str) or crossing.charts is not None:
         raise DefinitionError(
             "the Crossing of a recording must name a signal, and no charts."
         )
-    return crossing.function
+    return crossing.signal
 
 
 def check_events(

@@ -242,7 +242,7 @@ def test_designs_within_a_distortion(hopper_cycle):
     assert max(shares(plan.usual_rms).values()) == pytest.approx(1)
     assert plan.saved > 1.2
     assert 1 <= plan.certificate < 1.1
-    assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
+    assert f"With the {' and '.join(plan.limited)} limited, one cycle" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
 
     # Twice what is allowed: twice the power, half of the strides.

@@ -68,7 +68,7 @@ def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
         two, expected_htf(two, plan.usual, TWO_NOISE, harmonics), estimator="fit_ldtp"
     )
     assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
-    for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
+    for other in random_designs(3, 0.1, 6, 32, frequencies=(0, 3), inputs=two.inputs):
         bound = hj.identify.cramer_rao(
             two, expected_htf(two, other, TWO_NOISE, harmonics), estimator="fit_ldtp"
         )
@@ -165,7 +165,7 @@ def test_several_models(robust, exponent, three):
         return np.mean(powers) ** (1 / exponent)
 
     assert mean(plan.design) == pytest.approx(plan.criterion, rel=2e-3)
-    for other in random_designs(5, 0.1, N, 32, band=(0, 2)):
+    for other in random_designs(5, 0.1, N, 32, frequencies=(0, 2)):
         assert mean(other) > plan.criterion / plan.certificate
     for_one = hj.optimal_design(
         three[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1}

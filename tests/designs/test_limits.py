@@ -44,9 +44,9 @@ def test_rates(optimal_two):
 
 def test_strides(optimal_two, two_usual):
     """A smaller number of experiments holds fewer lines; words and strides go together."""
-    plan = optimal_two(limit=Limits(rms="input", strides=300))
+    plan = optimal_two(limit=Limits(rms="input", cycles=300))
     assert plan.design.experiments == 300 // 32
-    assert plan.strides <= 300
+    assert plan.cycles <= 300
     power = np.sqrt(np.mean(two_usual.signals() ** 2, axis=(0, 1)))
     assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
 

@@ -54,11 +54,11 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
     assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
     assert (
-        f"stride of this design replaces {plan.saved:.2g} with equal amplitudes."
+        f"cycle of this design replaces {plan.saved:.2g} with equal amplitudes."
         in repr(plan)
     )
     assert re.search(
-        r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
+        r"cycles +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
     )
     assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 
@@ -87,8 +87,8 @@ def test_experiments_are_as_promised(plan, isochron_ldtp):
     )
     rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
     assert_allclose(rms, [plan.rms["yM"], plan.rms["vM"]], rtol=1e-3)
-    assert plan.strides == plan.usual.cycles(0)
-    assert plan.strides_for(plan.standard_errors.max() / 2) == 4 * plan.strides
+    assert plan.cycles == plan.usual.cycles(0)
+    assert plan.cycles_for(plan.standard_errors.max() / 2) == 4 * plan.cycles
 
 
 def test_fits_reach_what_is_promised(model):

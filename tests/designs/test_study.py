@@ -50,10 +50,10 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
     plan = hj.optimal_design(model, first, noise=NOISE)
     error = end.standard_errors[-1, 0]
     strides_of_first = plan.usual_criterion * plan.usual.cycles(0) / error**2
-    assert strides_of_first > 4 * end.strides[-1]
+    assert strides_of_first > 4 * end.cycles[-1]
     # The bound of as many strides, all of them with the best design for the true model.
     bound_of_plan = np.linalg.norm(plan.standard_errors)
-    bound = bound_of_plan * np.sqrt(plan.strides / end.strides[-1])
+    bound = bound_of_plan * np.sqrt(plan.cycles / end.cycles[-1])
     assert error > 0.95 * bound
 
 
@@ -63,9 +63,9 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     assert studies[0].design is first
     assert studies[0].fit is None
     cycles = [study.design.cycles(0) for study in studies[:-1]]
-    assert_array_equal(studies[-1].strides, np.cumsum(cycles))
+    assert_array_equal(studies[-1].cycles, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
-        assert after.strides[-1] <= 3 * before.strides[-1]
+        assert after.cycles[-1] <= 3 * before.cycles[-1]
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
@@ -113,7 +113,7 @@ def test_repeated_windows_count(model, first):
     study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
-    assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
+    assert once.cycles[0] == twice.cycles[0] == 2 * first.cycles(0)
     assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
@@ -172,8 +172,8 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
     assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
     assert (
-        hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.strides
-        > half.plan.strides
+        hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.cycles
+        > half.plan.cycles
     )
 
 

@@ -79,7 +79,7 @@ def cycles(t):
     yield t.cycle.responses, dict(modes=0)
     yield (
         t.cycle.asymptotic_phase,
-        dict(chart="plane", state=np.array([2.0, 0.1]), turns=9),
+        dict(chart="plane", state=np.array([2.0, 0.1]), cycles=9),
     )
     yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
@@ -236,9 +236,9 @@ def designs_data(t):
     ask = hj.designs.MultiplierGoal(harmonics=0, extra_lags=6)
     yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
     yield hj.designs.ParameterGoal, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
-    yield hj.designs.ResponseGoal, dict(band=(0.1, 1.0))
+    yield hj.designs.ResponseGoal, dict(frequencies=(0.1, 1.0))
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
-    limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
+    limits = hj.designs.Limits(rms={"u0": 1.0}, cycles=64)
     yield limits.require_inputs, dict(inputs=("u0",))
     yield limits.experiments, dict(design=t.design, cosines=4)
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
@@ -248,7 +248,7 @@ def designs_data(t):
     )
     yield t.study.add, dict(data=t.block)
     yield hj.designs.draw_models, dict(fit=t.joint, count=1)
-    yield t.plan.strides_for, dict(standard_error=1.0)
+    yield t.plan.cycles_for, dict(standard_error=1.0)
 
 
 def recordings(t):
@@ -358,7 +358,7 @@ def plots(t):
     yield positional(plot.htf), dict(values={"a": t.estimate})
     yield positional(plot.htf), dict(values=t.estimate)
     yield plot.spectrum, dict(plan=t.plan, model=t.model)
-    yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
+    yield plot.standard_errors, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
     yield plot.animate, dict(motion=t.cycle)
     yield hj.explore, dict(system=t.cycle, ranges={"a": (-9.0, 9.0)})

@@ -140,7 +140,7 @@ def test_a_controller_is_a_finding(plant):
     for fit in (hj.fit_series(data, 2, check=False), hj.fit_ldtp(data, 2, check=False)):
         assert "feedback" in causes(fit)
         text = next(f.text for f in fit.findings if f.cause == "feedback")
-        assert "(force)" in text and "name their `reference`" in text
+        assert "(force)" in text and "name their `references`" in text
 
 
 def test_a_misfit_is_a_finding(plant):

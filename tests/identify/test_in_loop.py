@@ -210,7 +210,7 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
         held.append(fit.contains(plant.multipliers, 0.99)[0])
         biased = hj.fit_series(data, 2, check=False)
         (doubt,) = (x for x in biased.findings if x.cause == "feedback")
-        assert "(u): the fit is biased; name their `reference`" in doubt.text
+        assert "(u): the fit is biased; name their `references`" in doubt.text
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
@@ -318,5 +318,5 @@ def test_what_does_not_fit_is_refused(plant):
             hj.experiments.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape),
             references="r",
         )
-    with refused("`reference`, `noise` and `start` are for time series"):
+    with refused("`references`, `noise` and `start` are for time series"):
         hj.fit_ldtp(plant.htf([0.3]), 2, references="r")

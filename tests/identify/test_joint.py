@@ -155,7 +155,7 @@ def test_undetermined_responses_have_infinite_variance():
     f = np.arange(1, 40) / 80
     htf = small.htf(f, (-1, 0, 1))
     draw = noisy(htf, np.full(htf.H.shape, 1e-6), np.random.default_rng(0))
-    fit = hj.fit_ldtp(draw, shaken(small, np.random.default_rng(1)))
+    fit = hj.fit_ldtp(draw, initial=shaken(small, np.random.default_rng(1)))
     variance = fit.htf(f, (-2, -1, 0, 1)).variance
     assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
     assert fit.contains(small.multipliers[:2], 0.999).all()

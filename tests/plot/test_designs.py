@@ -47,9 +47,9 @@ def test_what_strides_buy(plan):
     studied = study.add(noisy)
     more_than_colors = {f"there {k}": studied for k in range(8)}
     studies = {"here": [studied, studied], **more_than_colors}
-    ax = hj.plot.strides(plan, studies).ax
+    ax = hj.plot.standard_errors(plan, studies).ax
     lines = {line.get_label(): line for line in ax.get_lines()}
-    assert lines["here"].get_xdata() == studied.strides
+    assert lines["here"].get_xdata() == studied.cycles
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
 
     strides, errors = lines["equal amplitudes"].get_data()
@@ -58,4 +58,4 @@ def test_what_strides_buy(plan):
     expected = np.linalg.norm(plan.usual_standard_errors)
     assert np.exp(log_error) == pytest.approx(expected)
     with pytest.raises(hj.errors.DefinitionError, match="without a block"):
-        hj.plot.strides(plan, {"here": study})
+        hj.plot.standard_errors(plan, {"here": study})
