@@ -25,10 +25,7 @@ from .experiments.stored import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
-from .identify.multipliers import (
-    fit_multipliers as fit_multipliers,
-    select_order as select_order,
-)
+from .identify.multipliers import fit_multipliers as fit_multipliers
 from .identify.series.fit import fit_series as fit_series
 from .identify.validation import validate as validate
 from .io import load as load, save as save
@@ -37,6 +34,7 @@ from .orbits.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .orbits.find import find_limit_cycle as find_limit_cycle
 from .plot.explorer import explore as explore
 from .recordings.identification import identify_recording as identify_recording
+from .recordings.order import select_order as select_order
 from .recordings.read import read_recording as read_recording
 from .recordings.recording import Recording as Recording
 from .scale.sweeps import sweep as sweep

@@ -113,7 +113,7 @@ figure = hj.plot.section_data(data)
 # for which both tests allow.
 
 # %%
-print("order:", hj.recordings.choose_order(data))
+print("order:", hj.select_order(data).order)
 held_out = hj.recordings.hold_out(data, order=2)
 held_out.validation
 

@@ -187,6 +187,7 @@ UNCHECKED = {
         "Fluctuations",
         "HarmonicStateSpace",
         "HeldOut",
+        "HeldOutOrders",
         "Identifiability",
         "Identification",
         "Impact",

@@ -290,26 +290,9 @@ class OrderSelection(eqx.Module):
         return "\n".join(rows)
 
 
-@checked
 @one_blas_thread()
-def select_order(
-    htf: HTF, max_order: Order = 5, *, extra_lags: Index | None = None
-) -> OrderSelection:
-    r"""Compare numbers of multipliers, from none to `max_order`.
-
-    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is removed. The
-    rest has one independent component for each multiplier (D at most), and noise. Components are
-    counted by generalized singular values: each above the largest value of noise alone counts.
-    *MDL*: Rissanen's criterion for a fit of each order, with numerators of the degree that belongs
-    to this order.
-
-    **Arguments:** as in `fit_multipliers`. Without variances the misfit of the largest order is
-    taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors
-    that are not random (a transient, distortion by an input that was not drawn at random) then
-    look like multipliers. `max_order` defaults to 5.
-
-    **Raises:** `DefinitionError` as `fit_multipliers`.
-    """
+def compare_orders(htf: HTF, max_order: int, extra_lags: int | None) -> OrderSelection:
+    """Compare numbers of multipliers of HTFs, see `hj.select_order`."""
     rms = weights.check_values(htf)
     size = varpro.numerator_size(htf, max_order, extra_lags)
     weight = weights.error_weights(htf, rms)

@@ -9,7 +9,7 @@ from .findings import Inspection as Inspection
 from .fit_warnings import Diagnosis as Diagnosis, diagnose as diagnose
 from .held_out import (
     HeldOut as HeldOut,
-    choose_order as choose_order,
+    HeldOutOrders as HeldOutOrders,
     hold_out as hold_out,
 )
 from .identification import Identification as Identification

@@ -124,7 +124,7 @@ def identify_recording(
 
     **Arguments:** those of `sample_sections`, and
 
-    - `order`: the number of multipliers. Default: the result of `choose_order`; in a loop, the most
+    - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
       that the reference determines, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated

@@ -38,7 +38,9 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     band, seed, lines, nu, more
 ):
     N, P, top = band
-    arguments = dict(n_sections=N, periods=P, frequencies=(0, top / P), lines=lines, inputs=nu)
+    arguments = dict(
+        n_sections=N, periods=P, frequencies=(0, top / P), lines=lines, inputs=nu
+    )
     # Line j is the frequency j / P. Multiples of 1/2 are excited with two phases or not at all.
     is_half = {j: (2 * j) % P == 0 for j in range(top + 1)}
     excited = [j for j in range(top + 1) if lines == "two-phase" or not is_half[j]]

@@ -188,7 +188,7 @@ def estimates(t):
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
     yield t.structured.interval, dict(level=0.9)
-    yield hj.select_order, dict(htf=t.estimate, extra_lags=6)
+    yield hj.select_order, dict(data=t.estimate, extra_lags=6)
     yield hj.identify.cramer_rao, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
     yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
@@ -279,7 +279,7 @@ def recordings(t):
         dict(recording=t.recording, inputs="f", outputs=("x", "v")),
     )
     yield hj.recordings.diagnose, dict(data=t.section_data, fit=t.found.fit)
-    yield hj.recordings.choose_order, dict(data=t.section_data)
+    yield hj.select_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
     yield t.found.responses.of_model, dict(model=t.model)

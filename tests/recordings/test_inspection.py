@@ -187,7 +187,7 @@ def test_an_order_that_is_too_low_is_named():
     with pytest.warns(
         hj.errors.FindingWarning, match="orders above 1 could not be tried"
     ):
-        hj.recordings.choose_order(untried.data)
+        hj.select_order(untried.data)
 
 
 @pytest.mark.slow
