@@ -326,7 +326,7 @@ def walker(draws=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
     middle = hj.AtEvent("middle")
-    # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
+    # Section of the cycle, outputs, phase, event to mark, rms of the force, order, extra lags
     # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
         "rimless wheel": (

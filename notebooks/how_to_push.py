@@ -129,6 +129,6 @@ for name in ("time.csv", "phase.csv"):
         print(name, *(next(file).strip() for _ in range(4)), sep="\n  ")
 
 # %% [markdown]
-# The hardware returns a recording. `section_data(...).experiments(block.periods)` converts it to
+# The hardware returns a recording. `sample_sections(...).experiments(block.periods)` converts it to
 # the argument of `study.add` (see the notebook `recording`). A study depends only on its arguments
 # and blocks, so that it can be reconstructed from stored data on another day.

@@ -188,7 +188,7 @@ class SequentialDesign(eqx.Module):
         """Return the study with one more block, its estimate and its next design.
 
         **Arguments:** `data`: the responses to `design`, or to other inputs of the same lines (from
-        recordings: `section_data(...).experiments(periods)`). `repeats`: number of last windows
+        recordings: `sample_sections(...).experiments(periods)`). `repeats`: number of last windows
         that are averaged. Default: 1.
 
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data

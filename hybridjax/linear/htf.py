@@ -344,7 +344,7 @@ class HTF(eqx.Module):
         **Returns:** (n, ny).
 
         **Raises:** `DefinitionError` if `n` is no multiple of `N`, if the harmonics are not
-        symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
+        symmetric about 0, or if `u` holds a frequency that is not on the grid (up to sign).
         """
         self.require_sampled("`predict`")
         N = self.n_sections
@@ -524,7 +524,7 @@ def require_distinct(f: Float[np.ndarray, " F"]) -> None:
     again = np.flatnonzero(np.diff(f) < SAME_FREQUENCY)
     if len(again):
         raise DefinitionError(
-            f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one."
+            f"`frequencies` holds {f[again[0]]:.10g} cycles per period twice: keep one."
         )
 
 

@@ -133,7 +133,7 @@ def diagnosis_of(
     return Diagnosis(
         findings=findings,
         plain=plain,
-        band=tuple(band),
+        bandwidths=tuple(band),
         cycles=cycles,
         expected=fit.standard_errors * smaller[:, None],
     )

@@ -54,8 +54,8 @@ def select_order(
 
     **Returns:** the comparison, whose `order` is the number that is selected.
 
-    **Raises:** `DefinitionError` for HTFs as `fit_multipliers`; for data with too few cycles for one
-    multiplier.
+    **Raises:** `DefinitionError` for HTFs as `fit_multipliers`; for data with too few cycles for
+    one multiplier.
     """
     if isinstance(data, HTF):
         return compare_orders(data, max_order or 5, extra_lags)

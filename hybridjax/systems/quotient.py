@@ -106,15 +106,15 @@ class Symmetric(Derived):
 
     def __check_init__(self):
         charts = self.system.charts()
-        require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
+        require_among("chart", (*self.swap, *self.swap.values()), charts, "Symmetric: ")
         states = sorted(set().union(*(chart.states for chart in charts.values())))
         named = (*dict(self.names), *self.flipped, *self.translation)
-        require_among("state", named, states, "Quotient: ")
+        require_among("state", named, states, "Symmetric: ")
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
                 raise DefinitionError(
-                    f"Quotient: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
+                    f"Symmetric: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
                     f"{sorted(charts[image].states)}: use `relabel`."
                 )
         if self.half_period:
@@ -123,7 +123,7 @@ class Symmetric(Derived):
     def _check_half_period(self):
         if (self.system.period() is not None) != (self.half_period is True):
             raise DefinitionError(
-                "Quotient: `half_period` must be True if a clock drives the system, else a state "
+                "Symmetric: `half_period` must be True if a clock drives the system, else a state "
                 "or a function of (t, q)."
             )
         for x in self.system.transitions():
@@ -132,12 +132,12 @@ class Symmetric(Derived):
             phase = math.remainder(x.guard.offset / x.guard.period, 1.0)
             if abs(phase) < TOGETHER:
                 raise DefinitionError(
-                    f"Quotient: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
+                    f"Symmetric: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
                     "the clock begin earlier."
                 )
         if isinstance(self.half_period, str):
             for name, chart in self.system.charts().items():
-                here = f"Quotient: in '{name}' "
+                here = f"Symmetric: in '{name}' "
                 require_among("state", [self.half_period], chart.states, here)
 
     def period(self):
@@ -389,7 +389,7 @@ def check_symmetry(
             once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
                 f"{type(system.system).__name__} does not have the symmetry of its "
-                f"Quotient{once}: {sentence}."
+                f"Symmetric{once}: {sentence}."
             )
 
 

@@ -221,4 +221,4 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
         StoredExperiments(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(hj.errors.DefinitionError, match="file"):
-        stream(*arguments, store=tmp_path / "file")
+        hj.run_experiments(*arguments, store=tmp_path / "file")

@@ -263,10 +263,10 @@ def recordings(t):
     yield t.recording.mark, dict(event="e", crossing=rises)
     for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
-    yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
+    yield hj.recordings.estimate_phase, dict(recording=t.recording, sections=angle)
     take = dict(
         recording=t.recording,
-        phase=t.phase,
+        sections=t.phase,
         inputs="f",
         outputs=("x", "v"),
         n_sections=2,
@@ -382,7 +382,7 @@ def rhythms(t):
 
     yield hj.systems.filippov, dict(charts=charts, surface=surface)
     yield hj.orbits.simultaneous_events, dict(cycle=t.cycle)
-    about = dict(recording=t.recording, phase=BEAT, input="f")
+    about = dict(recording=t.recording, sections=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(curve=t.beats)
     at = dict(phase=[0.1, 0.2])
@@ -407,7 +407,7 @@ def without_arguments(t):
         t.model.monodromy,
         t.model.rank,
         t.estimate.confidence_radius,
-        design.inputs,
+        design.signals,
         design.expected_variance,
         design.cycles,
         data.windows,

@@ -78,7 +78,6 @@ CALLED = {
     "frequencies": "f =",
     "line": "f =",
     "frame": "column|signals",
-    "definition": "phase",
 }
 # What compiles, or computes for seconds, where a value is right: a value must be wrong by its kind.
 SLOW = {

@@ -79,7 +79,7 @@ def test_intervals_of_few_blocks_are_wider_than_percentiles():
 
 
 def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
-    sections = {"phase": hj.AtEvent("turn"), "n_sections": N}
+    sections = {"sections": hj.AtEvent("turn"), "n_sections": N}
     marked = rhythm.mark("turn", hj.Crossing("v", "falling"))
     given = hj.recordings.sample_sections(
         marked, inputs="force", outputs=("x", "v"), **sections

@@ -96,7 +96,7 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
 
     run()
     with pytest.raises(
-        hj.errors.DefinitionError, match=r"`over.slope` is not the same"
+        hj.errors.DefinitionError, match=r"`values.slope` is not the same"
     ):
         run(over=small | {"slope": np.array([0.071, 0.08])})
     with pytest.raises(
