@@ -106,10 +106,10 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     pytest.importorskip("xarray")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
-    one = dataset.H.sel(f=0.4, harmonic=-1, input="w", output="y")
+    one = dataset.H.sel(frequency=0.4, harmonic=-1, input="w", output="y")
     assert one.item() == complex(H[-1][-1, 0, 1])
     assert dataset.input_unit.sel(input="u").item() == "N"
-    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
+    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(frequency=slice(0, 0.2))
     fewer = convert.from_xarray(part)
     assert fewer.harmonics == (-1, 0)
     assert fewer.inputs == ("u",)

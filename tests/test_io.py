@@ -115,7 +115,7 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     dataset = hj.convert.to_xarray(htf)
     assert dataset["variance_dof.roundness"].dims == (
         "harmonic",
-        "f",
+        "frequency",
         "output",
         "input",
     )
@@ -191,7 +191,7 @@ def rewrite(path, header=None, arrays=None):
         ({"header": {"static": 3}}, "header is incomplete"),
         ({"header": {"arrays": {}}}, "header lists"),
         ({"arrays": {"source": np.zeros(2)}}, "not those of HTF"),
-        ({"arrays": {"f": np.array(["a"])}}, "content is no HTF"),
+        ({"arrays": {"frequencies": np.array(["a"])}}, "content is no HTF"),
     ],
 )
 def test_foreign_content(folder, things, change, says):
@@ -214,7 +214,7 @@ def test_pickles_are_not_executed(folder, things):
 
 
 def test_a_matlab_file(folder, ldtp, htf):
-    for thing, names in ((ldtp, "A dims"), (htf, "H scatter_freedom")):
+    for thing, names in ((ldtp, "A dims"), (htf, "H variance_dof_dof")):
         hj.save(folder / "thing.mat", thing)
         read = scipy.io.loadmat(folder / "thing.mat")
         for name in names.split():
@@ -250,6 +250,6 @@ def test_traced_and_batched_objects(folder, ldtp):
         jax.jit(inside)(np.zeros(1))
     batch = jax.vmap(lambda f: ldtp.htf(f))(np.linspace(0.1, 0.4, 4).reshape(2, 2))
     with pytest.raises(
-        hj.errors.DefinitionError, match="cannot be saved: its f is float64"
+        hj.errors.DefinitionError, match="cannot be saved: its frequencies is float64"
     ):
         hj.save(folder / "x.npz", batch)

@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
+from hybridjax._core.public import place_of
 from hybridjax._core.text import p_value
 from hybridjax.experiments.data import Simulated
 from hybridjax.orbits.branches import Branch, BranchEnd, BranchPoint
@@ -107,7 +108,8 @@ def test_definitions_print_as_they_are_written():
         "Scheduled(period=2, offset=0.5)",
     ]
     for text in written:
-        assert repr(eval(f"hj.{text}")) == text
+        place = place_of(text.partition("(")[0]).rpartition(".")[0]
+        assert repr(eval(f"{place}.{text}")) == text
     network = eqx.nn.MLP(2, 1, 8, 1, key=jax.random.key(0))
 
     class Learned(hj.models.VerticalHopper):

@@ -111,11 +111,10 @@ def from_xarray(dataset: Any) -> Saved:
             if f"{dimension}_unit" in dataset.coords:
                 units = dataset[f"{dimension}_unit"].values
                 static[field] = tuple(map(Signal, static[field], map(str, units)))
-        names = set(dataset.data_vars)
-        if "frequency" in dataset.coords:
-            names.add("frequencies")
         arrays = {}
-        for name in map(str, names):
+        if "frequency" in dataset.coords:
+            arrays["frequencies"] = np.asarray(dataset["frequency"].values)
+        for name in map(str, dataset.data_vars):
             array = dataset[name].transpose(*_axes(kind, name))
             arrays[name] = np.asarray(array.values)
         return put_together(kind, static, arrays)
@@ -144,8 +143,8 @@ def _from_module(module: eqx.Module) -> Any:
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
     kind = type(module)
     variables = {name: (_axes(kind, name), x) for name, x in arrays.items()}
-    if "f" in variables:
-        coordinates["f"] = variables.pop("f")
+    if "frequencies" in variables:
+        coordinates["frequency"] = variables.pop("frequencies")
     units = {str(name): name.unit for name in signals_in(static)}
     dataset = package("xarray").Dataset(variables, coordinates)
     sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}

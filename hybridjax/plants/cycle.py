@@ -543,7 +543,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> PlantPhase:
 
 
 def _is_of_a_signal(crossing: Any) -> bool:
-    return isinstance(getattr(crossing, "function", None), str) and not crossing.charts
+    return isinstance(getattr(crossing, "signal", None), str) and not crossing.charts
 
 
 def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> PlantPhase:

@@ -53,7 +53,7 @@ def systems(t):
 
 
 def sections(t):
-    yield hj.Crossing, dict(function="y", direction="falling", value=0.0)
+    yield hj.Crossing, dict(signal="y", direction="falling", value=0.0)
     yield hj.AtEvent, dict(name="hit")
     yield hj.ClockPhase, dict(n_sections=8, anchor=0.0)
     turn = dict(
@@ -74,14 +74,14 @@ def cycles(t):
     yield t.cycles.__getitem__, dict(i=0)
     yield (
         hj.continuation,
-        dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05),
+        dict(cycle=t.cycle, parameter="mu", range=(0.1, 0.2), step=0.05),
     )
     yield t.cycle.responses, dict(modes=0)
     yield (
         t.cycle.asymptotic_phase,
         dict(chart="plane", state=np.array([2.0, 0.1]), cycles=9),
     )
-    yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
+    yield t.cycle.htf, dict(frequencies=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
     yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
     yield t.cycle.sensitivity("mu").shape, dict(phase=np.array([0.3]))
@@ -103,7 +103,7 @@ def linear(t):
     for name, v in (("periodic_state", u), ("periodic_states", u[None])):
         yield getattr(t.model, name), dict(u=v, periods=2)
     yield t.model.impulse_response, dict(n_lags=3)
-    yield t.model.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.model.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield (
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
@@ -117,7 +117,10 @@ def linear(t):
         noise_variance=size,
         variance_dof=hj.linear.VarianceDof(np.ones(len(f)), size),
     )
-    yield hj.linear.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
+    yield (
+        hj.linear.HTF,
+        dict(frequencies=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors,
+    )
     yield hj.linear.VarianceDof, dict(dof=f, roundness=size)
     yield variance_dof.quantile, dict(level=0.9)
     yield variance_dof.sources, dict(frequencies=f)
@@ -179,10 +182,10 @@ def estimates(t):
     yield hj.identify.estimate_loop, dict(data=t.data, at_input=t.data.inputs[1])
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2)
     yield hj.identify.fit_rational, dict(htf=t.estimate, output=0)
-    yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.rational.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])
     yield hj.fit_multipliers, dict(htf=t.estimate, order=2, extra_lags=6)
-    yield t.structured.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.structured.htf, dict(frequencies=np.array([0.1, 0.2]))
     true = np.asarray(t.model.multipliers)
     yield t.structured.distance, dict(true=true)
     yield t.structured.compare, dict(true=true)
@@ -190,9 +193,9 @@ def estimates(t):
     yield t.structured.interval, dict(level=0.9)
     yield hj.select_order, dict(data=t.estimate, extra_lags=6)
     yield hj.identify.cramer_rao, dict(model=t.model, htf=t.uncertain)
-    yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
-    yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
-    yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
+    yield hj.fit_ldtp, dict(data=t.uncertain, initial=t.model)
+    yield t.joint.htf, dict(frequencies=np.array([0.1, 0.2]))
+    yield t.driven.noise_spectrum, dict(frequencies=np.array([0.1, 0.2]))
     yield (
         hj.identify.cramer_rao,
         dict(estimator="fit_ldtp", model=t.model, htf=t.uncertain),
@@ -203,7 +206,7 @@ def series(t):
     yield hj.fit_series, dict(data=t.record, order=2)
     yield t.fit.impulse_response, dict(n_lags=3)
     yield t.fit.interval, dict(level=0.9)
-    yield t.fit.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.fit.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield hj.validate, dict(model=t.fit, data=t.record)
 
 

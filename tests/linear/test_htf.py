@@ -126,5 +126,7 @@ def test_a_multiplier_on_the_unit_circle_is_named():
 
 
 def test_frequencies_are_given_once():
-    with pytest.raises(hj.errors.DefinitionError, match="`frequencies` holds 0.1 .* twice"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="`frequencies` holds 0.1 .* twice"
+    ):
         hj.linear.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)
