@@ -132,8 +132,8 @@ class Symmetric(Derived):
             phase = math.remainder(x.guard.offset / x.guard.period, 1.0)
             if abs(phase) < TOGETHER:
                 raise DefinitionError(
-                    f"Symmetric: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
-                    "the clock begin earlier."
+                    f"Symmetric: '{x.name}' must not be scheduled at t = 0, where halves begin: "
+                    "let the clock begin earlier."
                 )
         if isinstance(self.half_period, str):
             for name, chart in self.system.charts().items():
