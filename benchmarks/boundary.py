@@ -33,10 +33,10 @@ def words(
 
 
 def records(
-    data: hj.Record | Sequence[hj.Record],
-    order: Order | hj.LDTP,
+    data: hj.experiments.SectionSeries | Sequence[hj.experiments.SectionSeries],
+    order: Order | hj.linear.LDTP,
     *,
-    overhang: Index | None = None,
+    extra_lags: Index | None = None,
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
 ): ...
@@ -47,8 +47,10 @@ def array(u: Annotated[Numbers, Reals("S n nu")]): ...
 
 def cases() -> dict[str, tuple[Callable, tuple, dict]]:
     """What is called, and with what."""
-    record = hj.Record(np.ones((64, 1)), np.ones((64, 2)), n_sections=8)
-    options = {"overhang": 3, "start": "cycle", "check": True}
+    record = hj.experiments.SectionSeries(
+        np.ones((64, 1)), np.ones((64, 2)), n_sections=8
+    )
+    options = {"extra_lags": 3, "start": "cycle", "check": True}
     sizes = {"y": 1.0, "v": 2.0, "q": 3.0}
     return {
         "one integer": (count, (32,), {}),
@@ -82,20 +84,24 @@ def calls() -> dict[str, tuple[Callable, tuple, dict]]:
     y = np.asarray(model.simulate(u)) + 1e-3 * rng.normal(
         size=(len(u), len(model.outputs))
     )
-    record = hj.Record(u, y, n_sections=model.n_sections)
+    record = hj.experiments.SectionSeries(u, y, n_sections=model.n_sections)
     hopper = hj.models.VerticalHopper()
     cycle = hj.find_limit_cycle(hopper)
     return {
-        "LDTP.simulate, 1200 samples": (hj.LDTP.simulate, (model, u), {}),
+        "LDTP.simulate, 1200 samples": (hj.linear.LDTP.simulate, (model, u), {}),
         "LDTP.htf, 10 frequencies": (
-            hj.LDTP.htf,
+            hj.linear.LDTP.htf,
             (model, np.linspace(0.1, 0.9, 10)),
             {},
         ),
         "fit_series, 200 cycles": (hj.fit_series, (record, 2), {}),
         "validate, 200 cycles": (hj.validate, (model, record), {}),
         "find_limit_cycle, hopper": (hj.find_limit_cycle, (hopper, cycle), {}),
-        "place_sections, 8": (hj.place_sections, (cycle, hj.ClockPhase(8)), {}),
+        "place_sections, 8": (
+            hj.sections.place_sections,
+            (cycle, hj.ClockPhase(8)),
+            {},
+        ),
     }
 
 

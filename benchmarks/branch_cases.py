@@ -35,7 +35,7 @@ class Case:
     ends: tuple[str, str] = (OVER, OVER)
     marks: list[tuple[str, float]] | None = None
     border: tuple[float, float] = (np.nan, np.nan)
-    exact: Callable[[hj.LimitCycle], tuple[float, float]] | None = None
+    exact: Callable[[hj.orbits.LimitCycle], tuple[float, float]] | None = None
     within: float = 1e-6
     """Relative error of `marks`, `border` and `exact` that is allowed."""
 
@@ -153,8 +153,8 @@ class Boost(hj.HybridSystem):
         }
 
     def transitions(self):
-        tick = hj.Scheduled(self.T)
-        opens = hj.Scheduled(self.T, self.duty * self.T)
+        tick = hj.systems.Scheduled(self.T)
+        opens = hj.systems.Scheduled(self.T, self.duty * self.T)
         return (
             hj.Transition("opens", "on", "off", opens),
             hj.Transition("closes", "off", "on", tick),
@@ -278,7 +278,7 @@ def _least_restitution() -> float:
     return (1 - ratio) / (1 + ratio)
 
 
-def _van_der_pol(cycle: hj.LimitCycle) -> tuple[float, float]:
+def _van_der_pol(cycle: hj.orbits.LimitCycle) -> tuple[float, float]:
     """Published periods (H. T. Davis, Introduction to nonlinear differential and integral
     equations, 1962, and others)."""
     known = {1.0: 6.6632868593, 5.0: 11.6122306678, 10.0: 19.0783695673}
@@ -286,7 +286,7 @@ def _van_der_pol(cycle: hj.LimitCycle) -> tuple[float, float]:
     return period, known.get(float(cycle.system.mu), period)
 
 
-def _largest_multiplier(cycle: hj.LimitCycle) -> float:
+def _largest_multiplier(cycle: hj.orbits.LimitCycle) -> float:
     return float(cycle.multipliers[0].real)
 
 

@@ -24,7 +24,7 @@ from scipy.integrate import DOP853
 from scipy.optimize import brentq
 
 import hybridjax as hj
-from hybridjax.orbits.continuation import Branch
+from hybridjax.orbits.branches import Branch
 from hybridjax.orbits.curve import far_from_events
 
 
@@ -81,7 +81,7 @@ class Loop:
 
             return jax.jit(after)
 
-        scheduled = [isinstance(x.guard, hj.Scheduled) for x in transitions]
+        scheduled = [isinstance(x.guard, hj.systems.Scheduled) for x in transitions]
         numbers = range(len(transitions))
         of_chart = {
             name: [g for g in numbers if transitions[g].source == name]
@@ -170,7 +170,7 @@ class Loop:
         return brentq(level, low, high, xtol=1e-15 * max(1.0, abs(high)), rtol=1e-14)
 
 
-def faults(loop: Loop, cycle: hj.LimitCycle, at_end: bool = False) -> list[str]:
+def faults(loop: Loop, cycle: hj.orbits.LimitCycle, at_end: bool = False) -> list[str]:
     """What scipy says against a cycle. At the end of a branch, where events are about to be lost,
     it must close, and no more is compared."""
     loop.at(cycle.system)
@@ -214,7 +214,7 @@ def faults(loop: Loop, cycle: hj.LimitCycle, at_end: bool = False) -> list[str]:
     return found
 
 
-def _closes_sooner(cycle: hj.LimitCycle) -> float | None:
+def _closes_sooner(cycle: hj.orbits.LimitCycle) -> float | None:
     """A time less than the period after which the path of the cycle is back at its start."""
     path, period = cycle.trajectory(2.0), float(cycle.period)
     times = path.t[0] + np.linspace(0.0, 0.99, 40) * period
@@ -241,7 +241,7 @@ def _apart(a, b) -> float:
     return far
 
 
-def same(a: hj.LimitCycle, b: hj.LimitCycle) -> bool:
+def same(a: hj.orbits.LimitCycle, b: hj.orbits.LimitCycle) -> bool:
     off = abs(float(a.period) / float(b.period) - 1)
     size = max(1.0, np.abs(b.multipliers).max(initial=0.0))
     apart = _apart(a.multipliers, b.multipliers)
@@ -252,13 +252,13 @@ def single_search(case: Case, system: hj.HybridSystem) -> Any:
     """A cycle found from the model's own guess, or none."""
     try:
         cycle: Any = hj.find_limit_cycle(system, throw=False, **case.find)
-    except hj.ComputationError:
+    except hj.errors.ComputationError:
         return None
-    return cycle if int(cycle.result) == hj.Result.OK else None
+    return cycle if int(cycle.result) == hj.errors.Result.OK else None
 
 
 def compare(
-    case: Case, loop: Loop, cycle: hj.LimitCycle, at_end: bool
+    case: Case, loop: Loop, cycle: hj.orbits.LimitCycle, at_end: bool
 ) -> tuple[str, list[str]]:
     """The result of a single search, and all faults."""
     found = faults(loop, cycle, at_end)
@@ -271,8 +271,8 @@ def compare(
     if single is not None:
         found += [f"single search: {x}" for x in faults(loop, single)]
     again = hj.find_limit_cycle(cycle.system, cycle, throw=False)
-    if int(again.result) != hj.Result.OK:
-        message = hj.Result(int(again.result)).message
+    if int(again.result) != hj.errors.Result.OK:
+        message = hj.errors.Result(int(again.result)).message
         found.append(f"a search from the cycle of the branch fails: {message}")
     elif not same(again, cycle):
         found.append("a search from the cycle of the branch finds another")
@@ -322,7 +322,7 @@ def run(name: str, every: int) -> tuple[int, int]:
     searches = []
     for k in rows:
         at_end = any(
-            end.result != hj.Result.OK and end.value == branch.values[k]
+            end.result != hj.errors.Result.OK and end.value == branch.values[k]
             for end in branch.ends
         )
         search, wrong = compare(case, loop, branch[int(k)], at_end)
@@ -347,7 +347,7 @@ def main() -> int:
     for name in given.only:
         try:
             totals += run(name, given.every)
-        except hj.HybridJaxError as error:
+        except hj.errors.HybridJaxError as error:
             print(f"== {name}\n  WRONG {type(error).__name__}: {error}", flush=True)
             totals += (0, 1)
     print(f"{totals[0]} comparisons, {totals[1]} wrong")

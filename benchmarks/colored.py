@@ -9,7 +9,7 @@ variances that realizations show (`htf`) and without (`htf_plain`), and `fit_ser
   as at the opposite one.
 - `sensor`: measurement noise with a correlation time of half a cycle.
 - `drift`: white measurement noise, and a drift of each output with a correlation time of 30 cycles,
-  five times as large. `fit_series` is also told of it (`Record(drift=20)`).
+  five times as large. `fit_series` is also told of it (`SectionSeries(drift=20)`).
 
 Printed, as `name value` lines: rms error, rms of the standard errors (`said`), how many of the
 regions held the true multipliers (`held`), and `p` of the binomial test of 95 %; `doubted`: how
@@ -34,7 +34,9 @@ BY_SECTION = 0.002 * (1 + 0.8 * np.cos(2 * np.pi * np.arange(N) / N))
 SENSOR = (1e-4, 1e-3)
 
 
-def with_noise(case: str, clean: hj.ExperimentData, run, rng) -> hj.ExperimentData:
+def with_noise(
+    case: str, clean: hj.experiments.ExperimentData, run, rng
+) -> hj.experiments.ExperimentData:
     """**Arguments:** `run(process_noise)` runs the experiments."""
     seed = int(rng.integers(2**31))
     if case == "white":
@@ -49,8 +51,8 @@ def with_noise(case: str, clean: hj.ExperimentData, run, rng) -> hj.ExperimentDa
     )
 
 
-def told_of_drift(record: hj.Record) -> hj.Record:
-    return hj.Record(
+def told_of_drift(record: hj.experiments.SectionSeries) -> hj.experiments.SectionSeries:
+    return hj.experiments.SectionSeries(
         record.u,
         record.y,
         n_sections=N,
@@ -87,7 +89,7 @@ def show(name: str, values: dict[str, np.ndarray]) -> None:
 def one_case(case: str, draws: int) -> None:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     truth = complex(cycle.multipliers[0])
-    placed = hj.place_sections(cycle, PHASE)
+    placed = hj.sections.place_sections(cycle, PHASE)
     design = hj.multisine(N, PERIODS, lines="odd").scaled(RMS).realizations(4)
 
     def run(process_noise=None):
@@ -118,7 +120,7 @@ def one_case(case: str, draws: int) -> None:
             for k, x in found(fit, truth).items()
         }
 
-    values = hj.monte_carlo(one, draws, seed=1)
+    values = hj.scale.monte_carlo(one, draws, seed=1)
     for name in ("htf", "htf_plain", "series", "series_told"):
         if name != "series_told" or case == "drift":
             kinds = ("error", "said", "held", "doubted")
@@ -135,7 +137,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=cases, default=cases)
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     for case in options.only:
         one_case(case, options.draws)
 

@@ -29,10 +29,12 @@ N, FINE, DELAY, OUTPUTS = 8, 125, (0.037, 0.081), ("yM", "vM")
 TRUE = {"k": 10.0, "b": 5.0, "input_delay": DELAY[0], "output_delay": DELAY[1]}
 
 
-def experiments(cycle: hj.LimitCycle, settling: int = 20) -> hj.ExperimentData:
+def experiments(
+    cycle: hj.orbits.LimitCycle, settling: int = 20
+) -> hj.experiments.ExperimentData:
     """Experiments without noise."""
-    design = hj.multisine(N, 16, band=(0, N / 2)).scaled(0.001).realizations(4)
-    u = design.inputs(design.periods + settling)
+    design = hj.multisine(N, 16, frequencies=(0, N / 2)).scaled(0.001).realizations(4)
+    u = design.signals(design.periods + settling)
     late, early = (round(x * N * FINE) for x in DELAY)
     held = np.repeat(u, FINE, axis=1)
     held = np.concatenate([np.zeros((len(u), late, 1)), held], axis=1)[
@@ -43,7 +45,7 @@ def experiments(cycle: hj.LimitCycle, settling: int = 20) -> hj.ExperimentData:
     )
     first = settling * N
     rows = FINE * np.arange(first, u.shape[1]) - early
-    return hj.ExperimentData(
+    return hj.experiments.ExperimentData(
         u[:, first:],
         fine.y[:, rows],
         n_sections=N,
@@ -66,7 +68,9 @@ def main() -> None:
     rows = []
     for k in range(options.first, options.first + options.draws):
         noisy = hj.experiments.add_noise(data, std=noise, seed=k)
-        observed = hj.ObservedHTF(hj.estimate_htf(noisy), phase, delay=(0.06, 0.06))
+        observed = hj.fitting.ObservedHTF(
+            hj.estimate_htf(noisy), phase, delay=(0.06, 0.06)
+        )
         began = time.process_time()
         start = hj.models.VerticalHopper(k=11.0, b=4.5)
         fit = hj.fit_model(start, observed, tuple(TRUE), guess=cycle)

@@ -43,10 +43,10 @@ def distortion(family, draws: int) -> None:
         )
 
 
-def not_linear(family, design: hj.Design) -> tuple[np.ndarray, np.ndarray]:
+def not_linear(family, design: hj.experiments.Design) -> tuple[np.ndarray, np.ndarray]:
     """rms of what is not linear in the response of the hopper, one draw of the phases, and of what
     is odd in it."""
-    u, model = design.inputs(), family.model
+    u, model = design.signals(), family.model
     starts = model.periodic_states(u, design.periods)
     linear = np.stack(
         [model.simulate(one, x0) for one, x0 in zip(u, starts, strict=True)]

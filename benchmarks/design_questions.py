@@ -24,15 +24,15 @@ _ASIDE = 1e-4
 
 
 def measured(
-    data, design: hj.Design, noise: dict[str, float], harmonics, rng
-) -> hj.HTF:
+    data, design: hj.experiments.Design, noise: dict[str, float], harmonics, rng
+) -> hj.linear.HTF:
     """HTFs from data with noise, whose variance is known."""
     std = np.array(list(noise.values()))
     noisy = hj.experiments.add_noise(data, std=std, seed=int(rng.integers(2**31)))
     htf = hj.estimate_htf(noisy, harmonics, variance="auto")
     each = design.expected_variance()[:, None, :] * std[:, None] ** 2
-    return hj.HTF(
-        htf.f,
+    return hj.linear.HTF(
+        htf.frequencies,
         htf.H,
         htf.harmonics,
         htf.n_sections,
@@ -50,8 +50,8 @@ def goals(family, draws: int) -> None:
     """Bounds of other goals and with a limit of peaks; 620 lines."""
     design = hj.designs
     asked = {
-        "fit_ldtp": design.Multipliers(estimator="fit_ldtp", harmonics=HARMONICS),
-        "response": design.FrequencyResponse((0.1, 1.0), harmonics=HARMONICS),
+        "fit_ldtp": design.MultiplierGoal(estimator="fit_ldtp", harmonics=HARMONICS),
+        "response": design.ResponseGoal((0.1, 1.0), harmonics=HARMONICS),
     }
     for limit in ("input", "output"):
         for name, goal in asked.items():
@@ -76,7 +76,7 @@ def parameters(family, draws: int) -> None:
     before = family.recorded(usual)
     noise = family.noise(before[0])
     sections = family.placed.family
-    goal = hj.designs.Parameters(family.cycle, sections, SPRING, harmonics=HARMONICS)
+    goal = hj.designs.ParameterGoal(family.cycle, sections, SPRING, harmonics=HARMONICS)
     plan = hj.optimal_design(family.model, usual, goal=goal, noise=noise)
     system = family.cycle.system
     truth = np.array([float(getattr(system, name)) for name in SPRING])
@@ -90,11 +90,14 @@ def parameters(family, draws: int) -> None:
             std = {k: scale * x for k, x in noise.items()}
             htf = measured(data[rng.integers(len(data))], design, std, HARMONICS, rng)
             fit = hj.fit_model(
-                system, hj.ObservedHTF(htf, sections), SPRING, guess=family.cycle
+                system,
+                hj.fitting.ObservedHTF(htf, sections),
+                SPRING,
+                guess=family.cycle,
             )
             return np.asarray(fit.values) / truth - 1
 
-        errors = hj.monte_carlo(error, draws, seed=3).value.values
+        errors = hj.scale.monte_carlo(error, draws, seed=3).value.values
         clean = error(np.random.default_rng(0), scale=1e-3)
         found.append(rms(np.linalg.norm(errors, axis=1)))
         family.show(f"parameters.{name}.rms_error", found[-1])
@@ -112,7 +115,7 @@ def deviation(family, draws: int) -> None:
     noise = family.noise(before[0])
     about = {"limit": "output", "noise": noise}
     free = hj.optimal_design(family.model, usual, **about)
-    goal = hj.designs.Multipliers(estimator="fit_ldtp")
+    goal = hj.designs.MultiplierGoal(estimator="fit_ldtp")
     plan = hj.optimal_design(family.model, usual, goal=goal, **about)
     N, truth = family.model.n_sections, family.model.multipliers
     minimal = realized(np.asarray(family.model.impulse_response(4 * N + 1)))
@@ -130,12 +133,12 @@ def deviation(family, draws: int) -> None:
         ):
             htf = measured(data[k], design, noise, range(-N // 2, N // 2), rng)
             begin = time.process_time()
-            fit = hj.fit_ldtp(htf, start)
+            fit = hj.fit_ldtp(htf, initial=start)
             error[name] = np.abs(fit.multipliers - truth[0]).min()
             error[f"{name}.seconds"] = time.process_time() - begin
         return {name: float(x) for name, x in error.items()}
 
-    found = hj.monte_carlo(one, draws, seed=5)
+    found = hj.scale.monte_carlo(one, draws, seed=5)
     error = {x: rms(found[x].values) for x in ("numerators", "ldtp", "together")}
     bound = {
         "numerators": np.linalg.norm(free.usual_standard_errors),
@@ -156,7 +159,10 @@ def deviation(family, draws: int) -> None:
 
 
 def physical(
-    family, design: hj.Design, noise: dict[str, float], free: tuple[str, ...]
+    family,
+    design: hj.experiments.Design,
+    noise: dict[str, float],
+    free: tuple[str, ...],
 ) -> float:
     """Bound of the multiplier for whoever knows the equations, but not these parameters."""
     htf = family.model.htf(design.frequencies, HARMONICS)
@@ -164,8 +170,8 @@ def physical(
         design.expected_variance()[:, None, :]
         * np.array(list(noise.values()))[:, None] ** 2
     )
-    htf = hj.HTF(
-        htf.f,
+    htf = hj.linear.HTF(
+        htf.frequencies,
         htf.H,
         HARMONICS,
         htf.n_sections,
@@ -173,8 +179,11 @@ def physical(
         OUTPUTS,
         variance=np.broadcast_to(each, htf.H.shape),
     )
-    system, observed = family.cycle.system, hj.ObservedHTF(htf, family.placed.family)
-    seen = hj.identifiability(system, observed, free, guess=family.cycle)
+    system, observed = (
+        family.cycle.system,
+        hj.fitting.ObservedHTF(htf, family.placed.family),
+    )
+    seen = hj.fitting.identifiability(system, observed, free, guess=family.cycle)
     slopes = []
     for name in free:
         values = [float(getattr(system, name)) * (1 + x) for x in (-_ASIDE, _ASIDE)]

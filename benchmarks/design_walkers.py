@@ -55,7 +55,7 @@ WALKERS = {
 
 
 def crossings(
-    walker: Walker, cycle: hj.LimitCycle
+    walker: Walker, cycle: hj.orbits.LimitCycle
 ) -> tuple[list[hj.Crossing], np.ndarray]:
     """The sections, and by how much each output changes per change of the angle there (N, ny)."""
     t, angle, *outputs = cycle.trajectory(3)(walker.angle, *walker.outputs, per_step=64)
@@ -81,11 +81,13 @@ class Laboratory:
             walker.system, section=hj.AtEvent(walker.event)
         )
         family, self.slope = crossings(walker, self.cycle)
-        self.placed = hj.place_sections(self.cycle, family)
+        self.placed = hj.sections.place_sections(self.cycle, family)
         self.model = hj.linearize(self.cycle, self.placed, walker.outputs)
         self.truth = np.asarray(self.cycle.multipliers)
 
-    def recorded(self, design: hj.Design) -> list[hj.ExperimentData]:
+    def recorded(
+        self, design: hj.experiments.Design
+    ) -> list[hj.experiments.ExperimentData]:
         """Without noise, for some draws of the phases."""
         drawn = [design.realizations(1, seed=k) for k in range(PHASES)]
         return [
@@ -100,13 +102,17 @@ class Laboratory:
         return std**2 * (1 + (self.slope**2).mean(axis=0))
 
     def estimate(
-        self, data: hj.ExperimentData, design: hj.Design, std: float, rng
-    ) -> hj.HTF:
+        self,
+        data: hj.experiments.ExperimentData,
+        design: hj.experiments.Design,
+        std: float,
+        rng,
+    ) -> hj.linear.HTF:
         """From noisy samples of everything."""
         S, n, ny = data.y.shape
         late = np.resize(self.slope, (n, ny)) * rng.normal(size=(S, n, 1))
         noisy = data.y + std * (rng.normal(size=(S, n, ny)) - late)
-        data = hj.ExperimentData(
+        data = hj.experiments.ExperimentData(
             data.u,
             noisy,
             n_sections=N,
@@ -116,8 +122,8 @@ class Laboratory:
         )
         htf = hj.estimate_htf(data, (-2, -1, 0, 1, 2), variance="auto")
         each = design.expected_variance()[:, None, :] * self.variance(std)[:, None]
-        return hj.HTF(
-            htf.f,
+        return hj.linear.HTF(
+            htf.frequencies,
             htf.H,
             htf.harmonics,
             N,
@@ -126,7 +132,7 @@ class Laboratory:
             variance=np.broadcast_to(each, htf.H.shape),
         )
 
-    def rms_error(self, design: hj.Design, std: float, draws: int) -> float:
+    def rms_error(self, design: hj.experiments.Design, std: float, draws: int) -> float:
         """Of the leading multipliers, over draws of noise."""
         records, leading = self.recorded(design), self.walker.order
 
@@ -136,7 +142,7 @@ class Laboratory:
             return fit.compare(self.truth).error[:leading].max()
 
         return float(
-            np.sqrt(np.mean(hj.monte_carlo(error, draws, 3).value.values ** 2))
+            np.sqrt(np.mean(hj.scale.monte_carlo(error, draws, 3).value.values ** 2))
         )
 
 
@@ -149,7 +155,7 @@ def walkers(draws: int) -> None:
         noise = dict(
             zip(walker.outputs, np.sqrt(lab.variance(std)).tolist(), strict=True)
         )
-        goal = hj.designs.Multipliers(which=0)
+        goal = hj.designs.MultiplierGoal(which=0)
         plan = hj.optimal_design(lab.model, usual, goal=goal, noise=noise)
         everything = hj.optimal_design(lab.model, usual, noise=noise)
         found = [lab.rms_error(design, std, draws) for design in (usual, plan.design)]

@@ -10,10 +10,10 @@ rms errors at equal numbers of strides (and equal rms of the input). Printed, as
 - `known`: rms errors of draws with new noise, four draws of the phases; the model is known. The
   input's rms is 0.001, on odd lines (P = 128), so that distortion is below noise. `strong`: the
   same for a rms of 0.02 and 0.1.
-- `nothing`: from nothing, by `hj.designs.Study`, which is asked for a standard error of 5e-5: 640
-  strides of equal amplitudes, then designs made from what was measured, until it stops. The noise
-  is not known either. All strides are counted, and compared with those of equal amplitudes whose
-  bound is the rms error that was reached.
+- `nothing`: from nothing, by `hj.designs.SequentialDesign`, which is asked for a standard error of
+  5e-5: 640 strides of equal amplitudes, then designs made from what was measured, until it stops.
+  The noise is not known either. All strides are counted, and compared with those of equal
+  amplitudes whose bound is the rms error that was reached.
 - `stopping`: of the same studies, how many regions of 95 % held the true multipliers at the time of
   stopping, the p-value of that number, and the standard error that was asked for, said and true.
 - `goals`: bounds of other goals, of both limits: multipliers by `fit_ldtp`, the harmonic transfer
@@ -60,13 +60,15 @@ class Family:
 
     def __init__(self, name: str, cycle, definition):
         self.name, self.cycle = name, cycle
-        self.placed = hj.place_sections(cycle, definition)
+        self.placed = hj.sections.place_sections(cycle, definition)
         self.model = hj.linearize(cycle, self.placed, OUTPUTS)
 
     def show(self, name: str, value: float) -> None:
         print(f"designs.{self.name}.{name} {value:.4g}", flush=True)
 
-    def recorded(self, design: hj.Design, seed: int = 1) -> list[hj.ExperimentData]:
+    def recorded(
+        self, design: hj.experiments.Design, seed: int = 1
+    ) -> list[hj.experiments.ExperimentData]:
         """Without noise, for some draws of the phases."""
         drawn = [design.realizations(1, seed=seed + k) for k in range(PHASES)]
         return [
@@ -74,7 +76,7 @@ class Family:
             for one in drawn
         ]
 
-    def noise(self, data: hj.ExperimentData) -> dict[str, float]:
+    def noise(self, data: hj.experiments.ExperimentData) -> dict[str, float]:
         """20 dB below the outputs."""
         rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
         return dict(zip(OUTPUTS, 0.1 * rms, strict=True))
@@ -87,7 +89,9 @@ def rms_error(family: Family, fit, draws: int, seed: int) -> float:
     def error(rng):
         return fit(rng).compare(truth).error[0]
 
-    return float(np.sqrt(np.mean(hj.monte_carlo(error, draws, seed).value.values ** 2)))
+    return float(
+        np.sqrt(np.mean(hj.scale.monte_carlo(error, draws, seed).value.values ** 2))
+    )
 
 
 def bounds(family: Family, draws: int) -> None:
@@ -105,7 +109,7 @@ def bounds(family: Family, draws: int) -> None:
             )
         family.show(f"bound.{limit}.cpu_seconds", seconds)
     noise = {"yM": 6e-6, "vM": 1.2e-5}
-    usual = (hj.multisine().scaled(RMS), hj.multisine(band=(0, 2)).scaled(RMS))
+    usual = (hj.multisine().scaled(RMS), hj.multisine(frequencies=(0, 2)).scaled(RMS))
     plan, slow = (hj.optimal_design(family.model, x, noise=noise) for x in usual)
     as_much = slow.usual_criterion * usual[1].cycles(0)
     family.show("bound.slow.saved", as_much / (plan.criterion * plan.design.cycles(0)))
@@ -140,10 +144,10 @@ def known(family: Family, draws: int, rms: float = RMS, row: str = "known") -> N
 
 def study(
     family: Family, rng, first, begun, noise: dict[str, float]
-) -> hj.designs.Study:
+) -> hj.designs.SequentialDesign:
     """One, from nothing to its end; `begun`: responses to the first blocks, without noise."""
     k = int(rng.integers(PHASES))
-    found = hj.designs.Study(
+    found = hj.designs.SequentialDesign(
         first[k], order=2, standard_error=PRECISION, seed=int(rng.integers(999))
     )
     data = begun[k]
@@ -171,7 +175,7 @@ def studies(family: Family, draws: int) -> np.ndarray:
         error = done.fit.compare(truth).error[0]
         held = bool(done.fit.contains(truth)[0])
         rows.append(
-            (done.strides[-1], done.blocks, error, held, done.standard_errors[-1, 0])
+            (done.cycles[-1], done.blocks, error, held, done.standard_errors[-1, 0])
         )
     return np.array(rows)
 
@@ -222,7 +226,7 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", default=("isochron", "kinematic"))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name in options.families:
         family = Family(name, cycle, sections()[name])

@@ -36,7 +36,7 @@ phase = hj.KinematicPhase(
 )
 model = timed("linearize", lambda: hj.linearize(cycle, phase, outputs=("yM", "vM")))
 print("multipliers", *np.asarray(model.multipliers))
-design = hj.paper_design(seed=0)
+design = hj.experiments.paper_design(seed=0)
 for count in (1, 200):
     large = design.realizations(count) if count > 1 else design
     run = ft.partial(hj.run_experiments, cycle, phase, large, outputs=("yM", "vM"))
@@ -46,10 +46,12 @@ k, b = (
     x.ravel() for x in jnp.meshgrid(jnp.linspace(8, 13, 100), jnp.linspace(3, 7, 100))
 )
 hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-cycles = timed("cycles.10000", lambda: hj.find_limit_cycles(hoppers, guess=cycle))
+cycles = timed(
+    "cycles.10000", lambda: hj.orbits.find_limit_cycles(hoppers, guess=cycle)
+)
 print("mean modulus", np.abs(np.asarray(cycles.multipliers)).mean())
-response = hj.response_function(cycle, phase, ("yM", "vM"))
-u = design.inputs(cycles=84)[:1]
+response = hj.experiments.response_function(cycle, phase, ("yM", "vM"))
+u = design.signals(cycles=84)[:1]
 gradient = eqx.filter_jit(
     eqx.filter_grad(lambda s: jnp.mean(response(u, system=s).y ** 2))
 )

@@ -15,7 +15,7 @@ exact H_m (`each`, the worst of them). Names say `family.protocol.rms.what.outpu
 - `crest`: crest factors of signals of 31 lines.
 - `discs`: how often 95 % discs about means of some complex errors hold zero. Errors are normal, of
   constant modulus (`constant`), or sums of both, with the rms of the normal part relative to the
-  other. Discs of `size` look at the size of the scatter alone, those of `shape` are
+  other. Discs of `size` look at the size of the variance_dof alone, those of `shape` are
   `HTF.confidence_radius`; `wider` is the ratio of their mean radii.
 - `coverage`: 1000 runs at 20 dB, each some realizations of 20 experiments (P = 32, 300 lines) with
   new phases and new noise. How often the 95 % regions of H_0, H_1 and H_-1 at ten fixed frequencies
@@ -53,7 +53,7 @@ class Family:
 
     def __init__(self, name: str, cycle, definition):
         self.name, self.cycle = name, cycle
-        self.placed = hj.place_sections(cycle, definition)
+        self.placed = hj.sections.place_sections(cycle, definition)
         self.model = hj.linearize(cycle, self.placed, OUTPUTS)
 
     def run(self, design, **options):
@@ -63,7 +63,7 @@ class Family:
 
     def report(self, name: str, data) -> None:
         estimate = hj.estimate_htf(data, HARMONICS)
-        exact = self.model.htf(estimate.f, HARMONICS)
+        exact = self.model.htf(estimate.frequencies, HARMONICS)
         error = np.abs(estimate.H - exact.H).max(axis=(1, 3))
         own = np.abs(exact.H).max(axis=(1, 3))
         for k, output in enumerate(OUTPUTS):
@@ -78,7 +78,9 @@ def periodic(family: Family) -> None:
     """Nothing is random here but the design."""
     full, odd = hj.multisine(), hj.multisine(periods=128, lines="odd")
     for rms in (0.002, 0.02, 0.06):
-        family.report(f"paper.{rms}", family.run(hj.paper_design().scaled(rms)))
+        family.report(
+            f"paper.{rms}", family.run(hj.experiments.paper_design().scaled(rms))
+        )
         for name, design in (("full", full), ("odd", odd)):
             for label, start in (("predicted", "periodic"), ("steady", "steady")):
                 data = family.run(design.scaled(rms), start=start)
@@ -112,7 +114,7 @@ def interpolated(data, degree: int):
         w * np.roll(Y, -k, axis=1) for w, k in zip(weights, offsets, strict=True)
     )
     y = np.fft.ifft(Y - transient, axis=1).real
-    return hj.ExperimentData(
+    return hj.experiments.ExperimentData(
         data.u, y, n_sections=N, periods=data.periods, outputs=OUTPUTS
     )
 
@@ -135,7 +137,7 @@ def discs(draws: int = 200_000) -> None:
         "1": (1, 1),
     }
     for count in (2, 3, 4, 6, 8, 16):
-        freedom = np.full(draws, count - 1.0)
+        dof = np.full(draws, count - 1.0)
         for kind, (constant, noise) in kinds.items():
             error = constant * np.exp(2j * np.pi * rng.random((count, draws)))
             error += (
@@ -155,7 +157,7 @@ def discs(draws: int = 200_000) -> None:
                 ("size", None),
                 ("shape", roundness[None, :, None, None]),
             ):
-                quantile = np.asarray(hj.Scatter(freedom, shape).quantile(0.95))
+                quantile = np.asarray(hj.linear.VarianceDof(dof, shape).quantile(0.95))
                 radii.append(np.sqrt(np.ravel(quantile) * power / count / (count - 1)))
                 inside = np.mean(np.abs(mean) <= radii[-1])
                 print(f"estimation.discs.{count}.{kind}.{name} {inside:.4f}")
@@ -175,7 +177,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
         )
 
     truth = hj.estimate_htf((run(100, seed + k) for k in range(20)), (-1, 0, 1))
-    rows = [int(np.argmin(np.abs(truth.f - x))) for x in chosen]
+    rows = [int(np.argmin(np.abs(truth.frequencies - x))) for x in chosen]
 
     def draw(rng):
         phases, noise = rng.integers(2**31, size=2).tolist()
@@ -189,7 +191,7 @@ def coverage(family: Family, rms: float, each: int, runs: int, seed: int) -> Non
             ],
         }
 
-    found = hj.monte_carlo(draw, runs, seed)
+    found = hj.scale.monte_carlo(draw, runs, seed)
     name = f"coverage.{rms}.{each}_realizations"
     hits = found["disc"].sum("draw").values
     tests = np.array([stats.binomtest(int(h), runs, 0.95).pvalue for h in hits.flat])
@@ -218,7 +220,7 @@ def main() -> None:
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     if "crest" not in options.skip:
         crest()
     if "discs" not in options.skip:

@@ -43,13 +43,13 @@ class HTFs:
         self.std = np.broadcast_to(rms * 10 ** (-SNR / 20), H.shape)
 
     def clean(self):
-        return hj.ObservedHTF(self.exact, SECTIONS)
+        return hj.fitting.ObservedHTF(self.exact, SECTIONS)
 
     def noisy(self, seed: int):
         real, imag = np.random.default_rng(seed).normal(size=(2, *self.std.shape))
         H = np.asarray(self.exact.H) + self.std * (real + 1j * imag) / np.sqrt(2)
-        noisy = hj.HTF(
-            self.exact.f,
+        noisy = hj.linear.HTF(
+            self.exact.frequencies,
             H,
             self.exact.harmonics,
             SECTIONS.n_sections,
@@ -57,7 +57,7 @@ class HTFs:
             OUTPUTS,
             variance=self.std**2,
         )
-        return hj.ObservedHTF(noisy, SECTIONS)
+        return hj.fitting.ObservedHTF(noisy, SECTIONS)
 
 
 class Series:
@@ -71,10 +71,10 @@ class Series:
         self.std = np.sqrt(np.mean(self.data.y**2, axis=(0, 1))) * 10 ** (-SNR / 20)
 
     def clean(self):
-        return hj.ObservedSeries(self.data, SECTIONS)
+        return hj.fitting.ObservedSeries(self.data, SECTIONS)
 
     def noisy(self, seed: int):
-        return hj.ObservedSeries(
+        return hj.fitting.ObservedSeries(
             hj.experiments.add_noise(self.data, snr=SNR, seed=seed), SECTIONS, self.std
         )
 
@@ -128,7 +128,10 @@ def noise(kind: str, data, cycle, draws: int) -> None:
         for seed in range(draws)
     ]
     inside = sum(fit.contains(cycle.system) for fit in fits)
-    show(f"{kind}.noise.converged", sum(fit.result == hj.Result.OK for fit in fits))
+    show(
+        f"{kind}.noise.converged",
+        sum(fit.result == hj.errors.Result.OK for fit in fits),
+    )
     show(f"{kind}.noise.covered", inside / draws)
     show(f"{kind}.noise.p", stats.binomtest(inside, draws, 0.95).pvalue)
     ratio = [fit.chi_square(cycle.system) / fit.identifiability.rank for fit in fits]

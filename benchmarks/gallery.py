@@ -32,7 +32,9 @@ PERIODS = 32
 NAMES = [*CASES, "branches"]
 
 
-def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
+def compute(
+    case: Case,
+) -> tuple[hj.orbits.LimitCycle, hj.linear.HTF, hj.linear.HTF | None]:
     """The cycle, the exact HTF, and its estimate."""
     cycle = hj.find_limit_cycle(
         case.system,
@@ -42,13 +44,13 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
         conserved=case.conserved,
         max_period=case.max_period,
     )
-    placed = hj.place_sections(cycle, case.sections)
+    placed = hj.sections.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     N = placed.n_sections
     design = hj.multisine(
         N,
         PERIODS,
-        band=(0, min(4.0, N / 2)),
+        frequencies=(0, min(4.0, N / 2)),
         amplitude=case.amplitude or 1.0,
         lines="odd",
         inputs=case.system.inputs,
@@ -68,13 +70,16 @@ def compute(case: Case) -> tuple[hj.LimitCycle, hj.HTF, hj.HTF | None]:
         estimate = hj.estimate_htf(
             data, harmonics=[h for h in HARMONICS if -N / 2 <= h < N / 2]
         )
-    f = np.unique(design.f) if estimate is None else estimate.f
+    f = np.unique(design.frequency) if estimate is None else estimate.frequencies
     harmonics = HARMONICS if estimate is None else estimate.harmonics
     return cycle, model.htf(f, harmonics=harmonics), estimate
 
 
 def numbers(
-    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None
+    case: Case,
+    cycle: hj.orbits.LimitCycle,
+    exact: hj.linear.HTF,
+    estimate: hj.linear.HTF | None,
 ) -> dict:
     """What the table says."""
     multipliers = cycle.multipliers
@@ -97,7 +102,11 @@ def numbers(
 
 
 def draw(
-    case: Case, cycle: hj.LimitCycle, exact: hj.HTF, estimate: hj.HTF | None, path: Path
+    case: Case,
+    cycle: hj.orbits.LimitCycle,
+    exact: hj.linear.HTF,
+    estimate: hj.linear.HTF | None,
+    path: Path,
 ):
     """The cycle (of one that is rest: its multipliers), and |H_m| beside it; of a walker, a turn
     before."""
@@ -117,7 +126,7 @@ def draw(
         else:
             hj.plot.cycle(cycle, *case.plane, ax=left)
         htfs = [exact] if estimate is None else [estimate, exact]
-        hj.plot.magnitude(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
+        hj.plot.htf(*htfs, harmonics=(0, 1, -1)[: len(exact.harmonics)], ax=right)
         lowest = min(
             np.min(line.get_ydata(), initial=np.inf) for line in right.get_lines()
         )
@@ -134,7 +143,7 @@ def draw(
         save(path, figure)
 
 
-def sticks(case: Case, cycle: hj.LimitCycle, ax) -> None:
+def sticks(case: Case, cycle: hj.orbits.LimitCycle, ax) -> None:
     """One turn of a walker at equal times, lighter where it is earlier, up to the touchdown (not to
     the exchange of its legs)."""
     links = len(case.sticks[0][0])

@@ -407,7 +407,7 @@ CASES: dict[str, Callable[[], Case]] = {
     ),
     "van der Pol, 100": lambda: Case(
         "van der Pol, mu = 100",
-        m.VanDerPol(mu=100.0, solver=hj.Radau()),
+        m.VanDerPol(mu=100.0, solver=hj.systems.Radau()),
         [
             *(hj.Crossing("x", "falling", x) for x in (0.5, 0.0, -0.5)),
             *(hj.Crossing("x", "rising", x) for x in (-0.5, 0.0, 0.5)),

@@ -67,11 +67,11 @@ class Identification(Family):
 
 
 def paper(family: Identification) -> None:
-    data = family.run(hj.paper_design())
+    data = family.run(hj.experiments.paper_design())
     estimate = hj.estimate_htf(data)
     family.show("paper.structured", family.error(hj.fit_multipliers(estimate, 2)))
     rational, H = hj.identify.fit_rational(estimate), np.asarray(estimate[0])[..., 0]
-    z = np.exp(2j * np.pi * np.asarray(estimate.f) / N)
+    z = np.exp(2j * np.pi * np.asarray(estimate.frequencies) / N)
     inner = z.imag > 1e-12
     z, H = np.append(z, z[inner].conj()), np.concatenate([H, H[inner].conj()])
     for k, output in enumerate(OUTPUTS):
@@ -80,7 +80,7 @@ def paper(family: Identification) -> None:
             family.show(
                 f"paper.{name}.{output}", np.nanmin(abs(multipliers - family.true))
             )
-    some = hj.ExperimentData(
+    some = hj.experiments.ExperimentData(
         data.u[:20],
         data.y[:20],
         n_sections=N,
@@ -113,10 +113,10 @@ def noise(family: Identification, seeds: int) -> None:
         # Of white noise; distortion comes on top.
         variance = np.mean(size, axis=0)[:, None] * 10 ** (-snr / 10)
         variance = variance * design.expected_variance()[:, None, :]
-        bound = hj.identify.multiplier_bound(
+        bound = hj.identify.cramer_rao(
             family.model,
-            hj.HTF(
-                exact.f,
+            hj.linear.HTF(
+                exact.frequencies,
                 exact.H,
                 BAND,
                 N,
@@ -149,7 +149,7 @@ def white(family: Identification, draws: int) -> None:
     data = family.run(u, start="cycle", discard=0)
 
     def one(s, y):
-        return hj.Record(
+        return hj.experiments.SectionSeries(
             data.u[s], y[s], n_sections=N, inputs=data.inputs, outputs=OUTPUTS
         )
 
@@ -181,31 +181,31 @@ def coverage(family: Identification, rms: float, runs: int) -> None:
         phases, noise = rng.integers(2**31, size=2).tolist()
         noisy = hj.experiments.add_noise(run(4, phases), snr=20, seed=noise)
         estimate = hj.estimate_htf(noisy, chosen, repeats=2)
-        freedom = estimate.scatter.freedom
-        return {"H": estimate.H, "variance": estimate.variance, "freedom": freedom}
+        dof = estimate.variance_dof.dof
+        return {"H": estimate.H, "variance": estimate.variance, "dof": dof}
 
-    def fitted(H, variance, freedom):
-        htf = hj.HTF(
-            mean.f,
+    def fitted(H, variance, dof):
+        htf = hj.linear.HTF(
+            mean.frequencies,
             H,
             chosen,
             N,
             mean.inputs,
             mean.outputs,
             variance=variance,
-            scatter=hj.Scatter(freedom),
+            variance_dof=hj.linear.VarianceDof(dof),
         )
         return hj.fit_multipliers(htf, 2)
 
-    found = hj.monte_carlo(draw, runs)
-    freedom = float(found.freedom[0])
+    found = hj.scale.monte_carlo(draw, runs)
+    dof = float(found.dof[0])
     fits = [
-        fitted(H, variance, freedom)
+        fitted(H, variance, dof)
         for H, variance in zip(found.H.values, found.variance.values, strict=True)
     ]
     # Where distortion matters the HTFs are not of the structure exactly, and the fit to them
     # depends on the weights: the truth has those of the runs.
-    weighted = fitted(mean.H, found.variance.mean("draw").values, freedom)
+    weighted = fitted(mean.H, found.variance.mean("draw").values, dof)
     truth = weighted.multipliers[:1]
     hits = sum(int(fit.contains(truth).all()) for fit in fits)
     errors = np.array([family.error(fit, truth) for fit in fits])
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--skip", nargs="*", default=(), help=", ".join(STEPS))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         family = Identification(name, cycle, definition)

@@ -6,13 +6,13 @@ of a tenth of the outputs' rms, which goes round the loop. Printed, as `name val
 `--draws` draws:
 
 - `bound`: Cramer-Rao bound of the plant's first multiplier, for 300 strides of the loop.
-- `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(reference="r")`:
+- `ldtp.rms`, `ldtp.ratio` (to the bound), `ldtp.covered`, `ldtp.p`: of `fit_ldtp(references="r")`:
   rms error, how often its 95 % region holds the true multiplier, p-value of 95 % (binomial test).
   `without.covered`: without the reference, and with D free. `series.*`: of
-  `fit_series(reference="r")`.
+  `fit_series(references="r")`.
 - `plant.covered`, `plant.p`, `controller.*`: how often the 95 % discs of HTFs hold the truth, of
-  `hj.identify.loop` with two references, and noise of a fifth of r in what the controller does;
-  the p-value is that of their mean over draws (t test).
+  `hj.identify.estimate_loop` with two references, and noise of a fifth of r in what the controller
+  does; the p-value is that of their mean over draws (t test).
 - `seconds.*`: CPU seconds of fits.
 - with `--random 20`: `short_gait.*`, errors of the multiplier 4.00386 of the simplest walker's
   short gait, from nonlinear experiments in a loop that stabilizes it; and of random plants (2 to 5
@@ -61,7 +61,7 @@ N, STRIDES, BEFORE, SENSOR, MOTOR = 8, 300, 20, 0.1, 0.2
 GAIN = np.array([[0.3, 1.0]])
 
 
-def hopper() -> hj.LDTP:
+def hopper() -> hj.linear.LDTP:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
     exact = hj.linearize(cycle, phase, ("yM", "vM"))
@@ -69,7 +69,7 @@ def hopper() -> hj.LDTP:
     return eqx.tree_at(lambda x: x.D, minimal, 0 * minimal.D)  # (1e-17)
 
 
-def respond(model: hj.LDTP, r, d, w, e) -> tuple[np.ndarray, np.ndarray]:
+def respond(model: hj.linear.LDTP, r, d, w, e) -> tuple[np.ndarray, np.ndarray]:
     """u and y of the loop u = r - K y, y = C x + d + e, for signals (S, n, .)."""
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     x, u, y = np.zeros((len(r), A.shape[1])), np.zeros(r.shape), np.zeros(d.shape)
@@ -81,7 +81,7 @@ def respond(model: hj.LDTP, r, d, w, e) -> tuple[np.ndarray, np.ndarray]:
     return u, y
 
 
-def sizes(model: hj.LDTP) -> np.ndarray:
+def sizes(model: hj.linear.LDTP) -> np.ndarray:
     """Return the rms of the outputs without noise."""
     r, zero = (
         np.random.default_rng(1).normal(size=(1, N * STRIDES, 1)),
@@ -91,27 +91,30 @@ def sizes(model: hj.LDTP) -> np.ndarray:
 
 
 def draw(
-    model: hj.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator
-) -> hj.Record:
+    model: hj.linear.LDTP, size: float, sensor: np.ndarray, rng: np.random.Generator
+) -> hj.experiments.SectionSeries:
     n, left = N * (STRIDES + BEFORE), slice(N * BEFORE, None)
     r, w = rng.normal(size=(2, 1, n, 1))
     e = sensor * rng.normal(size=(1, n, 2))
     u, y = respond(model, r, 0 * e, size * w, e)
     z = np.concatenate([u, r], axis=2)[0, left]
-    return hj.Record(
+    return hj.experiments.SectionSeries(
         z, y[0, left], n_sections=N, inputs=("u", "r"), outputs=model.outputs
     )
 
 
 def bound(
-    model: hj.LDTP, size: float, sensor: np.ndarray, records: list[hj.Record]
+    model: hj.linear.LDTP,
+    size: float,
+    sensor: np.ndarray,
+    records: list[hj.experiments.SectionSeries],
 ) -> float:
     """Of the first multiplier, from the information of the predictions in some records."""
     B = np.concatenate(
         [size * np.asarray(model.B), np.zeros((N, model.A.shape[1], 2))], axis=2
     )
     D = np.tile(np.concatenate([np.zeros((2, 1)), np.diag(sensor)], axis=1), (N, 1, 1))
-    noise = hj.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
+    noise = hj.linear.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
     K, S = innovations(PeriodicModel.of(noise, np.ones(2)))
     coordinates = local_coordinates(
         PeriodicModel.of(model, np.ones(2))._replace(K=K), False
@@ -137,9 +140,9 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
         results[f"{name}.covered"] = float(fit.contains(true).all())
 
     dims = np.asarray(model.dims)
-    record("series", lambda: hj.fit_series(data, 2, check=False, reference="r"))
-    record("ldtp", lambda: hj.fit_ldtp(data, dims, reference="r"))
-    alone = hj.Record(
+    record("series", lambda: hj.fit_series(data, 2, check=False, references="r"))
+    record("ldtp", lambda: hj.fit_ldtp(data, dims, references="r"))
+    alone = hj.experiments.SectionSeries(
         data.u[:, :1], data.y, n_sections=N, inputs="u", outputs=data.outputs
     )
     record("without", lambda: hj.fit_ldtp(alone, dims, noise="innovations"))
@@ -149,7 +152,7 @@ def parametric(model, size, sensor, rng) -> dict[str, float]:
 def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
     """Return the shares of discs of HTFs that hold the truth."""
     both = design.realizations(6, seed=int(rng.integers(1 << 31)))
-    z = both.inputs(both.periods + BEFORE)
+    z = both.signals(both.periods + BEFORE)
     w, e = (
         rng.normal(size=(*z.shape[:2], 1)),
         sensor * rng.normal(size=(*z.shape[:2], 2)),
@@ -158,7 +161,7 @@ def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
     c = MOTOR * rng.normal(size=w.shape)
     u, y = respond(model, z[..., :1] + c, d, size * w, e)
     inputs = np.concatenate([u, z[..., :1], d], axis=2)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         inputs,
         y,
         n_sections=N,
@@ -166,14 +169,14 @@ def discs(model, size, sensor, design, truths, rng) -> dict[str, float]:
         outputs=model.outputs,
         inputs=("u", "r", "d0", "d1"),
     )
-    loop = hj.identify.loop(data, at_input="r", at_output=("d0", "d1"))
+    loop = hj.identify.estimate_loop(data, at_input="r", at_output=("d0", "d1"))
     return {
         name: float((np.abs(htf.H - truths[name]) <= htf.confidence_radius()).mean())
         for name, htf in (("plant", loop.plant), ("controller", loop.controller))
     }
 
 
-def unlike(k: int) -> hj.LDTP:
+def unlike(k: int) -> hj.linear.LDTP:
     """Return the k-th of random plants: 2 to 5 states, 1 or 2 inputs, 8 to 24 sections.
 
     Every tenth is unstable. All moduli are above 0.3, and the outputs tell all states.
@@ -191,10 +194,10 @@ def unlike(k: int) -> hj.LDTP:
     root = turn @ np.diag(size ** (1 / n)) @ turn.T
     A = [T[(i + 1) % n] @ root @ np.linalg.inv(T[i]) for i in range(n)]
     B, C = rng.normal(size=(n, d, nu)), rng.normal(size=(n, d, d)) / 2 + np.eye(d)
-    return hj.LDTP(A, B, C)
+    return hj.linear.LDTP(A, B, C)
 
 
-def regulator(model: hj.LDTP, weight: float) -> np.ndarray:
+def regulator(model: hj.linear.LDTP, weight: float) -> np.ndarray:
     """Return gains of u = -K y that minimize the mean of |x|^2 + weight |u|^2 (Riccati)."""
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     P, K = np.eye(A.shape[1]), np.zeros((len(A), B.shape[2], A.shape[1]))
@@ -207,8 +210,13 @@ def regulator(model: hj.LDTP, weight: float) -> np.ndarray:
 
 
 def in_a_loop(
-    model: hj.LDTP, gain: np.ndarray, rng, noise: float, strides: int, sensor=None
-) -> hj.Record:
+    model: hj.linear.LDTP,
+    gain: np.ndarray,
+    rng,
+    noise: float,
+    strides: int,
+    sensor=None,
+) -> hj.experiments.SectionSeries:
     """Return a record with a white reference and white noise of process and sensors."""
     sensor = noise / 5 if sensor is None else sensor
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
@@ -223,7 +231,9 @@ def in_a_loop(
     names = tuple(f"u{j}" for j in range(r.shape[1])) + tuple(
         f"r{j}" for j in range(r.shape[1])
     )
-    return hj.Record(np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names)
+    return hj.experiments.SectionSeries(
+        np.concatenate([u, r], axis=1), y, n_sections=len(A), inputs=names
+    )
 
 
 def random_loops(first: int, count: int) -> dict[str, int]:
@@ -235,14 +245,18 @@ def random_loops(first: int, count: int) -> dict[str, int]:
         data = in_a_loop(model, gain, rng, 0.5, 400)
         try:
             fit = hj.fit_ldtp(
-                data, len(model.multipliers), reference=data.inputs[gain.shape[1] :]
+                data, len(model.multipliers), references=data.inputs[gain.shape[1] :]
             )
-        except hj.DefinitionError:
+        except hj.errors.DefinitionError:
             counts["reported"] += 1
             continue
         right = fit.contains(model.multipliers, 0.9999).all()
         name = (
-            "reported" if fit.result != hj.Result.OK else "right" if right else "wrong"
+            "reported"
+            if fit.result != hj.errors.Result.OK
+            else "right"
+            if right
+            else "wrong"
         )
         counts[name] += 1
         counts["covered"] += int(fit.contains(model.multipliers).all())
@@ -253,7 +267,7 @@ def random_loops(first: int, count: int) -> dict[str, int]:
     return counts
 
 
-def few_outputs(k: int) -> hj.LDTP:
+def few_outputs(k: int) -> hj.linear.LDTP:
     """Return the k-th of random plants: 2 to 4 multipliers, some complex, and 1 to 3 outputs."""
     rng = np.random.default_rng((7, k))
     d, nu, n, ny = (
@@ -269,10 +283,12 @@ def few_outputs(k: int) -> hj.LDTP:
     T = rng.normal(size=(n, d, d)) / 2 + 1.5 * np.eye(d)
     turn = np.linalg.qr(rng.normal(size=(d, d)))[0]
     A = [T[(i + 1) % n] @ turn @ root @ turn.T @ np.linalg.inv(T[i]) for i in range(n)]
-    return hj.LDTP(A, rng.normal(size=(n, d, nu)), rng.normal(size=(n, ny, d)))
+    return hj.linear.LDTP(A, rng.normal(size=(n, d, nu)), rng.normal(size=(n, ny, d)))
 
 
-def noisy(model: hj.LDTP, kind: str, rng) -> tuple[hj.Record, tuple[str, ...] | None]:
+def noisy(
+    model: hj.linear.LDTP, kind: str, rng
+) -> tuple[hj.experiments.SectionSeries, tuple[str, ...] | None]:
     """Return 300 cycles of a random plant, and the names of its references."""
     (N, ny, _), nu = model.C.shape, model.B.shape[2]
     gain = rng.normal(size=(N, nu, ny)) * (kind == "loop")
@@ -286,12 +302,12 @@ def noisy(model: hj.LDTP, kind: str, rng) -> tuple[hj.Record, tuple[str, ...] | 
     x = data.y / size
     bent = 10 ** rng.uniform(-2, -0.5) * (0.7 * x**2 + 0.3 * x**3) * (kind == "bent")
     drift = np.inf if kind == "bent" else None  # (even powers have a mean)
-    return hj.Record(
+    return hj.experiments.SectionSeries(
         data.u[:, :nu], data.y + size * bent, n_sections=N, drift=drift
     ), None
 
 
-def bent_hopper(count: int, seed: int) -> list[hj.Record]:
+def bent_hopper(count: int, seed: int) -> list[hj.experiments.SectionSeries]:
     """Return 300 strides each, at amplitudes at which half a percent to half is distortion."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
@@ -303,7 +319,10 @@ def bent_hopper(count: int, seed: int) -> list[hj.Record]:
     y = data.y + 0.01 * data.y.std(axis=1, keepdims=True) * rng.normal(
         size=data.y.shape
     )
-    return [hj.Record(u[k], y[k], n_sections=N) for k in np.flatnonzero(data.ok)]
+    return [
+        hj.experiments.SectionSeries(u[k], y[k], n_sections=N)
+        for k in np.flatnonzero(data.ok)
+    ]
 
 
 def too_low(first: int, count: int) -> None:
@@ -329,7 +348,7 @@ def too_low(first: int, count: int) -> None:
         for order in range(2, len(true) + 1):
             try:
                 began = time.process_time()
-                fit = hj.fit_series(data, order, reference=reference)
+                fit = hj.fit_series(data, order, references=reference)
                 whole = time.process_time() - began
                 with (
                     mock.patch.object(
@@ -338,9 +357,9 @@ def too_low(first: int, count: int) -> None:
                     mock.patch.object(series_fit, "_about_drift", lambda *_: []),
                 ):
                     began = time.process_time()
-                    hj.fit_series(data, order, reference=reference)
+                    hj.fit_series(data, order, references=reference)
                     seconds[kind] += [whole, time.process_time() - began]
-            except hj.DefinitionError:
+            except hj.errors.DefinitionError:
                 continue
             error = (
                 np.abs(fit.multipliers[:, None] - true).min(axis=1)
@@ -365,7 +384,10 @@ def too_low(first: int, count: int) -> None:
 def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
     """Return CPU seconds of `identify_recording`: of a plant in its loop by the reference, and of
     the loop itself, from the reference as its input (the least of three calls)."""
-    n, r = strides * rate, hj.testing.random_force(strides + 1, rate, 8.0, seed=1)[:, 0]
+    n, r = (
+        strides * rate,
+        hj.experiments.random_input(strides + 1, rate, 8.0, seed=1)[:, 0],
+    )
     t, x, u, y = np.arange(n) / rate, np.zeros(2), np.zeros(n), np.zeros((2, n))
     noise = np.random.default_rng(0).normal(size=(2, n))
     for i in range(n):  # x'' + 2 x' + (30 + 8 cos 2 pi t) x = u
@@ -375,7 +397,7 @@ def recording_seconds(rate: int = 100, strides: int = 300) -> dict[str, float]:
         x = np.array([x[0] + v / rate, v])
     signals = {"u": u, "r": r[:n], "x": y[0], "v": y[1], "clock": np.cos(2 * np.pi * t)}
     recording, section = hj.Recording(t, signals), hj.Crossing("clock", "rising")
-    ways = {"with": dict(inputs="u", reference="r"), "without": dict(inputs="r")}
+    ways = {"with": dict(inputs="u", references="r"), "without": dict(inputs="r")}
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     for name, way in 3 * list(ways.items()):
         began = time.process_time()
@@ -398,20 +420,22 @@ def short_gait() -> dict[str, float]:
     strike, outputs = hj.AtEvent("heelstrike"), ("phi", "w", "p")
     cycle = hj.find_limit_cycle(walker, walker.short_gait(), section=strike)
     levels = [hj.Crossing("th", "falling", th) for th in (0.1, 0.0, -0.1)]
-    phase = hj.SectionList([strike, *levels])
+    phase = hj.sections.SectionList([strike, *levels])
     exact = hj.linearize(cycle, phase, outputs)
     model = realized(np.asarray(exact.impulse_response(40)))
-    design = hj.multisine(4, periods=8, band=(0, 2), amplitude=1e-6).realizations(3)
+    design = hj.multisine(
+        4, periods=8, frequencies=(0, 2), amplitude=1e-6
+    ).realizations(3)
     data = hj.run_experiments(
         cycle, phase, design, outputs, feedback=regulator(model, 1.0), discard=30
     )
-    htf = hj.estimate_htf(data, reference="r")
+    htf = hj.estimate_htf(data, references="r")
     noisy = hj.experiments.add_noise(data, std=0.001 * data.y.std(axis=(0, 1)), seed=1)
     fits = {
         "htf": hj.fit_multipliers(htf, 2, check=False),
-        "series": hj.fit_series(data, 2, reference="r"),
-        "ldtp": hj.fit_ldtp(data, model.dims, reference="r"),
-        "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, reference="r"),
+        "series": hj.fit_series(data, 2, references="r"),
+        "ldtp": hj.fit_ldtp(data, model.dims, references="r"),
+        "ldtp.noisy": hj.fit_ldtp(noisy, model.dims, references="r"),
     }
     return {
         x: float(fit.compare(cycle.multipliers).max_error) for x, fit in fits.items()
@@ -475,9 +499,15 @@ def main() -> None:
         )
         show(f"{name}.seconds", np.median(found[f"{name}.seconds"]))
     design = hj.multisine(
-        N, 8, band=(0, N / 2), inputs=3, division="orthogonal", amplitude=1.0, seed=1
+        N,
+        8,
+        frequencies=(0, N / 2),
+        inputs=3,
+        division="orthogonal",
+        amplitude=1.0,
+        seed=1,
     )
-    gain = hj.LDTP(
+    gain = hj.linear.LDTP(
         np.zeros((N, 1, 1)),
         np.zeros((N, 1, 2)),
         np.zeros((N, 1, 1)),

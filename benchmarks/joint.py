@@ -31,15 +31,15 @@ from hybridjax.identify.realization import realized
 N = 32
 
 
-def with_variances(model: hj.LDTP, snr: float) -> hj.HTF:
+def with_variances(model: hj.linear.LDTP, snr: float) -> hj.linear.HTF:
     """Exact HTFs, with the variances that noise gives them in these experiments."""
     design = hj.multisine(periods=84, lines="odd").scaled(0.02)
     y = hj.experiments.simulate_experiments(model, design, start="periodic").y
     sigma = np.std(y, axis=(0, 1)) * 10 ** (-snr / 20)
     exact = model.htf(design.frequencies)
     each = 4 * sigma[:, None] ** 2 / (N * design.periods * design.amplitude[0] ** 2)
-    return hj.HTF(
-        exact.f,
+    return hj.linear.HTF(
+        exact.frequencies,
         exact.H,
         exact.harmonics,
         N,
@@ -49,21 +49,21 @@ def with_variances(model: hj.LDTP, snr: float) -> hj.HTF:
     )
 
 
-def minimal_dims(model: hj.LDTP) -> np.ndarray:
+def minimal_dims(model: hj.linear.LDTP) -> np.ndarray:
     """What is known of the structure: how many states there are at each section."""
     response = np.asarray(model.impulse_response(4 * N + 1))
     return np.asarray(realized(response).dims)
 
 
 def one(
-    htf: hj.HTF, dims: np.ndarray, true: np.ndarray, rng: np.random.Generator
+    htf: hj.linear.HTF, dims: np.ndarray, true: np.ndarray, rng: np.random.Generator
 ) -> dict[str, float]:
     error = rng.normal(size=(2, *htf.H.shape)) * np.sqrt(np.asarray(htf.variance) / 2)
     draw = eqx.tree_at(lambda h: h.H, htf, htf.H + error[0] + 1j * error[1])
     start = realized_htf(draw, dims)
     start = eqx.tree_at(lambda model: model.D, start, 0 * start.D)  # (and stays so)
     began = time.process_time()
-    fit = hj.fit_ldtp(draw, start)
+    fit = hj.fit_ldtp(draw, initial=start)
     seconds = time.process_time() - began
     free = hj.fit_multipliers(draw.select(range(-4, 5)), 2)
     return {
@@ -71,25 +71,23 @@ def one(
         "ldtp": float(np.abs(fit.multipliers - true).min()),
         "said": float(fit.standard_errors[np.abs(fit.multipliers - true).argmin()]),
         "covered": float(fit.contains(true).all()),
-        "unconverged": float(fit.result != hj.Result.OK),
+        "unconverged": float(fit.result != hj.errors.Result.OK),
         "seconds": seconds,
     }
 
 
-def family(name: str, model: hj.LDTP, snr: float, draws: int) -> None:
+def family(name: str, model: hj.linear.LDTP, snr: float, draws: int) -> None:
     def show(what, value):
         print(f"joint.{name}.{what} {value:.4g}", flush=True)
 
     htf, true = with_variances(model, snr), np.asarray(model.multipliers)[:1]
     dims = minimal_dims(model)
-    free = hj.identify.multiplier_bound(
-        model, htf.select(range(-4, 5))
-    ).standard_errors[0]
-    joint = hj.identify.ldtp_bound(model, htf).standard_errors[0]
+    free = hj.identify.cramer_rao(model, htf.select(range(-4, 5))).standard_errors[0]
+    joint = hj.identify.cramer_rao(model, htf, estimator="fit_ldtp").standard_errors[0]
     show("bound.numerators", free)
     show("bound.ldtp", joint)
     show("strides", (free / joint) ** 2)
-    found = hj.monte_carlo(lambda rng: one(htf, dims, true, rng), draws)
+    found = hj.scale.monte_carlo(lambda rng: one(htf, dims, true, rng), draws)
     rms = {
         k: float(np.sqrt((found[k] ** 2).mean()))
         for k in ("numerators", "ldtp", "said")
@@ -112,7 +110,7 @@ def main() -> None:
     parser.add_argument("--families", nargs="*", default=("isochron", "kinematic"))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for name, definition in sections().items():
         if name in options.families:

@@ -502,7 +502,7 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
     def check(name, answer, judge):
         try:
             said[name] = answer()
-        except (hj.DefinitionError, hj.ComputationError) as error:
+        except (hj.errors.DefinitionError, hj.errors.ComputationError) as error:
             return {name: f"refused: {error}"}
         try:
             error = judge(said[name])
@@ -539,7 +539,10 @@ def verdicts(form: Form, x: Numbers) -> dict[str, Any]:
         )
 
     def of_model(model):
-        lanes, errors = hj.place_sections(said["cycle"], hj.ClockPhase(3)).lanes, []
+        lanes, errors = (
+            hj.sections.place_sections(said["cycle"], hj.ClockPhase(3)).lanes,
+            [],
+        )
         t, period = np.asarray(lanes.t), float(said["cycle"].period)
         for n, q in enumerate(np.asarray(lanes.q).T):
             held, end = (

@@ -41,7 +41,7 @@ METHODS = {
     "Tsit5": diffrax.Tsit5(),
     "Dopri5": diffrax.Dopri5(),
     "Dopri8": diffrax.Dopri8(),
-    "Radau": hj.Radau(),
+    "Radau": hj.systems.Radau(),
 }
 TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 # Intervals in which extrema of x are sought. Fewer: pairs of extrema are missed. More: time.

@@ -39,7 +39,7 @@ def results(case: Case) -> dict[str, np.ndarray]:
         for x in ("section", "multiplicity", "conserved", "max_period")
     }
     cycle = hj.find_limit_cycle(case.system, case.guess, **options)
-    placed = hj.place_sections(cycle, case.sections)
+    placed = hj.sections.place_sections(cycle, case.sections)
     model = hj.linearize(cycle, placed, case.output)
     design = hj.multisine(
         placed.n_sections,
@@ -47,7 +47,7 @@ def results(case: Case) -> dict[str, np.ndarray]:
         amplitude=case.amplitude or 1e-5,
         inputs=case.system.inputs,
     )
-    u = design.inputs(cycles=4)[:2]
+    u = design.signals(cycles=4)[:2]
     data = hj.run_experiments(cycle, placed, u, case.output, start="cycle", discard=0)
     q, y = np.asarray(placed.lanes.q), np.nan_to_num(data.y)
     return {

@@ -54,10 +54,10 @@ def cpu(work, *arguments):
 
 def overhead(cycles=84, experiments=80):
     """Time of the package beside that of the plant, in one process; and of two processes."""
-    design = hj.paper_design(seed=0)
-    u = design.inputs(cycles)[:experiments]
+    design = hj.experiments.paper_design(seed=0)
+    u = design.signals(cycles)[:experiments]
     for family in FAMILIES:
-        cycle = hj.plants.settle(Timed(), family, OUTPUTS)
+        cycle = hj.plants.find_cycle(Timed(), family, OUTPUTS)
         few = u[:4]
         Timed.spent, Timed.calls = 0.0, 0
         total = cpu(lambda: cycle.run_experiments(few, discard=20, processes=0))  # noqa: B023
@@ -66,7 +66,7 @@ def overhead(cycles=84, experiments=80):
             f"plant's own; {Timed.calls / few[..., 0].size:.2f} steps per section"
         )
         if family.label == "isochron":
-            plain = hj.plants.settle(Hopper(dt=1 / 32), family, OUTPUTS)
+            plain = hj.plants.find_cycle(Hopper(dt=1 / 32), family, OUTPUTS)
             experiments = lambda: plain.run_experiments(few, discard=20, processes=0)  # noqa: B023, E731
             alone, total = (
                 min(cpu(*work) for _ in range(5))
@@ -75,7 +75,7 @@ def overhead(cycles=84, experiments=80):
             print(
                 f"  {total / alone:.3f} times a loop of its steps from section to section"
             )
-    cycle = hj.plants.settle(Hopper(dt=1 / 32), FAMILIES[0], OUTPUTS)
+    cycle = hj.plants.find_cycle(Hopper(dt=1 / 32), FAMILIES[0], OUTPUTS)
     walls: dict[int, list[float]] = {1: [], 2: []}
     for processes in (1, 2) * 3:
         began, before = (
@@ -103,7 +103,7 @@ def accuracy():
     """Perturbed returns and HTFs against the exact linearization."""
     hopper = hj.find_limit_cycle(hj.models.VerticalHopper())
     for family in FAMILIES:
-        cycle = hj.plants.settle(Hopper(), family, OUTPUTS)
+        cycle = hj.plants.find_cycle(Hopper(), family, OUTPUTS)
         returns = cycle.perturbed_returns()
         error = returns.compare(hopper.multipliers).max_error
         print(f"{family.label}: {returns}\n  error {error:.1e}")
@@ -113,11 +113,11 @@ def accuracy():
         # hit few lines, and are smaller than the bias of third order.
         for seed in range(4):
             design = hj.multisine(
-                32, periods=32, band=(0, 4), amplitude=0.002, seed=seed
+                32, periods=32, frequencies=(0, 4), amplitude=0.002, seed=seed
             )
             data = cycle.run_experiments(design.realizations(4, seed), discard=48)
             estimate = hj.estimate_htf(data)
-            exact = model.htf(estimate.f, harmonics=estimate.harmonics)
+            exact = model.htf(estimate.frequencies, harmonics=estimate.harmonics)
             inside += [
                 np.mean(
                     np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
@@ -130,7 +130,7 @@ def accuracy():
         print(
             f"  mean {100 * np.mean(inside):.1f} % (standard error {100 * error:.1f} %)"
         )
-        design = hj.multisine(32, periods=16, band=(0, 8), amplitude=0.002)
+        design = hj.multisine(32, periods=16, frequencies=(0, 8), amplitude=0.002)
         estimate = hj.estimate_htf(cycle.run_experiments(design, discard=40))
         fit = hj.fit_multipliers(estimate, order=2)
         print(
@@ -150,7 +150,7 @@ def mujoco():
         plant = hj.plants.MuJoCoPlant(
             model, {"push": "N"}, control=drive, period=1.0, substeps=20
         )
-        cycle = hj.plants.settle(
+        cycle = hj.plants.find_cycle(
             plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate")
         )
         returns = cycle.perturbed_returns()
@@ -175,7 +175,7 @@ def walker():
         hj.KinematicPhase(8, "left", "left_rate", scale=(0.2, 2.0)),
         [hj.Crossing(name, "falling") for name in touchdowns],
     ):
-        cycle = hj.plants.settle(plant, sections, ("x_rate", "pitch"), cycles=40)
+        cycle = hj.plants.find_cycle(plant, sections, ("x_rate", "pitch"), cycles=40)
         clocked = isinstance(sections, hj.ClockPhase)
         returns = cycle.perturbed_returns(coordinates(plant) + ["time"] * (not clocked))
         print(f"{cycle}\n  {returns}")
@@ -211,7 +211,7 @@ def stairs():
         plant = hj.plants.MuJoCoPlant(
             model, {"push": "N"}, control=drive, period=1.0, substeps=round(0.01 / step)
         )
-        cycle = hj.plants.settle(
+        cycle = hj.plants.find_cycle(
             plant, hj.ClockPhase(10, anchor=0.7), ("yM", "yM_rate"), cycles=40
         )
         returns = cycle.perturbed_returns()

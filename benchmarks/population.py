@@ -39,7 +39,7 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
     rng = np.random.default_rng(0)
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sections = hj.ClockPhase(N, anchor=hj.Crossing("vM", "falling"))
-    response = hj.response_function(cycle, sections, OUTPUTS)
+    response = hj.experiments.response_function(cycle, sections, OUTPUTS)
     run = eqx.filter_jit(
         eqx.filter_vmap(lambda hopper, u: response(u[None], system=hopper).y)
     )
@@ -47,7 +47,9 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
     for first in range(0, subjects, chunk):
         k, b = (value * (1 + 0.04 * rng.normal(size=chunk)) for value in (10.0, 5.0))
         hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-        true = np.asarray(hj.find_limit_cycles(hoppers, guess=cycle).multipliers)[:, 0]
+        true = np.asarray(
+            hj.orbits.find_limit_cycles(hoppers, guess=cycle).multipliers
+        )[:, 0]
         u = 0.03 * rng.normal(size=(chunk, LONGEST * N, 1))
         y = np.asarray(jax.block_until_ready(run(hoppers, u) - run(hoppers, 0 * u)))[
             :, 0
@@ -63,7 +65,7 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
                     "strides": strides,
                     "fit": fit.multipliers[0],
                     "covariance": fit.multiplier_covariances[0],
-                    "freedom": fit.covariance_dof,
+                    "dof": fit.covariance_dof,
                     "short": short.multipliers[0] if short else np.nan,
                     "short_covariance": short.multiplier_covariances[0]
                     if short
@@ -77,14 +79,14 @@ def make_pool(path: pathlib.Path, subjects: int, chunk: int = 100) -> None:
 
 
 def fitted(u, y, strides):
-    record = hj.Record(
+    record = hj.experiments.SectionSeries(
         u[: strides * N],
         y[: strides * N],
         n_sections=N,
         inputs={"u": "N"},
         outputs={"yM": "m", "vM": "m/s"},
     )
-    return hj.fit_series(record, 2, overhang=0, start="cycle", check=False)
+    return hj.fit_series(record, 2, extra_lags=0, start="cycle", check=False)
 
 
 def moduli(pool, kind="fit") -> tuple[np.ndarray, np.ndarray]:
@@ -109,7 +111,7 @@ def show_held(name: str, held) -> None:
 def means(pool, populations: int = 400) -> None:
     """Intervals of the mean and the spread of the modulus."""
     y, error = moduli(pool)
-    true, freedom = np.abs(pool["true"]), pool["freedom"]
+    true, dof = np.abs(pool["true"]), pool["dof"]
     show("pool.subjects", len(y))
     show("pool.spread", true.std())
     show("pool.rms_standard_error", np.sqrt(np.mean(error**2)))
@@ -120,9 +122,7 @@ def means(pool, populations: int = 400) -> None:
         held, spread, plain = [], [], []
         for _ in range(populations):
             i = rng.choice(len(y), n, replace=False)
-            row = population(y[i], error[i], freedom[i], pool["strides"][i]).mean(
-                "modulus"
-            )
+            row = population(y[i], error[i], dof[i], pool["strides"][i]).mean("modulus")
             held.append(row["low"][0] <= true.mean() <= row["high"][0])
             spread.append(row["spread_low"][0] <= true.std() <= row["spread_high"][0])
             plain.append(
@@ -134,11 +134,9 @@ def means(pool, populations: int = 400) -> None:
         show_held(f"spread.{n}", spread)
 
 
-def population(y, error, freedom, strides):
+def population(y, error, dof, strides):
     table = {"subject": np.arange(len(y)), "strides": strides}
-    return hj.recordings.Population(
-        table, {"modulus": y}, {"modulus": error}, freedom=freedom
-    )
+    return hj.recordings.Population(table, {"modulus": y}, {"modulus": error}, dof=dof)
 
 
 def differences(pool, populations: int = 1000, n: int = 12) -> None:
@@ -162,13 +160,13 @@ def differences(pool, populations: int = 1000, n: int = 12) -> None:
                 rng, rejected = np.random.default_rng(7), []
                 for _ in range(populations):
                     i = rng.choice(len(y), 2 * n, replace=False)
-                    data = [y[i], error[i], pool["freedom"][i], pool["strides"][i]]
+                    data = [y[i], error[i], pool["dof"][i], pool["strides"][i]]
                     if lengths == "40_and_200":
                         i, j = (
                             rng.choice(x, 2 * n, replace=False) for x in (has, long)
                         )
                         few = short[i], short_error[i], pool["short_freedom"][i], SHORT
-                        many = y[j], error[j], pool["freedom"][j], pool["strides"][j]
+                        many = y[j], error[j], pool["dof"][j], pool["strides"][j]
                         data = [
                             np.where(is_short, *x) for x in zip(few, many, strict=True)
                         ]
@@ -178,7 +176,7 @@ def differences(pool, populations: int = 1000, n: int = 12) -> None:
                         table,
                         {"modulus": values},
                         {"modulus": data[1]},
-                        freedom=data[2],
+                        dof=data[2],
                     )
                     p = study.difference("modulus", "a", "b")["p"][0]
                     two = values[:n], values[n:]
@@ -217,7 +215,7 @@ def predictions(pool, populations: int = 400) -> None:
             study = population(
                 np.r_[short[few], y[others]],
                 np.r_[short_error[few], error[others]],
-                np.r_[pool["short_freedom"][few], pool["freedom"][others]],
+                np.r_[pool["short_freedom"][few], pool["dof"][others]],
                 np.r_[np.full(count, SHORT), pool["strides"][others]],
             )
             table = study.predictions("modulus")
@@ -275,7 +273,7 @@ def command(
             hopper = hj.models.VerticalHopper(k=10 * (1 + 0.04 * rng.normal()))
             cycle = hj.find_limit_cycle(hopper)
             force = [
-                hj.testing.random_force(
+                hj.experiments.random_input(
                     strides, rate, bandwidth=8, rms=0.02, seed=100 * s + k
                 )
                 for k in range(trials)
@@ -284,7 +282,7 @@ def command(
             made = hj.testing.simulate_recording(
                 cycle, made, OUTPUTS, rate=rate, steps=1
             )
-            made = hj.testing.spoil(made, OUTPUTS, noise=3e-4, seed=s)
+            made = hj.testing.add_artifacts(made, OUTPUTS, noise=3e-4, seed=s)
             for k, trial in enumerate(made.trials):
                 header = ",".join(("time", *made.signals))
                 np.savetxt(
@@ -298,7 +296,7 @@ def command(
                 rows.append(f"{s}_{k}.csv,S{s},{'young' if s % 2 else 'old'}")
         (folder / "subjects.csv").write_text("\n".join(rows) + "\n")
         options = (
-            "--input u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
+            "--inputs u --outputs yM,vM --crossing vM:falling --sections 16 --workers 2"
         )
         line = [
             sys.executable,

@@ -41,12 +41,14 @@ from hybridjax.identify.series.records import CycleGrid
 CYCLES, SENSOR, COLOR, GROWTH = 300, 0.1, 0.8, 1.145
 
 
-def system() -> hj.LDTP:
+def system() -> hj.linear.LDTP:
     model = hj.testing.synthetic_ldtp()
     return eqx.tree_at(lambda m: m.A, model, GROWTH * model.A)
 
 
-def truth(size: float, color: float) -> tuple[hj.LDTP, hj.LDTP, hj.LDTP]:
+def truth(
+    size: float, color: float
+) -> tuple[hj.linear.LDTP, hj.linear.LDTP, hj.linear.LDTP]:
     """The system, the same with the states of the noise, and the noise, with the states of both."""
     plant = system()
     own = PeriodicModel.of(plant, np.ones(2))
@@ -68,21 +70,25 @@ def truth(size: float, color: float) -> tuple[hj.LDTP, hj.LDTP, hj.LDTP]:
     direct = [np.zeros((ny, nu)) if color else size * D[:, :1] for D in own.D]
     B = [np.concatenate([b, np.zeros((len(b), ny))], axis=1) for b in B]
     D = [np.concatenate([d, SENSOR * np.eye(ny)], axis=1) for d in direct]
-    noise = hj.LDTP.from_blocks(A, B, C, D, outputs=plant.outputs)
+    noise = hj.linear.LDTP.from_blocks(A, B, C, D, outputs=plant.outputs)
     return (
         plant,
-        hj.LDTP.from_blocks(A, inputs, C, own.D, plant.inputs, plant.outputs),
+        hj.linear.LDTP.from_blocks(A, inputs, C, own.D, plant.inputs, plant.outputs),
         noise,
     )
 
 
-def draw(plant: hj.LDTP, noise: hj.LDTP, rng: np.random.Generator) -> hj.Record:
+def draw(
+    plant: hj.linear.LDTP, noise: hj.linear.LDTP, rng: np.random.Generator
+) -> hj.experiments.SectionSeries:
     n, before = 6 * CYCLES, 6 * 20
     u = rng.normal(size=(n + before, 2))
     y = np.asarray(plant.simulate(u)) + np.asarray(
         noise.simulate(rng.normal(size=(len(u), 3)))
     )
-    return hj.Record(u[before:], y[before:], n_sections=6, outputs=plant.outputs)
+    return hj.experiments.SectionSeries(
+        u[before:], y[before:], n_sections=6, outputs=plant.outputs
+    )
 
 
 def innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
@@ -119,7 +125,11 @@ def innovations(noise: PeriodicModel) -> tuple[list[np.ndarray], np.ndarray]:
     raise ValueError("the noise has no steady state: give a stable model of it.")
 
 
-def bound(joint: hj.LDTP, noise: hj.LDTP, records: list[hj.Record]) -> float:
+def bound(
+    joint: hj.linear.LDTP,
+    noise: hj.linear.LDTP,
+    records: list[hj.experiments.SectionSeries],
+) -> float:
     """Of the first multiplier, from the information in some records."""
     K, S = innovations(PeriodicModel.of(noise, np.ones(2)))
     model = PeriodicModel.of(joint, np.ones(2))._replace(K=K)
@@ -142,8 +152,8 @@ def one(plant, joint, noise, rng) -> dict[str, float]:
     free = hj.fit_series(data, 2, check=False)
     at = int(np.abs(fit.multipliers - true).argmin())
     checks = {
-        "fit": hj.validate(fit, other, level=0.05),
-        "simulated": hj.validate(plant, other, level=0.05),
+        "fit": hj.validate(fit, other, alpha=0.05),
+        "simulated": hj.validate(plant, other, alpha=0.05),
     }
     return {
         "ldtp": float(np.abs(fit.multipliers - true)[at]),
@@ -151,7 +161,7 @@ def one(plant, joint, noise, rng) -> dict[str, float]:
         "covered": float(fit.contains(true).all()),
         "series": float(np.abs(free.multipliers - true).min()),
         "series_covered": float(free.contains(true).all()),
-        "unconverged": float(fit.result != hj.Result.OK),
+        "unconverged": float(fit.result != hj.errors.Result.OK),
         "seconds": seconds,
     } | {name: float(check.white) for name, check in checks.items()}
 
@@ -169,7 +179,7 @@ def color(name: str, size: float, draws: int) -> None:
     rng = np.random.default_rng(0)
     least = bound(joint, noise, [draw(plant, noise, rng) for _ in range(10)])
     show("bound", least)
-    found = hj.monte_carlo(lambda rng: one(plant, joint, noise, rng), draws)
+    found = hj.scale.monte_carlo(lambda rng: one(plant, joint, noise, rng), draws)
     rms = {
         k: float(np.sqrt((found[k] ** 2).mean())) for k in ("ldtp", "said", "series")
     }
@@ -195,7 +205,7 @@ def main() -> None:
     parser.add_argument("--colors", nargs="*", default=("white", "colored"))
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     for name in options.colors:
         color(name, options.size, options.draws)
 

@@ -176,15 +176,15 @@ def robots():
     recording = robot()
     print("\nRobot:", hj.recordings.estimate_phase(recording, hj.AtEvent("stride")))
     steps = [np.diff(t.events["step"]) for t in recording.trials]
-    sizes, within, freedom = [], 0.0, 0
+    sizes, within, dof = [], 0.0, 0
     for duration in steps:  # a line and an alternation, which is that of the legs
         k = np.arange(len(duration))
         columns = np.stack([np.ones(len(k)), k, (-1.0) ** k], axis=1)
         fit, left, *_ = np.linalg.lstsq(columns, duration)
         sizes.append(2 * fit[2])
         within += float(left[0])
-        freedom += len(k) - 3
-    spread = np.sqrt(within / freedom)
+        dof += len(k) - 3
+    spread = np.sqrt(within / dof)
     ratio = (
         np.mean([len(d) * (x / 2) ** 2 for d, x in zip(steps, sizes, strict=True)])
         / spread**2
@@ -195,10 +195,10 @@ def robots():
     print(
         f"alternate steps differ by {rms:.0f} ms (rms over runs; from {low:.0f} to {high:.0f}), "
         f"steps of a leg scatter by {1000 * spread:.0f} ms: F = {ratio:.0f} of {len(steps)} and "
-        f"{freedom} degrees of freedom, p = {stats.f.sf(ratio, len(steps), freedom):.1g}"
+        f"{dof} degrees of freedom, p = {stats.f.sf(ratio, len(steps), dof):.1g}"
     )
     phase = hj.recordings.estimate_phase(recording, hj.AtEvent("stride"))
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording,
         phase,
         inputs="voltage",
@@ -206,19 +206,19 @@ def robots():
         n_sections=5,
         bandwidth=np.inf,
     )
-    looked = hj.recordings.inspect(
+    looked = hj.recordings.check_recording(
         recording, inputs=data.inputs, outputs=data.outputs, phase=phase, data=data
     )
     print(data, looked, sep="\n")
     try:
         hj.recordings.hold_out(data, 1)
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         print("to hold a quarter out:", error)
     try:
         hj.fit_series(data, 1, check=False)
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         print("to fit all of it:", error)
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording,
         phase,
         inputs=(),
@@ -247,7 +247,7 @@ def robot_layout(seeds=40, multiplier=0.6):
                 "width": float(np.abs(fit.ellipse(0) - fit.multipliers[0]).max()),
             }
 
-        found = hj.monte_carlo(one, seeds)
+        found = hj.scale.monte_carlo(one, seeds)
         off = found.value.values - multiplier
         print(
             f"{label:12s} mean {found.value.values.mean():.3f}, rms error "
@@ -278,7 +278,7 @@ def in_loop(model, cycles, gain, rng, noise=0.3):
         x = A[n % N] @ x + u[-1][0] + 0.5 * rng.normal(size=d)
     u, y = np.array(u[10 * N :]), np.array(y[10 * N :])
     y = y + noise * rng.normal(size=y.shape)
-    return hj.Record(u, y, n_sections=N, drift=np.inf)
+    return hj.experiments.SectionSeries(u, y, n_sections=N, drift=np.inf)
 
 
 def variability():
@@ -291,7 +291,7 @@ def variability():
             f"standard deviation {periods.std(ddof=1):.3f} s"
         )
     for n_sections in (8, 16, 32):
-        data = hj.recordings.section_data(
+        data = hj.recordings.sample_sections(
             recording,
             phase,
             inputs=(),
@@ -322,7 +322,7 @@ def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
             held = (low <= np.array(multipliers)) & (np.array(multipliers) <= high)
             return {"modulus": modulus, "held": held.astype(float)}
 
-        mean = hj.monte_carlo(one, seeds).mean("draw")
+        mean = hj.scale.monte_carlo(one, seeds).mean("draw")
         modulus, held = mean.modulus.values[:, 0], 100 * mean.held.values
         print(
             f"noise of {noise:.1f} of each output: by instruments {modulus[0]:.3f}, held in "
@@ -350,7 +350,7 @@ def variable(model, strides, noise, rng):
             hj.Recording(t, names, events=events, name=f"trial {len(trials)}")
         )
     recording = hj.Recording.join(trials)
-    return hj.recordings.section_data(
+    return hj.recordings.sample_sections(
         recording,
         hj.AtEvent("strike"),
         inputs=(),
@@ -381,7 +381,7 @@ def phase_model(seeds=10, seconds=3, trials=20):
             if "noise" in label:
                 force = np.stack(
                     [
-                        hj.testing.random_force(
+                        hj.experiments.random_input(
                             seconds, 2000, 100, rms=15, seed=seed + k
                         )[:, 0]
                         for k in range(trials)
@@ -404,7 +404,7 @@ def phase_model(seeds=10, seconds=3, trials=20):
                 "excess": found.excess,
             }
 
-        found = hj.monte_carlo(one, seeds)
+        found = hj.scale.monte_carlo(one, seeds)
         off = found.off.values
         rms, bias = (
             np.sqrt(np.mean(off**2, axis=(0, 2))),

@@ -24,7 +24,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.recordings.sampling import without_drift
-from hybridjax.testing import spoil
+from hybridjax.testing import add_artifacts
 
 
 sys.path.append(str(Path(__file__).parents[1] / "tests/recordings"))
@@ -50,7 +50,7 @@ def hopper(strides, seeds):
     """Recordings of the paper's hopper, one for each seed, and its multipliers."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     u = [
-        hj.testing.random_force(strides, RATE, BANDWIDTH, rms=RMS, seed=seed)
+        hj.experiments.random_input(strides, RATE, BANDWIDTH, rms=RMS, seed=seed)
         for seed in seeds
     ]
     both = hj.testing.simulate_recording(
@@ -63,7 +63,7 @@ def hopper(strides, seeds):
 
 def noisy(recording, noise, seed):
     """With white noise, in which the apex of each stride is marked."""
-    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
+    dirty = add_artifacts(recording, ("yM", "vM"), noise=noise, seed=seed)
     return dirty.mark("apex", hj.Crossing("vM", "falling"), bandwidth=16)
 
 
@@ -88,7 +88,7 @@ def start_of(recording, strides):
 
 def at_sections(recording, name, n_sections=N_SECTIONS):
     about = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": n_sections}
-    return hj.recordings.section_data(recording, phase_of(name, n_sections), **about)
+    return hj.recordings.sample_sections(recording, phase_of(name, n_sections), **about)
 
 
 def distance(multipliers, true):
@@ -109,7 +109,7 @@ def errors(seeds=10):
             fit = hj.fit_series(data.records, 2, check=False)
             found.append(distance(fit.multipliers, true))
             said.append(fit.standard_errors[0])
-            plain.append(distance(hj.recordings.advise(data, fit).plain, true))
+            plain.append(distance(hj.recordings.diagnose(data, fit).plain, true))
         row = [rms(found), np.median(found), rms(said), rms(plain)]
         row = "  ".join(f"{x:9.1e}" for x in row)
         print(f"{name:5s}  {strides:7d}  {noise:6.0e}  {row}", flush=True)
@@ -141,7 +141,7 @@ def coverage(
             for name in phases
         }
 
-    found = hj.monte_carlo(some, draws // chunk)
+    found = hj.scale.monte_carlo(some, draws // chunk)
     for name in phases:
         print(
             f"{name}: {tally(found[name].values.reshape(draws, 3, -1)[..., 0])}",
@@ -201,9 +201,9 @@ def dirt(seeds=5, strides=500, noise=1e-4):
         for seed, recording in enumerate(recordings):
             if name == "apex":
                 dirty = noisy(recording, noise, seed)
-                dirty = spoil(dirty, ("yM", "vM"), seed=seed, **spoiled)
+                dirty = add_artifacts(dirty, ("yM", "vM"), seed=seed, **spoiled)
             else:
-                dirty = spoil(
+                dirty = add_artifacts(
                     recording, ("yM", "vM"), noise=noise, seed=seed, **spoiled
                 )
             if mishap is not None:
@@ -233,7 +233,7 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
     )
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     force = [
-        hj.testing.random_force(strides, rate, BANDWIDTH, rms=RMS, seed=k)
+        hj.experiments.random_input(strides, rate, BANDWIDTH, rms=RMS, seed=k)
         for k in range(seeds * trials)
     ]
     made = hj.testing.simulate_recording(
@@ -263,12 +263,12 @@ def mishaps(seeds=3, trials=4, strides=75, rate=128, noise=1e-4, n_sections=16):
                     n_sections=n_sections,
                     order=2,
                 )
-            except hj.DefinitionError as error:
+            except hj.errors.DefinitionError as error:
                 verdict.append("refused")
                 causes[str(error)] = None
                 continue
             right = result.fit.contains(cycle.multipliers, 0.999).all()
-            doubts = {f.cause for f in result.advice.findings} - HINTS
+            doubts = {f.cause for f in result.diagnosis.findings} - HINTS
             causes |= dict.fromkeys(sorted(doubts))
             verdict.append(
                 "right" if right else "named" if doubts else "SILENTLY WRONG"
@@ -298,9 +298,11 @@ def spikes(seeds=50, strides=300, noise=1e-4, n_sections=16):
             for share in (0.0, 1e-3, 1e-2):
                 found, said, left_out = [], [], 0
                 for seed, recording in enumerate(recordings):
-                    dirty = spoil(recording, ("yM", "vM"), noise=noise, seed=seed)
-                    dirty = spoil(dirty, signals, spikes=share, seed=seed)
-                    data = hj.recordings.section_data(
+                    dirty = add_artifacts(
+                        recording, ("yM", "vM"), noise=noise, seed=seed
+                    )
+                    dirty = add_artifacts(dirty, signals, spikes=share, seed=seed)
+                    data = hj.recordings.sample_sections(
                         dirty,
                         phase,
                         inputs="u",
@@ -324,7 +326,7 @@ def walker(draws=30, strides=100, trials=5, noise=1e-4):
     print(f"\nWithout a clock: {trials} trials of {strides} strides, noise {noise:g}")
     wheel, gait = hj.models.RimlessWheel(), hj.models.CompassGait()
     middle = hj.AtEvent("middle")
-    # Section of the cycle, outputs, phase, event to mark, rms of the force, order, overhang
+    # Section of the cycle, outputs, phase, event to mark, rms of the force, order, extra lags
     # in cycles (what smaller multipliers leave after it is neglected).
     systems = {
         "rimless wheel": (
@@ -368,7 +370,7 @@ def walks(
     mark,
     size,
     order,
-    overhang,
+    extra_lags,
     draws,
     strides,
     trials,
@@ -381,7 +383,7 @@ def walks(
 
     def one(rng):
         force = [
-            hj.testing.random_force(
+            hj.experiments.random_input(
                 strides * period, rate, 8 / period, rms=size, seed=seed
             )
             for seed in rng.integers(2**31, size=trials).tolist()
@@ -389,13 +391,13 @@ def walks(
         made = hj.testing.simulate_recording(
             cycle, np.stack(force), outputs, rate=rate, steps=1
         )
-        made = spoil(made, outputs, noise=noise, seed=int(rng.integers(2**31)))
+        made = add_artifacts(made, outputs, noise=noise, seed=int(rng.integers(2**31)))
         if mark:
             made = made.mark("middle", hj.Crossing(*mark), bandwidth=20 / period)
-        data = hj.recordings.section_data(
+        data = hj.recordings.sample_sections(
             made, phase, inputs="u", outputs=outputs, n_sections=16, timing="duration"
         )
-        fit = hj.fit_series(data, order, overhang=16 * overhang, check=False)
+        fit = hj.fit_series(data, order, extra_lags=16 * extra_lags, check=False)
         reach = [
             np.abs(fit.ellipse(i) - z).max() for i, z in enumerate(fit.multipliers)
         ]
@@ -405,7 +407,7 @@ def walks(
             "reach": np.array(reach),
         }
 
-    found = hj.monte_carlo(one, draws)
+    found = hj.scale.monte_carlo(one, draws)
     print(
         f"{label} (multipliers {true}): rms error {rms(found.error.values):.1e}, 95 % regions "
         f"reach {found.reach.values.mean(axis=0)}, all held in {int(found.held.sum())}/{draws}",
@@ -431,7 +433,7 @@ def size(trials=10, minutes=10, rate=1000):
             "hybridjax",
             "identify",
             *files,
-            "--input",
+            "--inputs",
             "force",
         ]
         command += [
@@ -517,13 +519,13 @@ def write_trials(files, minutes, rate):
     hj.enable_x64()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     force = [
-        hj.testing.random_force(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k)
+        hj.experiments.random_input(minutes * 60, rate, BANDWIDTH, rms=RMS, seed=k)
         for k in range(len(files))
     ]
     made = hj.testing.simulate_recording(
         cycle, np.stack(force), ("yM", "vM"), rate=rate, steps=1
     )
-    made = spoil(made, ("yM", "vM"), noise=1e-4)
+    made = add_artifacts(made, ("yM", "vM"), noise=1e-4)
     for file, trial in zip(files, made.trials, strict=True):
         table = np.column_stack([trial.time, trial.values])
         header = "time (s),force (N),yM (m),vM (m/s)"

@@ -90,7 +90,9 @@ def alone(points: int, store: pathlib.Path | None) -> None:
         values = (x.ravel() for x in np.meshgrid(*over.values(), indexing="ij"))
         make = lambda k, b, M: hj.models.VerticalHopper(k=k, b=b, M=M)  # noqa: E731
         hoppers = eqx.filter_vmap(make)(*map(jnp.asarray, values))
-        found = hj.find_limit_cycles(hoppers, cycle, execution=hj.Execution(workers=1))
+        found = hj.orbits.find_limit_cycles(
+            hoppers, cycle, execution=hj.scale.Execution(workers=1)
+        )
         assert np.isfinite(found.multipliers[found.ok]).all()
 
     work(few(over))  # compiled
@@ -181,7 +183,7 @@ sys.path.insert(0, sys.argv[3])
 import hybridjax as hj, scale
 hj.enable_x64()
 with Client(sys.argv[1]) as client:
-    hj.monte_carlo(scale.draw, 400, seed=1, chunk=2, store=sys.argv[2], client=client)
+    hj.scale.monte_carlo(scale.draw, 400, seed=1, chunk=2, store=sys.argv[2], client=client)
 """
 
 
@@ -191,7 +193,7 @@ def kills(count: int, folder: pathlib.Path) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join([here, os.environ.get("PYTHONPATH", "")])
     store, rng = folder / "draws.zarr", random.Random(0)
     begin = time.perf_counter()
-    reference = hj.monte_carlo(draw, 400, seed=1, chunk=2)
+    reference = hj.scale.monte_carlo(draw, 400, seed=1, chunk=2)
     show("kills.seconds_alone", time.perf_counter() - begin)
     times: dict[str, set[int]] = {}
     done, killed, restarts = 0, 0, 0
@@ -222,7 +224,7 @@ def kills(count: int, folder: pathlib.Path) -> None:
         for process in (*workers, scheduler, client):
             process.kill()
             process.wait()
-    found = hj.monte_carlo(draw, 400, seed=1, chunk=2, store=store).load()
+    found = hj.scale.monte_carlo(draw, 400, seed=1, chunk=2, store=store).load()
     show("kills.seconds", time.perf_counter() - begin)
     show("kills.killed", killed)
     show("kills.starts", restarts)
@@ -272,15 +274,14 @@ def quiet(command) -> subprocess.Popen:
 def experiments(count: int, fitted: int, folder: pathlib.Path) -> None:
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     phase = hj.ClockPhase(32, anchor=hj.Crossing("vM", "falling"))
-    placed = hj.place_sections(cycle, phase)
+    placed = hj.sections.place_sections(cycle, phase)
     outputs, periods = ("yM", "vM"), 16
 
     def store(S: int):
         design = hj.multisine(experiments=20, periods=periods).realizations(S // 20)
         begin, cpu = time.perf_counter(), time.process_time()
-        options = hj.experiments.Options(discard=4)
-        records = hj.experiments.stream_experiments(
-            cycle, placed, design, outputs, options, store=folder / f"{S}.zarr"
+        records = hj.run_experiments(
+            cycle, placed, design, outputs, discard=4, store=folder / f"{S}.zarr"
         )
         wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
         show(f"experiments.{S}.run_cpu_seconds", cpu)
@@ -367,7 +368,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1000)
     options = parser.parse_args()
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         if options.alone is not None:

@@ -38,7 +38,7 @@ def sections():
 
 def errors(cycle, placed, exact, seed: int, division: str) -> np.ndarray:
     """Largest error of H_0 per output."""
-    design = hj.paper_design(seed=seed, division=division)
+    design = hj.experiments.paper_design(seed=seed, division=division)
     data = hj.run_experiments(cycle, placed, design, OUTPUTS)
     return np.asarray(hj.estimate_htf(data, harmonics=0).error(exact))
 
@@ -50,12 +50,12 @@ def main() -> None:
     )
     seeds = range(parser.parse_args().seeds)
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     for family, definition in sections().items():
-        placed = hj.place_sections(cycle, definition)
+        placed = hj.sections.place_sections(cycle, definition)
         exact = hj.linearize(cycle, placed, OUTPUTS).htf(
-            hj.paper_design().frequencies, 0
+            hj.experiments.paper_design().frequencies, 0
         )
         for choice, label in (("random", "random"), ("sum-free", "avoiding")):
             found = np.array(

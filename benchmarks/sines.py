@@ -77,7 +77,9 @@ class Boost(hj.HybridSystem):
             "opens", "closed", "open", lambda t, q, u: 0.4 + u[0] - q[2]
         )
         anew = lambda t, q, u: (q[0], q[1], 0.0)  # noqa: E731
-        yield hj.Transition("closes", "open", "closed", hj.Scheduled(1e-5), reset=anew)
+        yield hj.Transition(
+            "closes", "open", "closed", hj.systems.Scheduled(1e-5), reset=anew
+        )
 
     def period(self):
         return 1e-5
@@ -119,7 +121,7 @@ def clocked(system, outputs, size):
 
 def wheel():
     cycle = hj.find_limit_cycle(hj.models.RimlessWheel())
-    period, tight = float(cycle.period), hj.Settings(1e-12, 1e-13)
+    period, tight = float(cycle.period), hj.orbits.Settings(1e-12, 1e-13)
     wave = Wave(*map(jnp.asarray, (1.0, 0.0, 2.5 * np.pi / period)))
 
     def mean(size, angle):

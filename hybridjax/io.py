@@ -16,7 +16,7 @@ from ._core.precision import require_x64
 from .errors import DefinitionError
 from .experiments.data import ExperimentData
 from .experiments.design.design import Design
-from .experiments.record import Record
+from .experiments.record import SectionSeries
 from .identify.multipliers import StructuredFit
 from .identify.rational import RationalFit
 from .identify.series.fit import SeriesFit
@@ -30,7 +30,7 @@ Saved = (
     | HTF
     | LDTP
     | RationalFit
-    | Record
+    | SectionSeries
     | SeriesFit
     | StructuredFit
 )
@@ -49,8 +49,8 @@ def save(path: FilePath, thing: Saved) -> None:
     **Arguments:**
 
     - `path`: ends in `.npz` or `.mat`; its folder must exist.
-    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit`, `Record`, `SeriesFit`
-      or `StructuredFit`.
+    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit`, `SectionSeries`,
+      `SeriesFit` or `StructuredFit`.
 
     **Raises:** `DefinitionError` for other objects, traced or batched ones, another suffix, and
     where the file cannot be written; `PrecisionError` in single precision.

@@ -47,7 +47,7 @@ cycle = hj.find_limit_cycle(truth)
 apex = hj.Crossing("vM", "falling")
 sections = hj.ClockPhase(SECTIONS, anchor=apex)
 design = hj.multisine(
-    SECTIONS, periods=16, band=(0, 3.0), amplitude=0.02, seed=0
+    SECTIONS, periods=16, frequencies=(0, 3.0), amplitude=0.02, seed=0
 ).realizations(4)
 data = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
 data = hj.experiments.add_noise(data, snr=20, seed=0)
@@ -62,7 +62,7 @@ estimate
 names = ("m", "M", "k", "b", "l0", "a", "g")
 wrong = hj.models.VerticalHopper(m=1.15, M=1.8, k=11.0, b=4.3, l0=2.2, a=18.0, g=2.1)
 fit = hj.fit_model(
-    wrong, hj.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4
+    wrong, hj.fitting.ObservedHTF(estimate, sections), names, guess=cycle, guesses=4
 )
 fit
 
@@ -99,11 +99,11 @@ with hj.plot.style():
     figure, panels = pyplot.subplots(
         2, 3, figsize=(hj.plot.PAGE, 3.6), layout="constrained", sharex=True
     )
-    order = np.argsort(np.asarray(estimate.f))
+    order = np.argsort(np.asarray(estimate.frequencies))
     for row, output in enumerate(OUTPUTS):
         for axes, m in zip(panels[row], (-1, 0, 1), strict=True):
             axes.plot(
-                estimate.f[order],
+                estimate.frequencies[order],
                 np.abs(estimate[m][order, row, 0]),
                 ".",
                 ms=3,
@@ -199,7 +199,7 @@ law = Law(jnp.asarray(5.0), small)
 guess = hj.find_limit_cycle(
     Hopper(damping=law), hj.Guess("stance", (1.965, 1.876), 0.5)
 )
-response = hj.response_function(guess, phases, OUTPUTS)
+response = hj.experiments.response_function(guess, phases, OUTPUTS)
 numbers, rest = eqx.partition(law, eqx.is_inexact_array)
 begin, back = jax.flatten_util.ravel_pytree(numbers)
 

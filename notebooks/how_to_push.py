@@ -56,7 +56,7 @@ def laboratory(design):
 
 # %%
 first = hj.multisine(32, periods=32, lines="odd").scaled(rms=force)
-study = hj.designs.Study(first, order=2, standard_error=asked)
+study = hj.designs.SequentialDesign(first, order=2, standard_error=asked)
 study
 
 # %%
@@ -89,12 +89,12 @@ study.plan
 # as requested, or the budget is spent.
 
 # %%
-while not study.done and study.strides[-1] + study.design.cycles(0) <= budget:
+while not study.done and study.cycles[-1] + study.design.cycles(0) <= budget:
     study = study.add(laboratory(study.design))
 study
 
 # %%
-hj.plot.strides(study.plan, {"this study": study})
+hj.plot.standard_errors(study.plan, {"this study": study})
 
 # %% [markdown]
 # ## Comparison with the truth
@@ -116,21 +116,19 @@ study.fit.compare(cycle.multipliers)
 
 # %%
 block = study.design
-u = block.inputs()
+u = block.signals()
 print(
     f"{len(u)} experiments of {block.periods} strides, rms {np.sqrt(np.mean(u**2)):.2g} N,"
 )
 print(f"peak {np.abs(u).max():.2g} N")
 folder = pathlib.Path(tempfile.mkdtemp())
-hj.recordings.write_design(
-    folder / "time.csv", block, period=float(cycle.period), rate=1000
-)
-hj.recordings.write_design(folder / "phase.csv", block)
+block.write(folder / "time.csv", period=float(cycle.period), rate=1000)
+block.write(folder / "phase.csv")
 for name in ("time.csv", "phase.csv"):
     with open(folder / name) as file:
         print(name, *(next(file).strip() for _ in range(4)), sep="\n  ")
 
 # %% [markdown]
-# The hardware returns a recording. `section_data(...).experiments(block.periods)` converts it to
+# The hardware returns a recording. `sample_sections(...).experiments(block.periods)` converts it to
 # the argument of `study.add` (see the notebook `recording`). A study depends only on its arguments
 # and blocks, so that it can be reconstructed from stored data on another day.

@@ -29,7 +29,7 @@ cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 phase = hj.ClockPhase(8, anchor=hj.Crossing("vM", "falling"))
 plant = hj.linearize(cycle, phase, ("yM", "vM"))
 ones = np.ones((8, 1, 1))
-controller = hj.LDTP(
+controller = hj.linear.LDTP(
     0.6 * ones,
     ones * [[0.3, 0.8]],
     ones,
@@ -48,9 +48,9 @@ print(np.abs(plant.multipliers), np.abs(closed.multipliers))
 
 # %%
 design = hj.multisine(
-    8, 16, band=(0, 4), inputs=3, division="orthogonal", amplitude=1e-3, seed=1
+    8, 16, frequencies=(0, 4), inputs=3, division="orthogonal", amplitude=1e-3, seed=1
 ).realizations(4)
-references = design.inputs(36)
+references = design.signals(36)
 references[..., 1:] *= [0.05, 0.2]  # (m and m/s for N)
 answers = np.stack([controller.simulate(x) for x in references[..., 1:]])
 data = hj.run_experiments(
@@ -61,7 +61,7 @@ data = hj.run_experiments(
     feedback=controller,
     process_noise=hj.experiments.ProcessNoise(2e-3),
 )
-measured = hj.ExperimentData(
+measured = hj.experiments.ExperimentData(
     np.concatenate([data.u[..., :1], references], axis=2),
     data.y + references[..., 1:],
     n_sections=8,
@@ -76,9 +76,9 @@ measured = hj.ExperimentData(
 # The broad pale lines are exact, the thin ones are estimates with bands of 95 %.
 
 # %%
-loop = hj.identify.loop(measured, at_input="r", at_output=("d0", "d1"))
+loop = hj.identify.estimate_loop(measured, at_input="r", at_output=("d0", "d1"))
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
-f = loop.plant.f
+f = loop.plant.frequencies
 panels = {
     "plant": (loop.plant, plant.htf(f), 1, 0),
     "plant with its controller": (loop.closed, closed.htf(f), 1, 0),
@@ -87,7 +87,7 @@ panels = {
 for ax, (title, (estimate, exact, output, source)) in zip(
     axes, panels.items(), strict=True
 ):
-    hj.plot.magnitude(
+    hj.plot.htf(
         estimate, exact, output=output, input=source, harmonics=(0,), decades=2, ax=ax
     )
     ax.set_title(title)
@@ -98,5 +98,5 @@ for ax, (title, (estimate, exact, output, source)) in zip(
 # %%
 fit = hj.fit_multipliers(loop.plant, 2)
 print(cycle.multipliers, fit, sep="\n")
-series = hj.fit_series(data, 2, reference="r")
+series = hj.fit_series(data, 2, references="r")
 print(series)

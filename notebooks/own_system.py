@@ -176,7 +176,7 @@ design = hj.multisine(n_sections=16, periods=32, lines="odd", seed=0).scaled(
 data = hj.run_experiments(cycle, phase, design, outputs=("y", "v"))
 print(data.summary())
 estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
-exact = model.htf(estimate.f, harmonics=(-1, 0, 1))
+exact = model.htf(estimate.frequencies, harmonics=(-1, 0, 1))
 print("largest error, of max |H_0|:", estimate.error(exact))
 hj.plot.bode(estimate, exact)
 # %%
@@ -223,7 +223,7 @@ class Forgetful(Robot):
 def attempt(action):
     try:
         action()
-    except hj.HybridJaxError as error:
+    except hj.errors.HybridJaxError as error:
         print(f"{type(error).__name__}: {error}\n")
 
 

@@ -144,7 +144,9 @@ families = {
         anchor=apex,
     ),
 }
-placed = {name: hj.place_sections(cycle, family) for name, family in families.items()}
+placed = {
+    name: hj.sections.place_sections(cycle, family) for name, family in families.items()
+}
 axes = hj.plot.cycle(
     cycle, "yM", "vM", sections=placed["kinematic"], perturbed=trajectory
 )
@@ -178,7 +180,7 @@ for name, model in models.items():
 # design.
 
 # %%
-design = hj.paper_design(SECTIONS, PERIODS, experiments=EXPERIMENTS, seed=0)
+design = hj.experiments.paper_design(SECTIONS, PERIODS, experiments=EXPERIMENTS, seed=0)
 print(design)
 print(hj.multisine(SECTIONS, PERIODS, seed=0))
 
@@ -205,7 +207,9 @@ figure = hj.plot.experiment(data["kinematic"], 0)
 
 # %%
 estimates = {name: hj.estimate_htf(d) for name, d in data.items()}
-exact = {name: models[name].htf(estimate.f) for name, estimate in estimates.items()}
+exact = {
+    name: models[name].htf(estimate.frequencies) for name, estimate in estimates.items()
+}
 for name in families:
     errors = estimates[name].harmonic_errors(exact[name])
     print(f"{name}: error of H_0 (of max|H_0|) {np.asarray(errors[SECTIONS // 2])}")
@@ -215,7 +219,7 @@ for name in families:
     )
 
 pairs = {name: (estimates[name], exact[name]) for name in families}
-figure = hj.plot.harmonics(pairs)
+figure = hj.plot.htf(pairs)
 
 # %% [markdown]
 # ## Parametric fits (Sec. VI-C3)
@@ -235,7 +239,7 @@ for name, fit in rational.items():
         print(
             f"{name}, {output}: error {error:.1e}; of the same fit to the exact H_0 {bias:.1e}"
         )
-figure = hj.plot.bodes(pairs, fits=rational)
+figure = hj.plot.bode(pairs, fits=rational)
 
 # %% [markdown]
 # All harmonics and outputs together have one denominator in $z^{-N}$, whose roots are the
@@ -279,7 +283,7 @@ for mass in (2.0, 1.9, 1.8):
 # %%
 estimate, model = estimates["isochron"], models["isochron"]
 n = np.arange(PERIODS * SECTIONS)
-lines = np.asarray(estimate.f)[[3, 40, 55]]
+lines = np.asarray(estimate.frequencies)[[3, 40, 55]]
 u = 0.01 * sum(np.cos(2 * np.pi * f * n / SECTIONS + f) for f in lines)[:, None]
 predicted = estimate.predict(u)
 linear = model.simulate(u, model.periodic_state(u, PERIODS))

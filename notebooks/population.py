@@ -42,12 +42,12 @@ for k in range(12):
     hopper = hj.models.VerticalHopper(k=spring, b=5 * (1 + 0.03 * rng.normal()))
     cycle = hj.find_limit_cycle(hopper)
     strides = int(rng.integers(80, 200))
-    force = hj.testing.random_force(strides, 64, bandwidth=6, rms=0.02, seed=k)
+    force = hj.experiments.random_input(strides, 64, bandwidth=6, rms=0.02, seed=k)
     clean = hj.testing.simulate_recording(
         cycle, force[None], ("yM", "vM"), rate=64, steps=1
     )
-    recording = hj.testing.spoil(clean, ("yM", "vM"), noise=5e-4, seed=k)
-    data = hj.recordings.section_data(
+    recording = hj.testing.add_artifacts(clean, ("yM", "vM"), noise=5e-4, seed=k)
+    data = hj.recordings.sample_sections(
         recording, apex, inputs="u", outputs=("yM", "vM"), n_sections=12
     )
     fits.append(hj.fit_series(data, order=2))

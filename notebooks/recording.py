@@ -39,11 +39,14 @@ hj.enable_x64()
 # %%
 cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 force = np.stack(
-    [hj.testing.random_force(250, 200, bandwidth=8, rms=0.02, seed=k) for k in range(2)]
+    [
+        hj.experiments.random_input(250, 200, bandwidth=8, rms=0.02, seed=k)
+        for k in range(2)
+    ]
 )
 clean = hj.testing.simulate_recording(cycle, force, ("yM", "vM"), rate=200, steps=1)
 dirt = {"noise": 1e-4, "quantum": 1e-5, "missing": 0.01, "gap": (100.0, 110.0)}
-recording = hj.testing.spoil(clean, ("yM", "vM"), **dirt)
+recording = hj.testing.add_artifacts(clean, ("yM", "vM"), **dirt)
 recording
 
 # %% [markdown]
@@ -55,7 +58,7 @@ recording
 # %%
 angle = hj.KinematicPhase(32, position="yM", velocity="vM")
 phase = hj.recordings.estimate_phase(recording, angle)
-data = hj.recordings.section_data(recording, phase, inputs="u", outputs=("yM", "vM"))
+data = hj.recordings.sample_sections(recording, phase, inputs="u", outputs=("yM", "vM"))
 fit = hj.fit_series(data, order=2)
 print(phase)
 data
@@ -81,7 +84,9 @@ print("held by the 95 % regions:", fit.contains(cycle.multipliers))
 
 # %%
 apex = hj.Crossing("vM", "falling")
-strides = hj.recordings.section_data(recording, apex, inputs="u", outputs=("yM", "vM"))
+strides = hj.recordings.sample_sections(
+    recording, apex, inputs="u", outputs=("yM", "vM")
+)
 surer = hj.fit_series(strides.records, order=2)
 print(surer)
 print(surer.compare(cycle.multipliers))
@@ -108,7 +113,7 @@ figure = hj.plot.section_data(data)
 # for which both tests allow.
 
 # %%
-print("order:", hj.recordings.choose_order(data))
+print("order:", hj.select_order(data).order)
 held_out = hj.recordings.hold_out(data, order=2)
 held_out.validation
 
@@ -122,13 +127,13 @@ figure = hj.plot.validation(held_out.validation)
 # standard errors for other numbers of strides.
 
 # %%
-advice = hj.recordings.advise(data, fit)
-advice
+diagnosis = hj.recordings.diagnose(data, fit)
+diagnosis
 
 # %%
-for strides, errors in zip(advice.strides, advice.expected, strict=True):
+for strides, errors in zip(diagnosis.cycles, diagnosis.expected, strict=True):
     print(f"{strides:5d} strides: standard error {errors[0]:.1e}")
-axes = hj.plot.multipliers(fit, {"plain regression": advice.plain})
+axes = hj.plot.multipliers(fit, {"plain regression": diagnosis.plain})
 
 # %% [markdown]
 # ## Transfer functions and impulse responses
@@ -158,17 +163,17 @@ figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
 # A multisine is written as a table: by phase, for hardware that triggers on it, or against time.
 
 # %%
-design = hj.multisine(periods=64, band=(0, 8.0), lines="odd").scaled(rms=0.02)
+design = hj.multisine(periods=64, frequencies=(0, 8.0), lines="odd").scaled(rms=0.02)
 with tempfile.TemporaryDirectory() as folder:
-    hj.recordings.write_design(Path(folder) / "by_phase.csv", design)
+    design.write(Path(folder) / "by_phase.csv")
     print((Path(folder) / "by_phase.csv").read_text()[:120])
 
 # %% [markdown]
 # ## All of it in one command
 #
 # ```
-# hybridjax identify trial1.csv trial2.csv --input force --outputs yM,vM --phase yM,vM --out results
-# ```
+# hybridjax identify trial1.csv trial2.csv --inputs force --outputs yM,vM --phase yM,vM --out
+# results ```
 #
 # does the same and writes a report of one page. From Python:
 
@@ -177,7 +182,7 @@ found = hj.identify_recording(
     recording, angle, inputs="u", outputs=("yM", "vM"), order=2
 )
 with tempfile.TemporaryDirectory() as folder:
-    page = hj.write_report(Path(folder) / "results", found)
+    page = found.write_report(Path(folder) / "results")
     print(
         sorted(path.name for path in page.parent.iterdir()),
         page.stat().st_size // 1000,

@@ -67,7 +67,7 @@ print(np.round(1000 * np.array([s[0::2].mean() - s[1::2].mean() for s in steps])
 # section lies there (`bandwidth=np.inf`).
 
 # %%
-strides = hj.recordings.section_data(
+strides = hj.recordings.sample_sections(
     recording,
     phase,
     inputs="voltage",
@@ -76,7 +76,7 @@ strides = hj.recordings.section_data(
     bandwidth=np.inf,
 )
 print(strides)
-looked = hj.recordings.inspect(
+looked = hj.recordings.check_recording(
     recording, inputs="voltage", outputs=("hip", "stance"), phase=phase, data=strides
 )
 print(looked.findings[-1])
@@ -91,7 +91,7 @@ figure = hj.plot.section_data(strides)
 # %%
 try:
     hj.fit_series(strides, order=1)
-except hj.DefinitionError as error:
+except hj.errors.DefinitionError as error:
     print(error)
 
 # %% [markdown]
@@ -102,7 +102,7 @@ except hj.DefinitionError as error:
 # very wide.
 
 # %%
-angles = hj.recordings.section_data(
+angles = hj.recordings.sample_sections(
     recording,
     phase,
     inputs=(),

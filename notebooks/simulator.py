@@ -63,7 +63,7 @@ def control(model, data):
     _, z, pitch, left, _, right, _ = data.qpos
     speed, _, rate, left_rate, _, right_rate, _ = data.qvel
     if z < 0.7 or abs(pitch) > 1:
-        raise hj.ComputationError("fell")
+        raise hj.errors.ComputationError("fell")
     phase = math.sin(2 * math.pi * data.time / PERIOD)
     swings = 0.5 + 0.5 * math.tanh(4 * phase)  # 1: left, 0: right
     ahead = speed * PERIOD / 4 + 0.3 * (speed - 0.4)
@@ -91,7 +91,7 @@ plant = hj.plants.MuJoCoPlant(
 # equal times.
 
 # %%
-cycle = hj.plants.settle(plant, hj.ClockPhase(8), ("x_rate", "pitch"), cycles=40)
+cycle = hj.plants.find_cycle(plant, hj.ClockPhase(8), ("x_rate", "pitch"), cycles=40)
 print(cycle)
 
 
@@ -103,12 +103,12 @@ def draw(z):
         return hip + length * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
 
     left, right = (
-        hj.Drawing.spring(
+        hj.systems.Drawing.spring(
             hip, along(z["pitch"] + z[side], 0.95 + z[f"{side}_leg"]), 0.03
         )
         for side in ("left", "right")
     )
-    return hj.Drawing(
+    return hj.systems.Drawing(
         {
             "ground": [(-9.0, 0.0), (99.0, 0.0)],
             "left": left,
@@ -176,7 +176,7 @@ plt.show()
 # to two thirds. Larger pushes give a biased estimate, because the walker is not linear:
 
 # %%
-strong = cycle.run_experiments(10 * design.inputs(40), discard=24)
+strong = cycle.run_experiments(10 * design.signals(40), discard=24)
 print(hj.fit_multipliers(hj.estimate_htf(strong), order=2))
 
 # %% [markdown]
@@ -194,12 +194,12 @@ def stands(rng):
     try:
         for u, duration in ((0.0, begin), (force, 0.1), *[(0.0, PERIOD)] * 8):
             plant.step([u], duration)
-    except hj.ComputationError:
+    except hj.errors.ComputationError:
         fell = plant.data.time - start - begin
     return {"begin": begin, "force": force, "fell": fell}
 
 
-draws = hj.monte_carlo(stands, 150, seed=0)
+draws = hj.scale.monte_carlo(stands, 150, seed=0)
 begin, force, fell = draws.begin.values, draws.force.values, draws.fell.values
 stood = np.isnan(fell)
 print(f"{stood.mean():.0%} of pushes between -200 and 200 N are stood")

@@ -63,7 +63,7 @@ print(data.summary())
 
 # %%
 estimate = hj.estimate_htf(data, (-1, 0, 1))
-exact = hj.linearize(cycle, phase, outputs).htf(estimate.f, (-1, 0, 1))
+exact = hj.linearize(cycle, phase, outputs).htf(estimate.frequencies, (-1, 0, 1))
 hj.plot.bode(exact, estimate)
 inside = np.abs(estimate.H - exact.H) <= estimate.confidence_radius(0.95)
 print(f"{100 * np.mean(inside):.1f} % of the true values lie inside their 95 % regions")
@@ -125,7 +125,7 @@ noisy = hj.experiments.add_noise(walk, snr=20)
 y = noisy.y[0].copy()
 y[1000:1100] = np.nan  # a hundred samples were lost
 series = hj.fit_series(
-    hj.Record(noisy.u[0], y, n_sections=32, outputs=outputs), order=2
+    hj.experiments.SectionSeries(noisy.u[0], y, n_sections=32, outputs=outputs), order=2
 )
 series
 
@@ -139,7 +139,9 @@ print(f"error {np.max(np.abs(series.multipliers - truth)):.2g}")
 # than 90 %.
 
 # %%
-test = hj.Record(noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs)
+test = hj.experiments.SectionSeries(
+    noisy.u[1], noisy.y[1], n_sections=32, outputs=outputs
+)
 report = hj.validate(series.model, test)
 report
 

@@ -45,7 +45,7 @@ cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
 k_axis, b_axis = np.linspace(8, 18, POINTS), np.linspace(2.6, 11, POINTS)
 k, b = (jnp.asarray(x.ravel()) for x in np.meshgrid(k_axis, b_axis))
 hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-cycles = hj.find_limit_cycles(hoppers, guess=cycle)
+cycles = hj.orbits.find_limit_cycles(hoppers, guess=cycle)
 cycles
 
 # %% [markdown]
@@ -90,10 +90,11 @@ with hj.plot.style():
 #
 # ## The best hopper of a given height
 #
-# `hj.spectral_radius` is smooth everywhere, and a little above the true radius: the number $r$ with
-# $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its gradient,
-# and that of the apex height, are computed through the limit cycle and its events, in forward mode,
-# because there are only two parameters. The optimizer is one of scipy, for losses with constraints.
+# `hj.fitting.spectral_radius` is smooth everywhere, and a little above the true radius: the number
+# $r$ with $\sum_j r^{-2j} \lVert\Phi^j\rVert^2 = d/\epsilon$ for the monodromy matrix $\Phi$. Its
+# gradient, and that of the apex height, are computed through the limit cycle and its events, in
+# forward mode, because there are only two parameters. The optimizer is one of scipy, for losses
+# with constraints.
 
 # %%
 WANTED = 2.3  # height of the body at the apex, in meters
@@ -107,8 +108,10 @@ def look(kb):
     def both(kb):
         system = hj.models.VerticalHopper(k=kb[0], b=kb[1])
         found = hj.find_limit_cycle(system, cycle)
-        height = hj.place_sections(found, [apex]).lanes.q[0, 0]
-        values = jnp.stack([height, jnp.log(hj.spectral_radius(found, smoothing=1e-4))])
+        height = hj.sections.place_sections(found, [apex]).lanes.q[0, 0]
+        values = jnp.stack(
+            [height, jnp.log(hj.fitting.spectral_radius(found, smoothing=1e-4))]
+        )
         return values, values
 
     slopes, values = jax.jacfwd(both, has_aux=True)(kb)

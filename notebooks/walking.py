@@ -51,7 +51,7 @@ for segment, (first, last) in enumerate([(6, 61), (1, 54)]):
     )
 recording = hj.Recording.join(trials)
 phase = hj.recordings.estimate_phase(recording, hj.AtEvent("strike"))
-strides = hj.recordings.section_data(
+strides = hj.recordings.sample_sections(
     recording, phase, inputs=(), outputs=recording.signals, n_sections=16
 )
 print(phase)
@@ -95,7 +95,7 @@ def variable(noise, strides=300, sections=8, seed=0):
     made = hj.Recording(
         time, {f"y{i}": v for i, v in enumerate(y.T)}, events={"e": np.arange(strides)}
     )
-    return hj.recordings.section_data(
+    return hj.recordings.sample_sections(
         made,
         hj.AtEvent("e"),
         inputs=(),

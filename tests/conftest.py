@@ -99,7 +99,7 @@ gc.set_threshold(100_000, 20, 20)
 for library in libraries():
     library.set(1)
 hj.enable_x64()
-hj.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
+hj.scale.enable_compilation_cache()  # of this run: what one worker has compiled the others need not
 hypothesis.settings.register_profile(
     "untimed", hypothesis.settings.default, deadline=None
 )
@@ -214,12 +214,12 @@ def lossy_cycle():
 
 @pytest.fixture(scope="session")
 def placed_isochrons(hopper_cycle):
-    return hj.place_sections(hopper_cycle, ISOCHRONS)
+    return hj.sections.place_sections(hopper_cycle, ISOCHRONS)
 
 
 @pytest.fixture(scope="session")
 def placed_kinematic(hopper_cycle):
-    return hj.place_sections(hopper_cycle, KINEMATIC)
+    return hj.sections.place_sections(hopper_cycle, KINEMATIC)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from .sessions import run_python
         ("--help", "usage: hybridjax"),
         ("reproduce --help", "--seed"),
         ("identify --help", "--crossing"),
-        ("sweep --help", "--over"),
+        ("sweep --help", "--values"),
     ],
 )
 def test_help_does_not_import_jax(arguments, text):
@@ -63,7 +63,7 @@ def test_reproduce_writes_its_results(results):
         model, fit = (
             hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
         )
-        assert_allclose(model.htf(exact.f).H, exact.H, atol=1e-12)
+        assert_allclose(model.htf(exact.frequencies).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
         assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
 
@@ -83,7 +83,7 @@ WRONG = {
         "--out x --formats gif": "--formats: 'gif' is not one or more of png, pdf, svg",
         "--out=": "--out: '' is not a name",
     },
-    "identify x.csv --out x --input u --outputs y": {
+    "identify x.csv --out x --inputs u --outputs y": {
         "": "one of the arguments --phase --crossing --event is required",
         "--phase y,v --event e": "not allowed with argument --phase",
         "--phase y": "--phase: 'y' is not two names with a comma in between",
@@ -96,11 +96,11 @@ WRONG = {
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--crossing u:falling": "u is an input: define the phase by another signal",
         "--event e z": "unrecognized arguments: z (names need commas)",
-        "--event e --reference u": "u: name it once (omit --reference without a controller)",
+        "--event e --references u": "u: name it once (omit --references without a controller)",
         "--crossing y:up": "'y:up' is not a signal, a direction and a value",
         "--crossing y:rising:nan": "'y:rising:nan' is not a signal, a direction and a value",
     },
-    "identify x.csv --out x --input u": {
+    "identify x.csv --out x --inputs u": {
         "--phase y,v": "name --outputs, or choose --timing"
     },
     "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},

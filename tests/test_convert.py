@@ -20,7 +20,9 @@ N = 5
 def model():
     """A stable system whose dimension varies, with two inputs and an output."""
     blocks = blocks_at_random(0, [2, 3, 2, 1, 3], 1, 2)
-    return hj.LDTP.from_blocks(*blocks, inputs={"u": "N", "w": ""}, outputs={"y": "m"})
+    return hj.linear.LDTP.from_blocks(
+        *blocks, inputs={"u": "N", "w": ""}, outputs={"y": "m"}
+    )
 
 
 def test_the_lifted_system_is_the_periodic_one(model):
@@ -104,14 +106,14 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     pytest.importorskip("xarray")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
-    one = dataset.H.sel(f=0.4, harmonic=-1, input="w", output="y")
+    one = dataset.H.sel(frequency=0.4, harmonic=-1, input="w", output="y")
     assert one.item() == complex(H[-1][-1, 0, 1])
     assert dataset.input_unit.sel(input="u").item() == "N"
-    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(f=slice(0, 0.2))
+    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(frequency=slice(0, 0.2))
     fewer = convert.from_xarray(part)
     assert fewer.harmonics == (-1, 0)
     assert fewer.inputs == ("u",)
-    assert len(fewer.f) == 2
+    assert len(fewer.frequencies) == 2
 
 
 def test_a_dataset_of_a_recording_knows_units_and_events():
@@ -134,7 +136,9 @@ def test_a_dataset_of_a_model_has_named_dimensions(model):
         dataset.isel(section=slice(2)),
         dataset.roll(section=1, roll_coords=True),
     ):
-        with pytest.raises(hj.DefinitionError, match="`section` must be in order"):
+        with pytest.raises(
+            hj.errors.DefinitionError, match="`section` must be in order"
+        ):
             convert.from_xarray(part)
 
 
@@ -142,7 +146,7 @@ def test_a_dataset_of_experiments_begins_at_section_0():
     pytest.importorskip("xarray")
     u = np.zeros((2, 4 * N, 2))
     y = u + np.arange(4 * N)[:, None]
-    data = hj.ExperimentData(u, y, n_sections=N, periods=2)
+    data = hj.experiments.ExperimentData(u, y, n_sections=N, periods=2)
     dataset = convert.to_xarray(data)
     second_period = convert.from_xarray(dataset.isel(sample=slice(N, None)))
     assert_array_equal(second_period.y, data.y[:, N:])
@@ -150,7 +154,7 @@ def test_a_dataset_of_experiments_begins_at_section_0():
     from_section_1 = slice(1, None)
     for part in (backwards, from_section_1):
         with pytest.raises(
-            hj.DefinitionError, match="`sample` must be in order, from section 0"
+            hj.errors.DefinitionError, match="`sample` must be in order, from section 0"
         ):
             convert.from_xarray(dataset.isel(sample=part))
 
@@ -159,14 +163,14 @@ def test_section_data(wave):
     pytest.importorskip("xarray")
     pytest.importorskip("pandas")
     crossing = hj.Crossing("v", "falling")
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         wave, crossing, inputs="f", outputs="x", n_sections=8
     )
     dataset = convert.to_xarray(data)
     assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
     average = dataset.average_cycle.sel(signal="x")
     assert_array_equal(average.values, data.cycle_outputs[:, 0])
-    with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
+    with pytest.raises(hj.errors.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
 
     frame = convert.to_pandas(data)
@@ -188,7 +192,7 @@ def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     table = convert.to_pandas(H)
-    row = table.loc[-1, H.f[1].item(), "y", "w"]
+    row = table.loc[-1, H.frequencies[1].item(), "y", "w"]
     value = complex(H[-1][1, 0, 1])
     assert tuple(row) == (value.real, value.imag, np.abs(value))
     assert np.asarray(H).tobytes() == H.H.tobytes()
@@ -198,7 +202,7 @@ def test_tables_of_fits(model):
     pytest.importorskip("pandas")
     rng = np.random.default_rng(3)
     u = rng.normal(size=(60 * N, 2))
-    record = hj.Record(u, model.simulate(u), n_sections=N)
+    record = hj.experiments.SectionSeries(u, model.simulate(u), n_sections=N)
     fit = hj.fit_series(record, order=1)
     table = convert.to_pandas(fit)
     multipliers = table["real"] + 1j * table["imaginary"]
@@ -216,11 +220,11 @@ def test_tables_of_fits(model):
 
 def test_what_is_refused():
     pytest.importorskip("xarray")
-    with pytest.raises(hj.DefinitionError, match="that `to_xarray` made of a"):
+    with pytest.raises(hj.errors.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray({"a": 1})
     clash = hj.Recording([0.0, 1.0], {"trial": [0.0, 1.0]})
     with pytest.raises(
-        hj.DefinitionError, match="'trial' is also the name of a coordinate"
+        hj.errors.DefinitionError, match="'trial' is also the name of a coordinate"
     ):
         convert.to_xarray(clash)
 
@@ -233,6 +237,6 @@ def test_what_is_refused():
 def test_a_library_that_is_missing_is_named(call, library, model, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(
-        hj.DefinitionError, match=rf"pip install 'hybridjax\[{library}\]'"
+        hj.errors.DefinitionError, match=rf"pip install 'hybridjax\[{library}\]'"
     ):
         call(model)

@@ -55,7 +55,7 @@ def ldtp():
     B = [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))]
     C = [np.ones((1, 2)), np.ones((1, 3))]
     names = (("x", "v"), ("x", "v", "z"))
-    return hj.LDTP.from_blocks(
+    return hj.linear.LDTP.from_blocks(
         A,
         B,
         C,
@@ -67,24 +67,28 @@ def ldtp():
 
 @pytest.fixture(scope="module")
 def things(ldtp, htf):
-    design = hj.multisine(n_sections=2, periods=16, band=(0, 1.0), inputs=ldtp.inputs)
+    design = hj.multisine(
+        n_sections=2, periods=16, frequencies=(0, 1.0), inputs=ldtp.inputs
+    )
     data = hj.experiments.simulate_experiments(ldtp, design)
     estimate = hj.estimate_htf(data)
-    plain = hj.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
+    plain = hj.linear.LDTP(ldtp.A, ldtp.B, ldtp.C, dims=ldtp.dims)
     fits = (
         hj.identify.fit_rational(estimate),
-        hj.fit_multipliers(estimate, ldtp, overhang=2),
+        hj.fit_multipliers(estimate, ldtp, extra_lags=2),
     )
-    record = hj.Record(data.u[0], data.y[0], n_sections=2, first_section=1)
-    series = hj.fit_series(data, ldtp, overhang=2)
+    record = hj.experiments.SectionSeries(
+        data.u[0], data.y[0], n_sections=2, first_section=1
+    )
+    series = hj.fit_series(data, ldtp, extra_lags=2)
     y = np.ones((2, 6, 1))
     y[1, 3:] = np.nan
-    failed = hj.ExperimentData(
+    failed = hj.experiments.ExperimentData(
         np.zeros((2, 6, 1)),
         y,
         n_sections=3,
         periods=1,
-        result=[0, hj.Result.GRAZING],
+        result=[0, hj.errors.Result.GRAZING],
         simulated=Simulated(np.array([-1, 3]), np.array([1e-9, 2e-9]), "by hand"),
         cycle_outputs=np.arange(3.0)[:, None],
     )
@@ -109,7 +113,12 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
             hj.convert.from_xarray(xarray.Dataset.from_dict(dataset.to_dict())), thing
         )
     dataset = hj.convert.to_xarray(htf)
-    assert dataset["scatter.roundness"].dims == ("harmonic", "f", "output", "input")
+    assert dataset["variance_dof.roundness"].dims == (
+        "harmonic",
+        "frequency",
+        "output",
+        "input",
+    )
 
 
 @settings(max_examples=15)
@@ -127,7 +136,7 @@ def test_round_trip_of_any_htf(folder, data):
     )
     words = st.text().map("y".__add__)  # (no input's name)
     names = data.draw(st.lists(words, min_size=ny, max_size=ny, unique=True))
-    htf = hj.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
+    htf = hj.linear.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
     assert same(htf, trip(folder, htf))
 
 
@@ -182,7 +191,7 @@ def rewrite(path, header=None, arrays=None):
         ({"header": {"static": 3}}, "header is incomplete"),
         ({"header": {"arrays": {}}}, "header lists"),
         ({"arrays": {"source": np.zeros(2)}}, "not those of HTF"),
-        ({"arrays": {"f": np.array(["a"])}}, "content is no HTF"),
+        ({"arrays": {"frequencies": np.array(["a"])}}, "content is no HTF"),
     ],
 )
 def test_foreign_content(folder, things, change, says):
@@ -205,20 +214,23 @@ def test_pickles_are_not_executed(folder, things):
 
 
 def test_a_matlab_file(folder, ldtp, htf):
-    for thing, names in ((ldtp, "A dims"), (htf, "H scatter_freedom")):
+    for thing, names in ((ldtp, "A dims"), (htf, "H variance_dof.dof")):
         hj.save(folder / "thing.mat", thing)
         read = scipy.io.loadmat(folder / "thing.mat")
         for name in names.split():
-            value = operator.attrgetter(name.replace("_", "."))(thing)
-            assert_array_equal(read[name].squeeze(), np.squeeze(value))
+            value = operator.attrgetter(name)(thing)
+            written = read[name.replace(".", "_")]
+            assert_array_equal(written.squeeze(), np.squeeze(value))
         assert json.loads(read["header"].item())["kind"] == type(thing).__name__
 
 
 def test_where_nothing_can_be_written_or_read(folder, things):
-    with pytest.raises(hj.DefinitionError, match="end in '.npz'"):
+    with pytest.raises(hj.errors.DefinitionError, match="end in '.npz'"):
         hj.save(folder / "data.txt", things[0])
     (folder / "taken.npz").mkdir()
-    with pytest.raises(hj.DefinitionError, match="cannot write .*Is a directory"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="cannot write .*Is a directory"
+    ):
         hj.save(folder / "taken.npz", things[0])
     os.mkfifo(folder / "pipe.npz")
     for name, problem in (
@@ -235,8 +247,10 @@ def test_traced_and_batched_objects(folder, ldtp):
         hj.save(folder / "x.npz", ldtp.htf(f))
         return f
 
-    with pytest.raises(hj.DefinitionError, match="outside of jit"):
+    with pytest.raises(hj.errors.DefinitionError, match="outside of jit"):
         jax.jit(inside)(np.zeros(1))
     batch = jax.vmap(lambda f: ldtp.htf(f))(np.linspace(0.1, 0.4, 4).reshape(2, 2))
-    with pytest.raises(hj.DefinitionError, match="cannot be saved: its f is float64"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="cannot be saved: its frequencies is float64"
+    ):
         hj.save(folder / "x.npz", batch)

@@ -47,7 +47,7 @@ def test_the_executed_notebook_has_the_code_of_its_source(name):
 
 def how_to_push(found):
     assert found.study.done
-    assert found.study.strides[-1] <= found.budget
+    assert found.study.cycles[-1] <= found.budget
     assert found.study.fit.contains(found.cycle.multipliers, 0.999).all()
 
 
@@ -120,7 +120,7 @@ def population(found):
 def in_the_loop(found):
     for fit in (found.fit, found.series):
         assert fit.contains(found.cycle.multipliers, 0.999).all()
-    truth = found.controller.htf(found.f).H
+    truth = found.controller.htf(found.frequencies).H
     held = (
         np.abs(found.loop.controller.H - truth)
         <= found.loop.controller.confidence_radius()

@@ -14,9 +14,10 @@ from numpy.testing import assert_allclose
 
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
+from hybridjax._core.public import place_of
 from hybridjax._core.text import p_value
 from hybridjax.experiments.data import Simulated
-from hybridjax.orbits.continuation import Branch, BranchEnd, BranchPoint
+from hybridjax.orbits.branches import Branch, BranchEnd, BranchPoint
 from hybridjax.systems.system import own_fields
 
 from .conftest import APEX, KINEMATIC, OUTPUTS
@@ -40,7 +41,7 @@ def shown(thing):
 
 @pytest.fixture(scope="module")
 def hopper_data(kinematic_ldtp):
-    design = hj.multisine(periods=16, band=(0, 4.0))
+    design = hj.multisine(periods=16, frequencies=(0, 4.0))
     return hj.experiments.simulate_experiments(kinematic_ldtp, design)
 
 
@@ -76,7 +77,7 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
     def look(k):
         written = (
             hj.models.VerticalHopper(k=k),
-            hj.Settings(rtol=k),
+            hj.orbits.Settings(rtol=k),
             hj.ClockPhase(8, anchor=k),
         )
         printed.extend(map(repr, (*written, hj.Guess("stance", (k, 0.0), k))))
@@ -100,14 +101,15 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
 def test_definitions_print_as_they_are_written():
     written = [
         "ClockPhase(n_sections=8, anchor=0.25)",
-        "Crossing(function='vM', direction='falling', value=0)",
+        "Crossing(signal='vM', direction='falling', value=0)",
         "AtEvent(name='touchdown')",
         "Guess(chart='stance', state=(2, 1.9), time=0.5)",
         "Settings(rtol=1e-09, atol=1e-12, max_steps=99)",
         "Scheduled(period=2, offset=0.5)",
     ]
     for text in written:
-        assert repr(eval(f"hj.{text}")) == text
+        place = place_of(text.partition("(")[0]).rpartition(".")[0]
+        assert repr(eval(f"{place}.{text}")) == text
     network = eqx.nn.MLP(2, 1, 8, 1, key=jax.random.key(0))
 
     class Learned(hj.models.VerticalHopper):
@@ -123,7 +125,7 @@ def test_definitions_print_as_they_are_written():
 def test_results_print_briefly(
     hopper_cycle, placed_kinematic, kinematic_ldtp, hopper_data
 ):
-    response = hj.response_function(hopper_cycle, placed_kinematic, OUTPUTS)
+    response = hj.experiments.response_function(hopper_cycle, placed_kinematic, OUTPUTS)
     htf = kinematic_ldtp.htf([0.1, 0.2])
     things = [
         hopper_cycle,
@@ -134,10 +136,10 @@ def test_results_print_briefly(
         hopper_data,
         KINEMATIC,
         response,
-        hj.section_map(hopper_cycle, placed_kinematic, 0, 5),
-        hj.ObservedHTF(htf, KINEMATIC),
-        hj.ObservedSeries(hopper_data, KINEMATIC),
-        hj.ObservedCycle(KINEMATIC, period=1.0),
+        hj.sections.section_map(hopper_cycle, placed_kinematic, 0, 5),
+        hj.fitting.ObservedHTF(htf, KINEMATIC),
+        hj.fitting.ObservedSeries(hopper_data, KINEMATIC),
+        hj.fitting.ObservedCycle(KINEMATIC, period=1.0),
         Simulated(np.zeros(3, int)),
     ]
     for thing in things:
@@ -155,8 +157,10 @@ def test_results_print_briefly(
 
 def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     m = kinematic_ldtp
-    end = BranchEnd(1.0, hj.Result.OK, "the <values> end")
-    model = hj.LDTP(m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM"))
+    end = BranchEnd(1.0, hj.errors.Result.OK, "the <values> end")
+    model = hj.linear.LDTP(
+        m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM")
+    )
     point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
     branch = Branch(
         "k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end)
@@ -167,7 +171,7 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     signals = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}
     events = {"<hit>": [1.0]}
     recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording, APEX, inputs="<u>", outputs=("yM & co", "vM"), n_sections=8
     )
     f = np.linspace(0.05, 5, 300)
@@ -194,11 +198,13 @@ def test_fits_show_standard_errors():
     A = [[[0.6, 0.5], [-0.5, 0.6]]] * 4
     B = [[[1.0], [0.3]]] * 4
     C = [[[1.0, 0.0], [0.2, 1.0]]] * 4
-    model = hj.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
+    model = hj.linear.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
     rng = np.random.default_rng(0)
     u = rng.normal(size=(600, 1))
     y = np.asarray(model.simulate(u)) + 1e-2 * rng.normal(size=(600, 2))
-    record = hj.Record(u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs)
+    record = hj.experiments.SectionSeries(
+        u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs
+    )
     fit = hj.fit_series(record, order=2)
     page = shown(fit)
     errors = [x for x in page.texts if re.fullmatch(r"\d\.\de-\d\d", x)]
@@ -244,8 +250,8 @@ def test_prints_are_true():
     assert "in steps of 1/8" in repr(odd) and "in steps of 1/16" in repr(
         hj.multisine(8, periods=16)
     )
-    alone = hj.Design.from_lines([[0.1]], 1.0, n_sections=8, periods=10)
+    alone = hj.experiments.Design.from_lines([[0.1]], 1.0, n_sections=8, periods=10)
     assert "steps" not in repr(alone)
-    model = hj.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]])
+    model = hj.linear.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]])
     assert "; 1 frequency 0.1 cycles/period; " in repr(model.htf([0.1]))
     assert "; 2 frequencies 0.1 to 0.2 cycles/period; " in repr(model.htf([0.1, 0.2]))

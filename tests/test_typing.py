@@ -22,29 +22,30 @@ hj.models.VerticalHopper(k=11.0)
 hj.find_limit_cycle(Juggler(g=9.8), hj.Guess("flight", (0.2, 4.5), time=0.1))
 hj.ClockPhase(8, anchor=0.05)
 hj.linearize(cycle, [hj.AtEvent("touchdown"), apex]).multipliers
-hj.section_map(cycle, phase, 0, 0)(cycle.anchor.q[:4, 0])
-hj.fit_series([data, hj.Record(data.u[0], data.y[0], n_sections=32)], order=2).multipliers
-hj.plot.cycle(cycle, sections=hj.place_sections(cycle, phase)).ax.set_title("hopper")
+hj.sections.section_map(cycle, phase, 0, 0)(cycle.anchor.q[:4, 0])
+series = hj.experiments.SectionSeries(data.u[0], data.y[0], n_sections=32)
+hj.fit_series([data, series], order=2).multipliers
+hj.plot.cycle(cycle, sections=hj.sections.place_sections(cycle, phase)).ax.set_title("hopper")
 recording.trials[0].values.shape
 hj.Guess("flight", jnp.array([0.2, 4.5]), 0)
 hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), [0.3, 1.9], anchor=0.5)
 hj.Crossing("vM", "falling", 0.1, charts=("flight",))
-hj.Settings(rtol=1e-8, atol=1e-9, max_steps=100)
-hj.Scheduled(0.5, offset=0.1)
+hj.orbits.Settings(rtol=1e-8, atol=1e-9, max_steps=100)
+hj.systems.Scheduled(0.5, offset=0.1)
 hj.models.VerticalHopper(k=jnp.array(11.0)).k + 1.0
 largest: complex = complex(cycle.multipliers[0])
 print(abs(cycle.multipliers).max(), branch.multipliers.shape, float(cycle.period) + 1)
-hj.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]]).htf([0.1, 0.2])
-hj.Record([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
+hj.linear.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]]).htf([0.1, 0.2])
+hj.experiments.SectionSeries([[1.0], [2.0]], [[1.0], [2.0]], n_sections=2)
 hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), cycle.period)
 hj.convert.to_lti(model).multipliers.shape
-hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.Multipliers(0, "modulus")).advice
+hj.optimal_design(model, limit={"u": 0.01}, goal=hj.designs.MultiplierGoal(0, "modulus")).advice
 hj.optimal_design([model], limit=hj.designs.Limits(peak={"u": 0.1})).advice
-hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.FrequencyResponse((0.1, 1.0))).saved
+hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.ResponseGoal((0.1, 1.0))).saved
 hj.designs.Limits(distortion=hj.designs.Distortion(cycle, phase, {"yM": 1e-5})).distortion
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
 hj.Recording.beside([recording, recording]).units
-hj.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
+hj.fitting.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
 """
 
 
@@ -102,7 +103,8 @@ ALLOWED = {
     "from_xarray.dataset",
     "MuJoCoPlant.__init__.model",
     "MuJoCoPlant.set_state",
-    "SettledCycle.__init__.state",
+    "PlantCycle.__init__.state",
+    "SubjectStudy.__init__.results",
 }
 
 
@@ -162,36 +164,72 @@ UNCHECKED = {
     },
     "checked with the system, by what takes it": {"HybridSystem"},
     "checked by its own constructor, inside of `draw`": {"Drawing", "Drawing.spring"},
+    "called by this package": {
+        "Diagnosis.with_earlier",
+        "LDTPFit.spread",
+        "Phase.by_trial",
+        "Phase.samples",
+        "SeriesFit.predict",
+        "SeriesFit.spread",
+    },
     "made by this package": {
-        "Advice",
+        "Arrival",
         "Branch",
+        "BranchEnd",
+        "BranchPoint",
         "Constrained",
+        "Coupling",
+        "Diagnosis",
+        "Event",
+        "Explorer",
+        "FilippovParts",
         "Finding",
+        "Fluctuations",
+        "HarmonicStateSpace",
+        "HeldOut",
+        "HeldOutOrders",
+        "Identifiability",
         "Identification",
         "Impact",
+        "Impulse",
         "ImpulseResponses",
         "Inspection",
-        "IntervalForecast",
         "LDTPFit",
-        "Lanes",
         "LimitCycle",
         "LimitCycles",
+        "Locked",
+        "Loop",
+        "MapResult",
+        "ModelFit",
         "Motion",
+        "MultiplierComparison",
+        "MultiplierEstimate",
         "NaturalMultipliers",
+        "OptimalDesign",
+        "OrderSelection",
+        "ParameterGuess",
         "Phase",
+        "PhaseCurve",
         "PhaseResponse",
         "PlacedSections",
-        "Plan",
-        "Plan.stride",
+        "PlantCycle",
         "Plot",
+        "RationalFit",
+        "Response",
         "ResponseFunction",
+        "Responses",
+        "Returns",
         "SectionData",
         "SectionMap",
+        "Sensitivity",
         "SeriesFit",
-        "SettledCycle",
-        "Stepping",
+        "SimultaneousEvents",
+        "StructuredFit",
+        "SubjectStudy",
         "Trajectory",
+        "TransientFit",
         "Trial",
+        "Validation",
     },
 }
 

@@ -112,8 +112,10 @@ class Switched(hj.HybridSystem):
 
     def transitions(self):
         return (
-            hj.Transition("switch on", "off", "on", hj.Scheduled(1.0)),
-            hj.Transition("switch off", "on", "off", hj.Scheduled(1.0, self.duty)),
+            hj.Transition("switch on", "off", "on", hj.systems.Scheduled(1.0)),
+            hj.Transition(
+                "switch off", "on", "off", hj.systems.Scheduled(1.0, self.duty)
+            ),
         )
 
     def period(self):

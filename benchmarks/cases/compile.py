@@ -141,7 +141,11 @@ def first_calls(model: str, family: str, repetition: int = 0):
     else:
         make = hj.models.VerticalHopper if model == "hopper" else defined_here()
         system, model = make(k=10 + 1e-3 * repetition), "hopper"
-    own, outputs, design = sections(model, family), OUTPUTS[model], hj.paper_design()
+    own, outputs, design = (
+        sections(model, family),
+        OUTPUTS[model],
+        hj.experiments.paper_design(),
+    )
 
     def timed(name, work):
         begin, processor = time.perf_counter(), time.process_time()
@@ -190,7 +194,7 @@ def derivatives() -> dict[str, float]:
 
     near, observed = (
         hj.models.VerticalHopper(k=10.8, b=4.75),
-        hj.ObservedHTF(htf, family),
+        hj.fitting.ObservedHTF(htf, family),
     )
     return twice(
         gradient=lambda: eqx.filter_grad(coefficient)(hopper).k.item(),
@@ -227,7 +231,7 @@ def cycles() -> dict[str, float]:
     found = {}
 
     def find():
-        found["cycles"] = hj.find_limit_cycles(systems, cycle)
+        found["cycles"] = hj.orbits.find_limit_cycles(systems, cycle)
 
     seconds = twice(find_limit_cycles=find, repeat=REPEAT)
     share = float(found["cycles"].ok.mean())
@@ -273,7 +277,7 @@ def walkers() -> dict[str, float]:
     hj.enable_x64()
     cycle = hj.find_limit_cycle(KneedWalker())
     angles = [hj.Crossing("stance", "rising", x) for x in np.linspace(-0.15, 0.25, 15)]
-    placed = hj.place_sections(cycle, [hj.AtEvent("heelstrike"), *angles])
+    placed = hj.sections.place_sections(cycle, [hj.AtEvent("heelstrike"), *angles])
     u = 1e-3 * np.random.default_rng(0).standard_normal((80, 32 * 16, 1))
     return twice(
         hopper=lambda: hj.find_limit_cycle(hj.models.VerticalHopper()),
@@ -359,7 +363,7 @@ def plane(name: str) -> dict[str, float]:
     found = {}
 
     def find():
-        found["cycles"] = hj.find_limit_cycles(systems, cycle)
+        found["cycles"] = hj.orbits.find_limit_cycles(systems, cycle)
 
     seconds = twice(find_limit_cycles=find, repeat=REPEAT)
     return seconds | {"found": float(found["cycles"].ok.mean())}
@@ -426,7 +430,7 @@ def main(model: str, family: str, folder: str | None) -> None:
     from hybridjax.experiments import run as batched
 
     hj.enable_x64()
-    hj.enable_compilation_cache()
+    hj.scale.enable_compilation_cache()
     from . import problems  # noqa: F401  (imports count as such)
 
     if folder is None:

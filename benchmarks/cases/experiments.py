@@ -106,7 +106,7 @@ def _compare(label: str, limit: float, seen: dict, show) -> None:
 def main(model: str, family: str, repeat: str, quick: str) -> None:
     import hybridjax as hj
 
-    hj.enable_loop_kernels()
+    hj.scale.enable_loop_kernels()
     hj.enable_x64()
     found = {}
     _runs(

@@ -6,7 +6,7 @@ states on the cycle as the reported ones are, but not below 1e-13.
 
 import numpy as np
 
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 
 from .problems import ALL, N, Problem, problem, record
 
@@ -35,7 +35,7 @@ def _honest(task: Problem, accuracy: float, name: str, show) -> None:
 def show_honesty(task: Problem, data, accuracy: float, name: str, show) -> None:
     """The share of experiments that ran well, and the errors of these."""
     campaign = prepare(
-        task.cycle, task.placed, task.u, task.outputs, Options(discard=0)
+        task.cycle, task.placed, task.u, task.outputs, RunOptions(discard=0)
     )
     scale = campaign.stepping.scales[:, 1:3]
     scale = np.resize(scale, task.exact.shape[1:])

@@ -28,7 +28,7 @@ def _program(placed):
 
 @eqx.filter_jit
 def _placing(cycle, family):
-    return hj.place_sections(cycle, family).flow_jacobians
+    return hj.sections.place_sections(cycle, family).flow_jacobians
 
 
 def run(show, options) -> None:
@@ -39,9 +39,11 @@ def run(show, options) -> None:
         exact = _on_sections(task, full)
         for rtol in RTOL:
             name = f"{task.label}.program.rtol_{rtol:.0e}"
-            settings = hj.Settings(rtol, rtol, scale=task.cycle.settings.scale)
+            settings = hj.orbits.Settings(rtol, rtol, scale=task.cycle.settings.scale)
             cycle = dataclasses.replace(task.cycle, settings=settings)
-            work = ft.partial(_program, hj.place_sections(cycle, task.placed.family))
+            work = ft.partial(
+                _program, hj.sections.place_sections(cycle, task.placed.family)
+            )
             (A, B), compiling, seconds = first_and_later(work, repeat)
             if rtol == RTOL[0]:
                 show(f"{name}.compile", compiling)

@@ -18,7 +18,7 @@ from peers.errors import Unavailable
 import hybridjax as hj
 from hybridjax.experiments import run as batched
 from hybridjax.experiments.response import course, flow_batch
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 from hybridjax.sections.placed import PlacedSections
 from hybridjax.systems.system import own_fields
 
@@ -42,7 +42,7 @@ class Problem:
     u: np.ndarray
 
     @property
-    def cycle(self) -> hj.LimitCycle:
+    def cycle(self) -> hj.orbits.LimitCycle:
         return self.placed.cycle
 
     @ft.cached_property
@@ -65,7 +65,9 @@ class Problem:
     def scaled(self, factor: float) -> "Problem":
         return dataclasses.replace(self, u=factor * self.u)
 
-    def run(self, accuracy: float = 1e-9, workers: int = 1) -> hj.ExperimentData:
+    def run(
+        self, accuracy: float = 1e-9, workers: int = 1
+    ) -> hj.experiments.ExperimentData:
         """All experiments, as a user runs them, by the program that jobs find after a while."""
         batched._LARGE = 0
         return hj.run_experiments(
@@ -75,10 +77,10 @@ class Problem:
             self.outputs,
             discard=0,
             accuracy=accuracy,
-            execution=hj.Execution(workers=workers),
+            execution=hj.scale.Execution(workers=workers),
         )
 
-    def error(self, data: hj.ExperimentData) -> float:
+    def error(self, data: hj.experiments.ExperimentData) -> float:
         """Largest error of the outputs, in their own units."""
         return self.distance(record(data))
 
@@ -87,7 +89,7 @@ class Problem:
 
     def response(self, accuracy: float = 1e-9) -> tuple:
         """Arguments of `program`: what `run` gives to it."""
-        options = Options(discard=0, accuracy=accuracy)
+        options = RunOptions(discard=0, accuracy=accuracy)
         prepared = prepare(self.cycle, self.placed, self.u, self.outputs, options)
         lanes = self.placed.lanes
         start = jnp.concatenate([lanes.t[None], lanes.q])[:, :1]
@@ -113,13 +115,13 @@ program = eqx.filter_jit(responding)
 """As JAX compiles it, without the options of `run_experiments`."""
 
 
-def record(data: hj.ExperimentData) -> np.ndarray:
+def record(data: hj.experiments.ExperimentData) -> np.ndarray:
     """Outputs themselves, not their deviations from the cycle."""
     return data.y + np.resize(data.cycle_outputs, (data.y.shape[1], data.y.shape[2]))
 
 
 @ft.cache
-def cycle(model: str) -> hj.LimitCycle:
+def cycle(model: str) -> hj.orbits.LimitCycle:
     return hj.find_limit_cycle(MODELS[model]())
 
 
@@ -144,8 +146,8 @@ def sections(model: str, family: str) -> hj.ClockPhase | hj.KinematicPhase:
 def problem(model: str, family: str, quick: bool = False) -> Problem:
     """80 experiments of 84 cycles with the paper's multisines; `quick`, 16 of 24 cycles."""
     experiments, cycles = (16, 24) if quick else (80, 84)
-    placed = hj.place_sections(cycle(model), sections(model, family))
-    u = hj.paper_design().inputs(84)[:experiments, : N * cycles]
+    placed = hj.sections.place_sections(cycle(model), sections(model, family))
+    u = hj.experiments.paper_design().signals(84)[:experiments, : N * cycles]
     return Problem(f"{model}.{family}", placed, OUTPUTS[model], u)
 
 
@@ -165,7 +167,7 @@ class InC(NamedTuple):
     seconds: Seconds
 
 
-def hoppers_in_c(cycle: hj.LimitCycle, k, b, repeat: int) -> InC | None:
+def hoppers_in_c(cycle: hj.orbits.LimitCycle, k, b, repeat: int) -> InC | None:
     """The cycles of a grid of hoppers beginning near `cycle`; None without gcc."""
     try:
         sweep = c_cycles.setup()

@@ -47,7 +47,7 @@ def main(n: int, contacts: str) -> None:
     system = (hj.models.BouncingChain if contacts == "together" else apart())(n=n)
     sections, outputs = hj.ClockPhase(N, anchor=0.02), ("y1", f"v{n}")
     u = 1e-3 * np.random.default_rng(0).standard_normal((EXPERIMENTS, CYCLES * N, 1))
-    one_core, found = hj.Execution(workers=1), {}
+    one_core, found = hj.scale.Execution(workers=1), {}
 
     def twice(name, work):
         for call in ("first", "again"):
@@ -58,7 +58,7 @@ def main(n: int, contacts: str) -> None:
 
     cycle = twice("cycle", lambda: hj.find_limit_cycle(system))
     twice("linearize", lambda: hj.linearize(cycle, sections, outputs))
-    placed = hj.place_sections(cycle, sections)
+    placed = hj.sections.place_sections(cycle, sections)
     experiments = lambda: hj.run_experiments(  # noqa: E731
         cycle, placed, u, outputs, discard=0, execution=one_core
     )

@@ -38,7 +38,7 @@ def _ours(task: Problem, exact, count: int, repeat: int, show) -> None:
     show(f"{name}.microseconds", 1e6 * seconds.cpu / part.u.size)
     part.__dict__["exact"] = exact
     show(f"{name}.error", part.error(data))
-    size = divide(count, hj.Execution(workers=1)).batch
+    size = divide(count, hj.scale.Execution(workers=1)).batch
     some = task.part(size, CYCLES)
     name = f"{task.label}.size_{count}.program"
     y, _, seconds = first_and_later(ft.partial(program, *some.response()), repeat)

@@ -41,7 +41,7 @@ def run(show, options) -> None:
 
 
 def _relaxation(show, mu: float, options) -> None:
-    system, period = hj.models.VanDerPol(mu, solver=hj.Radau()), PERIODS[mu]
+    system, period = hj.models.VanDerPol(mu, solver=hj.systems.Radau()), PERIODS[mu]
     sizes = np.array([2.0, 1.34 * mu])
     points = _points(mu, period, 1 if options.quick else 80)
     settings = Settings(RTOL, RTOL, 100_000, sizes[None])

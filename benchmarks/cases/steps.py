@@ -9,7 +9,7 @@ import hybridjax as hj
 from .problems import HOPPER, OUTPUTS, cycle, first_and_later, sections
 
 
-TIGHT = hj.Settings(rtol=1e-14, atol=1e-14)
+TIGHT = hj.orbits.Settings(rtol=1e-14, atol=1e-14)
 
 
 def run(show, options) -> None:
@@ -24,15 +24,15 @@ def run(show, options) -> None:
         "find_limit_cycle.multiplier_error",
         _distance(found.multipliers, tight.multipliers),
     )
-    f = hj.paper_design().frequencies[:: 50 if options.quick else 10]
+    f = hj.experiments.paper_design().frequencies[:: 50 if options.quick else 10]
     found = cycle("hopper")
     for model, family in HOPPER:
         own = sections(model, family)
         name = f"place_sections.{family}"
-        work = ft.partial(hj.place_sections, found, own)
+        work = ft.partial(hj.sections.place_sections, found, own)
         placed, _, seconds = first_and_later(work, options.repeat)
         show(f"{name}.wall", seconds.wall)
-        finer = hj.place_sections(tight, own)
+        finer = hj.sections.place_sections(tight, own)
         show(f"{name}.error", _distance(placed.lanes.q, finer.lanes.q))
         name = f"linearize.{family}"
         work = ft.partial(hj.linearize, found, placed, OUTPUTS[model])

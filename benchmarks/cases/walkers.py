@@ -10,7 +10,7 @@ import numpy as np
 
 import hybridjax as hj
 from hybridjax.experiments import run as batched
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 
 from .problems import first_and_later
 
@@ -53,17 +53,23 @@ def _costs(show, case, options) -> dict[str, float]:
         lambda: hj.find_limit_cycle(model), options.repeat
     )
     costs = {"cycle.first": compiling + seconds.wall, "cycle.cpu": seconds.cpu}
-    placed = hj.place_sections(cycle, sections)
+    placed = hj.sections.place_sections(cycle, sections)
     count, cycles = (16, 4) if options.quick else (EXPERIMENTS, CYCLES)
     u = amplitude * np.random.default_rng(0).standard_normal(
         (count, cycles * SECTIONS, 1)
     )
     batched._LARGE = 0
-    how = {"discard": 0, "accuracy": ACCURACY, "execution": hj.Execution(workers=1)}
+    how = {
+        "discard": 0,
+        "accuracy": ACCURACY,
+        "execution": hj.scale.Execution(workers=1),
+    }
     _, _, seconds = first_and_later(
         lambda: hj.run_experiments(cycle, placed, u, output, **how), options.repeat
     )
-    prepared = prepare(cycle, placed, u, output, Options(discard=0, accuracy=ACCURACY))
+    prepared = prepare(
+        cycle, placed, u, output, RunOptions(discard=0, accuracy=ACCURACY)
+    )
     s, chart = placed.structure(), np.asarray(placed.lanes.chart)
     steps = np.ceil(np.asarray(placed.duration) / np.asarray(prepared.stepping.plan.h))
     stages = [len(s.method(a).c) for a in chart]

@@ -38,7 +38,7 @@ def transition(event: Event, system) -> hj.Transition:
     if event.enabled is not None:
         more["enabled"] = bound(event.enabled, system)
     if event.schedule is not None:
-        trigger = hj.Scheduled(*event.schedule(system))
+        trigger = hj.systems.Scheduled(*event.schedule(system))
     else:
         trigger = bound(event.guard, system)
         more["direction"] = event.direction
@@ -93,7 +93,7 @@ def answer(model: Model, guess: Start) -> Answer:
         start = hj.Guess(guess.chart, guess.state, guess.time)
         cycle = hj.find_limit_cycle(system, start, **search)
         return Answer(orbit_of(cycle, model), str(cycle))
-    except hj.HybridJaxError as error:
+    except hj.errors.HybridJaxError as error:
         return Answer(None, f"{type(error).__name__}: {error}")
     except (
         Exception

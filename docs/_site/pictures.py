@@ -35,14 +35,14 @@ FRAMES = 24  # of a thumbnail
 def draw() -> dict[str, Plot]:
     """Plots by the names of their files."""
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    sections = hj.place_sections(cycle, hj.ClockPhase(32, anchor=APEX))
+    sections = hj.sections.place_sections(cycle, hj.ClockPhase(32, anchor=APEX))
     model = hj.linearize(cycle, sections, outputs=("yM", "vM"))
     first = hj.multisine(32, periods=32, lines="odd").scaled(rms=0.001)
-    force = hj.testing.random_force(100, 500, 8.0, rms=0.0205, seed=0)
+    force = hj.experiments.random_input(100, 500, 8.0, rms=0.0205, seed=0)
     recording = hj.testing.simulate_recording(
         cycle, force[None], ("yM", "vM"), rate=500
     )
-    data = hj.recordings.section_data(
+    data = hj.recordings.sample_sections(
         recording, APEX, inputs="u", outputs=("yM", "vM"), n_sections=16
     )
     fit = hj.fit_series(data, order=2)
@@ -61,7 +61,7 @@ def walk() -> Motion:
     return hj.plot.animate(gait)
 
 
-def thumbnail(cycle: hj.LimitCycle, plane: list[str]) -> str:
+def thumbnail(cycle: hj.orbits.LimitCycle, plane: list[str]) -> str:
     """An SVG of 160 x 120 in which the mechanism moves; or, of systems without a picture, the
     orbit with a dot that moves along it."""
     motion = hj.plot.animate(cycle)
@@ -140,7 +140,7 @@ def _animated(name: str, values: list[str], about: str) -> str:
     return f'<animate attributeName="{name}" values="{";".join(values)}" {how}/>'
 
 
-def run(name: str) -> tuple[hj.LimitCycle, list[str]]:
+def run(name: str) -> tuple[hj.orbits.LimitCycle, list[str]]:
     """The cycle and the plane that the code of a page of the gallery gives."""
     *lines, last = codes()[name][1].splitlines()
     scope: dict = {}

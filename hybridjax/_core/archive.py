@@ -27,8 +27,8 @@ import scipy
 from jaxtyping import jaxtyped
 
 from .. import __version__
-from ..errors import DefinitionError, FileFormatError, HybridJaxError
 from . import limits
+from .exceptions import DefinitionError, FileFormatError, HybridJaxError
 from .signal import Signal
 from .writing import replacing
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ComputationError, DefinitionError
+from .exceptions import ComputationError, DefinitionError
 
 
 if TYPE_CHECKING:

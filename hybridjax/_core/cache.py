@@ -11,10 +11,10 @@ import stat
 import tempfile
 import warnings
 
-from ..errors import DefinitionError
 from . import jax_compat
 from .boundary.checked import checked
 from .boundary.kinds import FilePath
+from .exceptions import DefinitionError
 
 
 # A larger file in the folder, in bytes, is no program. Smaller: the largest programs (1e8) are

@@ -22,8 +22,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..errors import ComputationError
 from . import executor, jax_compat
+from .exceptions import ComputationError
 from .executor import as_numpy, from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .meaning import program_digest
 from .progress import say_compiling

@@ -7,7 +7,7 @@ from typing import Literal
 
 import equinox as eqx
 
-from ..errors import DefinitionError, FindingWarning
+from .exceptions import DefinitionError, FindingWarning
 
 
 class Finding(eqx.Module):

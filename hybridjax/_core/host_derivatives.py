@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..errors import DefinitionError
 from . import jax_compat
 from .compilation import at_ease, uncollected
+from .exceptions import DefinitionError
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
 

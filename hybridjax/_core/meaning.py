@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import keystr, tree_leaves_with_path
 
-from ..errors import DefinitionError
 from . import jax_compat
 from .call import once_in_call
+from .exceptions import DefinitionError
 from .executor import Definition
 from .memo import Memory
 from .programs import Digests, digest_of_words

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..errors import PrecisionError
 from . import jax_compat
+from .exceptions import PrecisionError
 from .executor import is_inside_program
 
 

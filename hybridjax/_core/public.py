@@ -1,25 +1,173 @@
-"""Public names by their tables, imported when they are first used."""
+"""Public names: where they are, and what became of earlier ones.
 
+The `__init__.pyi` of a namespace lists its public names. Each is imported when it is first used
+(PEP 562), and type checkers read the same list.
+"""
+
+import ast
 import difflib
+import functools
+import importlib
+import pathlib
 from collections.abc import Callable
+from typing import Any
 
-import lazy_loader
+
+_ROOT = pathlib.Path(__file__).parents[1]
+
+# Names that became others before version 0.2, and those now.
+_NAMES = {
+    "Advice": "hj.recordings.Diagnosis",
+    "FrequencyResponse": "hj.designs.ResponseGoal",
+    "Multipliers": "hj.designs.MultiplierGoal",
+    "Options": "hj.run_experiments(..., start=, discard=, ...)",
+    "Parameters": "hj.designs.ParameterGoal",
+    "Points": "hj.scale.SweepPoints",
+    "Quotient": "hj.systems.Symmetric",
+    "Record": "hj.experiments.SectionSeries",
+    "Scatter": "hj.linear.VarianceDof",
+    "SettledCycle": "hj.plants.PlantCycle",
+    "Study": "hj.designs.SequentialDesign",
+    "add_command": "hj.recordings.attach_design",
+    "advise": "hj.recordings.diagnose",
+    "bodes": "hj.plot.bode",
+    "choose_order": "hj.select_order",
+    "coincidences": "hj.orbits.simultaneous_events",
+    "draws": "hj.designs.draw_models",
+    "harmonics": "hj.plot.htf",
+    "inspect": "hj.recordings.check_recording",
+    "ldtp_bound": "hj.identify.cramer_rao(model, htf, estimator='fit_ldtp')",
+    "loop": "hj.identify.estimate_loop",
+    "magnitude": "hj.plot.htf",
+    "multiplier_bound": "hj.identify.cramer_rao",
+    "random_force": "hj.experiments.random_input",
+    "section_data": "hj.recordings.sample_sections",
+    "settle": "hj.plants.find_cycle",
+    "sliding": "hj.systems.filippov",
+    "spoil": "hj.testing.add_artifacts",
+    "stream_experiments": "hj.run_experiments(..., chunk=, store=)",
+    "strides": "hj.plot.standard_errors",
+    "write_design": "design.write(path)",
+    "write_report": "result.write_report(folder)",
+}
+# Arguments of functions and attributes of classes that became others, and those now.
+_WORDS = {
+    "Crossing.function": "signal",
+    "Design.f": "frequency",
+    "Design.input_names": "inputs",
+    "Diagnosis.band": "bandwidths",
+    "Diagnosis.strides": "cycles",
+    "Diagnosis.warnings": "findings",
+    "HTF.f": "frequencies",
+    "HTF.scatter": "variance_dof",
+    "Identification.advice": "diagnosis",
+    "Limits.strides": "cycles",
+    "MultiplierGoal.overhang": "extra_lags",
+    "OptimalDesign.strides": "cycles",
+    "OptimalDesign.strides_for": "cycles_for",
+    "ParameterGoal.wanted": "quantities",
+    "PhaseResponse.freedom": "dof",
+    "Population.freedom": "dof",
+    "ResponseGoal.band": "frequencies",
+    "ResponseGoal.wanted": "quantities",
+    "SequentialDesign.strides": "cycles",
+    "SeriesFit.reference": "references",
+    "Validation.level": "alpha",
+    "VarianceDof.freedom": "dof",
+    "asymptotic_phase.turns": "cycles",
+    "continuation.values": "range",
+    "estimate_htf.reference": "references",
+    "estimate_phase.definition": "sections",
+    "fit_ldtp.guess": "dims` or `initial",
+    "fit_ldtp.reference": "references",
+    "fit_multipliers.errors": "covariance",
+    "fit_multipliers.overhang": "extra_lags",
+    "fit_series.overhang": "extra_lags",
+    "fit_series.reference": "references",
+    "htf.f": "frequencies",
+    "identify_recording.phase": "sections",
+    "identify_recording.reference": "references",
+    "multisine.band": "frequencies",
+    "noise_spectrum.f": "frequencies",
+    "phase_response.phase": "sections",
+    "sample_sections.phase": "sections",
+    "select_order.htf": "data",
+    "select_order.overhang": "extra_lags",
+    "sweep.over": "values",
+    "sweep.want": "quantities",
+    "validate.level": "alpha",
+    "validate.reference": "references",
+}
 
 
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
-    `__init__.pyi`. Each name is imported when it is first used (PEP 562)."""
-    find, listed, names = lazy_loader.attach_stub(package, file)
+    `__init__.pyi`."""
+    homes = _homes(pathlib.Path(file).with_suffix(".pyi"))
+    names = sorted(homes)
 
-    def __getattr__(name: str):
-        try:
-            return find(name)
-        except AttributeError as error:
-            close = difflib.get_close_matches(name, names, n=1)
-            text = f"module {package!r} has no attribute {name!r}"
-            if close:
-                text += f"; did you mean {close[0]!r}?"
+    def __getattr__(name: str) -> Any:
+        home = homes.get(name)
+        if home is None:
             # (With a `name` Python would suggest it again.)
-            raise AttributeError(text, name="") from error
+            raise AttributeError(about_name(package, name, names), name="")
+        module = importlib.import_module(home, package)
+        is_namespace = home == f".{name}"
+        return module if is_namespace else getattr(module, name)
 
-    return __getattr__, listed, names
+    def __dir__() -> list[str]:
+        return names
+
+    return __getattr__, __dir__, names
+
+
+def about_name(package: str, name: str, names: list[str]) -> str:
+    """Return one line that leads from a name that a namespace does not have to the one that is
+    meant."""
+    asked = package.replace("hybridjax", "hj", 1) + f".{name}"
+    place = _NAMES.get(name, place_of(name))
+    if place is not None:
+        return f"{asked} is {place}"
+    text = f"module {package!r} has no attribute {name!r}"
+    for known in (names, list(places())):
+        close = difflib.get_close_matches(name, known, n=1)
+        if close:
+            return f"{text}; did you mean {place_of(close[0])}?"
+    return text
+
+
+def place_of(name: str) -> str | None:
+    """Return the place of a public name, such as `hj.plot.bode`; None if there is none."""
+    return places().get(name)
+
+
+@functools.cache
+def places() -> dict[str, str]:
+    """The place of each public name: the package's before those of its namespaces, and names of
+    figures last."""
+    stubs = [_ROOT / "__init__.pyi", *sorted(_ROOT.glob("*/__init__.pyi"))]
+    stubs.sort(key=lambda stub: stub.parent.name == "plot")
+    found: dict[str, str] = {}
+    for stub in stubs:
+        namespace = ".".join(["hj", *stub.parent.relative_to(_ROOT).parts])
+        for name in _homes(stub):
+            found.setdefault(name, f"{namespace}.{name}")
+    return found
+
+
+def about_word(owner: str, word: str) -> str | None:
+    """Return one line about an earlier argument of a function, or attribute of a class."""
+    word_now = _WORDS.get(f"{owner.rpartition('.')[2]}.{word}")
+    return word_now and f"`{word}` of {owner} is `{word_now}`"
+
+
+def _homes(stub: pathlib.Path) -> dict[str, str]:
+    """The modules of the names in a stub, relative to its package."""
+    homes = {}
+    for statement in ast.parse(stub.read_text(encoding="utf-8")).body:
+        if not isinstance(statement, ast.ImportFrom):
+            continue
+        package = "." * statement.level
+        for alias in statement.names:
+            homes[alias.name] = package + (statement.module or alias.name)
+    return homes

@@ -37,7 +37,7 @@ class Result(enum.IntEnum):
         12,
         "the cycle closes sooner, or meets its section more often, than asked",
     )
-    COINCIDENCE = (
+    SIMULTANEOUS = (
         13,
         "two events coincide on the cycle: trajectories near it may meet them in either order",
     )
@@ -59,7 +59,7 @@ class Result(enum.IntEnum):
     PULSE_PASSED = (
         17,
         "the field or a guard has a pulse, or another sudden change, over which steps pass: begin "
-        "and end it by transitions (`hj.Scheduled` at known times)",
+        "and end it by transitions (`hj.systems.Scheduled` at known times)",
     )
     PLANT_STOPPED = 18, "the plant ended the experiment: see `data.simulated.causes`"
     GUARD_BEYOND = (

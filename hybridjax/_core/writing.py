@@ -13,8 +13,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Literal
 
-from ..errors import DefinitionError
 from . import limits
+from .exceptions import DefinitionError
 
 
 @contextlib.contextmanager

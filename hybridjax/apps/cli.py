@@ -195,14 +195,14 @@ def _add_identify(commands) -> None:
         help="processes for the subjects of --table (default: %(default)s)",
     )
     add(
-        "--input",
+        "--inputs",
         required=True,
         type=_names,
         metavar="NAMES",
         help="measured perturbations",
     )
     add(
-        "--reference",
+        "--references",
         type=_names,
         default=(),
         metavar="NAMES",
@@ -293,7 +293,7 @@ def _add_sweep(commands) -> None:
         help="a system, its class, or a function of parameters that gives one",
     )
     add(
-        "--over",
+        "--values",
         required=True,
         action="append",
         type=_axis,
@@ -301,7 +301,7 @@ def _add_sweep(commands) -> None:
         help="values of a parameter, evenly spaced; may be repeated",
     )
     add(
-        "--want",
+        "--quantities",
         type=_names,
         default=("spectral_radius", "period"),
         metavar="NAMES",
@@ -343,13 +343,13 @@ def _identify(options) -> int:
         options.parser.error(
             "--center and --scale are of the angle of --phase, which is not given"
         )
-    named = [*options.input, *options.reference, *options.outputs]
+    named = [*options.inputs, *options.references, *options.outputs]
     twice = ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1)
     if twice:
         options.parser.error(
-            f"{twice}: name it once (omit --reference without a controller)"
+            f"{twice}: name it once (omit --references without a controller)"
         )
-    beside = {*options.input} & {*(options.phase or (options.crossing or ())[:1])}
+    beside = {*options.inputs} & {*(options.phase or (options.crossing or ())[:1])}
     if beside:
         options.parser.error(
             f"{', '.join(beside)} is an input: define the phase by another signal"

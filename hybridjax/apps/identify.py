@@ -63,7 +63,7 @@ _CAPTIONS = {
 def run(options: Any) -> bool:
     """Identify, print and write a report, from the options of the command; whether the fit has
     converged."""
-    with report_folder(options.out, options.input, options.formats) as folder:
+    with report_folder(options.out, options.inputs, options.formats) as folder:
         signals, identify = steps_of(options)
         recording = read_recording(*options.files, time=options.time, signals=signals)
         print(recording)
@@ -78,7 +78,7 @@ def steps_of(
     options: Any,
 ) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
     """Return the names of the signals to be read, and the function that identifies a recording."""
-    named = (*options.input, *options.reference, *options.outputs)
+    named = (*options.inputs, *options.references, *options.outputs)
     named += options.phase or (options.crossing or ())[:1]
     if options.phase is not None:
         position, velocity = options.phase
@@ -91,15 +91,15 @@ def steps_of(
         sections = AtEvent(options.event)
     identify = functools.partial(
         identify_recording,
-        phase=sections,
-        inputs=options.input,
+        sections=sections,
+        inputs=options.inputs,
         outputs=options.outputs,
         n_sections=options.sections,
         order=options.order,
         bandwidth=options.bandwidth,
         timing=options.timing,
         drift=options.drift,
-        reference=options.reference or None,
+        references=options.references or None,
     )
     return tuple(dict.fromkeys(named)), identify
 
@@ -108,22 +108,7 @@ def steps_of(
 def write_report(
     folder: FilePath, result: Identification, formats: Sequence[Format] = ("png",)
 ) -> Path:
-    """Write all results of a recording into a folder. They appear when all of them are ready.
-
-    - `report.html`: everything in one page that needs no other file.
-    - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
-      `cycle.csv`: the average cycle.
-    - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the numbers.
-    - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
-
-    Other files in the folder stay as they are. Results of an earlier report are replaced; a hidden
-    list in the folder holds their names.
-
-    **Returns:** the path of the page.
-
-    **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these names,
-    or the folder cannot be written.
-    """
+    """Write all results of a recording into a folder, see `Identification.write_report`."""
     with report_folder(folder, result.data.inputs, formats) as new:
         write_results(new, result, formats)
     return Path(folder) / PAGE
@@ -169,7 +154,7 @@ def write_results(
     (folder / "figures").mkdir()
     data = result.data
     # 240 frequencies, up to the edge of the band that the inputs excited.
-    edge = min(max(result.advice.band), data.n_sections / 2)
+    edge = min(max(result.diagnosis.bandwidths), data.n_sections / 2)
     htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
     images = {}
     for name, drawn in _figures(result, htf):
@@ -238,7 +223,7 @@ def summarize(result: Identification) -> dict[str, Any]:
         "notes": [finding.text for finding in result.recording.findings],
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
-        "references": list(fit.reference),
+        "references": list(fit.references),
         "outputs": list(data.outputs),
         "sections": data.n_sections,
         "cycles": round(data.cycles, 2),
@@ -253,11 +238,11 @@ def summarize(result: Identification) -> dict[str, Any]:
         "multipliers": complex_pairs(fit.multipliers),
         "standard_errors": fit.standard_errors.tolist(),
         "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": complex_pairs(result.advice.plain),
+        "multipliers_of_plain_regression": complex_pairs(result.diagnosis.plain),
         "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
-        "input_band": list(result.advice.band),
-        "warnings": list(map(repr, result.advice.findings)),
+        "input_band": list(result.diagnosis.bandwidths),
+        "warnings": list(map(repr, result.diagnosis.findings)),
     }
 
 
@@ -266,13 +251,16 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
     shown = [m for m in (0, 1, -1) if m in htf.harmonics]
     yield (
         "multipliers",
-        plot.multipliers(result.fit, {"plain regression": result.advice.plain}),
+        plot.multipliers(result.fit, {"plain regression": result.diagnosis.plain}),
     )
     yield "validation", plot.validation(result.held_out.validation)
     yield "impulse_responses", plot.impulse_responses(result.responses)
     for i, suffix in enumerate(_suffixes(htf.inputs)):
         yield f"bode{suffix}", plot.bode(htf, input=i)
-        yield f"harmonics{suffix}", plot.harmonics({"": htf}, shown, input=i, decades=3)
+        yield (
+            f"harmonics{suffix}",
+            plot.htf({"": htf}, harmonics=shown, input=i, decades=3),
+        )
     yield "phase", plot.phase(result.phase)
     yield "sections", plot.section_data(result.data)
     if result.curve is not None:
@@ -283,16 +271,16 @@ def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data = result.data
     recording = result.recording
-    warnings = result.advice.findings
+    warnings = result.diagnosis.findings
     trials = escape(", ".join(t.name for t in recording.trials))
-    loop = result.fit.reference
+    loop = result.fit.references
     if loop:
         method = f"instrumental variables of {escape(listed(loop))}"
     else:
         method = "output-error fit"
     left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
     notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
-    expected = zip(result.advice.strides, result.advice.expected, strict=True)
+    expected = zip(result.diagnosis.cycles, result.diagnosis.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
         f"{data.n_sections} sections per cycle.</p>",

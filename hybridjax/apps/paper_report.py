@@ -31,7 +31,9 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
         biases = [
             family.rational_exact.compare(true, name).max_error for name in OUTPUTS
         ]
-        errors = family.estimate.harmonic_errors(family.ldtp.htf(family.estimate.f))
+        errors = family.estimate.harmonic_errors(
+            family.ldtp.htf(family.estimate.frequencies)
+        )
         at = {m: k for k, m in enumerate(family.estimate.harmonics)}
         results = family.structured.result, *np.ravel(family.rational.result)
         summary["families"][name] = {
@@ -101,7 +103,7 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     text = f"distance of the fitted zeros in z: {_pairs(moved)}"
     note("the choice of phase moves the zeros", np.any(moved > 1e-2), text)
     for name, family in families.items():
-        f = np.asarray(family.exact.f)
+        f = np.asarray(family.exact.frequencies)
         size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
         peaks = [
             f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))

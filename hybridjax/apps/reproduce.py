@@ -18,7 +18,7 @@ from ..engine.settings import Settings
 from ..engine.trajectory import Trajectory, simulate
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import paper_design
-from ..experiments.run import run_experiments
+from ..experiments.stored import run_experiments
 from ..identify.htf_estimate import estimate_htf
 from ..identify.multipliers import StructuredFit, fit_multipliers
 from ..identify.rational import RationalFit, fit_rational
@@ -29,7 +29,7 @@ from ..orbits.crossing import Crossing
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.families import ClockPhase, KinematicPhase
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
 from .paper_report import OUTPUTS, summarize, table
@@ -108,7 +108,8 @@ def _reproduce(out: Path, protocol: Protocol, formats: Sequence[Format]) -> dict
         experiments=protocol.experiments,
     )
     _log(
-        begin, f"design: {design.experiments} experiments, {len(design.f)} frequencies"
+        begin,
+        f"design: {design.experiments} experiments, {len(design.frequency)} frequencies",
     )
     cycle = find_limit_cycle(VerticalHopper())
     multipliers = ", ".join(f"{z:.9f}" for z in cycle.multipliers)
@@ -198,8 +199,8 @@ def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> It
         }
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}
     rational = {name: family.rational for name, family in families.items()}
-    yield "fig3_harmonics", plot.harmonics(pairs, (0, 1, -1, 2, -2))
-    yield "fig4_bode", plot.bodes(pairs, fits=rational)
+    yield "fig3_harmonics", plot.htf(pairs, harmonics=(0, 1, -1, 2, -2))
+    yield "fig4_bode", plot.bode(pairs, fits=rational)
     yield "multipliers", plot.multipliers(cycle, estimates)
     yield "poles_zeros", plot.poles_zeros(rational)
 

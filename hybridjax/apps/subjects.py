@@ -53,7 +53,7 @@ _FOREST = (
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Study:
+class SubjectStudy:
     """Results of `identify_subjects`.
 
     **Fields:** `population` of the subjects that were identified; its table also has `report`,
@@ -79,7 +79,7 @@ class Study:
 
     def __repr__(self) -> str:
         lines = [
-            f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"
+            f"SubjectStudy({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"
         ]
         lines += [folded(f"  {text}", "  ") for text in self.remarks]
         if len(self.results):
@@ -161,14 +161,14 @@ def identify_subjects(
     signals: OptionalNames = (),
     formats: tuple[Format, ...] = ("png",),
     client: DaskClient | concurrent.futures.Executor | None = None,
-) -> Study:
+) -> SubjectStudy:
     """Identify all subjects of a table, write a report for each, and one for all of them.
 
     Rows with the same subject, group and condition are trials of one recording. A subject that
     fails is named and does not stop the others. A later call continues an interrupted one: reports
     are kept unless files, options or the version have changed.
 
-    Files in `folder`: `SUBJECT-GROUP-CONDITION/` with the files of `hj.write_report`;
+    Files in `folder`: `SUBJECT-GROUP-CONDITION/` with the files of `Identification.write_report`;
     `subjects.csv`, a row for each report; `population.csv`, means and differences;
     `population.html`, the report for all.
 
@@ -176,9 +176,9 @@ def identify_subjects(
 
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
       and `group`, if there are any; other columns (age, speed) are kept in
-      `Study.population.table`.
+      `SubjectStudy.population.table`.
     - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
-      `functools.partial(hj.identify_recording, phase=..., inputs=..., outputs=...)`.
+      `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`.
     - `time`: name of the column with the times. Default: "time". `signals`: names of the signals
       to be read. Default: all.
     - `formats`: formats of the figures. Default: PNG.
@@ -219,7 +219,7 @@ def identify_subjects(
         failures["population"] = str(error)
     pandas = package("pandas")
     results = pandas.concat([pandas.DataFrame(), *parts], ignore_index=True)
-    study = Study(population, fits, failures, results, root)
+    study = SubjectStudy(population, fits, failures, results, root)
     methods = dict.fromkeys(part.attrs["methods"] for part in parts)
     _write(study, methods, formats)
     return study
@@ -275,7 +275,9 @@ def _rows(path: Path) -> Any:
     return rows
 
 
-def _write(study: Study, methods: Iterable[str], formats: tuple[Format, ...]) -> None:
+def _write(
+    study: SubjectStudy, methods: Iterable[str], formats: tuple[Format, ...]
+) -> None:
     """Write the tables, and the report for all."""
     population = study.population
     results = study.results

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import DefinitionError
 from ..plot.look import save_and_close
 from ..plot.over_parameters import sweep as plot_sweep
-from ..scale.sweep import sweep
+from ..scale.sweeps import sweep
 
 
 def run(options: Any) -> int:
@@ -18,20 +18,20 @@ def run(options: Any) -> int:
 
     **Raises:** `DefinitionError` for a file without such a model, and as `sweep`.
     """
-    over = {
-        name: np.linspace(low, high, count) for name, low, high, count in options.over
+    values = {
+        name: np.linspace(low, high, count) for name, low, high, count in options.values
     }
-    if len(over) < len(options.over):
+    if len(values) < len(options.values):
         raise DefinitionError(
-            "a parameter has two axes: give each `--over` another name."
+            "a parameter has two axes: give each `--values` another name."
         )
-    maps = sweep(_load(*options.model), over, options.want, store=options.out)
+    maps = sweep(_load(*options.model), values, options.quantities, store=options.out)
     print(maps)
     print(
         f"{int((maps.result == 0).sum())} of {maps.result.size} points have a limit cycle"
     )
-    for name in options.want:
-        if maps[name].dims == tuple(over) and len(over) <= 2:
+    for name in options.quantities:
+        if maps[name].dims == tuple(values) and len(values) <= 2:
             path = f"{Path(options.out).with_suffix('')}-{name}"
             print(*save_and_close(path, plot_sweep(maps, name), ("png",)))
     return 0

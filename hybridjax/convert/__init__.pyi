@@ -1,4 +1,5 @@
 from .lti import (
+    HarmonicStateSpace as HarmonicStateSpace,
     to_control as to_control,
     to_harmonic_state_space as to_harmonic_state_space,
     to_lti as to_lti,

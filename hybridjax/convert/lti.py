@@ -108,7 +108,7 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     outputs = [f"{y}[{m}]" for m, y in pairs]
     inputs = list(map(str, thing.inputs))
     H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
-    frequencies = 2 * np.pi * np.asarray(thing.f) / period
+    frequencies = 2 * np.pi * np.asarray(thing.frequencies) / period
     return package("control").FrequencyResponseData(
         H, frequencies, inputs=inputs, outputs=outputs, sysname="HTF"
     )
@@ -126,14 +126,15 @@ class HarmonicStateSpace(NamedTuple):
     error: float
     """The largest error of H_-1, H_0 and H_1, relative to the largest of them."""
 
+    @checked
     def transfer(
-        self, f: Frequencies, period: float
-    ) -> Complex[np.ndarray, "f M ny nu"]:
-        """Responses of all harmonics to inputs of frequencies in cycles per period."""
+        self, frequencies: Frequencies, period: Positive
+    ) -> Complex[np.ndarray, "F M ny nu"]:
+        """Responses of all harmonics to inputs of `frequencies` (F,) in cycles per period."""
         M = 2 * self.order + 1
         # (Inputs have the harmonic 0 only.)
         B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
-        rates = 2j * np.pi * np.asarray(f, float).reshape(-1, 1, 1) / period
+        rates = 2j * np.pi * np.asarray(frequencies).reshape(-1, 1, 1) / period
         resolvent = rates * np.eye(len(self.A)) - self.A
         H = self.C @ np.linalg.solve(resolvent, B[None]) + D
         return H.reshape(len(rates), M, -1, D.shape[-1])

@@ -9,7 +9,7 @@ from .._core.boundary.checked import checked
 from ..identify.multiplier_estimate import MultiplierFit
 from ..identify.rational import RationalFit
 from ..linear.htf import HTF
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording

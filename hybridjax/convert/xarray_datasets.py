@@ -18,7 +18,7 @@ from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
 from ..io import KINDS, Saved
 from ..linear.ldtp import LDTP
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.limit_cycles import LimitCycles
 from ..recordings.data import SectionData
 from ..recordings.recording import Recording
@@ -35,7 +35,7 @@ _AXES = {
     "n": "sample",
     "N": "section",
     "M": "harmonic",
-    "F": "f",
+    "F": "frequency",
     "ny": "output",
     "nu": "input",
     "d": "multiplier",
@@ -55,9 +55,9 @@ _COORDINATES = {"input": "inputs", "output": "outputs", "harmonic": "harmonics"}
 def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> Any:
     """Return an `xarray.Dataset` with named dimensions, coordinates, and units.
 
-    - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, f, output,
-      input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment, sample,
-      input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
+    - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, frequency,
+      output, input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment,
+      sample, input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
       `output_unit` beside them.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
@@ -111,11 +111,10 @@ def from_xarray(dataset: Any) -> Saved:
             if f"{dimension}_unit" in dataset.coords:
                 units = dataset[f"{dimension}_unit"].values
                 static[field] = tuple(map(Signal, static[field], map(str, units)))
-        names = set(dataset.data_vars)
-        if "f" in dataset.coords:
-            names.add("f")
         arrays = {}
-        for name in map(str, names):
+        if "frequency" in dataset.coords:
+            arrays["frequencies"] = np.asarray(dataset["frequency"].values)
+        for name in map(str, dataset.data_vars):
             array = dataset[name].transpose(*_axes(kind, name))
             arrays[name] = np.asarray(array.values)
         return put_together(kind, static, arrays)
@@ -144,8 +143,8 @@ def _from_module(module: eqx.Module) -> Any:
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
     kind = type(module)
     variables = {name: (_axes(kind, name), x) for name, x in arrays.items()}
-    if "f" in variables:
-        coordinates["f"] = variables.pop("f")
+    if "frequencies" in variables:
+        coordinates["frequency"] = variables.pop("frequencies")
     units = {str(name): name.unit for name in signals_in(static)}
     dataset = package("xarray").Dataset(variables, coordinates)
     sizes = {x: n for x, n in dataset.sizes.items() if x in _ORDERED}

@@ -1,4 +1,4 @@
-"""Experiments that estimate a quantity of interest in the fewest strides."""
+"""Experiments that estimate a quantity of interest in the fewest cycles."""
 
 from .._core.public import attach
 

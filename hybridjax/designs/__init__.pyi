@@ -1,8 +1,9 @@
-from .candidates import draws as draws
+from .candidates import draw_models as draw_models
 from .goals import (
-    FrequencyResponse as FrequencyResponse,
-    Multipliers as Multipliers,
-    Parameters as Parameters,
+    MultiplierGoal as MultiplierGoal,
+    ParameterGoal as ParameterGoal,
+    ResponseGoal as ResponseGoal,
 )
 from .limits import Distortion as Distortion, Limits as Limits
-from .study import Study as Study
+from .optimize import OptimalDesign as OptimalDesign
+from .study import SequentialDesign as SequentialDesign

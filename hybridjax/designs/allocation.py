@@ -196,5 +196,5 @@ def to_design(
         n_sections=cosines.n_sections,
         periods=cosines.periods,
         experiments=experiments,
-        input_names=usual.input_names,
+        inputs=usual.inputs,
     )

@@ -45,7 +45,7 @@ class Candidates(NamedTuple):
     """Index of the input."""
     periods: int
     n_sections: int
-    strides: int
+    cycles: int
     """T, periods of all experiments together."""
 
     @classmethod
@@ -58,8 +58,8 @@ class Candidates(NamedTuple):
         half = is_half_integer(design.line, design.periods)
         if half.any():
             raise DefinitionError(
-                f"f = {design.f[half][0]:g} is a multiple of 1/2: use a `design` without such "
-                "lines."
+                f"f = {design.frequency[half][0]:g} is a multiple of 1/2: use a `design` without "
+                "such lines."
             )
         shared = np.stack([design.experiment, design.line])
         if len(np.unique(shared, axis=1).T) < len(design.line):
@@ -208,7 +208,7 @@ def measured_htfs(
         members = np.flatnonzero(cosines.channel == i)
         htf = model.htf(cosines.f[members], harmonics)
         spectrum = noise.spectrum(cosines.f[members], htf.harmonics)
-        samples = cosines.n_sections * cosines.strides
+        samples = cosines.n_sections * cosines.cycles
         variance: Any = 2 * spectrum[..., None] / samples
         H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
         larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0
@@ -223,7 +223,7 @@ def measured_htfs(
 
 
 @checked
-def draws(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
+def draw_models(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
     """Draw stable models from the confidence region of an estimate, for `optimal_design`.
 
     The draws are Gaussian with the covariance of the fit; those with a multiplier of modulus one or

@@ -16,7 +16,7 @@ from ..identify.periodic import characteristic_slopes
 from ..identify.variable_projection import grouped
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, Criterion, LinearCriterion
-from .goals import Goal, Multipliers, Parameters
+from .goals import Goal, MultiplierGoal, ParameterGoal
 from .matrices import ldtp_matrices, response_criterion
 
 
@@ -45,15 +45,15 @@ def criterion_of(
     **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
     that do not exist, and combinations that the data do not identify, which are named.
     """
-    if isinstance(goal, Parameters) and (len(models) > 1 or not goal.cycle.stable):
+    if isinstance(goal, ParameterGoal) and (len(models) > 1 or not goal.cycle.stable):
         raise DefinitionError(
             "a `goal` of parameters needs a single `model` and a stable `cycle`."
         )
     each = []
     for model in models:
-        if isinstance(goal, Multipliers):
+        if isinstance(goal, MultiplierGoal):
             each.append(_multipliers(goal, model, cosines, noise, power))
-        elif isinstance(goal, Parameters):
+        elif isinstance(goal, ParameterGoal):
             each.append(_parameters(goal, model, cosines, noise))
         else:
             each.append(response_criterion(goal, model, cosines, noise, power))
@@ -61,7 +61,7 @@ def criterion_of(
 
 
 def _multipliers(
-    goal: Multipliers,
+    goal: MultiplierGoal,
     model: Model,
     cosines: Candidates,
     noise: Noise,
@@ -86,14 +86,14 @@ def _multipliers(
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
     channels = list[Channel]()
     for measured in htfs:
-        channels += _channels(measured, c, goal.overhang)
+        channels += _channels(measured, c, goal.extra_lags)
     wanted, names, part = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
     return LinearCriterion(names, unknowns, tuple(channels), wanted, part)
 
 
 def wanted_parts(
-    goal: Multipliers,
+    goal: MultiplierGoal,
     multipliers: Complex[np.ndarray, " d"],
     c: Float[np.ndarray, " d"],
 ) -> tuple[Float[np.ndarray, "rows d"], tuple[str, ...], Int[np.ndarray, " rows"]]:
@@ -135,14 +135,14 @@ def wanted_parts(
 
 
 def _parameters(
-    goal: Parameters,
+    goal: ParameterGoal,
     model: Model,
     lines: Candidates,
     noise: Noise,
 ) -> LinearCriterion:
     free = tuple(goal.free)
-    wanted = free if goal.wanted is None else tuple(goal.wanted)
-    require_among("free parameter", wanted, free, "`wanted` of `goal`: ")
+    wanted = free if goal.quantities is None else tuple(goal.quantities)
+    require_among("free parameter", wanted, free, "`quantities` of `goal`: ")
     channels = []
     for htf, members, _, weight in measured_htfs(model, lines, goal.harmonics, noise):
         observed = ObservedHTF(htf, goal.sections)
@@ -160,14 +160,14 @@ def _parameters(
 
 
 def _channels(
-    x: Measured, c: Float[np.ndarray, " d"], overhang: int | None
+    x: Measured, c: Float[np.ndarray, " d"], extra_lags: int | None
 ) -> Iterator[Channel]:
     r"""Yield H delayed by 1 to d periods, and the part of it that numerators can explain, from
     $dH = dB/\chi - H\, d\chi/\chi$.
 
     **Raises:** `DefinitionError` if the HTFs have too few frequencies.
     """
-    for group in grouped(x.htf, len(c), overhang):
+    for group in grouped(x.htf, len(c), extra_lags):
         delay = group.period_delay[:, None]
         powers = range(1, len(c) + 1)
         slopes = [group.weighted(c, delay**j * group.data) for j in powers]

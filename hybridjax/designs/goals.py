@@ -13,7 +13,7 @@ from ..sections.families import FamilyLike, as_family
 
 
 @checked
-class Multipliers(eqx.Module):
+class MultiplierGoal(eqx.Module):
     """The Floquet multipliers as goal: the criterion is the sum of their variances.
 
     **Arguments:**
@@ -26,7 +26,7 @@ class Multipliers(eqx.Module):
       (minimal) dimensions of this model. Default: `"fit_multipliers"`.
     - `harmonics`: harmonics that the estimator uses. Default: -2 to 2 for `fit_multipliers`, all
       for `fit_ldtp`.
-    - `overhang`: argument of `fit_multipliers`.
+    - `extra_lags`: argument of `fit_multipliers`.
     """
 
     which: Index | None = eqx.field(static=True, default=None)
@@ -35,7 +35,7 @@ class Multipliers(eqx.Module):
         static=True, default="fit_multipliers"
     )
     harmonics: Harmonics | None = eqx.field(static=True, default=None)
-    overhang: Index | None = eqx.field(static=True, default=None)
+    extra_lags: Index | None = eqx.field(static=True, default=None)
 
     @property
     def fitted_harmonics(self) -> Harmonics:
@@ -44,7 +44,7 @@ class Multipliers(eqx.Module):
 
 
 @checked
-class Parameters(eqx.Module):
+class ParameterGoal(eqx.Module):
     """Physical parameters, estimated by `fit_model` from HTFs: their relative errors.
 
     The derivatives are exact, through the limit cycle and its sections; they compile at the first
@@ -53,14 +53,15 @@ class Parameters(eqx.Module):
     **Arguments:**
 
     - `cycle`: limit cycle of the system with these parameters; `sections`: the family of sections.
-    - `free`: names of all unknown parameters. `wanted`: those whose errors matter. Default: all.
+    - `free`: names of all unknown parameters. `quantities`: those whose errors matter. Default:
+      all.
     - `harmonics`: harmonics of the HTFs. Default: -2 to 2.
     """
 
     cycle: LimitCycle
     sections: FamilyLike
     free: SignalNames = eqx.field(static=True)
-    wanted: SignalNames | None = eqx.field(static=True, default=None)
+    quantities: SignalNames | None = eqx.field(static=True, default=None)
     harmonics: Harmonics = eqx.field(static=True, default=(-2, -1, 0, 1, 2))
 
     def __check_init__(self):
@@ -68,25 +69,26 @@ class Parameters(eqx.Module):
 
 
 @checked
-class FrequencyResponse(eqx.Module):
+class ResponseGoal(eqx.Module):
     """Harmonic transfer functions in a band, estimated by `fit_ldtp` with the model's dimensions.
 
     The criterion is the mean of the variance over the band, relative to the mean square there of
-    each output's transfer functions (of all wanted harmonics).
+    each output's transfer functions (of all harmonics of interest).
 
-    **Arguments:** `band`: frequencies of the input, cycles per period. `wanted`: the harmonics of
-    interest. Default: 0. `harmonics`: those that the estimator uses. Default: all.
+    **Arguments:** `frequencies`: the lowest and the highest input frequency, cycles per period.
+    `quantities`: the harmonics of interest. Default: 0. `harmonics`: those that the estimator uses.
+    Default: all.
     """
 
-    band: tuple[NonNegative, Positive] = eqx.field(static=True)
-    wanted: Harmonics = eqx.field(static=True, default=(0,))
+    frequencies: tuple[NonNegative, Positive] = eqx.field(static=True)
+    quantities: Harmonics = eqx.field(static=True, default=(0,))
     harmonics: Harmonics | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not self.band[0] < self.band[1]:
+        if not self.frequencies[0] < self.frequencies[1]:
             raise DefinitionError(
-                f"`band` must be two ascending frequencies, not {self.band}."
+                f"`frequencies` must be two ascending frequencies, not {self.frequencies}."
             )
 
 
-Goal = Multipliers | Parameters | FrequencyResponse
+Goal = MultiplierGoal | ParameterGoal | ResponseGoal

@@ -87,7 +87,7 @@ class Limits(eqx.Module):
     - `peak`: largest modulus of an input, in every experiment. Phases are then optimized for a low
       peak, and experiments that still exceed it are scaled down. (Such phases are not random: the
       scatter of realizations does not show nonlinear distortion.)
-    - `strides`: cycles of all experiments together, without those that are discarded. Default: as
+    - `cycles`: those of all experiments together, without those that are discarded. Default: as
       many as in `design`.
     - `distortion`: limit of the nonlinear distortion of outputs.
     """
@@ -95,7 +95,7 @@ class Limits(eqx.Module):
     rms: Mapping[str, Level] | Words = eqx.field(default_factory=dict)
     rate: Mapping[str, Level] = eqx.field(default_factory=dict)
     peak: Mapping[str, Level] = eqx.field(default_factory=dict)
-    strides: Count | None = eqx.field(static=True, default=None)
+    cycles: Count | None = eqx.field(static=True, default=None)
     distortion: Distortion | None = None
 
     def require_inputs(self, inputs: tuple[str, ...]) -> None:
@@ -104,15 +104,15 @@ class Limits(eqx.Module):
             require_among("input", given, inputs, f"`{word}` of `limit`: ")
 
     def experiments(self, design: Design, cosines: int) -> int:
-        """Return the number of experiments that the strides allow.
+        """Return the number of experiments that the cycles allow.
 
         **Raises:** `DefinitionError` if they do not suffice for one, or there are fewer cosines.
         """
         periods = design.periods
-        count = design.experiments if self.strides is None else self.strides // periods
+        count = design.experiments if self.cycles is None else self.cycles // periods
         if count == 0:
             raise DefinitionError(
-                f"`limit` allows {self.strides} strides, fewer than one experiment has, {periods}: "
+                f"`limit` allows {self.cycles} cycles, fewer than one experiment has, {periods}: "
                 "allow more."
             )
         if count > cosines:
@@ -264,10 +264,10 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
         )
         phase[lines] = optimize_phases(single, seed).phase
     design = dataclasses.replace(design, phase=phase)
-    highest = np.abs(design.inputs()).max(axis=1)
+    highest = np.abs(design.signals()).max(axis=1)
     factor = np.ones_like(highest)
     for name, most in peak.items():
-        i = design.input_names.index(name)
+        i = design.inputs.index(name)
         factor[:, i] = most / np.maximum(highest[:, i], most)
     amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
     return dataclasses.replace(design, amplitude=amplitude)
@@ -311,7 +311,7 @@ class Products(NamedTuple):
     def rms(self, design: Design, phases: bool = False) -> Float[np.ndarray, " O"]:
         """Return the distortion in a design: expected with random phases, or with its `phases`."""
         if phases:
-            second = self.quadratic.second_order(design.inputs())
+            second = self.quadratic.second_order(design.signals())
             return np.sqrt(np.mean(second**2, axis=(0, 1)))
         power = self.cosines.powers_in(design)
         squares = np.einsum("ek,okl,el->o", power, self.expected, power, optimize=True)

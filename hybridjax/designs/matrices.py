@@ -21,7 +21,7 @@ from ..linear.frequency_response import Harmonics, check_harmonics
 from ..linear.ldtp import LDTP
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
 from .criterion import Channel, LinearCriterion
-from .goals import FrequencyResponse
+from .goals import ResponseGoal
 
 
 # Part of a wanted variance that left-out combinations may have, at least. Larger: standard errors
@@ -113,7 +113,7 @@ def _rows(
     for htf, cosines, channel, unit in htfs:
         weight = unit * error_weights(htf, scale)[..., 0] * scale
         for chunk, slopes in transfer_slopes(
-            coordinates, np.asarray(htf.f), htf.harmonics
+            coordinates, np.asarray(htf.frequencies), htf.harmonics
         ):
             rows = slopes[..., channel] * weight[:, chunk]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
@@ -125,7 +125,7 @@ def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines
 
 
 def response_criterion(
-    goal: FrequencyResponse,
+    goal: ResponseGoal,
     model: Model,
     cosines: Candidates,
     noise: Noise,
@@ -136,12 +136,12 @@ def response_criterion(
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
     N = cosines.n_sections
-    (low, high) = goal.band
+    (low, high) = goal.frequencies
     if high > N / 2:
         raise DefinitionError(
-            f"`band` must lie within 0 and {N / 2:g}, not {goal.band}."
+            f"`frequencies` must lie within 0 and {N / 2:g}, not {goal.frequencies}."
         )
-    harmonics = check_harmonics(goal.wanted, N)
+    harmonics = check_harmonics(goal.quantities, N)
     matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
     f = low + (high - low) * (np.arange(_POINTS) + 0.5) / _POINTS
     H = transfer(matrices.coordinates.model, f, harmonics)

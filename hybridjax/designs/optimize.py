@@ -1,4 +1,4 @@
-"""The design that estimates a quantity of interest in the fewest strides."""
+"""The design that estimates a quantity of interest in the fewest cycles."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from .candidates import (
 )
 from .criteria import criterion_of
 from .criterion import Criterion
-from .goals import Goal, Multipliers
+from .goals import Goal, MultiplierGoal
 from .limits import (
     Limit,
     PowerLimits,
@@ -48,7 +48,7 @@ _WORTH_IT = 1.5
 
 @checked_methods
 class OptimalDesign(eqx.Module):
-    """A design that needs the fewest strides, and the design that it improves.
+    """A design that needs the fewest cycles, and the design that it improves.
 
     Standard errors are Cramer-Rao bounds: a fit that uses all of the data reaches them where noise
     is white and responses are linear.
@@ -62,7 +62,7 @@ class OptimalDesign(eqx.Module):
     - `criterion` and `usual_criterion`: the minimized function, in units of a variance.
     - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
       to that of this one; with one limit the largest sensitivity of a line per unit of the limit.
-      No design needs fewer strides than 1/e of this one's. It is 1 at the optimum, except with
+      No design needs fewer cycles than 1/e of this one's. It is 1 at the optimum, except with
       peaks, which are treated as no larger than rms values. With limited distortion it compares
       with designs whose convex bound of the distortion is no larger than the limit, or this one's.
     - `frequencies` (K,) and `channels` (K,) of all cosines; `power` and `usual_power` (K,),
@@ -113,24 +113,22 @@ class OptimalDesign(eqx.Module):
         return np.sqrt(self.usual_variances)
 
     @property
-    def strides(self) -> int:
+    def cycles(self) -> int:
         """Cycles of all experiments, without those that are discarded."""
         return self.design.cycles(0)
 
     @property
     def saved(self) -> float:
-        """Number of strides of `usual` that one stride of `design` replaces."""
+        """Number of cycles of `usual` that one cycle of `design` replaces."""
         return (
-            self.usual_criterion
-            * self.usual.cycles(0)
-            / (self.criterion * self.strides)
+            self.usual_criterion * self.usual.cycles(0) / (self.criterion * self.cycles)
         )
 
-    def strides_for(self, standard_error: Positive) -> int:
-        """Return the strides, with repeats of `design`, after which no quantity has a larger
+    def cycles_for(self, standard_error: Positive) -> int:
+        """Return the cycles, with repeats of `design`, after which no quantity has a larger
         standard error."""
         return int(
-            np.ceil(self.strides * (self.standard_errors.max() / standard_error) ** 2)
+            np.ceil(self.cycles * (self.standard_errors.max() / standard_error) ** 2)
         )
 
     @property
@@ -141,7 +139,7 @@ class OptimalDesign(eqx.Module):
         rms = " and ".join(n for n in self.limited if n not in special)
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
-        text = f"one stride of this design replaces {saved:g} with {self.usual_name}."
+        text = f"one cycle of this design replaces {saved:g} with {self.usual_name}."
         if self.saved > _WORTH_IT:
             text = text
         else:
@@ -150,7 +148,7 @@ class OptimalDesign(eqx.Module):
 
     def __repr__(self) -> str:
         rows = [("", self.usual_name, "optimal")]
-        rows.append(("strides", str(self.usual.cycles(0)), str(self.strides)))
+        rows.append(("cycles", str(self.usual.cycles(0)), str(self.cycles)))
         errors = zip(
             self.names, self.usual_standard_errors, self.standard_errors, strict=True
         )
@@ -164,7 +162,7 @@ class OptimalDesign(eqx.Module):
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum):\n  "
             f"no design within the limits {'(of distortion: an upper bound) ' * bounded}"
-            f"needs less than {1 / self.certificate:.1%} of these strides"
+            f"needs less than {1 / self.certificate:.1%} of these cycles"
         )
         below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace(
             "\n", "\n  "
@@ -255,7 +253,7 @@ def optimal_design(
     seed: Seed = 0,
     robust: Literal["mean", "worst"] = "mean",
 ) -> OptimalDesign:
-    r"""Find the amplitudes with which a quantity of interest is estimated in the fewest strides.
+    r"""Find the amplitudes with which a quantity of interest is estimated in the fewest cycles.
 
     ```python
     plan = hj.optimal_design(model)               # multipliers, the input's power limited
@@ -271,15 +269,15 @@ def optimal_design(
     **Arguments:**
 
     - `model`: the system, exact or estimated; or a `StructuredFit`, whose fitted harmonics give the
-      deviations of outputs. Several models (`hj.designs.draws` of an estimate) make the design
-      robust, see `robust`; the limits hold for each.
+      deviations of outputs. Several models (`hj.designs.draw_models` of an estimate) make the
+      design robust, see `robust`; the limits hold for each.
     - `design`: the design to improve. Lines that are not in it are forbidden; inputs, periods and
       the number of experiments are kept. Default: `multisine` with all lines.
-    - `goal`: `"multipliers"`, or one of `hj.designs`: `Multipliers`, `Parameters`,
-      `FrequencyResponse`. Default: `"multipliers"`.
+    - `goal`: `"multipliers"`, or one of `hj.designs`: `MultiplierGoal`, `ParameterGoal`,
+      `ResponseGoal`. Default: `"multipliers"`.
     - `limit`: largest rms values over all experiments, by name of inputs or outputs (deviations
       from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
-      `hj.designs.Limits`, which also limits peaks, rates, strides and distortion.
+      `hj.designs.Limits`, which also limits peaks, rates, cycles and distortion.
       Default: `"input"`.
     - `noise`: standard deviation of the white noise of each measured output, by name; or a function
       of the frequency of the output (0 to N/2 cycles per period). Its value is the standard
@@ -321,7 +319,7 @@ def optimal_design(
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
     usual_rms = rms_of(squares, shown, usual_power)
-    goal = Multipliers() if isinstance(goal, str) else goal
+    goal = MultiplierGoal() if isinstance(goal, str) else goal
     errors = make_noise(models[0], noise, usual_rms)
     criterion = criterion_of(goal, models, cosines, errors, usual_power, robust)
 
@@ -370,4 +368,4 @@ def _check_alike(models: list[Model], design: Design) -> None:
                 "`model.feedback(controller)`."
             )
     require_equal("design and model", "n_sections", design.n_sections, first.n_sections)
-    require_equal("design and model", "inputs", design.input_names, first.inputs)
+    require_equal("design and model", "inputs", design.inputs, first.inputs)

@@ -20,16 +20,16 @@ from ..experiments.design.design import Design
 from ..identify.multipliers import StructuredFit
 from ..identify.weights import are_alike
 from .candidates import Candidates
-from .goals import Multipliers
+from .goals import MultiplierGoal
 from .limits import Limit, as_limits
 from .optimize import OptimalDesign, optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
 
 
-# A block has at most so many times the strides of all before it. Larger: more strides for a design
+# A block has at most so many times the cycles of all before it. Larger: more strides for a design
 # from a poor estimate. Smaller: more blocks.
 _GROWTH = 2.0
-# Part by which a block is longer than predicted. Larger: too many strides where the prediction was
+# Part by which a block is longer than predicted. Larger: too many cycles where the prediction was
 # right. Smaller: another block where it was a little too low.
 _SPARE = 0.05
 # Level of the confidence intervals whose widths are compared with the requested precision.
@@ -46,12 +46,12 @@ class History(NamedTuple):
 
 
 @checked
-class Study(eqx.Module):
+class SequentialDesign(eqx.Module):
     r"""A sequence of experiments that starts without a model, and ends at a requested precision.
 
     ```python
-    study = hj.designs.Study(hj.multisine(lines="odd").scaled(0.001), order=2, standard_error=1e-4)
-    while not study.done:
+    study = hj.designs.SequentialDesign(hj.multisine(lines="odd").scaled(0.001), order=2,
+    standard_error=1e-4) while not study.done:
         data = hj.run_experiments(cycle, sections, study.design, outputs, start="steady")
         study = study.add(data)     # in a laboratory: hj.identify.remove_transient(data).data
     print(study)
@@ -61,14 +61,14 @@ class Study(eqx.Module):
     The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as the standard error still requires, but at most twice the
-    strides so far. While the data do not support `order` multipliers, or the estimate is unstable,
+    cycles so far. While the data do not support `order` multipliers, or the estimate is unstable,
     the first block is repeated with new phases. No prior knowledge is used except the number of
     multipliers.
 
     *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
     blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
     the likelihood. The estimation error, divided by the estimated standard error, is Gaussian in
-    the limit of many strides (Wu, Biometrika 72, 1985, for designs that depend on estimates;
+    the limit of many cycles (Wu, Biometrika 72, 1985, for designs that depend on estimates;
     Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for
     stopping as soon as an interval of given width is reached). A standard error that is too small
     by chance would violate this. Therefore the larger of two standard errors is used: one from the
@@ -91,13 +91,13 @@ class Study(eqx.Module):
     - `seed`: seed of the phases, and of the division of lines among experiments, in all blocks but
       the first. Default: 0.
 
-    **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of strides.
+    **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of cycles.
     """
 
     first: Design
     order: Order = eqx.field(static=True)
     standard_error: Positive = eqx.field(static=True)
-    goal: Multipliers = eqx.field(default_factory=Multipliers, kw_only=True)
+    goal: MultiplierGoal = eqx.field(default_factory=MultiplierGoal, kw_only=True)
     limit: Limit = eqx.field(default="input", kw_only=True)
     outputs: OptionalNames = eqx.field(static=True, default=(), kw_only=True)
     seed: Seed = eqx.field(static=True, default=0, kw_only=True)
@@ -106,7 +106,7 @@ class Study(eqx.Module):
     def __check_init__(self):
         first = self.first
         goal = self.goal
-        if len(first.input_names) > 1:
+        if len(first.inputs) > 1:
             raise DefinitionError(
                 "`first` must have a single input: study one at a time."
             )
@@ -116,13 +116,13 @@ class Study(eqx.Module):
             )
         require_index("multiplier", goal.which or 0, self.order)
         limits = as_limits(self.limit)
-        if limits.strides is not None:
+        if limits.cycles is not None:
             raise DefinitionError(
-                "a study ends at `standard_error`: leave strides out of `limit`."
+                "a study ends at `standard_error`: leave `cycles` out of `limit`."
             )
-        limits.require_inputs(first.input_names)
+        limits.require_inputs(first.inputs)
         named = limits.rms
-        signals = (*first.input_names, *self.outputs)
+        signals = (*first.inputs, *self.outputs)
         if not isinstance(named, str):
             require_among(
                 "signal", named, signals, "`limit` (`outputs` names those to come): "
@@ -147,11 +147,9 @@ class Study(eqx.Module):
         return self._history.plan
 
     @property
-    def strides(self) -> Float[np.ndarray, " B"]:
+    def cycles(self) -> Float[np.ndarray, " B"]:
         """Cycles of all records up to each block, with those that were discarded."""
-        return np.cumsum([block.strides for block in self._history.blocks]).astype(
-            float
-        )
+        return np.cumsum([block.cycles for block in self._history.blocks]).astype(float)
 
     @property
     def standard_errors(self) -> Float[np.ndarray, "B g"]:
@@ -177,20 +175,20 @@ class Study(eqx.Module):
     @property
     def design(self) -> Design:
         """The next block: for `run_experiments`, or for hardware
-        (`hj.recordings.write_design`)."""
+        (`Design.write`)."""
         if self.fit is None:
             return self.first
         if self.plan is None:
             return self.first.realizations(1, seed=self.seed + self.blocks)
         return self.plan.design
 
-    @working("Study.add")
+    @working("SequentialDesign.add")
     @one_blas_thread()
-    def add(self, data: ExperimentData, *, repeats: Count = 1) -> "Study":
+    def add(self, data: ExperimentData, *, repeats: Count = 1) -> "SequentialDesign":
         """Return the study with one more block, its estimate and its next design.
 
         **Arguments:** `data`: the responses to `design`, or to other inputs of the same lines (from
-        recordings: `section_data(...).experiments(periods)`). `repeats`: number of last windows
+        recordings: `sample_sections(...).experiments(periods)`). `repeats`: number of last windows
         that are averaged. Default: 1.
 
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data
@@ -225,11 +223,11 @@ class Study(eqx.Module):
         errors_so_far = [*self.standard_errors, errors]
         width = max(map(len, errors_so_far))
         padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
-        strides = sum(block.strides for block in blocks)
+        cycles = sum(block.cycles for block in blocks)
         if best.objection:
             plan = None
         else:
-            plan = self._next(best, errors, strides, len(blocks))
+            plan = self._next(best, errors, cycles, len(blocks))
         history = History(blocks, np.array(padded), best, plan)
         return eqx.tree_at(
             lambda s: s._history, self, history, is_leaf=lambda x: x is None
@@ -239,10 +237,10 @@ class Study(eqx.Module):
         self,
         best: Estimate,
         errors: Float[np.ndarray, " g"],
-        strides: float,
+        cycles: float,
         blocks: int,
     ) -> OptimalDesign:
-        """Return the design for the missing strides."""
+        """Return the design for the missing cycles."""
 
         def planned(limit: Limit) -> OptimalDesign:
             return optimal_design(
@@ -259,35 +257,39 @@ class Study(eqx.Module):
         # Precisions of independent blocks add.
         now = (errors**2).sum()
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
-        missing = (
-            plan.strides * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
-        )
-        count = int(np.ceil(min(missing * (1 + _SPARE), _GROWTH * strides) / periods))
+        missing = plan.cycles * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
+        count = int(np.ceil(min(missing * (1 + _SPARE), _GROWTH * cycles) / periods))
         count = min(
             max(count, self.first.experiments), len(Candidates.of(self.first).f)
         )
         if count == self.first.experiments:
             return plan
         return planned(
-            dataclasses.replace(as_limits(self.limit), strides=count * periods)
+            dataclasses.replace(as_limits(self.limit), cycles=count * periods)
         )
 
     def __repr__(self) -> str:
         if self.fit is None:
             rows = [f"  next: {self.design!r}".replace("\n", "\n  ")]
         else:
-            rows = ["  strides  standard errors"]
+            rows = ["   cycles  standard errors"]
             rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
             rows.append(f"  {self.fit.show_multipliers()}")
             rows += [f"  {x}" for x in self._outlook().splitlines()]
-        return "\n".join([f"Study({self._state()})", *rows])
+        return "\n".join([f"SequentialDesign({self._state()})", *rows])
 
     def _repr_html_(self) -> str:
         if self.fit is None:
-            return card("Study", self._state())
+            return card("SequentialDesign", self._state())
         multipliers = multiplier_table(self.fit.multipliers, self.fit.standard_errors)
-        strides = table(("strides", "standard errors"), self._rows())
-        return card("Study", self._state(), multipliers, strides, text(self._outlook()))
+        cycles = table(("cycles", "standard errors"), self._rows())
+        return card(
+            "SequentialDesign",
+            self._state(),
+            multipliers,
+            cycles,
+            text(self._outlook()),
+        )
 
     def _state(self) -> str:
         wanted = f"standard error {self.standard_error:.2g} requested"
@@ -297,7 +299,7 @@ class Study(eqx.Module):
 
     def _rows(self) -> list[tuple[str, str]]:
         rows = []
-        for n, errors in zip(self.strides, self.standard_errors, strict=True):
+        for n, errors in zip(self.cycles, self.standard_errors, strict=True):
             numbers = ", ".join(f"{x:.2e}" for x in errors)
             rows.append(
                 (
@@ -318,7 +320,7 @@ class Study(eqx.Module):
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         usual_name = plan.usual_name.capitalize()
         comparison = (
-            f"{usual_name} would need about {equal:.3g} strides for the same standard "
+            f"{usual_name} would need about {equal:.3g} cycles for the same standard "
             "errors."
         )
         if self.done:
@@ -327,7 +329,9 @@ class Study(eqx.Module):
         return f"{comparison}\nnext: {design.experiments} experiments of {design.periods} periods"
 
 
-def _standard_errors(fit: StructuredFit, goal: Multipliers) -> Float[np.ndarray, " g"]:
+def _standard_errors(
+    fit: StructuredFit, goal: MultiplierGoal
+) -> Float[np.ndarray, " g"]:
     """Return standard errors of the multipliers of a goal, those of a conjugate pair once."""
     z = np.asarray(fit.multipliers)
     if goal.which is None:

@@ -26,7 +26,7 @@ from ..identify.variable_projection import (
 )
 from ..linear.htf import HTF
 from .allocation import ENOUGH
-from .goals import Multipliers
+from .goals import MultiplierGoal
 
 
 # Estimates of the noise, at most, each from the residual of a fit weighted by the last one. Fewer:
@@ -43,11 +43,11 @@ class Block(NamedTuple):
     htf: HTF
     """Responses to one cosine each, in one experiment each, with the variances for white noise of
     variance 1 on each sample."""
-    strides: int
+    cycles: int
     """All cycles of the records, with those that are discarded."""
 
 
-def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
+def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
     """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
     data.require_ok()
     require_deviations(data.records)
@@ -79,7 +79,7 @@ def block_of(data: ExperimentData, goal: Multipliers, repeats: int) -> Block:
         variance=variance,
     )
     # Frequencies may occur several times, measured each time on their own.
-    htf = eqx.tree_at(lambda htf: htf.f, htf, from_host(line / P))
+    htf = eqx.tree_at(lambda htf: htf.frequencies, htf, from_host(line / P))
     return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
 
 
@@ -100,7 +100,7 @@ class Estimate(NamedTuple):
         return dict(zip(self.fit.outputs, self.noise[-1].tolist(), strict=True))
 
 
-def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estimate:
+def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Estimate:
     """Fit all responses of all blocks as `fit_multipliers` does, each weighted by the power of its
     cosine and by the noise of its block.
 
@@ -115,9 +115,9 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
     where these are few; and from the levels of the noise, as if it were white.
     """
     htfs = to_host([block.htf for block in blocks])
-    f = np.concatenate([x.f for x in htfs])
+    f = np.concatenate([x.frequencies for x in htfs])
     H = np.concatenate([x.H for x in htfs], axis=1)
-    member = np.repeat(np.arange(len(blocks)), [len(htf.f) for htf in htfs])
+    member = np.repeat(np.arange(len(blocks)), [len(htf.frequencies) for htf in htfs])
     # To begin with, all of it may be noise.
     relative = [np.abs(htf.H) ** 2 / htf.variance for htf in htfs]
     noise = np.sqrt([np.mean(x, axis=(0, 1, 3)) for x in relative])
@@ -129,15 +129,17 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
         for htf, std in zip(htfs, noise, strict=True):
             variances.append(htf.variance * std[:, None] ** 2)
         values = f, H, np.concatenate(variances, axis=1)
-        htf = from_host(eqx.tree_at(lambda x: (x.f, x.H, x.variance), htfs[0], values))
-        return htf, grouped(htf, order, goal.overhang)
+        htf = from_host(
+            eqx.tree_at(lambda x: (x.frequencies, x.H, x.variance), htfs[0], values)
+        )
+        return htf, grouped(htf, order, goal.extra_lags)
 
     for _ in range(_SWEEPS):
         _, groups = weighted()
         c, _ = maximum_likelihood(groups, order, c)
         # The rms residual of each block and output, in units of the supposed noise.
         left = np.zeros(noise.shape)
-        freedom = np.zeros(noise.shape)
+        dof = np.zeros(noise.shape)
         for group in groups:
             misfit = misfit_of(group, c)
             block = member[group.line]
@@ -145,15 +147,15 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: Multipliers) -> Estima
             for k, output in enumerate(group.channel[:, 0]):
                 squares = (misfit.residual[:, :, k] ** 2).sum(axis=0)
                 np.add.at(left[:, output], block, squares)
-                np.add.at(freedom[:, output], block, free)
-        change = np.sqrt(left / freedom)
+                np.add.at(dof[:, output], block, free)
+        change = np.sqrt(left / dof)
         noise = noise * change
         if np.abs(np.log(change)).max() < ENOUGH:
             break
     htf, groups = weighted()
-    by_scatter = fit_multipliers(htf, order, overhang=goal.overhang, check=False)
+    by_scatter = fit_multipliers(htf, order, extra_lags=goal.extra_lags, check=False)
     by_level = fit_multipliers(
-        htf, order, overhang=goal.overhang, check=False, errors="variance"
+        htf, order, extra_lags=goal.extra_lags, check=False, covariance="variance"
     )
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
     objection = ""

@@ -63,8 +63,8 @@ class Settings(eqx.Module):
     dimension. `None`: magnitudes in the current step, which do not suffice for derivatives."""
     solver: Any = eqx.field(static=True)
     """Method for the charts, which overrides that of the system: a Runge-Kutta method of diffrax
-    with an error estimate, `hj.Radau()`, a mapping from names of charts to methods, or "auto" (in
-    `find_limit_cycle`), an implicit method in charts that are stiff on the cycle."""
+    with an error estimate, `hj.systems.Radau()`, a mapping from names of charts to methods, or
+    "auto" (in `find_limit_cycle`), an implicit method in charts that are stiff on the cycle."""
 
     def __repr__(self):
         return fields(self)
@@ -98,7 +98,8 @@ class Settings(eqx.Module):
         """
         if self.solver == "auto":
             raise DefinitionError(
-                '`solver="auto"` is for `find_limit_cycle`: name one here, such as `hj.Radau()`.'
+                '`solver="auto"` is for `find_limit_cycle`: name one here, such as '
+                "`hj.systems.Radau()`."
             )
         return system if self.solver is None else integrated(system, self.solver)
 

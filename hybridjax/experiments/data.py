@@ -14,7 +14,7 @@ from .._core.boundary.values import Integers, Reals
 from .._core.results import Result
 from .._core.text import fields, folded, listed
 from ..errors import DefinitionError
-from .record import Record
+from .record import SectionSeries
 
 
 # Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
@@ -161,7 +161,7 @@ class ExperimentData(eqx.Module):
             )
 
     @property
-    def records(self) -> tuple[Record, ...]:
+    def records(self) -> tuple[SectionSeries, ...]:
         """The experiments that ran to their end, each with all of its cycles."""
         about: Any = {
             "n_sections": self.n_sections,
@@ -169,7 +169,8 @@ class ExperimentData(eqx.Module):
             "outputs": self.outputs,
         }
         return tuple(
-            Record(self.u[s], self.y[s], **about) for s in np.flatnonzero(self.ok)
+            SectionSeries(self.u[s], self.y[s], **about)
+            for s in np.flatnonzero(self.ok)
         )
 
     @property

@@ -119,10 +119,10 @@ def simulate_experiments(
         raise DefinitionError(
             'the model is unstable: use start="periodic", or discard=0 for the transient itself.'
         )
-    u = design.inputs(design.periods + discard)
+    u = design.signals(design.periods + discard)
     x0 = None
     if start == "periodic":
-        x0 = ldtp.periodic_states(design.inputs(), design.periods)
+        x0 = ldtp.periodic_states(design.signals(), design.periods)
     applied = u
     if process_noise is not None:
         applied = u + process_noise.draw(u.shape, design.n_sections)

@@ -21,7 +21,7 @@ Drift = Annotated[float, Number("two cycles or more", low=2, infinite=True)]
 
 
 @checked
-class Record(eqx.Module):
+class SectionSeries(eqx.Module):
     """One stretch of recorded inputs and outputs, of any length, with any input.
 
     **Fields**, on the host:
@@ -78,11 +78,11 @@ class Record(eqx.Module):
         self.inputs, self.outputs = input_and_output_names(inputs, outputs, *sizes)
 
     @property
-    def records(self) -> tuple["Record"]:
+    def records(self) -> tuple["SectionSeries"]:
         """The record itself in a tuple, as `ExperimentData.records` and `SectionData.records`."""
         return (self,)
 
-    def part(self, first: Index, stop: Index) -> "Record":
+    def part(self, first: Index, stop: Index) -> "SectionSeries":
         """Return the samples `first`, ..., `stop - 1` as a record.
 
         **Raises:** `DefinitionError` if there are none.
@@ -98,24 +98,24 @@ class Record(eqx.Module):
         if missing:
             samples += f", {missing} with gaps"
         return folded(
-            f"Record({samples}; "
+            f"SectionSeries({samples}; "
             f"N = {self.n_sections}; {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
 
 @runtime_checkable
 class HasRecords(Protocol):
-    """Data made of records: `Record`, `ExperimentData`, `SectionData`."""
+    """Data made of records: `SectionSeries`, `ExperimentData`, `SectionData`."""
 
     @property
-    def records(self) -> Sequence[Record]: ...
+    def records(self) -> Sequence[SectionSeries]: ...
 
 
 RecordedData = HasRecords | Annotated[Iterable[HasRecords], Stream(HasRecords, "data")]
 """Data for fits to time series: data made of records, or several such data."""
 
 
-def uninterrupted_records(data: RecordedData) -> list[Record]:
+def uninterrupted_records(data: RecordedData) -> list[SectionSeries]:
     """Return all records, cut at unknown inputs: no input in the result is NaN.
 
     The output at an unknown input is not used, as it may depend on it directly, nor are those up to
@@ -124,7 +124,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
     parts = [data] if isinstance(data, HasRecords) else data
-    records: list[Record] = []
+    records: list[SectionSeries] = []
     for part in parts:
         records.extend(part.records)
     if not records:
@@ -142,7 +142,7 @@ def uninterrupted_records(data: RecordedData) -> list[Record]:
             "records of `data` must have the same sections, inputs, outputs, lead and drift, not "
             f"{about[0]} and {others[0]}."
         )
-    usable: list[Record] = []
+    usable: list[SectionSeries] = []
     for record in records:
         usable.extend(_with_known_inputs(record))
     if not usable:
@@ -163,7 +163,7 @@ def average_cycle(
         return total / count
 
 
-def require_deviations(records: Sequence[Record]) -> None:
+def require_deviations(records: Sequence[SectionSeries]) -> None:
     """**Raises:** `DefinitionError` if an output is nearly the same in all cycles, though no drift
     was declared and inputs change: it holds the limit cycle itself."""
     N = records[0].n_sections
@@ -187,7 +187,7 @@ def require_deviations(records: Sequence[Record]) -> None:
         )
 
 
-def _with_known_inputs(record: Record) -> Iterator[Record]:
+def _with_known_inputs(record: SectionSeries) -> Iterator[SectionSeries]:
     finite = np.isfinite(record.u).all(axis=1)
     edges = np.flatnonzero(np.diff(finite.astype(int), prepend=0, append=0))
     for first, stop in edges.reshape(-1, 2).tolist():

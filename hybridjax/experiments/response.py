@@ -248,7 +248,7 @@ def response_function(
     `jacfwd`.
 
     ```python
-    response = hj.response_function(cycle, sections, ("yM", "vM"))
+    response = hj.experiments.response_function(cycle, sections, ("yM", "vM"))
 
     @eqx.filter_jit
     @eqx.filter_grad

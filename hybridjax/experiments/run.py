@@ -9,15 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from .._core.arguments import names
-from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Index
 from .._core.boundary.values import Reals
 from .._core.compilation import Program
 from .._core.execution import Execution, in_threads
 from .._core.executor import from_host, on_cpu, to_host
 from .._core.meaning import require_as_made
 from .._core.memo import Memory
-from .._core.progress import counted, working
+from .._core.progress import counted
 from .._core.results import Result
 from .._core.signal import signals, unit_of
 from ..engine.settings import EXPERIMENT
@@ -26,7 +24,7 @@ from ..linear.algebra import Matrices, static_gain
 from ..linear.ldtp import LDTP, Gain
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.structure import Outputs
@@ -35,7 +33,7 @@ from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design, require_inputs
 from .noise import ProcessNoise
 from .passage import program
-from .plan import Accuracy, Stepping, plan_flow
+from .plan import Stepping, plan_flow
 from .response import (
     Course,
     Feedback,
@@ -69,75 +67,17 @@ _VECTOR = 8
 CHUNK = 2 * _BATCH
 
 
-@checked
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Options of experiments, the keyword arguments of `run_experiments`.
-
-    **Fields:** `start`, `discard`, `process_noise`, `accuracy`, `execution` and `feedback`,
-    with the defaults and the meaning that they have in `run_experiments`.
-    """
+class RunOptions:
+    """How experiments are run, with the defaults and the meaning that they have in
+    `run_experiments`."""
 
     start: StartName = "cycle"
-    discard: Index | None = None
+    discard: int | None = None
     process_noise: ProcessNoise | None = None
-    accuracy: Accuracy = EXPERIMENT
+    accuracy: float = EXPERIMENT
     execution: Execution | None = None
     feedback: LDTP | Gain | None = None
-
-
-@checked
-@working("run_experiments")
-def run_experiments(
-    cycle: LimitCycle,
-    sections: SectionsLike,
-    design: DesignLike,
-    outputs: OutputNames,
-    *,
-    start: StartName = "cycle",
-    discard: Index | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy = EXPERIMENT,
-    execution: Execution | None = None,
-    feedback: LDTP | Gain | None = None,
-) -> ExperimentData:
-    """Excite the system around its limit cycle and record its outputs at the sections.
-
-    The experiments of a batch run in one compiled call, and the batches on all cores. An experiment
-    that fails (a section missed, events in another order, ...) stops there; the others continue.
-    `hj.experiments.stream_experiments` runs experiments whose records do not fit into memory.
-
-    **Arguments:**
-
-    - `sections`: a family, or `PlacedSections`.
-    - `design`: a `Design`, or inputs (S, n, nu) that are constant from section to section. n must
-        be a whole number of periods. All periods after the discarded ones are used for estimation.
-    - `outputs`: names or `Output`s, recorded at each section before the new input acts.
-    - `start`: initial condition. "cycle" is a state on the limit cycle. "periodic" is a state on
-        the periodic response that the linearization predicts, which leaves a transient of second
-        order in the inputs. "steady" is a state on the periodic response itself, found by Newton's
-        method, without a transient. Default: "cycle".
-    - `discard`: number of cycles before the design's periods, which are not used for estimation.
-        Default: 20 from the cycle (as in the paper), 0 from a periodic or steady start.
-    - `process_noise`: a random input that is added to the excitation and is not recorded.
-    - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
-        every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
-        `data.error` estimates the error of each experiment. Default: 1e-9.
-    - `execution`: batches and threads.
-    - `feedback`: a controller F that is at work during the experiments: the input is
-        $u = r - F y$ with r the `design` and y the deviations of the `outputs` from the cycle,
-        measured before u acts. An `LDTP` from the outputs to the inputs, by name, or a static
-        gain, (nu, ny) or (N, nu, ny). It may stabilize an unstable cycle. Default: None.
-
-    **Returns:** `ExperimentData`. `data.summary()` lists failures with their causes. With
-    `feedback` its inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
-
-    **Raises:** `DefinitionError` for arguments that do not fit together; `ComputationError` for an
-    unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
-    found.
-    """
-    options = Options(start, discard, process_noise, accuracy, execution, feedback)
-    return prepare(cycle, sections, design, outputs, options).run()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +102,7 @@ class Inputs:
     def part(self, rows: slice) -> Float[np.ndarray, "S n nu"]:
         """Return the inputs of consecutive experiments."""
         if isinstance(self.source, Design):
-            return self.source.inputs(self.cycles, rows)
+            return self.source.signals(self.cycles, rows)
         return np.asarray(self.source[rows], float)
 
 
@@ -398,7 +338,7 @@ def prepare(
     sections: SectionsLike,
     design: DesignLike,
     outputs: OutputNames,
-    options: Options,
+    options: RunOptions,
     chunk: int | None = None,
 ) -> Campaign:
     """Check the arguments of `run_experiments`, and do what is done once for all experiments.
@@ -440,7 +380,7 @@ def prepare(
 
 
 def _controller(
-    placed: PlacedSections, outputs: tuple[str | Output, ...], options: Options
+    placed: PlacedSections, outputs: tuple[str | Output, ...], options: RunOptions
 ) -> Matrices:
     """Return the matrices of a controller.
 

@@ -10,7 +10,7 @@ from .._core.executor import to_host
 from .._core.memo import Memory
 from ..linear.ldtp import LDTP
 from ..linear.time_response import monodromy
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.placed import PlacedSections
 from ..systems.system import Output
 from .plan import Stepping

@@ -1,8 +1,8 @@
-"""Experiments in a Zarr store: more than memory holds, run by any number of processes."""
+"""Experiments at once, in chunks, or in a Zarr store that any number of processes fills."""
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, overload
 
 import equinox as eqx
 import jax
@@ -25,14 +25,19 @@ from .._core.pieces.store import (
 from .._core.progress import working
 from .._core.results import Result
 from .._core.signal import Signal, unit_of
+from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
+from ..linear.ldtp import LDTP, Gain
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import rough
 from ..sections.placed import SectionsLike
 from ..systems.system import OutputNames, describe
 from .data import ExperimentData, Simulated, summary
 from .design.design import Design
-from .run import CHUNK, Campaign, DesignLike, Options, prepare
+from .noise import ProcessNoise
+from .plan import Accuracy
+from .run import CHUNK, Campaign, DesignLike, RunOptions, prepare
+from .start import StartName
 
 
 _KIND = "experiments"
@@ -40,7 +45,7 @@ _KIND = "experiments"
 
 @checked
 class StoredExperiments:
-    """Experiments in a store that `stream_experiments(..., store=...)` fills.
+    """Experiments in a store that `run_experiments(..., store=...)` fills.
 
     Iterating over them reads chunk after chunk as `ExperimentData`, so that
     `estimate_htf(StoredExperiments(store))` needs memory for one chunk only.
@@ -123,22 +128,83 @@ class StoredExperiments:
         )
 
 
-@checked
-def stream_experiments(
+@overload
+def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
     outputs: OutputNames,
-    options: Options = Options(),  # noqa: B008 (immutable)
     *,
-    chunk: ExperimentCount = CHUNK,
+    start: StartName = "cycle",
+    discard: Index | None = None,
+    process_noise: ProcessNoise | None = None,
+    accuracy: Accuracy = EXPERIMENT,
+    execution: Execution | None = None,
+    feedback: LDTP | Gain | None = None,
+    chunk: None = None,
+    store: None = None,
+    client: None = None,
+) -> ExperimentData: ...
+@overload
+def run_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    *,
+    start: StartName = "cycle",
+    discard: Index | None = None,
+    process_noise: ProcessNoise | None = None,
+    accuracy: Accuracy = EXPERIMENT,
+    execution: Execution | None = None,
+    feedback: LDTP | Gain | None = None,
+    chunk: ExperimentCount,
+    store: None = None,
+    client: None = None,
+) -> Iterator[ExperimentData]: ...
+@overload
+def run_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    *,
+    start: StartName = "cycle",
+    discard: Index | None = None,
+    process_noise: ProcessNoise | None = None,
+    accuracy: Accuracy = EXPERIMENT,
+    execution: Execution | None = None,
+    feedback: LDTP | Gain | None = None,
+    chunk: ExperimentCount | None = None,
+    store: FilePath,
+    client: DaskClient | None = None,
+) -> StoredExperiments: ...
+@checked
+@working("run_experiments")
+def run_experiments(
+    cycle: LimitCycle,
+    sections: SectionsLike,
+    design: DesignLike,
+    outputs: OutputNames,
+    *,
+    start: StartName = "cycle",
+    discard: Index | None = None,
+    process_noise: ProcessNoise | None = None,
+    accuracy: Accuracy = EXPERIMENT,
+    execution: Execution | None = None,
+    feedback: LDTP | Gain | None = None,
+    chunk: ExperimentCount | None = None,
     store: FilePath | None = None,
     client: DaskClient | None = None,
-) -> Iterator[ExperimentData] | StoredExperiments:
-    """Run experiments chunk by chunk, in memory that does not depend on their number.
+) -> ExperimentData | Iterator[ExperimentData] | StoredExperiments:
+    """Excite the system around its limit cycle and record its outputs at the sections.
+
+    The experiments of a batch run in one compiled call, and the batches on all cores. An experiment
+    that fails (a section missed, events in another order, ...) stops there; the others continue.
+    With `chunk` or `store`, records need not fit into memory:
 
     ```python
-    chunks = hj.experiments.stream_experiments(cycle, sections, design, "yM")
+    chunks = hj.run_experiments(cycle, sections, design, "yM", chunk=640)
     estimate = hj.estimate_htf(chunks)
     ```
 
@@ -147,42 +213,68 @@ def stream_experiments(
     interruption, repeat the call. The records are the same to the last bit for any number of
     processes and interruptions, on machines of one kind.
 
-    **Arguments:** those of `run_experiments`, with its keyword arguments as one object, and
+    **Arguments:**
 
-    - `options`: for example `hj.experiments.Options(start="periodic")`. Default: `Options()`.
-    - `design`: an array may lie on disk (`numpy.load(file, mmap_mode="r")`).
-    - `chunk`: number of experiments per chunk. Default: 640.
+    - `sections`: a family, or `PlacedSections`.
+    - `design`: a `Design`, or inputs (S, n, nu) that are constant from section to section. n must
+        be a whole number of periods. All periods after the discarded ones are used for estimation.
+    - `outputs`: names or `Output`s, recorded at each section before the new input acts.
+    - `start`: initial condition. "cycle" is a state on the limit cycle. "periodic" is a state on
+        the periodic response that the linearization predicts, which leaves a transient of second
+        order in the inputs. "steady" is a state on the periodic response itself, found by Newton's
+        method, without a transient. Default: "cycle".
+    - `discard`: number of cycles before the design's periods, which are not used for estimation.
+        Default: 20 from the cycle (as in the paper), 0 from a periodic or steady start.
+    - `process_noise`: a random input that is added to the excitation and is not recorded.
+    - `accuracy`: bound on the error of the states (and on state-based sections, of the time) at
+        every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
+        `data.error` estimates the error of each experiment. Default: 1e-9.
+    - `execution`: batches and threads.
+    - `feedback`: a controller F that is at work during the experiments: the input is
+        $u = r - F y$ with r the `design` and y the deviations of the `outputs` from the cycle,
+        measured before u acts. An `LDTP` from the outputs to the inputs, by name, or a static
+        gain, (nu, ny) or (N, nu, ny). It may stabilize an unstable cycle. Default: None.
+    - `chunk`: number of experiments per chunk. Default: all experiments at once; 640 in a store.
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
-        holds the experiments of one call only.
+        holds the experiments of one call only. The `design` may then be an array that lies on disk
+        (`numpy.load(file, mmap_mode="r")`). Default: None.
     - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
-        `design`, so pass a `Design` or a small array.
+        `design`, so pass a `Design` or a small array. Default: None.
 
-    **Returns:** an iterator over `ExperimentData` of consecutive experiments, or with a store
-    `StoredExperiments`.
+    **Returns:** `ExperimentData`; with a `chunk` an iterator over those of consecutive experiments;
+    with a `store` the `StoredExperiments`. `data.summary()` lists failures with their causes. With
+    `feedback` its inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
 
-    **Raises:** as `run_experiments` (at once for arguments that do not fit together);
-    `DefinitionError` if the store holds other experiments (with the difference) or cannot be
-    written, or if the workers of the client cannot run them; `ComputationError` if the cluster is
-    lost.
+    **Raises:** `DefinitionError` for arguments that do not fit together, if the store holds other
+    experiments (with the difference) or cannot be written, or if the workers of the client cannot
+    run them; `ComputationError` for an
+    unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
+    found, or if the cluster is lost.
     """
+    options = RunOptions(start, discard, process_noise, accuracy, execution, feedback)
+    if store is not None:
+        _check_storable(options)
+        # (Batches as for one thread: their size does not depend on the machine.)
+        execution = dataclasses.replace(execution or Execution(), workers=1)
+        options = dataclasses.replace(options, execution=execution)
+        chunk = chunk or CHUNK
+    elif client is not None:
+        raise DefinitionError("a `client` needs a `store` to put records into.")
+    campaign = prepare(cycle, sections, design, outputs, options, chunk)
+    if chunk is None:
+        return campaign.run()
+    S = len(campaign.inputs)
     if store is None:
-        if client is not None:
-            raise DefinitionError("a `client` needs a `store` to put records into.")
-        campaign = prepare(cycle, sections, design, outputs, options, chunk)
-        S = len(campaign.inputs)
         return (campaign.run(slice(k, min(k + chunk, S))) for k in range(0, S, chunk))
+    fill(ExperimentJob(campaign, Blocks((S,), (min(chunk, S),))), store, client)
+    return StoredExperiments(store)
+
+
+def _check_storable(options: RunOptions) -> None:
     if options.feedback is not None:
         raise DefinitionError(
             "a store keeps no experiments with feedback: leave `store` out."
         )
-    # (Batches as for one thread: their size does not depend on the machine.)
-    execution = dataclasses.replace(options.execution or Execution(), workers=1)
-    options = dataclasses.replace(options, execution=execution)
-    with working("stream_experiments"):
-        campaign = prepare(cycle, sections, design, outputs, options, chunk)
-        S = len(campaign.inputs)
-        fill(ExperimentJob(campaign, Blocks((S,), (min(chunk, S),))), store, client)
-    return StoredExperiments(store)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,1 +1,6 @@
 """Physical parameters from data."""
+
+from .._core.public import attach
+
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -68,7 +68,8 @@ def fit_model(
     the data do not identify, and the result lists these.
 
     ```python
-    fit = hj.fit_model(hopper, hj.ObservedHTF(estimate, sections), ("M", "k", "b"), guesses=4)
+    fit = hj.fit_model(hopper, hj.fitting.ObservedHTF(estimate, sections), ("M", "k", "b"),
+    guesses=4)
     ```
 
     **Arguments:**
@@ -213,8 +214,8 @@ class End(NamedTuple):
 
     def explains(self, weighted: bool) -> bool:
         """Test whether the fit has converged to a cost that the data explain."""
-        freedom = max(len(self.residuals) - len(self.x), 1)
-        likely = freedom + _LIKELY * np.sqrt(2 * freedom)
+        dof = max(len(self.residuals) - len(self.x), 1)
+        likely = dof + _LIKELY * np.sqrt(2 * dof)
         goal = likely if weighted else _PERFECT * len(self.residuals)
         return bool(self.result == Result.OK and self.cost <= goal)
 

@@ -298,12 +298,13 @@ class ModelFit(Fit):
                 yield Finding("a bound", text)
 
     def _cost(self) -> str:
-        misfit = (
+        size = (
             f"residuals {100 * np.sqrt(np.mean(self.residuals**2)):.2g} % of the data"
         )
-        expected = f"expected {self.dof:.0f}" if self.weighted else misfit
+        if self.weighted:
+            size = f"chi-square per degree of freedom {self.chi2_per_dof:.3g}"
         good = sum(guess.result == Result.OK for guess in self.guesses)
-        head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
+        head = f"{size}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"
 
     def _rows(self) -> Iterator[tuple[str, str, str, str]]:

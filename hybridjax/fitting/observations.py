@@ -26,7 +26,7 @@ from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import last_turn
 from ..sections.families import AbstractSections, FamilyLike, as_family
-from ..sections.linearize import Delayed, Delays, linearize
+from ..sections.linearization import Delayed, Delays, linearize
 from ..sections.place import observed_at, place_sections
 
 
@@ -45,7 +45,7 @@ class AbstractObservation(eqx.Module):
     have no derivative where two of them coincide:
 
     ```python
-    class ObservedMultipliers(hj.AbstractObservation):
+    class ObservedMultipliers(hj.fitting.AbstractObservation):
         measured: Array  # numpy.poly(multipliers)[1:]
         sections: hj.ClockPhase
         weighted: Array
@@ -68,7 +68,7 @@ class AbstractObservation(eqx.Module):
         `cycle.factors` are NaN, because computing them would triple the compile time. Functions
         that need concrete values raise an error, such as `cycle.multipliers`. Linearize the cycle
         instead: `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()`
-        or `hj.spectral_radius(model)`.
+        or `hj.fitting.spectral_radius(model)`.
 
         Return NaN or infinity where the system cannot produce the measurement. The fit then takes a
         shorter step, or gives up a guess at which this happens.
@@ -97,7 +97,7 @@ class ObservedHTF(AbstractObservation):
     delays if `free` contains "input_delay" or "output_delay".
     """
 
-    f: Float[Array, " F"]
+    frequencies: Float[Array, " F"]
     H: Complex[Array, "M F ny nu"]
     harmonics: tuple[int, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -117,7 +117,7 @@ class ObservedHTF(AbstractObservation):
         **Raises:** `DefinitionError` for NaN, bad variances, or another number of sections.
         """
         self.delay = None if delay is None else jnp.asarray(delay, float)
-        self.f = htf.f
+        self.frequencies = htf.frequencies
         self.H = htf.H
         self.sections = as_family(sections)
         self.harmonics = htf.harmonics
@@ -131,9 +131,9 @@ class ObservedHTF(AbstractObservation):
     def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
         where = cycle, self.sections, self.outputs, self.inputs
         if self.delay is None:
-            H = linearize(*where).htf(self.f, self.harmonics).H
+            H = linearize(*where).htf(self.frequencies, self.harmonics).H
         else:
-            H = Delayed.of(*where, self.delay).htf(self.f, self.harmonics)
+            H = Delayed.of(*where, self.delay).htf(self.frequencies, self.harmonics)
         return _real(H, self.H, self.weights)
 
     def prepare(self, cycle: LimitCycle) -> "ObservedHTF":

@@ -211,13 +211,13 @@ class FitProblem(eqx.Module):
         """True if all data have standard deviations."""
         return all(bool(observation.weighted) for observation in self.observations)
 
-    def unit(self, cost: float, freedom: float) -> float:
+    def unit(self, cost: float, dof: float) -> float:
         """Return the factor of covariances for the cost of a fit, from the cost relative to its
         expected value: that of variances that are estimated, or this misfit where there are none
         (NaN if no residual is left to estimate it)."""
-        misfit = cost / max(freedom, 1)
+        misfit = cost / max(dof, 1)
         if not self.weighted:
-            return max(misfit, np.finfo(float).tiny) if freedom else np.nan
+            return max(misfit, np.finfo(float).tiny) if dof else np.nan
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
         return (
             estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1]

@@ -82,12 +82,12 @@ def sandwich(
     if not values[0] > ROUNDING * values[-1]:
         return Covariance.unknown(len(curvature))
     inverse = vectors / values @ vectors.T
-    freedom = np.inf
+    dof = np.inf
     if shares is not None:
         half = np.linalg.inv(np.linalg.cholesky(shares.sum(axis=0)))
         share = np.einsum("ij,ejk,ik->ei", half, shares, half)
-        freedom = float(1 / (share**2).sum(axis=0).mean())
-    return Covariance(inverse @ gradient @ inverse, freedom)
+        dof = float(1 / (share**2).sum(axis=0).mean())
+    return Covariance(inverse @ gradient @ inverse, dof)
 
 
 def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> int:

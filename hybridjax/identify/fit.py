@@ -45,6 +45,8 @@ class Fit(eqx.Module):
         @property
         def noise(self) -> Float[np.ndarray, " ny"] | None: ...
         @property
+        def cost(self) -> float: ...
+        @property
         def dof(self) -> float: ...
         @property
         def result(self) -> int: ...
@@ -55,6 +57,12 @@ class Fit(eqx.Module):
     def modulus(self) -> Float[np.ndarray, " d"]:
         """The moduli of the multipliers."""
         return np.abs(self.multipliers)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """Chi-square (`cost`) per degree of dof (`dof`), of fits that have both: about 1 if the
+        model and the standard deviations of the data are right."""
+        return self.cost / self.dof if self.dof else np.nan
 
     @property
     @abstractmethod

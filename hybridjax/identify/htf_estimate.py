@@ -13,7 +13,7 @@ from .._core.boundary.kinds import Count, Probability, SignalNames
 from .._core.precision import require_x64
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
-from ..linear.htf import HTF, Scatter
+from ..linear.htf import HTF, VarianceDof
 from .descent import ROUNDING
 from .instrument import htf_by_reference
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
@@ -32,7 +32,7 @@ def estimate_htf(
     repeats: Count = 1,
     variance: Literal["auto", "noise", "total"] = "auto",
     threshold: Probability = SILENT_LINE,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
 
@@ -53,8 +53,8 @@ def estimate_htf(
 
     **Arguments:**
 
-    - `data`: the experiments, or an iterable of parts of them, as `stream_experiments` and
-      `StoredExperiments` return; only sums over experiments are kept in memory.
+    - `data`: the experiments, or an iterable of parts of them, as `run_experiments` returns with
+      `chunk` or `store`; only sums over experiments are kept in memory.
     - `harmonics`: m of the H_m to estimate, one integer or several: 2 is H_2 alone. Default: all N.
     - `repeats`: number of the last windows of P periods that are averaged. Default: 1.
     - `variance`: "noise" is computed from the repeats, "total" from the realizations; each raises
@@ -62,7 +62,7 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the HTFs are those of the plant from these to the outputs, and noise that
       the controller feeds back does not bias them (`identify/instrument.py`). References have to
       excite all lines of a class f + integers, up to N/2. Default: None; there is no controller.
@@ -81,8 +81,8 @@ def estimate_htf(
             "the variance of noise alone needs two windows: record P periods more, pass repeats=2."
         )
     require_x64()
-    if reference is not None:
-        htf = htf_by_reference(data, reference, repeats, variance, threshold)
+    if references is not None:
+        htf = htf_by_reference(data, references, repeats, variance, threshold)
         return htf if harmonics is None else htf.select(harmonics)
     sums = spectral_sums(data, harmonics, threshold=threshold, repeats=repeats)
     rows = np.flatnonzero(sums.solvable())
@@ -99,15 +99,15 @@ def estimate_htf(
         _require_total(why_not, sums.f[rows], lines.realizations)
     total = lines.noise
     noise = None
-    scatter = None
+    variance_dof = None
     if variance != "noise" and np.median(lines.realizations) > 0 and not why_not:
         total = lines.total
         noise = lines.noise
         every = lines.realizations.sum()
-        freedom = np.where(lines.realizations < 1, every, lines.realizations)
-        scatter = Scatter(freedom.astype(float), _roundness(sums, rows, lines.H))
+        dof = np.where(lines.realizations < 1, every, lines.realizations)
+        variance_dof = VarianceDof(dof.astype(float), _roundness(sums, rows, lines.H))
     elif lines.noise is not None:
-        scatter = Scatter(sums.count[rows] * (repeats - 1.0))
+        variance_dof = VarianceDof(sums.count[rows] * (repeats - 1.0))
     return HTF(
         sums.f[rows],
         lines.H,
@@ -118,7 +118,7 @@ def estimate_htf(
         "estimate",
         variance=total,
         noise_variance=noise,
-        scatter=scatter,
+        variance_dof=variance_dof,
         power=lines.power,
     )
 
@@ -202,7 +202,7 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
 def _roundness(
     sums: SpectralSums, rows: Int[np.ndarray, " F"], H: Complex[np.ndarray, "M F ny nu"]
 ) -> Float[np.ndarray, "M F ny nu"] | None:
-    r"""Return `Scatter.roundness` of the residuals of realizations.
+    r"""Return `VarianceDof.roundness` of the residuals of realizations.
 
     None where inputs share experiments, lines are mirrored, or realizations are many. With the
     residuals $d_j = (Y_j - H U_j) \overline{U_j} / |U_j|$ of each input, $\sum_j |d_j|^2$ is the

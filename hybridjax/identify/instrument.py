@@ -26,10 +26,10 @@ from jaxtyping import Complex, Float, Int
 from .._core.arguments import require_among
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..experiments.record import Record, RecordedData, uninterrupted_records
+from ..experiments.record import RecordedData, SectionSeries, uninterrupted_records
 from ..linear.algebra import Lines
 from ..linear.frequency_response import check_harmonics
-from ..linear.htf import HTF, Scatter
+from ..linear.htf import HTF, VarianceDof
 from .descent import positive
 from .spectral_sums import SILENT_LINE, Experiments, Setup, parts_of
 
@@ -52,7 +52,7 @@ class Roles(NamedTuple):
     ) -> "Roles":
         """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
         `fewest` or more. Default: as many as the others."""
-        require_among("input", reference, names, "`reference`: ")
+        require_among("input", reference, names, "`references`: ")
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
         if not inputs:
@@ -69,7 +69,7 @@ class Roles(NamedTuple):
 
 def in_loop(
     data: RecordedData, reference: Sequence[str]
-) -> tuple[list[Record], list[Record]]:
+) -> tuple[list[SectionSeries], list[SectionSeries]]:
     """Return records from the plant's inputs to the outputs, and from the references to these
     inputs.
 
@@ -100,7 +100,7 @@ def require_loop(
     for i, k in itertools.product(roles.inputs, roles.references):
         if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
             raise DefinitionError(
-                f"{names[i]} and {names[k]} are equal: there is no loop, leave `reference` out."
+                f"{names[i]} and {names[k]} are equal: there is no loop, leave `references` out."
             )
 
 
@@ -211,7 +211,7 @@ def excited_classes(
     raise DefinitionError(
         f"the reference excites too little: at f = {best / sums.setup.periods:g} + integers it "
         f"tells {apart} of {len(r)} components apart. Excite all lines up to N/2, or use "
-        "`fit_ldtp(reference=)`."
+        "`fit_ldtp(references=)`."
     )
 
 
@@ -242,11 +242,11 @@ def solve(
     def entries(x):
         return None if x is None else lines.entries(x * unit**2).real
 
-    scatter = None
+    variance_dof = None
     if estimates.variance is not None:
-        freedom = np.zeros(len(f))
-        freedom[lines.row] = estimates.freedom[:, None]
-        scatter = Scatter(freedom, shared=True)
+        dof = np.zeros(len(f))
+        dof[lines.row] = estimates.dof[:, None]
+        variance_dof = VarianceDof(dof, shared=True)
     return HTF(
         f,
         lines.entries(estimates.H * unit),
@@ -257,7 +257,7 @@ def solve(
         "estimate",
         variance=entries(estimates.variance),
         noise_variance=entries(estimates.noise),
-        scatter=scatter,
+        variance_dof=variance_dof,
     )
 
 
@@ -269,7 +269,7 @@ class _ClassEstimates(NamedTuple):
     """From the scatter of experiments, or else that of windows."""
     noise: Float[np.ndarray, "K y u"] | None
     """From windows, if both are known."""
-    freedom: Float[np.ndarray, " K"]
+    dof: Float[np.ndarray, " K"]
     """Complex degrees of freedom of the variance."""
 
 
@@ -312,24 +312,24 @@ def _solve_classes(
     noise = None
     if repeats > 1:
         noise = variance(sums.between[classes], sums.experiments)
-    freedom = np.full(len(classes), float(sums.experiments - len(u)))
-    if kind == "total" and freedom[0] <= 0:
+    dof = np.full(len(classes), float(sums.experiments - len(u)))
+    if kind == "total" and dof[0] <= 0:
         raise DefinitionError(
             f"{sums.experiments} experiments with {len(u)} unknowns each leave no scatter: apply "
             "several realizations (`Design.realizations`), or pass variance='noise'."
         )
-    if kind == "noise" or freedom[0] <= 0:
-        freedom[:] = sums.experiments * (repeats - 1)
-        return _ClassEstimates(H, noise, None, freedom)
+    if kind == "noise" or dof[0] <= 0:
+        dof[:] = sums.experiments * (repeats - 1)
+        return _ClassEstimates(H, noise, None, dof)
     # The error of P multiplies all of U in E, of which the references explain only a part. The
     # other part adds errors of entries of P to E: of one at the edge of its disc, where they
     # count three times, and of all others, whose scatter takes degrees of freedom.
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
-    counted = freedom + _diagonal(left).sum(axis=1)
+    counted = dof + _diagonal(left).sum(axis=1)
     total = variance(G, counted[:, None, None] + 2 * edge[:, None])
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
-    return _ClassEstimates(H, total, noise, 1 / (1 / freedom + taken))
+    return _ClassEstimates(H, total, noise, 1 / (1 / dof + taken))
 
 
 def _require_answers(

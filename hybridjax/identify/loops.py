@@ -46,7 +46,7 @@ class Loop(eqx.Module):
 
 
 @checked
-def loop(
+def estimate_loop(
     data: ExperimentData,
     *,
     at_input: SignalNames | None = None,
@@ -58,7 +58,7 @@ def loop(
     The plant is estimated from references that are added to its input u, the controller from
     references that are added to the measured output y. Both kinds may act in the same experiments
     or in different ones: the response to references of the other kind is subtracted. Variances are
-    of first order, see `estimate_htf` with `reference`. `hj.fit_multipliers` and `hj.fit_ldtp`
+    of first order, see `estimate_htf` with `references`. `hj.fit_multipliers` and `hj.fit_ldtp`
     accept the HTFs, also those of unstable plants.
 
     **Arguments:**
@@ -77,7 +77,7 @@ def loop(
     d = at_output or ()
     if not (r or d):
         raise DefinitionError(
-            "`loop` needs references: name those that enter at the plant's input "
+            "`estimate_loop` needs references: name those that enter at the plant's input "
             "(`at_input`), at its output (`at_output`), or both."
         )
     roles = Roles.of(data.inputs, (*r, *d), fewest=0)

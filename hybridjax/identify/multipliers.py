@@ -9,7 +9,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.execution import one_blas_thread
@@ -25,7 +24,6 @@ from .descent import ROUNDING, Coefficients
 from .fit import not_converged
 from .multiplier_estimate import (
     FitWithoutModel,
-    MultiplierEstimate,
     RoughFit,
 )
 
@@ -73,12 +71,14 @@ class StructuredFit(FitWithoutModel):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     @checked
-    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
-        """Return the fitted HTFs at frequencies f (F,), cycles per period, inside the data's band.
+    def htf(
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> HTF:
+        """Return the fitted HTFs at `frequencies` (F,), cycles per period, inside the data's band.
 
         **Raises:** `DefinitionError` for a harmonic that was not fitted.
         """
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         H = divided_by_chi(self.numerators, self.coefficients, f, N)
         htf = HTF(f, H, self.harmonics, N, self.inputs, self.outputs, "structured fit")
@@ -87,9 +87,8 @@ class StructuredFit(FitWithoutModel):
     def _about(self) -> str:
         pairs = zip(self.outputs, self.residual, strict=True)
         misfit = ", ".join(f"{name} {x:.1e}" for name, x in pairs)
-        reduced = self.cost / self.dof
         return (
-            f"residual {misfit}; chi-square / degrees of freedom {reduced:.3g}; "
+            f"residual {misfit}; chi-square per degree of freedom {self.chi2_per_dof:.3g}; "
             f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
         )
 
@@ -100,8 +99,8 @@ def fit_multipliers(
     htf: HTF,
     order: Order | LDTP,
     *,
-    overhang: Index | None = None,
-    errors: Literal["residuals", "variance"] = "residuals",
+    extra_lags: Index | None = None,
+    covariance: Literal["residuals", "variance"] = "residuals",
     check: bool = True,
 ) -> StructuredFit:
     r"""Fit the common denominator of the HTFs, whose roots are the Floquet multipliers.
@@ -122,8 +121,8 @@ def fit_multipliers(
       (`htf.power`).
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
       `select_order` helps to find it.
-    - `overhang`: degree of the numerators beyond d N. Default: N.
-    - `errors`: source of the covariance. `"residuals"`: the residuals at each frequency. This
+    - `extra_lags`: degree of the numerators beyond d N. Default: N.
+    - `covariance`: source of the covariance. `"residuals"`: the residuals at each frequency. This
       remains valid if the errors of different harmonics are dependent (process noise, distortion)
       or the variances are only approximate (White 1980). `"variance"`: the variances, which must
       then be correct. Default: `"residuals"`.
@@ -136,18 +135,18 @@ def fit_multipliers(
     """
     order = order.rank() if isinstance(order, LDTP) else order
     rms = weights.check_values(htf)
-    if errors == "variance" and htf.variance is None:
+    if covariance == "variance" and htf.variance is None:
         raise DefinitionError(
-            "errors='variance' needs HTFs with variances: take 'residuals'."
+            "covariance='variance' needs HTFs with variances: take 'residuals'."
         )
-    solution = _solve(htf, rms, order, overhang)
+    solution = _solve(htf, rms, order, extra_lags)
     groups = solution.groups
     c = solution.c
-    covariance, cost, dof = varpro.summarize(groups, c, errors)
+    spread, cost, dof = varpro.summarize(groups, c, covariance)
     numerators = varpro.unfold(
         htf, groups, [varpro.numerators_of(group, c) for group in groups]
     )
-    f = np.asarray(htf.f)
+    f = np.asarray(htf.frequencies)
     H = np.asarray(htf.H)
     misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
@@ -155,7 +154,7 @@ def fit_multipliers(
     exact = htf.variance is None and residual.max() < ROUNDING
 
     def ratios(k: int) -> NoiseRatios:
-        fitted = solution if k == order else _solve(htf, rms, k, overhang)
+        fitted = solution if k == order else _solve(htf, rms, k, extra_lags)
         return noise_ratios(fitted.groups, htf, fitted.c, exact)
 
     surplus = unsupported(ratios, order, check)
@@ -164,7 +163,7 @@ def fit_multipliers(
     fit = StructuredFit(
         multipliers_of(c),
         c,
-        *covariance,
+        *spread,
         residual,
         weights.neighbor_correlation(misfit / scale, H / scale, f),
         numerators,
@@ -184,7 +183,7 @@ def fit_multipliers(
         groups = varpro.group_htf(htf, solution.weight, size)
         start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
         c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
-        return c, lambda: varpro.summarize(groups, c, errors)[0]
+        return c, lambda: varpro.summarize(groups, c, covariance)[0]
 
     # One more multiplier, or a pair.
     higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]
@@ -207,10 +206,10 @@ class _Solution(NamedTuple):
 
 
 def _solve(
-    htf: HTF, rms: Float[np.ndarray, " ny"], order: int, overhang: int | None
+    htf: HTF, rms: Float[np.ndarray, " ny"], order: int, extra_lags: int | None
 ) -> _Solution:
     """Return the solution weighted by variances, or else by those that its residuals suggest."""
-    size = varpro.numerator_size(htf, order, overhang)
+    size = varpro.numerator_size(htf, order, extra_lags)
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)
     c, converged = varpro.maximum_likelihood(groups, order)
@@ -218,55 +217,13 @@ def _solve(
         return _Solution(groups, weight, size, c, converged)
     lines = weights.line_variances(htf)
     for _ in range(_REWEIGHTINGS):
-        variance = varpro.error_spectrum(groups, c, np.asarray(htf.f), lines, len(rms))
+        variance = varpro.error_spectrum(
+            groups, c, np.asarray(htf.frequencies), lines, len(rms)
+        )
         weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
         groups = varpro.group_htf(htf, weight, size)
         c, converged = varpro.maximum_likelihood(groups, order, c)
     return _Solution(groups, weight, size, c, converged)
-
-
-@checked
-@one_blas_thread()
-def multiplier_bound(
-    model: LDTP, htf: HTF, overhang: Index | None = None
-) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers of a known model.
-
-    The errors of the HTFs are independent, circular and Gaussian, and all numerators are unknown.
-    The bound is the inverse of $J^T J$ at the true values, where J is the derivative of the HTFs in
-    units of their standard deviations, projected orthogonally to all changes of the numerators. It
-    limits the accuracy that an experiment can reach, before the experiment.
-
-    **Arguments:**
-
-    - `model`: the true system. `htf`: frequencies, harmonics and `variance`; its H is not used.
-    - `overhang`: degree of the numerators beyond d N. Default: N.
-
-    **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;
-    `standard_errors` are bounds of rms errors.
-
-    **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
-    few frequencies to find the multipliers at all.
-    """
-    exact = exact_htf(model, htf)
-    multipliers = model.multipliers
-    c = np.poly(multipliers).real[1:]
-    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), overhang), c)
-    return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
-
-
-def exact_htf(model: LDTP, htf: HTF) -> HTF:
-    """Return the HTFs of a model with the frequencies, harmonics and variances of others.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    require_same("model and HTFs", model, htf)
-    if htf.variance is None:
-        raise DefinitionError(
-            "a bound needs HTFs with variances: estimate them from several realizations or "
-            "windows (`repeats`)."
-        )
-    return dataclasses.replace(model.htf(htf.f, htf.harmonics), variance=htf.variance)
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
@@ -333,28 +290,11 @@ class OrderSelection(eqx.Module):
         return "\n".join(rows)
 
 
-@checked
 @one_blas_thread()
-def select_order(
-    htf: HTF, max_order: Order = 5, *, overhang: Index | None = None
-) -> OrderSelection:
-    r"""Compare numbers of multipliers, from none to `max_order`.
-
-    *Rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is removed. The
-    rest has one independent component for each multiplier (D at most), and noise. Components are
-    counted by generalized singular values: each above the largest value of noise alone counts.
-    *MDL*: Rissanen's criterion for a fit of each order, with numerators of the degree that belongs
-    to this order.
-
-    **Arguments:** as in `fit_multipliers`. Without variances the misfit of the largest order is
-    taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors
-    that are not random (a transient, distortion by an input that was not drawn at random) then
-    look like multipliers. `max_order` defaults to 5.
-
-    **Raises:** `DefinitionError` as `fit_multipliers`.
-    """
+def compare_orders(htf: HTF, max_order: int, extra_lags: int | None) -> OrderSelection:
+    """Compare numbers of multipliers of HTFs, see `hj.select_order`."""
     rms = weights.check_values(htf)
-    size = varpro.numerator_size(htf, max_order, overhang)
+    size = varpro.numerator_size(htf, max_order, extra_lags)
     weight = weights.error_weights(htf, rms)
     largest = varpro.group_htf(htf, weight, size)
     noise = np.ones(len(rms))
@@ -403,7 +343,7 @@ def _left_over(
     for group in groups:
         residual = varpro.misfit_of(group, c).residual
         np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
-        np.add.at(number, group.channel[:, 0], group.freedom)
+        np.add.at(number, group.channel[:, 0], group.dof)
     return np.sqrt(square / number)
 
 
@@ -432,13 +372,13 @@ def noise_ratios(
 
     **Arguments:** `exact`: whether the noise is rounding, which differs by orders of magnitude.
     """
-    cost, freedom = varpro.cost_of(groups, c)
-    level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / freedom)
+    cost, dof = varpro.cost_of(groups, c)
+    level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / dof)
     whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
     values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2 / level
     if exact:
         values = values / _ROUNDING_VARIES
-    return values, tails * float(np.sqrt(2 / freedom))
+    return values, tails * float(np.sqrt(2 / dof))
 
 
 def unsupported(

@@ -19,8 +19,8 @@ from ..linear.htf import HTF
 from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
 from .variable_projection import (
+    FittedResponse,
     HTFGroup,
-    Response,
     equal_weights,
     late_columns,
     numerators_of,
@@ -69,9 +69,9 @@ class RationalFit(eqx.Module):
     input: str = eqx.field(static=True)
 
     @checked
-    def htf(self, f: Scalar | Vector) -> HTF:
-        """Return the fitted functions at frequencies f (F,), cycles per period."""
-        f = np.atleast_1d(np.asarray(f, float))
+    def htf(self, frequencies: Scalar | Vector) -> HTF:
+        """Return the fitted functions at `frequencies` (F,), cycles per period."""
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         delay = np.exp(-2j * np.pi * f / N)
         polyval = np.polynomial.polynomial.polyval
@@ -165,7 +165,7 @@ def fit_rational(
             f"{len(H)} frequencies: take fewer poles, or measure more frequencies."
         )
     # The denominator of a system with one section.
-    f = np.asarray(htf.f) / htf.n_sections
+    f = np.asarray(htf.frequencies) / htf.n_sections
     fits = [
         _fit_one(f, H[:, row], f"H_0 of {htf.outputs[row]}", poles, zeros)
         for row in rows
@@ -218,7 +218,9 @@ def _fit_one(
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
     powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
-    response = Response((0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5))
+    response = FittedResponse(
+        (0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5)
+    )
     (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [response])
     linearize = functools.partial(residuals_of, [group])
     ends = []

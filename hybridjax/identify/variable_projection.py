@@ -67,7 +67,7 @@ class HTFGroup(NamedTuple):
     """The responses times `scale`."""
 
     @property
-    def freedom(self) -> int:
+    def dof(self) -> int:
         """Real equations that the numerator of one response leaves."""
         return len(self.basis) - self.basis.shape[1]
 
@@ -184,7 +184,7 @@ def residuals_of(groups: Groups, c: Coefficients) -> Gradient:
 def cost_of(groups: Groups, c: Coefficients) -> tuple[float, int]:
     """Return the sum of squares of the misfit, and its expectation for errors of variance 1."""
     cost = sum(float((misfit_of(group, c).residual ** 2).sum()) for group in groups)
-    return cost, sum(group.freedom * group.size for group in groups)
+    return cost, sum(group.dof * group.size for group in groups)
 
 
 def maximum_likelihood(
@@ -252,16 +252,16 @@ def summarize(
         slopes = misfit.jacobian
         np.add.at(score, group.line, np.einsum("jaek,aek->ej", slopes, error))
         np.add.at(shares, group.line, np.einsum("iaek,jaek->eij", slopes, slopes))
-    cost, freedom = cost_of(groups, c)
+    cost, dof = cost_of(groups, c)
     square = shares.sum(axis=0)
     if errors == "variance":
-        return sandwich(square - noise, square), cost, freedom
+        return sandwich(square - noise, square), cost, dof
     with suppress(np.linalg.LinAlgError):  # some combination of coefficients is unknown
         root = np.linalg.cholesky(square)
         half = np.linalg.inv(root)
         enlarged = inverse_of_remainder(half @ shares @ half.T, 0.5)
         score = np.einsum("lij,lj->li", enlarged, score @ half.T) @ root.T
-    return sandwich(square - noise, score.T @ score, shares), cost, freedom
+    return sandwich(square - noise, score.T @ score, shares), cost, dof
 
 
 def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"]:
@@ -287,13 +287,13 @@ def unfold(
     return np.moveaxis(out, 3, 1)
 
 
-def grouped(htf: HTF, order: int, overhang: int | None) -> list[HTFGroup]:
+def grouped(htf: HTF, order: int, extra_lags: int | None) -> list[HTFGroup]:
     """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
-    size = numerator_size(htf, order, overhang)
+    size = numerator_size(htf, order, extra_lags)
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
 
-class Response(NamedTuple):
+class FittedResponse(NamedTuple):
     """A combination of entries of HTFs whose numerator solves a problem of its own."""
 
     harmonic: tuple[int, int]
@@ -316,7 +316,7 @@ def group_htf(
     two responses with real numerators, and independent errors if both weights are the same. Other
     pairs, and harmonics without the opposite one, have complex numerators.
     """
-    f = np.asarray(htf.f)
+    f = np.asarray(htf.frequencies)
     N = htf.n_sections
     powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(size))
     turned = np.concatenate([powers, 1j * powers], axis=1)
@@ -326,14 +326,16 @@ def group_htf(
         "single": turned,
         "double": np.concatenate([turned, conjugate]),
     }
-    responses: dict[str, list[Response]] = {kind: [] for kind in matrices}
+    responses: dict[str, list[FittedResponse]] = {kind: [] for kind in matrices}
     row_of = {m % N: row for row, m in enumerate(htf.harmonics)}
     for m, row in row_of.items():
         other = row_of.get(-m % N, -1)
         if other < 0 or row <= other:
             for kind, response in _responses_of(htf, weight, row, other):
                 responses[kind].append(response)
-    sources = np.arange(len(f)) if htf.scatter is None else htf.scatter.sources(f)
+    sources = (
+        np.arange(len(f)) if htf.variance_dof is None else htf.variance_dof.sources(f)
+    )
     groups = []
     for kind, matrix in matrices.items():
         if responses[kind]:
@@ -343,7 +345,7 @@ def group_htf(
 
 def _responses_of(
     htf: HTF, weight: Float[np.ndarray, "M F ny nu"], row: int, other: int
-) -> Iterator[tuple[str, Response]]:
+) -> Iterator[tuple[str, FittedResponse]]:
     """Iterate over the responses of a harmonic and the opposite one, with their kinds."""
     H = np.asarray(htf.H)
     half = np.sqrt(0.5)
@@ -355,19 +357,19 @@ def _responses_of(
         h = H[row][at]
         g = H[other][at]
         if other == row:
-            yield "real", Response((row, -1), 1.0, channel, h, w[at])
+            yield "real", FittedResponse((row, -1), 1.0, channel, h, w[at])
         elif other < 0:
-            yield "single", Response((row, -1), 1.0, channel, h, w[at])
+            yield "single", FittedResponse((row, -1), 1.0, channel, h, w[at])
         elif alike[channel]:
             pair = (row, other)
             total = half * (h + g)
             difference = half / 1j * (h - g)
-            yield "real", Response(pair, half, channel, total, w[at])
-            yield "real", Response(pair, 1j * half, channel, difference, w[at])
+            yield "real", FittedResponse(pair, half, channel, total, w[at])
+            yield "real", FittedResponse(pair, 1j * half, channel, difference, w[at])
         else:
             values = np.concatenate([h, g])
             both = np.concatenate([w[at], v[at]])
-            yield "double", Response((row, other), 1.0, channel, values, both)
+            yield "double", FittedResponse((row, other), 1.0, channel, values, both)
 
 
 def equal_weights(
@@ -375,7 +377,7 @@ def equal_weights(
     sources: Int[np.ndarray, " F"],
     size: int,
     matrix: Complex[np.ndarray, "E u"],
-    responses: list[Response],
+    responses: list[FittedResponse],
 ) -> list[HTFGroup]:
     """Return responses whose numerators solve the same problem, one group for each weight.
 
@@ -428,13 +430,13 @@ def powers_basis(
     return u[:, kept], vh[kept].conj().T / s[kept]
 
 
-def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
-    """Return how many coefficients each numerator has; `overhang` as of `fit_multipliers`.
+def numerator_size(htf: HTF, order: int, extra_lags: int | None) -> int:
+    """Return how many coefficients each numerator has; `extra_lags` as of `fit_multipliers`.
 
     **Raises:** `DefinitionError` for too few frequencies to determine them and the multipliers.
     """
     N = htf.n_sections
-    beyond = N if overhang is None else overhang
+    beyond = N if extra_lags is None else extra_lags
     size = order * N + beyond + 1
     harmonics = {m % N for m in htf.harmonics}
     # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
@@ -444,10 +446,10 @@ def numerator_size(htf: HTF, order: int, overhang: int | None) -> int:
     def enough(frequencies: int) -> bool:
         return sum(max(2 * frequencies - k, 0) for k in unknown) * entries >= order
 
-    if not enough(len(htf.f)):
+    if not enough(len(htf.frequencies)):
         raise DefinitionError(
-            f"{len(htf.f)} frequencies are too few for numerators of {size} coefficients and "
-            f"{order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
+            f"{len(htf.frequencies)} frequencies are too few for numerators of {size} coefficients "
+            f"and {order} multipliers: {next(filter(enough, count()))} or more are needed. Measure "
             "more, take fewer sections, or lower `order`."
         )
     return size

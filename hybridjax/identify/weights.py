@@ -39,8 +39,9 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
         if len(bad):
             m, k, i, _ = bad[0].tolist()
             raise DefinitionError(
-                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at f = {htf.f[k]:g} is "
-                "not a positive number: leave f out, or measure several realizations or windows."
+                f"the variance of H_{htf.harmonics[m]} of {htf.outputs[i]} at "
+                f"f = {htf.frequencies[k]:g} is not a positive number: leave f out, or measure "
+                "several realizations or windows."
             )
     return rms
 
@@ -61,22 +62,22 @@ def error_weights(
         weight = 1 / (rms[:, None] * np.sqrt(line_variances(htf)))
         return np.broadcast_to(weight, htf.H.shape)
     variance = np.asarray(htf.variance)
-    if htf.scatter is not None and variance.all():
-        variance = _separated(htf.harmonics, variance, np.asarray(htf.scatter.freedom))
+    if htf.variance_dof is not None and variance.all():
+        variance = _separated(htf.harmonics, variance, np.asarray(htf.variance_dof.dof))
     return weights_of(variance, rms)
 
 
 def _separated(
     harmonics: tuple[int, ...],
     variance: Float[np.ndarray, "M F ny nu"],
-    freedom: Float[np.ndarray, " F"],
+    dof: Float[np.ndarray, " F"],
 ) -> Float[np.ndarray, "M F ny nu"]:
     """Return the nearest product of a factor for each frequency and one for each harmonic."""
     _, same = np.unique(np.abs(harmonics), return_inverse=True)
     size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
     for _ in range(20):  # more sweeps change nothing in 6 digits
         by_line = (variance / size[same]).mean(axis=0)
-        mean = np.average(variance / by_line, axis=1, weights=freedom)
+        mean = np.average(variance / by_line, axis=1, weights=dof)
         for k in range(len(size)):
             size[k] = mean[same == k].mean(axis=0)
     return size[same] * by_line
@@ -85,7 +86,7 @@ def _separated(
 def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
     """Return variances of each frequency and input by white noise, relative to their mean."""
     if htf.power is None:
-        return np.ones((len(htf.f), 1, len(htf.inputs)))
+        return np.ones((len(htf.frequencies), 1, len(htf.inputs)))
     variance = 1 / np.asarray(htf.power)[:, None]
     return variance / variance.mean()
 
@@ -116,10 +117,10 @@ def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
 
 def largest_misfit(htf: HTF) -> float:
     """Return the misfit that the scatter of variances explains."""
-    if htf.scatter is None:
+    if htf.variance_dof is None:
         return 1.0
-    freedom = float(np.median(htf.scatter.freedom))
-    return freedom / (freedom - 1) if freedom > 1 else np.inf
+    dof = float(np.median(htf.variance_dof.dof))
+    return dof / (dof - 1) if dof > 1 else np.inf
 
 
 def neighbor_correlation(
@@ -136,6 +137,6 @@ def neighbor_correlation(
     return float(neighbors / np.maximum(square, rounding))
 
 
-def are_alike(correlation: float, freedom: float) -> bool:
+def are_alike(correlation: float, dof: float) -> bool:
     """Test for a correlation of errors that is not chance, and large: the model is too simple."""
-    return correlation > max(0.1, 5 / np.sqrt(freedom))
+    return correlation > max(0.1, 5 / np.sqrt(dof))

@@ -29,13 +29,13 @@ _ENTRIES = "harmonics frequencies outputs inputs"
 
 
 @checked
-class Scatter(eqx.Module):
+class VarianceDof(eqx.Module):
     r"""Degrees of freedom of an estimated `HTF.variance`, and shape of the sample that it was
     estimated from.
 
     **Arguments:**
 
-    - `freedom` (F,): complex degrees of freedom of the variance.
+    - `dof` (F,): complex degrees of freedom of the variance.
     - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
       the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
       None, or an array of ones: the shape is not used.
@@ -45,26 +45,27 @@ class Scatter(eqx.Module):
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """
 
-    freedom: Float[Array, " F"]
+    dof: Float[Array, " F"]
     roundness: Float[Array, "M F ny nu"] | None
     shared: bool = eqx.field(static=True)
 
     def __init__(
         self,
-        freedom: Annotated[Numbers, Reals("frequencies", sign="positive")],
+        dof: Annotated[Numbers, Reals("frequencies", sign="positive")],
         roundness: Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative")]
         | None = None,
         shared: bool = False,
     ):
         require_x64()
         self.shared = shared
-        self.freedom, self.roundness = from_host((freedom, roundness))
+        self.dof, self.roundness = from_host((dof, roundness))
 
-    def sources(self, f: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
+    def sources(self, frequencies: Float[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
         """Return the index of the noise from which the errors of each line stem."""
         if not self.shared:
-            return np.arange(len(f))
-        return np.unique(np.round(np.minimum(f % 1, -f % 1), 9), return_inverse=True)[1]
+            return np.arange(len(frequencies))
+        distance = np.minimum(frequencies % 1, -frequencies % 1)
+        return np.unique(np.round(distance, 9), return_inverse=True)[1]
 
     def quantile(self, level: Probability) -> Float[Array, "*M F ny nu"]:
         r"""Quantile of $|\delta H|^2 / v$ at this probability.
@@ -77,12 +78,12 @@ class Scatter(eqx.Module):
         zero. If the mean of a few of them is large, they lie on an arc, nearly on a line, and w is
         small.
         """
-        freedom, roundness = to_host((self.freedom, self.roundness))
-        freedom = freedom[:, None, None]
-        xp = namespace(freedom)
+        dof, roundness = to_host((self.dof, self.roundness))
+        dof = dof[:, None, None]
+        xp = namespace(dof)
         excess = 0.0 if roundness is None else roundness - 1
         miss = (1 - level) * (1 + level**2 * excess)
-        return from_host(freedom * xp.expm1(-xp.log(miss) / freedom))
+        return from_host(dof * xp.expm1(-xp.log(miss) / dof))
 
 
 Variance = Annotated[Numbers, Reals(_ENTRIES, sign="nonnegative", infinite=True)]
@@ -109,7 +110,7 @@ class HTF(eqx.Module):
 
     **Arguments:**
 
-    - `f` (F,): input frequencies, cycles per period.
+    - `frequencies` (F,): input frequencies, cycles per period.
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
     - `n_sections`: `N`, the number of sections (samples) in one period; 0 in continuous time, where
@@ -121,18 +122,18 @@ class HTF(eqx.Module):
       experiments reveal. None if it is unknown.
     - `noise_variance` (M, F, ny, nu): the part of `variance` that is noise, from repeated periods.
       The remainder is nonlinear distortion, which random phases make random. None if it is unknown.
-    - `scatter`: degrees of freedom of `variance`; None if the variance is exact.
+    - `variance_dof`: degrees of dof of `variance`; None if the variance is exact.
     - `power` (F, nu): excitation of each frequency, in any unit. Fits take errors as inversely
       proportional to it where `variance` is None. Default: the same for all.
 
     **Raises:** `DefinitionError` if these do not fit together.
     """
 
-    f: Float[Array, " F"]
+    frequencies: Float[Array, " F"]
     H: Complex[Array, "M F ny nu"]
     variance: Float[Array, "M F ny nu"] | None
     noise_variance: Float[Array, "M F ny nu"] | None
-    scatter: Scatter | None
+    variance_dof: VarianceDof | None
     power: Float[Array, "F nu"] | None
     harmonics: tuple[int, ...] = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
@@ -142,7 +143,7 @@ class HTF(eqx.Module):
 
     def __init__(
         self,
-        f: Vector,
+        frequencies: Vector,
         H: Annotated[Numbers, Complexes(_ENTRIES)],
         harmonics: Harmonics,
         n_sections: Annotated[int, Whole(0, limits.SECTIONS)],
@@ -152,21 +153,21 @@ class HTF(eqx.Module):
         *,
         variance: Variance | None = None,
         noise_variance: Variance | None = None,
-        scatter: Scatter | None = None,
+        variance_dof: VarianceDof | None = None,
         power: Annotated[Numbers, Reals("frequencies inputs", sign="positive")]
         | None = None,
     ):
         require_x64()
-        self.f, self.H = from_host((f, H.astype(complex)))
+        self.frequencies, self.H = from_host((frequencies, H.astype(complex)))
         self.harmonics = check_harmonics(harmonics, n_sections)
         shape = self.H.shape
-        if shape[:2] != (len(self.harmonics), self.f.shape[0]):
+        if shape[:2] != (len(self.harmonics), self.frequencies.shape[0]):
             raise DefinitionError(
                 f"`H` has shape {shape}, but there are {len(self.harmonics)} harmonics and "
-                f"{self.f.shape[0]} frequencies (its first two axes)."
+                f"{self.frequencies.shape[0]} frequencies (its first two axes)."
             )
-        if not is_traced(f):
-            require_distinct(np.asarray(f))
+        if not is_traced(frequencies):
+            require_distinct(np.asarray(frequencies))
         if tuple(np.ravel(np.asarray(harmonics))) != self.harmonics:
             raise DefinitionError(f"`harmonics` must be ascending, but is {harmonics}.")
         self.n_sections = n_sections
@@ -175,18 +176,18 @@ class HTF(eqx.Module):
         self.source = source
         self.variance = _optional("variance", variance, shape)
         self.noise_variance = _optional("noise_variance", noise_variance, shape)
-        self.scatter = scatter
+        self.variance_dof = variance_dof
         self.power = _optional("power", power, (shape[1], shape[3]))
-        if scatter is not None:
-            _optional("scatter.freedom", scatter.freedom, self.f.shape)
-            _optional("scatter.roundness", scatter.roundness, shape)
+        if variance_dof is not None:
+            _optional("variance_dof.dof", variance_dof.dof, self.frequencies.shape)
+            _optional("variance_dof.roundness", variance_dof.roundness, shape)
 
     def __repr__(self) -> str:
-        count = self.f.shape[-1]
-        frequencies = "1 frequency" if count == 1 else f"{count} frequencies"
+        count = self.frequencies.shape[-1]
+        counted = "1 frequency" if count == 1 else f"{count} frequencies"
         span = ""
-        if count and not is_traced(self.f):
-            f = np.asarray(self.f)
+        if count and not is_traced(self.frequencies):
+            f = np.asarray(self.frequencies)
             span = f" {f.min():.4g}"
             if count > 1:
                 span = f" {f.min():.4g} to {f.max():.4g}"
@@ -199,7 +200,7 @@ class HTF(eqx.Module):
         if self.n_sections:
             sections = f"{self.n_sections} sections"
         return folded(
-            f"HTF({self.source}; harmonics {shown}; {frequencies}{span} cycles/period; "
+            f"HTF({self.source}; harmonics {shown}; {counted}{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 
@@ -209,7 +210,7 @@ class HTF(eqx.Module):
             return None
         size = np.abs(np.asarray(self.H))[..., 0]
         u = self.inputs[0]
-        f = np.asarray(self.f)
+        f = np.asarray(self.frequencies)
         order = np.argsort(f)
         largest = np.argsort(-np.nanmax(size, axis=(1, 2)), kind="stable")[:_SHOWN]
         drawn = []
@@ -243,13 +244,13 @@ class HTF(eqx.Module):
             "variance": self.variance,
             "noise_variance": self.noise_variance,
         }
-        if self.scatter is not None:
-            arrays["roundness"] = self.scatter.roundness
+        if self.variance_dof is not None:
+            arrays["roundness"] = self.variance_dof.roundness
         chosen = jax.tree.map(lambda x: x[rows], to_host(arrays))
-        scatter = self.scatter
-        if scatter is not None:
-            scatter = replace(scatter, roundness=chosen.pop("roundness"))
-        return replace(self, harmonics=harmonics, scatter=scatter, **chosen)
+        variance_dof = self.variance_dof
+        if variance_dof is not None:
+            variance_dof = replace(variance_dof, roundness=chosen.pop("roundness"))
+        return replace(self, harmonics=harmonics, variance_dof=variance_dof, **chosen)
 
     def __matmul__(self, other: "HTF | HasHTF") -> "HTF":
         """This system after another, which acts first: the series `P @ Q`.
@@ -259,7 +260,7 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` as `feedback`, and if the outputs of `other` are not the
         inputs of this system, by name and unit.
         """
-        other = other if isinstance(other, HTF) else other.htf(self.f)
+        other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_chain("@", other.outputs, self.inputs, self, other)
         return _combined(algebra.series, [self, other], other.inputs, self.outputs)
 
@@ -268,7 +269,7 @@ class HTF(eqx.Module):
 
         **Raises:** `DefinitionError` as `feedback`, and if inputs or outputs differ.
         """
-        other = other if isinstance(other, HTF) else other.htf(self.f)
+        other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_same("terms of a sum", self, other)
         return _combined(algebra.parallel, [self, other], self.inputs, self.outputs)
 
@@ -297,7 +298,11 @@ class HTF(eqx.Module):
         **Raises:** `DefinitionError` if not all N harmonics and all lines f + integers are there,
         or if names, units or frequencies do not fit.
         """
-        other = controller if isinstance(controller, HTF) else controller.htf(self.f)
+        other = (
+            controller
+            if isinstance(controller, HTF)
+            else controller.htf(self.frequencies)
+        )
         require_chain("feedback", self.outputs, other.inputs, self, other)
         require_chain("feedback", other.outputs, self.inputs, self, other)
         return _combined(algebra.feedback, [self, other], self.inputs, self.outputs)
@@ -306,8 +311,8 @@ class HTF(eqx.Module):
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 
         $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. If the variance was
-        estimated from few experiments, discs are larger (`Scatter.quantile`). The probability is
-        exact for complex Gaussian errors. With at least four realizations it is nearly exact for
+        estimated from few experiments, discs are larger (`VarianceDof.quantile`). The probability
+        is exact for complex Gaussian errors. With at least four realizations it is nearly exact for
         errors of equal moduli, as from the distortion by a single product of two cosines. The true
         value is the best linear approximation for inputs of the kind that was applied, not the
         response to infinitely small ones.
@@ -320,7 +325,9 @@ class HTF(eqx.Module):
                 "design or from repeated periods."
             )
         quantile = (
-            -np.log1p(-level) if self.scatter is None else self.scatter.quantile(level)
+            -np.log1p(-level)
+            if self.variance_dof is None
+            else self.variance_dof.quantile(level)
         )
         quantile, variance = to_host((quantile, self.variance))
         return from_host((quantile * variance) ** 0.5)
@@ -337,7 +344,7 @@ class HTF(eqx.Module):
         **Returns:** (n, ny).
 
         **Raises:** `DefinitionError` if `n` is no multiple of `N`, if the harmonics are not
-        symmetric about 0, or if `u` holds a frequency that is not on the grid `f` (up to sign).
+        symmetric about 0, or if `u` holds a frequency that is not on the grid (up to sign).
         """
         self.require_sampled("`predict`")
         N = self.n_sections
@@ -352,7 +359,7 @@ class HTF(eqx.Module):
         size = np.abs(U).max(axis=1)
         lines = np.flatnonzero(size > _SILENT_LINE * size.max())
         # A real system responds to -f with the conjugate of its response to f.
-        f = np.concatenate([self.f, -np.asarray(self.f)])
+        f = np.concatenate([self.frequencies, -np.asarray(self.frequencies)])
         distance = np.abs(self._circle(lines[:, None] / periods - f))
         lost = lines[distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY]
         if len(lost):
@@ -417,7 +424,7 @@ class HTF(eqx.Module):
 class HasHTF(Protocol):
     """Anything with HTFs at all frequencies: `LDTP`, fits."""
 
-    def htf(self, f: Vector) -> HTF: ...
+    def htf(self, frequencies: Vector) -> HTF: ...
 
 
 def require_chain(
@@ -434,12 +441,12 @@ def require_chain(
 
 
 def _require_same_lines(a: HTF, b: HTF) -> None:
-    same = a.f.shape == b.f.shape
-    if same and not is_traced(a.f, b.f):
-        same = np.allclose(a.f, b.f, rtol=0, atol=SAME_FREQUENCY)
+    same = a.frequencies.shape == b.frequencies.shape
+    if same and not is_traced(a.frequencies, b.frequencies):
+        same = np.allclose(a.frequencies, b.frequencies, rtol=0, atol=SAME_FREQUENCY)
     if not same:
         raise DefinitionError(
-            "two HTFs have different frequencies: compute both at one `f`."
+            "two HTFs have different frequencies: compute both at the same `frequencies`."
         )
 
 
@@ -459,7 +466,7 @@ def _combined(
             raise DefinitionError(
                 f"algebra needs all {len(every)} harmonics: leave `harmonics` out."
             )
-    lines = algebra.Lines.of(np.asarray(first.f), first.n_sections)
+    lines = algebra.Lines.of(np.asarray(first.frequencies), first.n_sections)
     matrices = [lines.matrices(H) for H in to_host([term.H for term in terms])]
     result, pairs = operation(*matrices)
 
@@ -472,7 +479,7 @@ def _combined(
 
     exact = all(term.source == "exact" for term in terms)
     return HTF(
-        first.f,
+        first.frequencies,
         lines.entries(result),
         every,
         first.n_sections,
@@ -481,7 +488,7 @@ def _combined(
         "exact" if exact else "estimate",
         variance=variance("variance"),
         noise_variance=variance("noise_variance"),
-        scatter=_least_scatter(terms, lines),
+        variance_dof=_least_scatter(terms, lines),
     )
 
 
@@ -497,16 +504,18 @@ def _variances(terms: list[HTF], name: str) -> list[Any] | None:
     return None if all(term.source == "exact" for term in terms) else out
 
 
-def _least_scatter(terms: list[HTF], lines: algebra.Lines) -> Scatter | None:
+def _least_scatter(terms: list[HTF], lines: algebra.Lines) -> VarianceDof | None:
     """Return the degrees of freedom of all lines of a class: the least of its lines and terms."""
-    freedoms = to_host([x.scatter.freedom for x in terms if x.scatter is not None])
+    freedoms = to_host(
+        [x.variance_dof.dof for x in terms if x.variance_dof is not None]
+    )
     if not freedoms:
         return None
     xp = namespace(freedoms[0])
     by_line = xp.stack(freedoms).min(axis=0)
     by_class = by_line[lines.row].min(axis=1, keepdims=True)
     spread = put(xp.zeros(len(by_line)), lines.row, by_class)
-    return Scatter(spread, shared=True)
+    return VarianceDof(spread, shared=True)
 
 
 def require_distinct(f: Float[np.ndarray, " F"]) -> None:
@@ -515,7 +524,7 @@ def require_distinct(f: Float[np.ndarray, " F"]) -> None:
     again = np.flatnonzero(np.diff(f) < SAME_FREQUENCY)
     if len(again):
         raise DefinitionError(
-            f"`f` holds {f[again[0]]:.10g} cycles per period twice: keep one."
+            f"`frequencies` holds {f[again[0]]:.10g} cycles per period twice: keep one."
         )
 
 

@@ -240,12 +240,12 @@ class LDTP(eqx.Module):
         require_x64(self)
         return time_response.impulse_response(self.matrices, n_lags)
 
-    def htf(self, f: Frequencies, harmonics: Harmonics | None = None) -> HTF:
+    def htf(self, frequencies: Frequencies, harmonics: Harmonics | None = None) -> HTF:
         """The exact harmonic transfer functions.
 
         **Arguments:**
 
-        - `f` (F,): input frequencies in cycles per period.
+        - `frequencies` (F,): input frequencies in cycles per period.
         - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all
           up to it. Default: all `N`.
 
@@ -254,8 +254,8 @@ class LDTP(eqx.Module):
         transformations values are not known, and the result there is infinite or meaningless.)
         """
         harmonics = check_harmonics(harmonics, self.n_sections)
-        require_x64(self, f)
-        f = from_host(to_host(f).reshape(-1))
+        require_x64(self, frequencies)
+        f = from_host(to_host(frequencies).reshape(-1))
         self._refuse_resonance(f)
         H = to_host(harmonic_transfer(*self.matrices[:4], f))
         H = H[np.array(harmonics) % self.n_sections]

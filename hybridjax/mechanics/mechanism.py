@@ -62,7 +62,7 @@ class Mechanism(eqx.Module):
     def kinetic(q, v):
         return 0.5 * m * l**2 * v[0] ** 2
 
-    pendulum = hj.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
+    pendulum = hj.systems.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
     acceleration = pendulum.acceleration(q, v, force)  # in the field of a chart
     ```
 

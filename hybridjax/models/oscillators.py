@@ -5,7 +5,7 @@ from jaxtyping import Array
 
 from ..systems.chart import FieldChart
 from ..systems.drawing import Drawing
-from ..systems.sliding import Sliding, sliding
+from ..systems.surfaces import FilippovParts, filippov
 from ..systems.system import Guess, HybridSystem, Parameter, parameter
 from ..systems.transition import Transition
 
@@ -183,8 +183,8 @@ class BeltOscillator(HybridSystem):
 
     States: extension `x` of the spring and speed `v`. Dry friction decreases with the speed
     relative to the belt. On the belt (chart "sticks") both sides push towards the same speed
-    (`hj.sliding`). After sticking, the block always leaves the belt at x = friction / k, so that
-    all multipliers are zero. Input `u` is a force.
+    (`hj.systems.filippov`). After sticking, the block always leaves the belt at x = friction / k,
+    so that all multipliers are zero. Input `u` is a force.
 
     R. I. Leine, D. H. van Campen, A. de Kraker, L. van den Steen, Stick-slip vibrations induced by
     alternate friction models, Nonlinear Dynamics 16, 1998.
@@ -209,9 +209,9 @@ class BeltOscillator(HybridSystem):
     def transitions(self):
         return self._parts().transitions
 
-    def _parts(self) -> Sliding:
+    def _parts(self) -> FilippovParts:
         sides = {"ahead": self._slips(1.0), "behind": self._slips(-1.0)}
-        return sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+        return filippov(sides, lambda t, q: q[1] - self.belt, "sticks")
 
     def _slips(self, side: float) -> FieldChart:
         def field(t, q, u):

@@ -279,8 +279,8 @@ def check_jumps(cycle: LimitCycle) -> None:
             f"the {function} in chart '{s.names[a]}' has a pulse, a jump or another sudden change, "
             f"over which the step from t = {path.t[row]:.6g} on passes"
             f"{','.join(lines_of_jumps(s, a))}. "
-            "Begin and end a pulse by transitions (`hj.Scheduled` at known times); for a jump, "
-            "write a chart for each side and a `Transition` between them."
+            "Begin and end a pulse by transitions (`hj.systems.Scheduled` at known times); for a "
+            "jump, write a chart for each side and a `Transition` between them."
         )
     period = float(cycle.period)
     t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
@@ -307,8 +307,8 @@ def check_jumps(cycle: LimitCycle) -> None:
                     f"the {column_name(s, a, column)} in chart '{s.names[a]}' jumps by {jump:.3g} "
                     f"at t = {time:.6g}{','.join(lines_of_jumps(s, a))}, where the cycle has no "
                     "event: linearizations would lack the saltation. Write a chart for each side "
-                    "and a `Transition` between them, or `hj.sliding` for a surface along which "
-                    "the state may slide."
+                    "and a `Transition` between them, or `hj.systems.filippov` for a surface along "
+                    "which the state may slide."
                 )
 
 
@@ -339,7 +339,7 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
     code = Result(int(cycle.result))
-    if code == Result.COINCIDENCE:
+    if code == Result.SIMULTANEOUS:
         pair = coincident(cycle.return_map, turn)
         if pair is not None:
             return _about_coincidence(cycle, pair)
@@ -380,7 +380,7 @@ def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
     return (
         f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
         "they come in one order or the other, and no linearization holds for both: "
-        "`hj.coincidences` of the cycle, which `throw=False` returns, has the "
+        "`hj.orbits.simultaneous_events` of the cycle, which `throw=False` returns, has the "
         "derivatives of each. Let them happen at different times, or write them as one event."
     )
 
@@ -469,7 +469,7 @@ def _about_decisions(s: Structure) -> str:
         return ""
     return (
         f" The field may jump{','.join(lines)}: then write a chart for each side and a "
-        "`Transition` between them, or `hj.sliding`."
+        "`Transition` between them, or `hj.systems.filippov`."
     )
 
 

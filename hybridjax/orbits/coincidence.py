@@ -39,7 +39,7 @@ from .return_map import ReturnMap, Turn
 SAME = 1e-6
 
 
-class Coincidence(NamedTuple):
+class SimultaneousEvents(NamedTuple):
     """Events of a cycle that happen at the same time."""
 
     time: float
@@ -63,21 +63,21 @@ class _Order(NamedTuple):
 
 
 @checked
-def coincidences(cycle: LimitCycle) -> list[Coincidence]:
+def simultaneous_events(cycle: LimitCycle) -> list[SimultaneousEvents]:
     """Find groups of events that coincide on a limit cycle, with derivatives for each order.
 
     If the orders of a group commute, `find_limit_cycle`, sweeps and `continuation` treat the cycle
-    as ok; otherwise its result is `Result.COINCIDENCE` (`find_limit_cycle` returns it with
+    as ok; otherwise its result is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it with
     `throw=False`). A group contains at least one event that is not scheduled.
     """
     return [group for group in _groups(cycle) if group is not None]
 
 
-def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
+def _groups(cycle: LimitCycle) -> list[SimultaneousEvents | None]:
     """The groups of events that happen at the same time; `None` for one whose order is the same for
     all neighbors of the cycle."""
     cycle = to_host(cycle)
-    if cycle.result != Result.COINCIDENCE:
+    if cycle.result != Result.SIMULTANEOUS:
         cycle.require_found()
     # (A little more than one turn, for events at its end. Rounding may spoil another one, where
     # events coincide.)
@@ -86,7 +86,7 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
     rows = np.flatnonzero(path.event >= 0)
     times = path.t[rows]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
-    groups: list[Coincidence | None] = []
+    groups: list[SimultaneousEvents | None] = []
     for first, after in itertools.pairwise([*starts, len(rows)]):
         since_begin = float(times[first]) - path.t[0]
         if not TOGETHER * period < since_begin <= (1 + TOGETHER) * period:
@@ -106,7 +106,7 @@ def _groups(cycle: LimitCycle) -> list[Coincidence | None]:
     return groups
 
 
-def _coincidence(cycle: LimitCycle, path: Trajectory, k: int) -> Coincidence:
+def _coincidence(cycle: LimitCycle, path: Trajectory, k: int) -> SimultaneousEvents:
     """The group of events of which event k of a path is the first."""
     s = cycle.structure
     t = float(path.t[k])
@@ -120,7 +120,7 @@ def _coincidence(cycle: LimitCycle, path: Trajectory, k: int) -> Coincidence:
     )
     derivatives = tuple(order.derivative for order in orders)
     commute = _commute(np.asarray(cycle.settings.scale), a, orders)
-    return Coincidence(t, names, derivatives, commute)
+    return SimultaneousEvents(t, names, derivatives, commute)
 
 
 def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:

@@ -99,7 +99,7 @@ def continuous_htf(
         np.asarray(f, float).reshape(-1),
     )
     if not len(frequencies):
-        raise DefinitionError("`f` holds no frequency: give one or more.")
+        raise DefinitionError("`frequencies` holds no frequency: give one or more.")
     map = cycle.return_map
     z, names, columns = asked(map.structure, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, longest_piece(frequencies, harmonics))
@@ -156,7 +156,7 @@ def _transfer(
         if (apart < _POLE).any():
             where = "every whole number" if map.base else "its multipliers of modulus 1"
             raise DefinitionError(
-                f"`f` = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
+                f"f = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
                 f"lie at {where}: leave it out."
             )
     # Responses to inputs, and to states at phase 0, are columns.

@@ -31,7 +31,7 @@ class Crossing(Definition):
 
     **Fields:**
 
-    - `function`: the name of a state, an output or a recorded signal; an `Output`; or a function
+    - `signal`: the name of a state, an output or a recorded signal; an `Output`; or a function
       (t, q) -> number.
     - `direction`: "falling" or "rising".
     - `value`: the level, in the function's unit. Default: 0.
@@ -39,23 +39,23 @@ class Crossing(Definition):
       defined.
     """
 
-    function: str | Output | Callable[..., Any]
+    signal: str | Output | Callable[..., Any]
     direction: Direction = eqx.field(static=True)
     value: Float[Array, ""]
     charts: tuple[str, ...] | None = eqx.field(static=True)
 
     def __init__(
         self,
-        function: str | Output | Callable[..., Any],
+        signal: str | Output | Callable[..., Any],
         direction: Direction,
         value: Scalar = 0.0,
         charts: SignalNames | None = None,
     ):
-        self.function, self.direction, self.value = function, direction, real(value)
+        self.signal, self.direction, self.value = signal, direction, real(value)
         self.charts = None if charts is None else tuple(charts)
 
     def __str__(self):
-        name = self.function
+        name = self.signal
         if not isinstance(name, str):
             name = getattr(name, "name", getattr(name, "__name__", ""))
         return f"{name if name.isidentifier() else 'function'} {self.direction}"
@@ -67,10 +67,10 @@ class Crossing(Definition):
         functions that are not well formed."""
         for name in self.charts or ():
             s.chart_index(name)
-        if isinstance(self.function, str):
-            s.resolve_outputs(self.function)
+        if isinstance(self.signal, str):
+            s.resolve_outputs(self.signal)
             return
-        output: Any = self.function
+        output: Any = self.signal
         if not isinstance(output, Output):
             of_state = lambda t, q, u, f=output: f(t, q)  # noqa: E731
             output = Output(str(self), dict.fromkeys(self.charts or s.names, of_state))
@@ -80,18 +80,18 @@ class Crossing(Definition):
         """True if it can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
-        if isinstance(self.function, str | Output):
-            return s.resolve_outputs(self.function).defined(a)
+        if isinstance(self.signal, str | Output):
+            return s.resolve_outputs(self.signal).defined(a)
         return True
 
     def level(
         self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
     ) -> Float[Array, ""]:
         """The level of one state of chart a: it falls through zero at the section."""
-        if isinstance(self.function, str | Output):
-            value = s.resolve_outputs(self.function)(a, t, q, jnp.zeros(s.nu))[0]
+        if isinstance(self.signal, str | Output):
+            value = s.resolve_outputs(self.signal)(a, t, q, jnp.zeros(s.nu))[0]
         else:
-            value = jnp.asarray(self.function(t, q), float)
+            value = jnp.asarray(self.signal(t, q), float)
         return (1.0 if self.direction == "falling" else -1.0) * (value - self.value)
 
 

@@ -315,22 +315,22 @@ class LimitCycle(eqx.Module):
         return responses(self._checked(), modes)
 
     def asymptotic_phase(
-        self, chart: str, state: Annotated[Numbers, Reals("n")], turns: Count = 1000
+        self, chart: str, state: Annotated[Numbers, Reals("n")], cycles: Count = 1000
     ) -> float:
         """The phase, in cycles, of the state on the cycle that a state off it approaches. It flows
         until it meets the section near the anchor, where phases are linear.
 
         **Arguments:** `chart`, `state`: as of `simulate`; in a chart of sliding, on its surface.
-        `turns`: largest number of crossings of the section. Default: 1000.
+        `cycles`: largest number of crossings of the section. Default: 1000.
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock; `ComputationError` for
         a state that does not reach the cycle.
         """
-        return asymptotic_phase(self._checked(), chart, np.asarray(state), turns)
+        return asymptotic_phase(self._checked(), chart, np.asarray(state), cycles)
 
     def htf(
         self,
-        f: Frequencies,
+        frequencies: Frequencies,
         harmonics: Harmonics = 0,
         outputs: OutputNames | None = None,
         inputs: SignalNames | None = None,
@@ -346,7 +346,7 @@ class LimitCycle(eqx.Module):
 
         **Arguments:**
 
-        - `f`: input frequencies, in cycles per period.
+        - `frequencies`: input frequencies, in cycles per period.
         - `harmonics`: m of the H_m, one integer or several: 2 is H_2 alone, `range(-2, 3)` all up
           to it. Default: 0.
         - `outputs`: names or `Output`s. Default: all states that every chart defines.
@@ -355,7 +355,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for an output that a chart of the cycle does not define, an
         input that does not exist, and frequencies at a pole, as whole ones of autonomous cycles.
         """
-        return continuous_htf(self._checked(), f, harmonics, outputs, inputs)
+        return continuous_htf(self._checked(), frequencies, harmonics, outputs, inputs)
 
     def sensitivity(self, parameter: str) -> Sensitivity:
         """Derivatives of the period, of times of events and of the shape by a parameter.

@@ -304,7 +304,7 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
     # (Of events that coincide on the guess, too, its search has compared the orders.)
     if near is None or not meet(map.structure, known.period, near[1]):
         together = meet(map.structure, solution.turn.period, solution.turn.tapes)
-        code = update_result(solution.result, together, Result.COINCIDENCE)
+        code = update_result(solution.result, together, Result.SIMULTANEOUS)
         solution = solution._replace(result=code)
     cycle = _cycle(map, solution, known.event_sequence)
     keep_turn(cycle, solution.turn)
@@ -411,7 +411,7 @@ def _judged(
         return cycle, solution.turn
     check_begin(cycle.return_map)
     if coincident(map, solution.turn) and not commutes(cycle):
-        return _with_result(cycle, Result.COINCIDENCE), solution.turn
+        return _with_result(cycle, Result.SIMULTANEOUS), solution.turn
     checked = verdict(cycle)
     if checked.sooner is not None and map.base is not None and map.multiplicity == 1:
         say("Newton's method, with the shorter period at which the cycle closes")

@@ -60,7 +60,7 @@ class _Plane(eqx.Module):
 
 def is_default(section: Crossing | AtEvent | None) -> bool:
     """True for the plane through the guess, which is the section if none is given."""
-    return isinstance(section, Crossing) and isinstance(section.function, _Plane)
+    return isinstance(section, Crossing) and isinstance(section.signal, _Plane)
 
 
 def return_map_near(

@@ -417,7 +417,7 @@ def examined(
     coincide: Bool[np.ndarray, " S"],
     walked: Bool[np.ndarray, " S"] | None = None,
 ) -> LimitCycles:
-    """The cycles, with the result `COINCIDENCE` if events `coincide` that do not commute, and with
+    """The cycles, with the result `SIMULTANEOUS` if events `coincide` that do not commute, and with
     those of their verdicts: of eight cycles and, if one of these has a fault, of all.
 
     **Arguments:** `walked`: cycles that a second integration has checked already. Default: none.
@@ -428,7 +428,7 @@ def examined(
     rows = np.flatnonzero(coincide & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if not all(commutes(cycles[i]) for i in few):
-        result[[i for i in rows if not commutes(cycles[i])]] = Result.COINCIDENCE
+        result[[i for i in rows if not commutes(cycles[i])]] = Result.SIMULTANEOUS
     good = np.flatnonzero(result == Result.OK)
     if walked is not None:
         good = good[~walked[good]]
@@ -438,7 +438,7 @@ def examined(
         check_found(cycles[i])
     if any(verdict(cycles[i]).refused for i in tested):
         result[good] = [verdict(cycles[i]).result for i in good]
-    found = np.isin(result, [Result.OK, Result.SINGULAR, Result.COINCIDENCE])
+    found = np.isin(result, [Result.OK, Result.SINGULAR, Result.SIMULTANEOUS])
     period = np.where(found, cycles.period, np.nan)
     return dataclasses.replace(cycles, result=result, period=period)
 

@@ -137,7 +137,7 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
     result = update_result(result, ~kept, Result.EVENT_ORDER)
     result = update_result(result, ~fine, Result.STEP_LIMIT)
     together = _coincide(route, found, expected)
-    return update_result(result, together, Result.COINCIDENCE)
+    return update_result(result, together, Result.SIMULTANEOUS)
 
 
 def _coincide(route: Route, found: Corrected, expected):

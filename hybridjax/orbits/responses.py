@@ -39,8 +39,8 @@ from ..engine.lanes import lane_at
 from ..engine.move import move
 from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
-from ..systems.sliding import SlidingChart
 from ..systems.structure import Structure
+from ..systems.surfaces import SlidingChart
 from .crossing import to_section
 from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
@@ -153,7 +153,7 @@ class Responses(eqx.Module):
     """Responses of a limit cycle to brief pushes, at every phase (see `LimitCycle.responses`).
 
     Phase 0 is the anchor of the cycle. At an event, responses are those right after it. In a chart
-    of sliding (`hj.sliding`), a push off the surface is followed by the return to it.
+    of sliding (`hj.systems.filippov`), a push off the surface is followed by the return to it.
 
     **Fields:**
 

@@ -360,7 +360,7 @@ class ReturnMap(eqx.Module):
         if self.base is not None:
             if self.event >= 0 and not self.expected.ndim:  # (not in sweeps)
                 ends_at_once = turn.closed & self._follows(turn.end)
-                code = xp.where(ends_at_once, Result.COINCIDENCE, code)
+                code = xp.where(ends_at_once, Result.SIMULTANEOUS, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             at_rest = turn.closed & self._rests(q, turn)

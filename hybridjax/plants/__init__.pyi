@@ -3,5 +3,9 @@ from .adapters import (
     GymnasiumPlant as GymnasiumPlant,
     MuJoCoPlant as MuJoCoPlant,
 )
-from .cycle import SettledCycle as SettledCycle, settle as settle
+from .cycle import (
+    PlantCycle as PlantCycle,
+    Returns as Returns,
+    find_cycle as find_cycle,
+)
 from .drive import Plant as Plant

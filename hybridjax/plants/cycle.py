@@ -30,7 +30,7 @@ from ..orbits.crossing import Crossing
 from ..sections import families
 from ..systems import chart, system
 from ..systems.structure import Structure
-from .drive import At, Drive, Phase, Plant, Trial, resume, run_all
+from .drive import At, Drive, Plant, PlantPhase, Trial, resume, run_all
 
 
 Draw = Callable[[Any], Any]
@@ -90,7 +90,7 @@ class _ReturnMap:
     three are known after `measure`.
     """
 
-    def __init__(self, cycle: "SettledCycle", names: SignalNames | None = None):
+    def __init__(self, cycle: "PlantCycle", names: SignalNames | None = None):
         plant = cycle.plant
         self.drive = cycle.drive
         if not self.drive.sets or self.drive.fixed:
@@ -218,8 +218,8 @@ def _resolved(
 
 @checked_methods
 @dataclasses.dataclass(frozen=True, eq=False)
-class SettledCycle:
-    """The limit cycle of a plant, as `hj.plants.settle` measures it.
+class PlantCycle:
+    """The limit cycle of a plant, as `hj.plants.find_cycle` measures it.
 
     **Fields:**
 
@@ -368,12 +368,12 @@ class SettledCycle:
 
         **Arguments:**
 
-        - `draw`: function of the signals by name that returns a `hj.Drawing`, written with JAX.
-          Default: none, the signals are drawn over time.
+        - `draw`: function of the signals by name that returns a `hj.systems.Drawing`, written with
+          JAX. Default: none, the signals are drawn over time.
         - `u` (n, nu): inputs, each held until the next section. Default: one cycle without inputs.
 
         **Returns:** a `Trajectory` in the chart `plant`, from time 0 on. Where the plant raises a
-        `hj.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
+        `hj.errors.ComputationError` (a fall) it ends with `Result.PLANT_STOPPED`.
 
         **Raises:** any other error of the plant.
         """
@@ -401,15 +401,15 @@ class SettledCycle:
 
     def __repr__(self) -> str:
         return folded(
-            f"SettledCycle({type(self.plant).__name__}: period {self.period:.9g}, "
+            f"PlantCycle({type(self.plant).__name__}: period {self.period:.9g}, "
             f"{len(self.cycle_outputs)} sections, {listed(self.inputs)} -> "
             f"{listed(self.outputs)})"
         )
 
 
 @checked
-@working("settle")
-def settle(
+@working("find_cycle")
+def find_cycle(
     plant: Plant,
     sections: families.FamilyLike,
     outputs: SignalNames,
@@ -417,7 +417,7 @@ def settle(
     cycles: Annotated[int, Whole(8, 1_000_000)] = 100,
     guess: Vector | None = None,
     seed: Seed = 0,
-) -> SettledCycle:
+) -> PlantCycle:
     """Let a plant run without inputs until it repeats itself, and locate sections on its cycle.
 
     **Arguments:**
@@ -432,7 +432,7 @@ def settle(
       the cycle, also an unstable one. Default: none, the plant settles.
     - `seed`: seed of `reset`. Default: 0.
 
-    **Returns:** a `SettledCycle`.
+    **Returns:** a `PlantCycle`.
 
     **Raises:** `DefinitionError` for unknown signals, for sections that need equations, and for a
     plant that does not continue from the state that it returned; `ComputationError` if the plant
@@ -463,7 +463,7 @@ def settle(
     return _measure(drive, family, 2, seed)
 
 
-def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
+def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> PlantCycle:
     """Record cycles, and prepare experiments. The plant is on section 0."""
     plant = drive.plant
     points = list[At]()
@@ -488,7 +488,7 @@ def _measure(drive: Drive, family: Any, cycles: int, seed: int) -> SettledCycle:
             )
     names = [drive.names[c] for c in columns]
     units = getattr(plant, "units", {})
-    return SettledCycle(
+    return PlantCycle(
         plant,
         family,
         inputs=Names(units=True, empty=True).take(plant.inputs),
@@ -524,7 +524,7 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
         )
 
 
-def _bound(drive: Drive, family: Any, turns: float) -> Phase:
+def _bound(drive: Drive, family: Any, turns: float) -> PlantPhase:
     """Return the sections as a plant is taken to them. An angle first makes so many turns."""
     period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
@@ -533,7 +533,7 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
     anchor: Any = getattr(family, "anchor", None)
     is_number = not isinstance(anchor, Crossing)
     if is_number and period is not None and type(family) is families.ClockPhase:
-        return Phase(family.n_sections, period, float(anchor) * period)
+        return PlantPhase(family.n_sections, period, float(anchor) * period)
     if is_number and type(family) is families.KinematicPhase:
         return _by_angle(drive, family, float(anchor), turns)
     raise DefinitionError(
@@ -543,22 +543,22 @@ def _bound(drive: Drive, family: Any, turns: float) -> Phase:
 
 
 def _is_of_a_signal(crossing: Any) -> bool:
-    return isinstance(getattr(crossing, "function", None), str) and not crossing.charts
+    return isinstance(getattr(crossing, "signal", None), str) and not crossing.charts
 
 
-def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> Phase:
+def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> PlantPhase:
     names = drive.names
-    require_among("signal", [x.function for x in crossings], names, "Crossing: ")
+    require_among("signal", [x.signal for x in crossings], names, "Crossing: ")
     rows = []
     for x in crossings:
         sign = 1.0 if x.direction == "falling" else -1.0
-        rows.append((names.index(x.function), sign, float(x.value)))
-    return Phase(len(rows), crossings=rows)
+        rows.append((names.index(x.signal), sign, float(x.value)))
+    return PlantPhase(len(rows), crossings=rows)
 
 
 def _by_angle(
     drive: Drive, family: families.KinematicPhase, anchor: float, turns: float
-) -> Phase:
+) -> PlantPhase:
     """Sections by the angle of two signals, whose sense so many turns show."""
     pair = family.position, family.velocity
     require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
@@ -566,7 +566,7 @@ def _by_angle(
     center = np.zeros(2) if family.center is None else np.asarray(family.center)
     scale = np.ones(2) if family.scale is None else np.asarray(family.scale)
     axes = zip(columns, center.tolist(), scale.tolist(), strict=True)
-    phase = Phase(family.n_sections, axes=list(axes))
+    phase = PlantPhase(family.n_sections, axes=list(axes))
     phase.begin(drive.t, drive.z)
     began = phase.turns
     while abs(phase.turns - began) < turns:

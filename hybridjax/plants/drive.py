@@ -59,7 +59,7 @@ class Plant(Protocol):
 
 
 @dataclasses.dataclass
-class Phase:
+class PlantPhase:
     """Sections at equal phases of a period, of the angle of two signals, or where signals cross
     levels.
 
@@ -137,7 +137,7 @@ class Drive:
         self.names = tuple[str, ...]()
         self.columns = tuple[int, ...]()
         self.z = tuple[float, ...]()
-        self.phase = Phase(1)
+        self.phase = PlantPhase(1)
         self.start = At(0.0, ())
         self.last = At(0.0, ())
 

@@ -6,14 +6,16 @@ from .data import (
     section_data as section_data,
     validation as validation,
 )
-from .designs import spectrum as spectrum, strides as strides
-from .frequency import (
-    bode as bode,
-    bodes as bodes,
-    harmonics as harmonics,
-    magnitude as magnitude,
+from .designs import spectrum as spectrum, standard_errors as standard_errors
+from .explorer import Explorer as Explorer
+from .frequency import bode as bode, htf as htf
+from .look import (
+    COLORS as COLORS,
+    PAGE as PAGE,
+    Plot as Plot,
+    save as save,
+    style as style,
 )
-from .look import COLORS as COLORS, PAGE as PAGE, save as save, style as style
 from .motion import Motion as Motion, animate as animate
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep

@@ -12,7 +12,7 @@ from .._core.results import Result
 from .._core.signal import SECONDS, Signal, ratio, square, unit_of, with_unit
 from .._core.text import p_value
 from ..experiments.data import ExperimentData
-from ..identify.validate import Validation
+from ..identify.validation import Validation
 from ..linear.ldtp import LDTP
 from ..orbits.responses import PhaseCurve
 from ..recordings.beats.response import PhaseResponse

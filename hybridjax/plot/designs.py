@@ -1,4 +1,4 @@
-"""Designs for a quantity of interest: their spectra, and standard errors against strides."""
+"""Designs for a quantity of interest: their spectra, and standard errors against cycles."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,7 +9,7 @@ from .._core.boundary.checked import checked
 from .._core.signal import unit_of, with_unit
 from ..designs.candidates import Model
 from ..designs.optimize import OptimalDesign
-from ..designs.study import Study
+from ..designs.study import SequentialDesign
 from ..errors import DefinitionError
 from .frequency import FREQUENCY
 from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
@@ -59,13 +59,13 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
 
 
 @checked
-def strides(
+def standard_errors(
     plan: OptimalDesign,
-    studies: Mapping[str, Study | Sequence[Study]] | None = None,
+    studies: Mapping[str, SequentialDesign | Sequence[SequentialDesign]] | None = None,
     *,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """The standard error against the number of strides, on logarithmic axes.
+    """The standard error against the number of cycles, on logarithmic axes.
 
     Lines are bounds for the optimal design and that which it improves. Points are standard errors
     of studies after each block, the first of which has that design. For several quantities, the
@@ -77,9 +77,9 @@ def strides(
     """
     with panels(ax, height=2.4) as axes:
         panel = axes[0, 0]
-        reached: list[float] = [plan.strides]
+        reached: list[float] = [plan.cycles]
         for k, (label, given) in enumerate((studies or {}).items()):
-            several = [given] if isinstance(given, Study) else list(given)
+            several = [given] if isinstance(given, SequentialDesign) else list(given)
             color = CYCLE[k % len(CYCLE)]
             for number, study in enumerate(several):
                 if not study.blocks:
@@ -90,12 +90,12 @@ def strides(
                 style = dict(
                     label=label if number == 0 else None, color=color, zorder=2
                 )
-                panel.plot(study.strides, error, marker="o", ms=3, lw=0.6, **style)
-                reached += study.strides.tolist()
+                panel.plot(study.cycles, error, marker="o", ms=3, lw=0.6, **style)
+                reached += study.cycles.tolist()
         around = 1.5 if studies else 10.0
         low = min(reached) / around
         high = max(reached) * around
-        for errors, cycles, color, label in (
+        for errors, needed, color, label in (
             (
                 plan.usual_standard_errors,
                 plan.usual.cycles(0),
@@ -104,15 +104,15 @@ def strides(
             ),
             (
                 plan.standard_errors,
-                plan.strides,
+                plan.cycles,
                 COLORS["black"],
                 "optimal, model known",
             ),
         ):
             n = np.array([low, high])
-            size = np.linalg.norm(errors) * np.sqrt(cycles / n)
+            size = np.linalg.norm(errors) * np.sqrt(needed / n)
             panel.plot(n, size, color=color, lw=1.2, label=label, zorder=1)
-        panel.set(xscale="log", yscale="log", xlabel="strides", ylabel="standard error")
+        panel.set(xscale="log", yscale="log", xlabel="cycles", ylabel="standard error")
         panel.set_xlim(low, high)
         for axis, text in ((panel.xaxis, "{x:.0f}"), (panel.yaxis, "{x:.0e}")):
             axis.set_major_locator(LogLocator(subs=(1, 2, 5)))

@@ -23,6 +23,9 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 Fit = RationalFit | StructuredFit
 Transfer = HTF | LDTP
 """HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them."""
+Families = Mapping[str, Transfer | Sequence[Transfer]]
+"""HTFs by name, such as that of a family of sections."""
+Fits = Fit | Sequence[Fit]
 FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [
     COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")
@@ -35,95 +38,92 @@ _FIT_NAMES: dict[type, str] = {
 
 
 @checked
-def magnitude(
-    *htfs: Transfer,
-    output: str | int = 0,
+def htf(
+    *htfs: Transfer | Families,
+    output: str | int | None = None,
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
     decades: Positive = 5,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """|H_m| of one output against the input frequency, on a logarithmic scale.
+    """|H_m| against the input frequency, on a logarithmic scale.
 
     One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`) at the
     frequencies of the first HTF, are drawn as broad pale lines under the estimates, in any order of
     the arguments. HTFs with a variance have a band that holds the true value at each frequency with
     a probability of 95 %.
 
-    **Arguments:** `output`, `input`: names or indices. Default: the first; the axis names the input
-    if there are several. `decades`: how far below the largest value the scale reaches. `ax`: Axes.
-    Default: a new figure.
+    **Arguments:**
+
+    - `htfs`: one HTF or several, for a panel with one output; or a dict by name (the paper's Fig.
+      3), for a column for each name and a row for each output. An entry is an HTF, or several (an
+      estimate, and an exact HTF or a model); all have the same outputs, and a row shares one scale.
+    - `output`, `input`: names or indices. Default: the first; all outputs of a dict. The axis names
+      the input if there are several.
+    - `decades`: how far below the largest value the scale reaches. Default: 5.
+    - `ax`: Axes. Default: a new figure.
 
     **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
     """
-    if not harmonics:
-        raise DefinitionError("`harmonics` must hold one harmonic or more.")
-    drawn = _exact_first(htfs)
-    first = drawn[0]
-    name = _pick("output", output, first.outputs)
-    pushed = _pick("input", input, first.inputs)
-    with panels(ax, height=2.2) as axes:
-        panel = axes[0, 0]
-        for htf in drawn:
-            for m in harmonics:
-                observed = _same(name, output, htf.outputs)
-                excited = _same(pushed, input, htf.inputs)
-                f, values, radius = _values(htf, m, observed, excited)
-                size = np.abs(values)
-                style = _harmonic_style(m, harmonics)
-                line = _line(htf, drawn, style, _name(m))
-                panel.plot(f, size, **line)
-                if radius is not None:
-                    lowest = 0.3 * np.min(size)
-                    _band(panel, f, size, radius, line["color"], lowest)
-        curve = _curve(name, pushed, first)
-        label = with_unit(f"$|H_m|$, {curve}", ratio(name, pushed))
-        panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
-        _frequency_limits(panel, f)
-        top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
-        panel.set_ylim(top * 10.0**-decades, top * 2)
-        _legend(panel, drawn)
-    return Plot(axes)
-
-
-@checked
-def harmonics(
-    families: Mapping[str, Transfer | Sequence[Transfer]],
-    harmonics: Sequence[int] = (0, 1, -1),
-    *,
-    input: str | int = 0,
-    decades: Positive = 5,
-    ax: AxesLike | None = None,
-) -> Plot:
-    """The paper's Fig. 3: |H_m|, one row per output and one column per section family.
-
-    **Arguments:** `families`: by the name of the family, an HTF or several (an estimate, and an
-    exact HTF or a model), all with the same outputs. `harmonics`, `input` and `decades` as in
-    `magnitude`; a row shares one scale.
-    """
+    families = _families(htfs)
+    if families is None:
+        drawn = _exact_first(htfs)
+        shown = 0 if output is None else output
+        with panels(ax, height=2.2) as axes:
+            _magnitude(axes[0, 0], drawn, shown, input, harmonics, decades)
+        return Plot(axes)
     columns = _columns(families)
     outputs = next(iter(columns.values()))[0].outputs
+    if output is not None:
+        outputs = (_pick("output", output, outputs),)
     with _grid(columns, len(outputs), 0.4 + 1.7 * len(outputs), ax) as axes:
-        for row, output in zip(axes, outputs, strict=True):
+        for row, name in zip(axes, outputs, strict=True):
             limits = []
-            for panel, htfs in zip(row, columns.values(), strict=True):
-                magnitude(
-                    *htfs,
-                    output=output,
-                    input=input,
-                    harmonics=harmonics,
-                    decades=decades,
-                    ax=panel,
-                )
+            for panel, drawn in zip(row, columns.values(), strict=True):
+                _magnitude(panel, drawn, name, input, harmonics, decades)
                 limits.append(panel.get_ylim())
             row[0].set_ylim(*np.max(limits, axis=0))
     return Plot(axes)
 
 
+def _magnitude(
+    panel: Axes,
+    drawn: list[HTF],
+    output: str | int,
+    input: str | int,
+    harmonics: Sequence[int],
+    decades: float,
+) -> None:
+    if not harmonics:
+        raise DefinitionError("`harmonics` must hold one harmonic or more.")
+    first = drawn[0]
+    name = _pick("output", output, first.outputs)
+    pushed = _pick("input", input, first.inputs)
+    for htf in drawn:
+        for m in harmonics:
+            observed = _same(name, output, htf.outputs)
+            excited = _same(pushed, input, htf.inputs)
+            f, values, radius = _values(htf, m, observed, excited)
+            size = np.abs(values)
+            style = _harmonic_style(m, harmonics)
+            line = _line(htf, drawn, style, _name(m))
+            panel.plot(f, size, **line)
+            if radius is not None:
+                lowest = 0.3 * np.min(size)
+                _band(panel, f, size, radius, line["color"], lowest)
+    curve = _curve(name, pushed, first)
+    label = with_unit(f"$|H_m|$, {curve}", ratio(name, pushed))
+    panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
+    _frequency_limits(panel, f)
+    top = max(np.nanmax(line.get_ydata()) for line in panel.get_lines())
+    panel.set_ylim(top * 10.0**-decades, top * 2)
+    _legend(panel, drawn)
+
+
 @checked
 def bode(
-    *htfs: Transfer,
-    fits: Fit | Sequence[Fit] = (),
+    *htfs: Transfer | Families,
+    fits: Fits | Mapping[str, Fits] = (),
     harmonic: int = 0,
     outputs: SignalNames | None = None,
     input: str | int | None = None,
@@ -134,12 +134,13 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: exact HTFs, and those of models (`LDTP`) at the frequencies of the first HTF, are
+    - `htfs`: one HTF or several, or a dict of them by name (the paper's Fig. 4), for a column for
+      each name. Exact HTFs, and those of models (`LDTP`) at the frequencies of the first HTF, are
       drawn as broad pale lines under the estimates. HTFs with a variance have bands that contain
       the true values with a probability of 95 %. Their phase is not drawn where the band of the
       magnitude contains zero.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
-      that it has.
+      that it has; by name beside a dict of HTFs.
     - `outputs`: names of outputs. Default: all.
     - `input`: name or index of one input. Default: all. Each output and input has a curve of its
       own color.
@@ -148,9 +149,14 @@ def bode(
     **Raises:** `DefinitionError` for a name or harmonic that is not there, and for fits that have
     none of the inputs.
     """
+    families = _families(htfs)
+    if families is not None:
+        return _bodes(families, fits, harmonic, outputs, input, ax)
+    if isinstance(fits, Mapping):
+        raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
     drawn = _exact_first(htfs)
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
-    fitted = [fit.htf(drawn[-1].f) for fit in fits]
+    fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
     curves = _curves(drawn[0], outputs, input)
     for htf in fitted:
         if all(curve.input not in htf.inputs for curve in curves):
@@ -179,7 +185,7 @@ def bode(
         upper.set(yscale="log", ylabel=with_unit(f"$|{symbol}|$", same))
         lower.set(xlabel=FREQUENCY, ylabel=f"$\\angle {symbol}$ (degrees)")
         for panel in (upper, lower):
-            _frequency_limits(panel, np.sort(drawn[-1].f))
+            _frequency_limits(panel, np.sort(drawn[-1].frequencies))
         lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
         _legend(upper, drawn)
     return Plot(axes)
@@ -244,35 +250,40 @@ def _response(
     return f[is_certain], phase[is_certain]
 
 
-@checked
-def bodes(
-    families: Mapping[str, Transfer | Sequence[Transfer]],
-    *,
-    fits: Mapping[str, Fit | Sequence[Fit]] | None = None,
-    harmonic: int = 0,
-    input: str | int | None = None,
-    ax: AxesLike | None = None,
+def _bodes(
+    families: Families,
+    fits: Fits | Mapping[str, Fits],
+    harmonic: int,
+    outputs: SignalNames | None,
+    input: str | int | None,
+    ax: AxesLike | None,
 ) -> Plot:
-    """The paper's Fig. 4: a Bode plot of one harmonic with its fits, one column per family.
-
-    **Arguments:** `families` and `fits`: HTFs and fits by the name of the section family. The other
-    arguments are those of `bode`.
-
-    **Raises:** `DefinitionError` for fits of a family that is not there.
-    """
+    """Bode plots side by side."""
     columns = _columns(families)
-    fits = dict(fits or {})
+    if not isinstance(fits, Mapping):
+        fits = dict.fromkeys(families, fits)
     require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
-        for k, (family, htfs) in enumerate(columns.items()):
+        for k, (family, drawn) in enumerate(columns.items()):
             bode(
-                *htfs,
+                *drawn,
                 fits=fits.get(family, ()),
                 harmonic=harmonic,
+                outputs=outputs,
                 input=input,
                 ax=axes[:, k],
             )
     return Plot(axes)
+
+
+def _families(htfs: Sequence[Transfer | Families]) -> Families | None:
+    """HTFs by name, if a dict of them was given."""
+    named = [x for x in htfs if isinstance(x, Mapping)]
+    if not named:
+        return None
+    if len(htfs) > 1:
+        raise DefinitionError("pass HTFs, or one dict of them by name, not both.")
+    return named[0]
 
 
 def _columns(families) -> dict[str, list[HTF]]:
@@ -282,11 +293,9 @@ def _columns(families) -> dict[str, list[HTF]]:
         columns[name] = (htfs,) if isinstance(htfs, Transfer) else tuple(htfs)
         outputs.update(htf.outputs for htf in columns[name])
     if not columns or not all(columns.values()):
-        raise DefinitionError("`families` must hold at least one HTF in each family.")
+        raise DefinitionError("a dict of HTFs must hold at least one for each name.")
     if len(outputs) > 1:
-        raise DefinitionError(
-            "the families must have the same outputs to share a figure."
-        )
+        raise DefinitionError("HTFs must have the same outputs to share a figure.")
     return {name: _exact_first(htfs) for name, htfs in columns.items()}
 
 
@@ -312,7 +321,7 @@ def _grid(
 
 
 def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
-    grids = [htf.f for htf in htfs if isinstance(htf, HTF)]
+    grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
         raise DefinitionError(
             "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`."
@@ -343,14 +352,14 @@ def _values(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return frequencies in ascending order, the values of H_m, and the radii of the discs that
     hold the true values; None without a variance."""
-    order = np.argsort(htf.f)
+    order = np.argsort(htf.frequencies)
     i = channel_index("output", output, htf.outputs)
     j = channel_index("input", input, htf.inputs)
     values = np.asarray(htf[m])[order, i, j]
     radius = None
     if htf.variance is not None:
         radius = np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
-    return np.asarray(htf.f)[order], values, radius
+    return np.asarray(htf.frequencies)[order], values, radius
 
 
 def _frequency_limits(ax: Axes, f) -> None:

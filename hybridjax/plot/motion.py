@@ -23,11 +23,11 @@ from .._core.writing import replacing
 from ..engine.trajectory import Trajectory, observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.placed import PlacedSections
-from ..systems.quotient import Quotient
+from ..systems.quotient import Symmetric
 from ..systems.structure import Structure
 from ..systems.system import Guess
 from .film import BODY, frames, gif, player
@@ -185,8 +185,8 @@ def animate(
     **Arguments:**
 
     - `motion`: a limit cycle, a trajectory, or a branch, of which each frame is a cycle at another
-        value of the parameter. Where `hj.Quotient(half_period=)` halves a cycle, both halves are
-        drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
+        value of the parameter. Where `hj.systems.Symmetric(half_period=)` halves a cycle, both
+        halves are drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `place_sections`, on this cycle.
     - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
@@ -338,12 +338,12 @@ def _unit_circle(ax: Axes, multipliers: Any) -> None:
 
 
 def _both_halves(cycle: LimitCycle) -> LimitCycle:
-    """The cycle of the system itself, where a `Quotient` with `half_period` has a half of it."""
+    """The cycle of the system itself, where a `Symmetric` with `half_period` has a half of it."""
     s = cycle.structure
     anchor = to_host(cycle.anchor)
     a = int(anchor.chart[0])
     at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
-    whole = cycle.system.whole(at) if isinstance(cycle.system, Quotient) else None
+    whole = cycle.system.whole(at) if isinstance(cycle.system, Symmetric) else None
     return cycle if whole is None else find_limit_cycle(*whole)
 
 

@@ -11,7 +11,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.values import show
 from .._core.signal import Signal
 from ..errors import DefinitionError
-from ..orbits.continuation import KINDS, Branch
+from ..orbits.branches import KINDS, Branch
 from ..systems.system import unit_of_parameter
 from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
 

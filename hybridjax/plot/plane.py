@@ -42,7 +42,7 @@ def multipliers(
     - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them; or the estimate with which
         others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
-        `SeriesFit` or the result of `multiplier_bound`, or multipliers.
+        `SeriesFit` or the result of `cramer_rao`, or multipliers.
     - `zoom`: draw the inset.
 
     **Raises:** `DefinitionError` if there are no multipliers.

@@ -14,7 +14,7 @@ from .._core.html import COLORS, Curve, card, picture, text
 from .._core.signal import unit_of, with_unit
 from .._core.text import folded
 from ..experiments.data import ExperimentData
-from ..experiments.record import Record, uninterrupted_records
+from ..experiments.record import SectionSeries, uninterrupted_records
 
 
 # Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
@@ -30,8 +30,8 @@ class SectionData(eqx.Module):
 
     **Fields:**
 
-    - `records`: `Record`s for `fit_series`, `validate`, ...: one for each uninterrupted stretch.
-      Samples in gaps are NaN, so that no equation reaches across one.
+    - `records`: `SectionSeries` for `fit_series`, `validate`, ...: one for each uninterrupted
+      stretch. Samples in gaps are NaN, so that no equation reaches across one.
     - `times`: for each record, the times at its sections. `trials`: for each, the index of its
       trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
@@ -42,7 +42,7 @@ class SectionData(eqx.Module):
       below 1.3 for noise.
     """
 
-    records: tuple[Record, ...]
+    records: tuple[SectionSeries, ...]
     times: tuple[Float[np.ndarray, " _"], ...]
     trials: tuple[int, ...] = eqx.field(static=True)
     cycle_inputs: Float[np.ndarray, "N nu"]
@@ -88,6 +88,7 @@ class SectionData(eqx.Module):
         size = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0))
         return size[:nu], size[nu:]
 
+    @checked
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
         columns = [self.inputs.index(name) for name in names]
@@ -103,6 +104,7 @@ class SectionData(eqx.Module):
             spikes=(*of_inputs, *of_outputs),
         )
 
+    @checked
     def with_drift(self, cycles: int | float) -> "SectionData":
         """Let fits allow for changes of the outputs that take longer than so many cycles."""
         records = tuple(replace(r, drift=float(cycles)) for r in self.records)
@@ -164,7 +166,7 @@ class SectionData(eqx.Module):
         return folded(summary + ")")
 
 
-def whole_cycles(record: Record) -> slice:
+def whole_cycles(record: SectionSeries) -> slice:
     """Return the samples of the whole cycles of a record, from section 0 on."""
     N = record.n_sections
     first = -record.first_section % N

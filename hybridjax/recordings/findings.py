@@ -19,7 +19,7 @@ CLEAR = 4.0
 
 NAME_REFERENCE = (
     "Are inputs and outputs swapped? If not, record a signal that acts on the loop from outside, "
-    "and name it as the `reference`."
+    "and name it as the `references`."
 )
 
 

@@ -20,7 +20,7 @@ from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, ordinary_least_squares
-from ..identify.validate import Validation
+from ..identify.validation import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE
 
@@ -49,40 +49,40 @@ _LEVEL = 0.01
 Multipliers = Complex[np.ndarray, " d"]
 
 
-class Advice(eqx.Module):
+class Diagnosis(eqx.Module):
     """Reasons to doubt a fit. Printing it shows the findings.
 
     **Fields:**
 
     - `findings` about the data and the fit; none if there is no reason for doubt.
     - `plain` (d,): the multipliers from plain regression (ARX).
-    - `band`: for each input the frequency (cycles per period) up to which it had power.
-    - `strides`: numbers of strides. `expected` (k, d): the standard errors of the multipliers that
-      so many strides like these would give.
+    - `bandwidths`: for each input the frequency (cycles per period) up to which it had power.
+    - `cycles`: numbers of cycles. `expected` (k, d): the standard errors of the multipliers that
+      so many cycles like these would give.
     """
 
     findings: tuple[Finding, ...]
     plain: Multipliers
-    band: tuple[float, ...] = eqx.field(static=True)
-    strides: tuple[int, ...] = eqx.field(static=True)
+    bandwidths: tuple[float, ...] = eqx.field(static=True)
+    cycles: tuple[int, ...] = eqx.field(static=True)
     expected: Float[np.ndarray, "k d"]
 
     def __repr__(self) -> str:
         findings = print_findings(self.findings)
         return findings or "No reason to doubt the multipliers was found."
 
-    def with_earlier(self, findings: Sequence[Finding]) -> "Advice":
+    def with_earlier(self, findings: Sequence[Finding]) -> "Diagnosis":
         """Return the advice with other findings before its own."""
         return replace(self, findings=(*findings, *self.findings))
 
 
 @checked
-def advise(
+def diagnose(
     data: SectionData,
     fit: SeriesFit,
     validation: Validation | None = None,
     findings: Sequence[Finding] = (),
-) -> Advice:
+) -> Diagnosis:
     """List the reasons to doubt a fit to recorded data.
 
     They are: too few strides for the unknowns, more multipliers than the data support, inputs
@@ -95,22 +95,22 @@ def advise(
     of an inspection and of other estimates, which come first. Default: none.
     """
     prepared = PreparedRecords(data, free_start=True)
-    advice = advice_about(data, prepared, fit, validation)
-    warn_of(advice.findings)
-    return advice.with_earlier([*findings, *slow_sampling(data)])
+    diagnosis = diagnosis_of(data, prepared, fit, validation)
+    warn_of(diagnosis.findings)
+    return diagnosis.with_earlier([*findings, *slow_sampling(data)])
 
 
-def advice_about(
+def diagnosis_of(
     data: SectionData,
     prepared: PreparedRecords,
     fit: SeriesFit,
     validation: Validation | None,
-) -> Advice:
+) -> Diagnosis:
     """Return advice about the fit alone, from data that were prepared for it."""
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
-    overhang = R - 1 - fit.lead - d * N
-    problem = OutputErrorProblem.from_data(prepared, d, overhang, free_start=True)
+    extra_lags = R - 1 - fit.lead - d * N
+    problem = OutputErrorProblem.from_data(prepared, d, extra_lags, free_start=True)
     plain = ordinary_least_squares(late_outputs(problem, d))
     grid = prepared.whole()
     sampled = int(grid.sampled.all(axis=3).sum(axis=(0, 1)).min())
@@ -126,15 +126,15 @@ def advice_about(
         *_about_samples(data),
     )
     # Variances decrease with the number of strides beyond that of the unknowns.
-    strides = (100, 300, 1000, 3000)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in strides], float)
+    cycles = (100, 300, 1000, 3000)
+    later = np.array([max(n - (R * nu + d + 1), 0) for n in cycles], float)
     with np.errstate(divide="ignore"):
         smaller = np.sqrt(max(sampled - unknowns, 1) / later)
-    return Advice(
+    return Diagnosis(
         findings=findings,
         plain=plain,
-        band=tuple(band),
-        strides=strides,
+        bandwidths=tuple(band),
+        cycles=cycles,
         expected=fit.standard_errors * smaller[:, None],
     )
 

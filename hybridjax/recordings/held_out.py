@@ -3,21 +3,20 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
-from .._core.findings import warn_of
 from ..errors import DefinitionError
-from ..experiments.record import Record, uninterrupted_records
+from ..experiments.record import HasRecords, SectionSeries, uninterrupted_records
 from ..identify.denominator import Covariance
 from ..identify.series.fit import SeriesFit, assemble, fit_series, missing_cycles
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem, TooFewCycles
 from ..identify.series.records import CycleGrid, PreparedRecords
 from ..identify.series.subspace import late_outputs, total_least_squares
-from ..identify.validate import Validation, can_be_compared, validate
+from ..identify.validation import Validation, can_be_compared, validate
 from .data import SectionData
-from .findings import untried_orders
 
 
 # Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
@@ -41,15 +40,41 @@ class HeldOut(NamedTuple):
         return f"{self.fit}\n{self.validation}"
 
 
+class HeldOutOrders(NamedTuple):
+    """How well fits of each order predict held-out cycles. Printing it shows a table.
+
+    **Fields:** `orders` (k,): 1, 2, ..., the largest that could be tried. `errors` (k,): rms errors
+    of the predictions, relative to the smallest (a geometric mean over the outputs). `order`: the
+    smallest whose error is within 2 % of the smallest.
+    """
+
+    orders: Int[np.ndarray, " k"]
+    errors: Float[np.ndarray, " k"]
+    order: int
+
+    def __repr__(self) -> str:
+        rows = ["order  error of held-out cycles (relative)"]
+        rows += [
+            f"{order:5d}  {error:.3f}"
+            for order, error in zip(self.orders, self.errors, strict=True)
+        ]
+        return "\n".join([*rows, f"order: {self.order}"])
+
+
 class Split(NamedTuple):
     """Records to be fitted, prepared once for all fits, and records that are held out."""
 
     early: PreparedRecords
-    late: list[Record]
+    late: list[SectionSeries]
 
     def best_order(self, most: int = 4) -> tuple[int, str]:
-        """Choose an order; see `choose_order`. Return it and, if it is the largest that could be
+        """Choose an order; see `select_order`. Return it and, if it is the largest that could be
         tried, the obstacle to a larger one."""
+        compared, obstacle = self.compare_orders(most)
+        return compared.order, obstacle
+
+    def compare_orders(self, most: int) -> tuple[HeldOutOrders, str]:
+        """Compare orders, as `best_order`."""
         ends = uninterrupted_records(self.late)
         fits: list[SeriesFit] = []
         obstacle = ""
@@ -71,8 +96,10 @@ class Split(NamedTuple):
             raise DefinitionError(obstacle)
         grid = CycleGrid.from_records(ends)
         misfits = np.array([_misfit(fit, grid) for fit in fits])
+        errors = np.exp(misfits - misfits.min())
         best = 1 + int(np.argmax(misfits <= misfits.min() + _AS_GOOD))
-        return best, obstacle if best == len(fits) else ""
+        compared = HeldOutOrders(1 + np.arange(len(fits)), errors, best)
+        return compared, obstacle if best == len(fits) else ""
 
     def _rough_fit(self, order: int) -> tuple[SeriesFit | None, str]:
         """Return a fit to the early part by total least squares or, if it has too few cycles, the
@@ -99,30 +126,14 @@ class Split(NamedTuple):
             f"sections: record {-(-4 * missing // 3)} more{fewer}."
         )
 
-    def fit(self, order: int, reference: tuple[str, ...] | None = None) -> HeldOut:
+    def fit(self, order: int, references: tuple[str, ...] | None = None) -> HeldOut:
         """Fit the early part and validate the fit on the late part."""
         try:
-            fit = fit_series(self.early, order, check=False, reference=reference)
-            return HeldOut(fit, validate(fit, self.late, reference=reference))
+            fit = fit_series(self.early, order, check=False, references=references)
+            return HeldOut(fit, validate(fit, self.late, references=references))
         except DefinitionError as error:
             hint = "A quarter is held out: `fit_series` fits all, without a test."
             raise DefinitionError(f"{error} {hint}") from error
-
-
-@checked
-def choose_order(data: SectionData) -> int:
-    """Return the number of multipliers that predicts held-out strides best.
-
-    For each number, the model is estimated by total least squares (which is consistent) without the
-    held-out strides (see `hold_out`), and then simulates these strides. The result is the smallest
-    number, up to four, whose misfit is within 2 % of the best. At most the first 1000 cycles of a
-    recording are used. If the data are too few to try a larger number, a warning gives the reason.
-
-    **Raises:** `DefinitionError` if there are too few cycles for one multiplier.
-    """
-    order, obstacle = split(data).best_order()
-    warn_of(untried_orders(order, obstacle))
-    return order
 
 
 @checked
@@ -137,10 +148,12 @@ def hold_out(data: SectionData, order: Order) -> HeldOut:
     return split(data).fit(order)
 
 
-def split(data: SectionData) -> Split:
+def split(data: HasRecords) -> Split:
     """Split the records into a part to be fitted, and a quarter to be held out."""
-    ends = [round(len(r.u) * min(1.0, _ENOUGH / data.cycles)) for r in data.records]
-    short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * data.n_sections]
+    n_sections = data.records[0].n_sections
+    cycles = sum(len(r.u) for r in data.records) / n_sections
+    ends = [round(len(r.u) * min(1.0, _ENOUGH / cycles)) for r in data.records]
+    short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * n_sections]
     held_out = short[3::4]
     # If all records are short, but too few to hold one out, all are cut.
     fitted = short if held_out or len(short) < len(ends) else []

@@ -1,14 +1,22 @@
 """All steps from a recording to multipliers, in one call."""
 
+import importlib
 import itertools
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import equinox as eqx
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
+from .._core.boundary.kinds import (
+    FilePath,
+    OptionalNames,
+    Order,
+    SectionCount,
+    SignalNames,
+)
 from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
@@ -20,14 +28,14 @@ from ..identify.series.records import SLOW, PreparedRecords
 from .beats.response import PhaseResponse, phase_response
 from .data import SectionData
 from .findings import untried_orders
-from .fit_warnings import Advice, advice_about, slow_sampling, undamped
+from .fit_warnings import Diagnosis, diagnosis_of, slow_sampling, undamped
 from .held_out import HeldOut, Split, split
 from .impulse import ImpulseResponses, impulse_responses
-from .inspection.inspect import inspect, inspect_cycles
+from .inspection.inspect import check_recording, inspect_cycles
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording
-from .sampling import DriftCycles, section_data, without_drift
+from .sampling import DriftCycles, sample_sections, without_drift
 from .smoothing import Bandwidth
 
 
@@ -58,7 +66,30 @@ class Identification(eqx.Module):
     held_out: HeldOut
     responses: ImpulseResponses
     curve: PhaseResponse | None
-    advice: Advice
+    diagnosis: Diagnosis
+
+    @checked
+    def write_report(self, folder: FilePath, formats: Sequence[str] = ("png",)) -> Path:
+        """Write all results into a folder. They appear when all of them are ready.
+
+        - `report.html`: everything in one page that needs no other file.
+        - `sections.csv`: deviations of inputs and outputs from the average cycle at the sections.
+          `cycle.csv`: the average cycle.
+        - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the
+          numbers.
+        - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
+
+        Other files in the folder stay as they are. Results of an earlier report are replaced; a
+        hidden list in the folder holds their names.
+
+        **Returns:** the path of the page.
+
+        **Raises:** `DefinitionError` if a file that is not of an earlier report has one of these
+        names, or the folder cannot be written.
+        """
+        # (Reports are made of figures, which are drawn above this layer.)
+        report = importlib.import_module("hybridjax.apps.identify")
+        return report.write_report(folder, self, formats)
 
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]
@@ -68,7 +99,7 @@ class Identification(eqx.Module):
             repr(self.fit),
             *meaning,
             repr(self.held_out.validation),
-            repr(self.advice),
+            repr(self.diagnosis),
         ]
         return "\n".join(results)
 
@@ -77,7 +108,7 @@ class Identification(eqx.Module):
 @working("identify_recording")
 def identify_recording(
     recording: Recording,
-    phase: Phase | PhaseDefinition,
+    sections: Phase | PhaseDefinition,
     *,
     inputs: SignalNames,
     outputs: OptionalNames,
@@ -86,35 +117,37 @@ def identify_recording(
     bandwidth: Bandwidth | None = None,
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> Identification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
-    reasons to doubt them. The recording is inspected first (`hj.recordings.inspect`).
+    reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
 
-    **Arguments:** those of `section_data`, and
+    **Arguments:** those of `sample_sections`, and
 
-    - `order`: the number of multipliers. Default: the result of `choose_order`; in a loop, the most
+    - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
       that the reference determines, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
-    - `reference`: signals that enter a control loop from outside, at least as many as inputs. The
+    - `references`: signals that enter a control loop from outside, at least as many as inputs. The
       controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
-    `section_data` and `fit_series`; `PrecisionError` in single precision.
+    `sample_sections` and `fit_series`; `PrecisionError` in single precision.
     """
     require_x64()
     say("inspection")
-    outside = None if reference is None else tuple(reference)
+    outside = None if references is None else tuple(references)
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
-    inspection = inspect(recording, inputs=signals, outputs=outputs)
+    inspection = check_recording(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
     say("phase")
-    recording, phase = _phase_without_drift(inspection.recording, phase, outputs, drift)
+    recording, phase = _phase_without_drift(
+        inspection.recording, sections, outputs, drift
+    )
     say("data at the sections")
-    whole = section_data(
+    whole = sample_sections(
         recording,
         phase,
         inputs=signals,
@@ -142,15 +175,15 @@ def identify_recording(
     say("fit to all")
     prepared = PreparedRecords(data, free_start=True)
     fit = fit_series(
-        prepared if outside is None else whole, order, check=False, reference=outside
+        prepared if outside is None else whole, order, check=False, references=outside
     )
     findings += undamped(data, fit)
     curve = None
     if _is_of_events_alone(data, phase):
         curve = phase_response(recording, phase, input=data.inputs[0])
         findings += curve.findings
-    advice = advice_about(data, prepared, fit, held_out.validation)
-    warn_of([*findings, *advice.findings])
+    diagnosis = diagnosis_of(data, prepared, fit, held_out.validation)
+    warn_of([*findings, *diagnosis.findings])
     findings = [*inspection.findings, *findings]
     return Identification(
         recording=recording,
@@ -161,7 +194,7 @@ def identify_recording(
         held_out=held_out,
         responses=impulse_responses(fit, data),
         curve=curve,
-        advice=advice.with_earlier([*findings, *slow_sampling(data)]),
+        diagnosis=diagnosis.with_earlier([*findings, *slow_sampling(data)]),
     )
 
 
@@ -172,12 +205,12 @@ def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:
     return data.outputs == ("duration",) and len(data.inputs) == 1 and of_events
 
 
-def _require_outside(reference: Sequence[str], signals: Sequence[str]) -> None:
+def _require_outside(references: Sequence[str], signals: Sequence[str]) -> None:
     """**Raises:** `DefinitionError` for a reference that is an input or an output."""
-    inside = [name for name in reference if name in signals]
+    inside = [name for name in references if name in signals]
     if inside:
         raise DefinitionError(
-            "`reference` must name other signals than `inputs` and `outputs`, not "
+            "`references` must name other signals than `inputs` and `outputs`, not "
             f"{listed(inside)}."
         )
 
@@ -233,14 +266,14 @@ def _order(
 def _order_in_loop(
     order: int | None,
     data: SectionData,
-    reference: Sequence[str],
+    references: Sequence[str],
 ) -> tuple[int, list[Finding]]:
     """Return the largest order that the reference determines, or the given one, and doubts about
     it."""
     if order is None:
-        best, obstacle = best_order(data, reference, most=4)
+        best, obstacle = best_order(data, references, most=4)
         return best, untried_orders(best, obstacle)
-    best, _ = best_order(data, reference, most=order + 2)
+    best, _ = best_order(data, references, most=order + 2)
     if best <= order:
         return order, []
     return order, [

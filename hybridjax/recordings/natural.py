@@ -131,7 +131,7 @@ def natural_multipliers(
 
     **Arguments:**
 
-    - `data`: result of `section_data(..., inputs=())`; the average cycle of each trial is
+    - `data`: result of `sample_sections(..., inputs=())`; the average cycle of each trial is
       subtracted.
     - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
       one multiplier more contradicts the largest modulus, `findings` say so. Default: 1.

@@ -137,8 +137,8 @@ class Phase(eqx.Module):
     def jitter(self) -> float:
         """Relative standard deviation of the periods of each trial about their line."""
         residuals = [signal.detrend(p) for p in self.periods if len(p) > 2]
-        freedom = sum(len(x) - 2 for x in residuals)
-        square = sum(x @ x for x in residuals) / max(freedom, 1)
+        dof = sum(len(x) - 2 for x in residuals)
+        square = sum(x @ x for x in residuals) / max(dof, 1)
         return float(np.sqrt(square)) / self.period
 
     def __repr__(self) -> str:

@@ -40,7 +40,7 @@ _COMMON = 0.1
 @checked
 def estimate_phase(
     recording: Recording,
-    definition: PhaseDefinition,
+    sections: PhaseDefinition,
     *,
     bandwidth: Bandwidth | None = None,
 ) -> Phase:
@@ -48,7 +48,7 @@ def estimate_phase(
 
     **Arguments:**
 
-    - `definition`, one of
+    - `sections`, one of
         - a `KinematicPhase`: the angle of two signals about a center, counted in the sense in which
           it turns.
         - a `Crossing`: the phase grows by one from each crossing of a level by a signal to the
@@ -72,14 +72,14 @@ def estimate_phase(
     have (functions of a state, charts), a phase that does not wind, or a recording of less than two
     cycles.
     """
-    if isinstance(definition, KinematicPhase):
-        angles = _angles(recording, definition, bandwidth)
-        return _from_angles(angles, definition.n_sections)
-    if isinstance(definition, Crossing):
-        return _from_crossings(recording, definition, bandwidth)
+    if isinstance(sections, KinematicPhase):
+        angles = _angles(recording, sections, bandwidth)
+        return _from_angles(angles, sections.n_sections)
+    if isinstance(sections, Crossing):
+        return _from_crossings(recording, sections, bandwidth)
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
-    return _from_events(recording, definition.name)
+    return _from_events(recording, sections.name)
 
 
 def _from_crossings(

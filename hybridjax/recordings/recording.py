@@ -216,7 +216,7 @@ class Recording(eqx.Module):
         that wraps, is not. A signal that crosses the level several times within a cycle, in noise,
         makes doubled events, which `estimate_phase` leaves out. Crossings in gaps that are longer
         than three samples, and than half a wavelength at the bandwidth, are unknown, and make no
-        events. Isolated spikes are ignored (see `section_data`).
+        events. Isolated spikes are ignored (see `sample_sections`).
 
         **Arguments:** `event`: its name. `crossing`: crossing of a signal, given by name.
         `bandwidth`: bandwidth in Hz of the smoothing spline whose crossings are taken. Default:
@@ -359,11 +359,11 @@ def signal_of(crossing: Crossing) -> str:
 
     **Raises:** `DefinitionError` for a crossing of a function or in charts.
     """
-    if not isinstance(crossing.function, str) or crossing.charts is not None:
+    if not isinstance(crossing.signal, str) or crossing.charts is not None:
         raise DefinitionError(
             "the Crossing of a recording must name a signal, and no charts."
         )
-    return crossing.function
+    return crossing.signal
 
 
 def check_events(

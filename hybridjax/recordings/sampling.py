@@ -17,7 +17,7 @@ from .._core.boundary.values import Number
 from .._core.findings import warn_of
 from .._core.signal import Signal
 from ..errors import DefinitionError
-from ..experiments.record import Record, average_cycle
+from ..experiments.record import SectionSeries, average_cycle
 from ..identify.descent import ROUNDING
 from . import smoothing
 from .data import SectionData
@@ -46,9 +46,9 @@ with the drift."""
 
 
 @checked
-def section_data(
+def sample_sections(
     recording: Recording,
-    phase: Phase | PhaseDefinition,
+    sections: Phase | PhaseDefinition,
     *,
     inputs: OptionalNames,
     outputs: OptionalNames,
@@ -69,7 +69,7 @@ def section_data(
 
     **Arguments:**
 
-    - `phase`: the result of `estimate_phase`, or a definition for it.
+    - `sections`: the result of `estimate_phase`, or what it takes as `sections`.
     - `inputs`, `outputs`: names of signals. Without outputs, `()`, only the times of the events are
       known: `timing` is then "duration". Without inputs, `()`, the data are for
       `natural_multipliers`.
@@ -86,8 +86,8 @@ def section_data(
       section before.
 
     The average cycle of each trial is subtracted, and the records let fits allow for a constant
-    that remains (`Record.drift`). Drift of sensors also moves the phase: remove it from the signals
-    before (`without_drift`), as `identify_recording` does.
+    that remains (`SectionSeries.drift`). Drift of sensors also moves the phase: remove it from the
+    signals before (`without_drift`), as `identify_recording` does.
 
     **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs or times
     that repeat from cycle to cycle, a bandwidth below the rate of the rhythm, another number of
@@ -96,6 +96,7 @@ def section_data(
     inputs = tuple(inputs)
     outputs = tuple(outputs)
     _require_signals(recording, (*inputs, *outputs))
+    phase = sections
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     N = _number_of_sections(n_sections, phase)
@@ -144,7 +145,7 @@ def section_data(
 
 
 class _Plan(NamedTuple):
-    """How all trials are sampled; the fields are those of `section_data`."""
+    """How all trials are sampled; the fields are those of `sample_sections`."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -244,14 +245,14 @@ def _records(
     parts: list[_Sections],
     plan: _Plan,
     lead: int,
-) -> tuple[Record, ...]:
+) -> tuple[SectionSeries, ...]:
     """Return a record of each stretch, which allows for a constant that remains."""
     names = [Signal(name, recording.unit(name)) for name in plan.signals]
     if plan.timing is not None:
         names.append(Signal("time" if plan.timing == "clock" else "duration", "s"))
     nu = len(plan.inputs)
     return tuple(
-        Record(
+        SectionSeries(
             part.values[:, :nu],
             part.values[:, nu:],
             n_sections=plan.n_sections,

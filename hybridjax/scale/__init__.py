@@ -1,1 +1,6 @@
-"""Sweeps and Monte Carlo in pieces, on one machine or many, with results as labeled arrays."""
+"""Sweeps and Monte Carlo in chunks, on one machine or many, and what makes calls faster."""
+
+from .._core.public import attach
+
+
+__getattr__, __dir__, __all__ = attach(__name__, __file__)

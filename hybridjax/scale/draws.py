@@ -39,7 +39,7 @@ def monte_carlo(
         data = hj.experiments.add_noise(clean, 1e-4, seed=int(rng.integers(2**31)))
         return hj.fit_multipliers(hj.estimate_htf(data), order=2).multipliers
 
-    errors = hj.monte_carlo(error, 1000, client=client)
+    errors = hj.scale.monte_carlo(error, 1000, client=client)
     errors.value.std("draw")
     ```
 

@@ -35,7 +35,7 @@ Axes = Mapping[str, Vector]
 
 
 @checked
-class Points:
+class SweepPoints:
     """A list of points for `sweep`, each with one value of every parameter."""
 
     def __init__(self, values: Axes):
@@ -58,7 +58,7 @@ class Points:
         count: ExperimentCount,
         *,
         seed: Seed = 0,
-    ) -> "Points":
+    ) -> "SweepPoints":
         """Return points that cover a box evenly, from a scrambled Sobol sequence (Owen 1998).
 
         **Arguments:** `ranges`: the lowest and the highest value of each parameter. `count`: number
@@ -84,7 +84,7 @@ class Points:
         return len(next(iter(self.values.values())))
 
     def __repr__(self) -> str:
-        return f"Points({len(self)} of {', '.join(self.values)})"
+        return f"SweepPoints({len(self)} of {', '.join(self.values)})"
 
 
 @dataclasses.dataclass(frozen=True)

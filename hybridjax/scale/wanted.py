@@ -24,9 +24,12 @@ class Wanted:
     """Quantities to keep of each cycle: those with a name, and users' functions."""
 
     def __init__(
-        self, want: Want | Measure | Sequence[Want | Measure], system: HybridSystem
+        self,
+        quantities: Want | Measure | Sequence[Want | Measure],
+        system: HybridSystem,
     ):
-        items = [want] if isinstance(want, str) or callable(want) else list(want)
+        is_one = isinstance(quantities, str) or callable(quantities)
+        items = [quantities] if is_one else list(quantities)
         self.names = tuple(dict.fromkeys(x for x in items if isinstance(x, str)))
         functions = [x for x in items if not isinstance(x, str)]
         self.measures = {getattr(f, "__name__", ""): f for f in functions}
@@ -34,7 +37,7 @@ class Wanted:
         own = [x for x in self.measures if x.isidentifier() and x not in taken]
         if len(own) < len(functions):
             raise DefinitionError(
-                "functions of `want` need names of their own, other than "
+                "functions of `quantities` need names of their own, other than "
                 f"{', '.join(sorted(taken))}: define them by `def`."
             )
         # (Words only: workers get a copy.)

@@ -180,7 +180,7 @@ def _locate(
     lanes, moved, tape = side_by_side(pieces)
     duration = moved.lanes.t - lanes.t
     near = _near_events(map, bound, lanes, moved.lanes, tape)
-    result = update_result(moved.result, near, Result.COINCIDENCE)
+    result = update_result(moved.result, near, Result.SIMULTANEOUS)
     if not on_host(period):  # (on the host `_check` says more)
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)
@@ -444,7 +444,7 @@ def _require_reached(placed: PlacedSections, results: list[int]) -> None:
     for i, code in enumerate(results):
         if code == Result.OK:
             continue
-        if code == Result.COINCIDENCE:
+        if code == Result.SIMULTANEOUS:
             raise ComputationError(
                 f"{name(i - 1)} coincides with an event: move the sections, or use `AtEvent`."
             )

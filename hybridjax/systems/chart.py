@@ -45,8 +45,8 @@ class Chart(eqx.Module):
     - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
         stand in `u` (the map g_a of the paper: the others are ignored). `None` means all.
     - `solver`: how the chart is integrated: a Runge-Kutta method of diffrax with an error estimate,
-        or `hj.Radau()`. `None` means the explicit pair of order 7, for charts that are not stiff. A
-        `solver` of the system overrides it.
+        or `hj.systems.Radau()`. `None` means the explicit pair of order 7, for charts that are not
+        stiff. A `solver` of the system overrides it.
     - `absent`: values of states that this chart lacks but outputs and sections may use, e.g.
         `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """

@@ -52,8 +52,8 @@ class Drawing(eqx.Module):
 
     ```python
     def draw(self, chart, t, q):
-        leg = hj.Drawing.spring((0.0, q["foot"]), (0.0, q["body"]))
-        return hj.Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": leg},
+        leg = hj.systems.Drawing.spring((0.0, q["foot"]), (0.0, q["body"]))
+        return hj.systems.Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)], "leg": leg},
                           circles={"body": (0.0, q["body"], 0.2)})
     ```
 

@@ -23,12 +23,12 @@ from .varied import parameter_of, with_parameters
 
 
 @checked
-class Quotient(Derived):
+class Symmetric(Derived):
     """`system` modulo a symmetry. The symmetry is declared here, and the resets of `system` do not
     contain it.
 
     ```python
-    walker = Quotient(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},
+    walker = Symmetric(Biped(), swap={"left stance": "right stance"}, relabel={"left": "right"},
                       translation=("x",))
     step = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
     ```
@@ -106,15 +106,15 @@ class Quotient(Derived):
 
     def __check_init__(self):
         charts = self.system.charts()
-        require_among("chart", (*self.swap, *self.swap.values()), charts, "Quotient: ")
+        require_among("chart", (*self.swap, *self.swap.values()), charts, "Symmetric: ")
         states = sorted(set().union(*(chart.states for chart in charts.values())))
         named = (*dict(self.names), *self.flipped, *self.translation)
-        require_among("state", named, states, "Quotient: ")
+        require_among("state", named, states, "Symmetric: ")
         for kept, image in self.swap.items():
             mirrored = {self._partner(name) for name in charts[kept].states}
             if mirrored != set(charts[image].states):
                 raise DefinitionError(
-                    f"Quotient: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
+                    f"Symmetric: '{kept}' mirrored has {sorted(mirrored)}, but '{image}' "
                     f"{sorted(charts[image].states)}: use `relabel`."
                 )
         if self.half_period:
@@ -123,7 +123,7 @@ class Quotient(Derived):
     def _check_half_period(self):
         if (self.system.period() is not None) != (self.half_period is True):
             raise DefinitionError(
-                "Quotient: `half_period` must be True if a clock drives the system, else a state "
+                "Symmetric: `half_period` must be True if a clock drives the system, else a state "
                 "or a function of (t, q)."
             )
         for x in self.system.transitions():
@@ -132,12 +132,12 @@ class Quotient(Derived):
             phase = math.remainder(x.guard.offset / x.guard.period, 1.0)
             if abs(phase) < TOGETHER:
                 raise DefinitionError(
-                    f"Quotient: '{x.name}' must not be scheduled at t = 0, where halves begin: let "
-                    "the clock begin earlier."
+                    f"Symmetric: '{x.name}' must not be scheduled at t = 0, where halves begin: "
+                    "let the clock begin earlier."
                 )
         if isinstance(self.half_period, str):
             for name, chart in self.system.charts().items():
-                here = f"Quotient: in '{name}' "
+                here = f"Symmetric: in '{name}' "
                 require_among("state", [self.half_period], chart.states, here)
 
     def period(self):
@@ -243,7 +243,7 @@ class Quotient(Derived):
             at = Guess(at.chart, at.state[:-1], at.state[-1])
         if not self.translation:
             return self.system, at
-        return Quotient(self.system, translation=self.translation), at
+        return Symmetric(self.system, translation=self.translation), at
 
     def _claims(self, sizes: Mapping[str, Any]):
         """The statements of the symmetry: a sentence for its failure, and two functions of
@@ -366,12 +366,12 @@ def check_symmetry(
     system: HybridSystem, sizes: Any = None, along: str | None = None
 ) -> None:
     """Raise an error if functions, or with `along` their derivatives by this parameter, do not have
-    the symmetry that a `Quotient` states.
+    the symmetry that a `Symmetric` states.
 
     **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
     which states are small, states of 1 hide all but the highest powers.)
     """
-    if not isinstance(system, Quotient):
+    if not isinstance(system, Symmetric):
         return
     check_symmetry(system.system, None, along and along.removeprefix("system."))
     if not sizes:
@@ -389,7 +389,7 @@ def check_symmetry(
             once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
                 f"{type(system.system).__name__} does not have the symmetry of its "
-                f"Quotient{once}: {sentence}."
+                f"Symmetric{once}: {sentence}."
             )
 
 

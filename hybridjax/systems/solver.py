@@ -131,8 +131,9 @@ def _as_method(solver: Any) -> Method:
 
 def _no_solver(given: Any) -> DefinitionError:
     return DefinitionError(
-        "a solver must be `hj.Radau()` or a Runge-Kutta method of diffrax with an error estimate, "
-        "an explicit first stage and one vector field, such as `diffrax.Kvaerno5()` (stiff) or "
+        "a solver must be `hj.systems.Radau()` or a Runge-Kutta method of diffrax with an error "
+        "estimate, an explicit first stage and one vector field, "
+        "such as `diffrax.Kvaerno5()` (stiff) or "
         f"`diffrax.Tsit5()`, not {show(given)}."
     )
 

@@ -248,7 +248,7 @@ class HybridSystem(Definition):
     and `time_unit` that of time. States, inputs and outputs share one space of names: without
     `inputs`, there is one input `u`, or `input` if a state or an output is called `u`. `solver`, a
     keyword of every constructor, is the method of integration of all charts, or of some by name
-    (`{"stance": hj.Radau()}`); it overrides `Chart.solver`.
+    (`{"stance": hj.systems.Radau()}`); it overrides `Chart.solver`.
     """
 
     inputs: ClassVar[tuple[str, ...]] = _DefaultInputs()  # type: ignore[assignment]

@@ -6,8 +6,6 @@ from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
-from scipy import signal
 
 from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
@@ -21,7 +19,7 @@ from .._core.boundary.kinds import (
 )
 from .._core.boundary.values import Reals
 from .._core.compilation import quick_jit
-from .._core.limits import PERIODS, SECTIONS
+from .._core.limits import SECTIONS
 from .._core.signal import unit_of
 from ..errors import DefinitionError
 from ..experiments.response import response_function
@@ -35,44 +33,6 @@ from ..systems.system import OutputNames
 # Longest step of `simulate_beats`, in cycles. Longer: events are late by more than the noise of
 # measured ones (the error grows as the root of the step). Shorter: simulations take longer.
 _STEP = 0.005
-
-
-@checked
-def random_force(
-    duration: Positive,
-    rate: Positive,
-    bandwidth: Positive,
-    *,
-    rms: NonNegative = 1.0,
-    seed: Seed = 0,
-) -> Float[np.ndarray, "n 1"]:
-    """Return a random perturbation with power up to `bandwidth`: white noise, low-passed.
-
-    The filter is a Butterworth filter of order 4, applied forwards and backwards. The perturbation
-    is not aligned to any phase, so any hardware that plays a file can apply it.
-
-    **Arguments:** `duration` in seconds. `rate` in samples per second. `bandwidth` in Hz, where
-    half of the amplitude is left. `rms`. Default: 1. `seed`.
-
-    **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
-    """
-    if bandwidth >= rate / 2:
-        raise DefinitionError(
-            f"`bandwidth` must be less than half of `rate`, {rate / 2:g}, but is {bandwidth:g}."
-        )
-    # Samples that are cut off at either end, where the filter starts.
-    transient = 4 * rate / bandwidth
-    samples = duration * rate + 2 * transient
-    if not samples <= PERIODS:
-        raise DefinitionError(
-            f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples, more than {PERIODS}."
-        )
-    n = round(duration * rate)
-    pad = round(transient)
-    sos = signal.butter(4, bandwidth, fs=rate, output="sos")
-    white = np.random.default_rng(seed).normal(size=(n + 2 * pad, 1))
-    force = signal.sosfiltfilt(sos, white, axis=0)[pad : pad + n]
-    return rms * force / np.sqrt(np.mean(force**2, axis=0))
 
 
 @checked
@@ -139,7 +99,7 @@ _respond = quick_jit(lambda response, u: response(u).y)
 
 
 @checked
-def spoil(
+def add_artifacts(
     recording: Recording,
     signals: SignalNames,
     *,

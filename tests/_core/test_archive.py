@@ -29,7 +29,7 @@ def pack(path, members, **options):
 
 def saved(path, static):
     """A design, with other static fields than it was saved with."""
-    hj.save(path, hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5)))
+    hj.save(path, hj.multisine(n_sections=4, periods=4, frequencies=(0.25, 0.5)))
     with np.load(path) as file:
         content = dict(file)
     header = json.loads(str(content.pop("header")))
@@ -90,7 +90,7 @@ DECLARED = {
         dict(n_sections=10**5, periods=10**6),
         "more samples than an experiment",
     ),
-    "a name that is none": (dict(input_names=[["u"]]), "input_names is"),
+    "a name that is none": (dict(inputs=[["u"]]), "inputs is"),
 }
 
 

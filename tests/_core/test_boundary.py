@@ -146,7 +146,7 @@ def test_arrays_that_may_hold_any_number_are_not_read(monkeypatch):
 
 @pytest.mark.parametrize("annotation, given, said", REFUSED)
 def test_what_does_not_fit_is_refused_in_one_sentence(annotation, given, said):
-    with pytest.raises(hj.DefinitionError) as caught:
+    with pytest.raises(hj.errors.DefinitionError) as caught:
         called(annotation, given)
     text = str(caught.value)
     assert said in text, text
@@ -170,7 +170,9 @@ def test_every_parameter_is_checked_however_it_is_given():
         (lambda: several(1, 2, "r", 3), "rest"),
         (lambda: several(1, c="y"), "c"),
     ]:
-        with pytest.raises(hj.DefinitionError, match=f"^several: `{name}` must be "):
+        with pytest.raises(
+            hj.errors.DefinitionError, match=f"^several: `{name}` must be "
+        ):
             bad()
 
 
@@ -230,7 +232,9 @@ def test_a_class_is_checked_where_it_is_built_and_used():
         (lambda: module(0), "Module.__call__: `k`"),
         (lambda: dataclasses.replace(module, n=0), "Module: `n`"),
     ]:
-        with pytest.raises(hj.DefinitionError, match=f"^{name} must be an integer"):
+        with pytest.raises(
+            hj.errors.DefinitionError, match=f"^{name} must be an integer"
+        ):
             bad()
     assert module._hidden(0) == 0
     assert Heir(1, z=2).z == 2
@@ -255,7 +259,7 @@ def test_named_tuples_and_dataclasses_are_checked(cls):
     assert type(cls(1).first) is float
     assert pickle.loads(pickle.dumps(cls(1))) == cls(1)
     with pytest.raises(
-        hj.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"
+        hj.errors.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"
     ):
         cls(1, second=2)
 
@@ -284,7 +288,7 @@ def test_arrays_may_be_traced():
     assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
     assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
     with pytest.raises(
-        hj.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
+        hj.errors.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
     ):
         jax.jit(summed)(1.0)
 
@@ -300,12 +304,13 @@ TRANSFORMS = {
 def test_where_values_are_needed_a_sentence_says_so(transform):
     x = jnp.arange(3.0)
     with pytest.raises(
-        hj.DefinitionError, match="^summed: `power` must be .* traces it: call"
+        hj.errors.DefinitionError, match="^summed: `power` must be .* traces it: call"
     ):
         transform(lambda x: summed(x, power=x[0]))(x)
     for function, name in [(on_host, "on_host"), (around, "around")]:
         with pytest.raises(
-            hj.DefinitionError, match=f"^{name} needs values, but JAX traces them"
+            hj.errors.DefinitionError,
+            match=f"^{name} needs values, but JAX traces them",
         ):
             transform(function)(x)
     assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})

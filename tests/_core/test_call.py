@@ -60,7 +60,7 @@ def test_a_function_that_a_public_call_calls_may_change_what_a_system_computes()
         cycle = hj.find_limit_cycle(Slowed())
         return {"drag": DRAG[0], "value": cycle.multipliers[0].real}
 
-    draws = hj.monte_carlo(multiplier, 3)
+    draws = hj.scale.monte_carlo(multiplier, 3)
     assert len(np.unique(draws.drag)) == 3
     assert_allclose(draws.value, np.exp(-draws.drag), rtol=1e-9)
 
@@ -71,7 +71,7 @@ def test_a_function_that_a_public_call_calls_may_change_what_a_system_computes()
         lambda cycle: hj.linearize(cycle, SECTIONS, "x"),
         lambda cycle: cycle.trajectory(),
         lambda cycle: hj.continuation(cycle, "wind", (-0.01, 0.01)),
-        lambda cycle: hj.place_sections(cycle, SECTIONS).observe("x"),
+        lambda cycle: hj.sections.place_sections(cycle, SECTIONS).observe("x"),
     ],
 )
 def test_a_cycle_is_compared_in_each_call_of_a_users_function(use):
@@ -84,17 +84,17 @@ def test_a_cycle_is_compared_in_each_call_of_a_users_function(use):
         return 0.0
 
     with pytest.raises(
-        hj.DefinitionError, match="of chart 'air' of Slowed has changed"
+        hj.errors.DefinitionError, match="of chart 'air' of Slowed has changed"
     ):
-        hj.monte_carlo(changed, 1)
+        hj.scale.monte_carlo(changed, 1)
 
 
 def test_systems_given_together_that_are_equal_may_compute_something_else():
     systems = [Slowed(Water("lake", k)) for k in (0.7, 1.3)]
     assert systems[0].water == systems[1].water
     first = hj.find_limit_cycle(systems[0])
-    with pytest.raises(hj.DefinitionError, match="systems"):
-        hj.find_limit_cycles(systems, first)
+    with pytest.raises(hj.errors.DefinitionError, match="systems"):
+        hj.orbits.find_limit_cycles(systems, first)
     for system, k in zip(systems, (0.7, 1.3), strict=True):
         cycle = hj.find_limit_cycle(system)
         assert_allclose(cycle.multipliers, [np.exp(-k)], rtol=1e-9)

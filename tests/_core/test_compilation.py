@@ -169,7 +169,7 @@ def test_the_cache_is_a_folder_of_its_own(tmp_path, monkeypatch, cache_setting):
     (tmp_path / "shared").mkdir()
     (tmp_path / "shared/jit_f-cache").write_bytes(b"a colleague's")
     for _ in range(2):
-        folder = hj.enable_compilation_cache("shared")
+        folder = hj.scale.enable_compilation_cache("shared")
         assert folder == tmp_path / "shared/programs"
     assert jax.config.jax_compilation_cache_dir == str(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -214,12 +214,12 @@ ATTACKS = {
 def test_a_cache_of_others_is_refused(tmp_path, attack, cache_setting):
     if "user" in attack or "owner" in attack:
         os.geteuid() == 0 or pytest.skip("only root gives files away")
-    hj.enable_compilation_cache(tmp_path / "x")
+    hj.scale.enable_compilation_cache(tmp_path / "x")
     (tmp_path / "x/programs/notes").symlink_to(__file__)  # which JAX does not read
-    hj.enable_compilation_cache(tmp_path / "x")
+    hj.scale.enable_compilation_cache(tmp_path / "x")
     ATTACKS[attack](tmp_path / "x")
-    with pytest.raises(hj.DefinitionError, match="give another folder"):
-        hj.enable_compilation_cache(tmp_path / "x")
+    with pytest.raises(hj.errors.DefinitionError, match="give another folder"):
+        hj.scale.enable_compilation_cache(tmp_path / "x")
 
 
 def test_without_a_home_nothing_is_kept(tmp_path, monkeypatch, cache_setting):
@@ -230,8 +230,8 @@ def test_without_a_home_nothing_is_kept(tmp_path, monkeypatch, cache_setting):
             monkeypatch.setattr(pathlib.Path, "home", raise_no_home)
         monkeypatch.setenv("HOME", "/dev/null")
         with pytest.warns(UserWarning, match="nothing is kept"):
-            assert hj.enable_compilation_cache() is None
-    assert hj.enable_compilation_cache(tmp_path) == tmp_path / "programs"
+            assert hj.scale.enable_compilation_cache() is None
+    assert hj.scale.enable_compilation_cache(tmp_path) == tmp_path / "programs"
 
 
 def raise_no_home():
@@ -243,9 +243,9 @@ import jax, os, hybridjax as hj
 from hybridjax._core.jax_compat import loops_are_kernels
 always = loops_are_kernels()
 try:
-    hj.enable_loop_kernels()
+    hj.scale.enable_loop_kernels()
     print("done", always)
-except hj.ComputationError as error:
+except hj.errors.ComputationError as error:
     print(os.environ.get("XLA_FLAGS"), error)
 """
 LAPACK = """
@@ -267,14 +267,14 @@ class Kicked(hj.HybridSystem):
             B = (2 + q[0] ** 2) * jnp.eye(33)  # and so is a system of so many equations
             x = jnp.linalg.eigvals(A).real.sum() + jnp.linalg.solve(B, jnp.ones(33))[0]
             return 0.1 * x + self.kick, 0.5 * q[1] + 0.2
-        return [hj.Transition("kick", "a", "a", hj.Scheduled(1.0), reset=reset)]
+        return [hj.Transition("kick", "a", "a", hj.systems.Scheduled(1.0), reset=reset)]
     def period(self):
         return 1.0
 
-two = hj.Execution(workers=2, batch=250)
+two = hj.scale.Execution(workers=2, batch=250)
 cycle = hj.find_limit_cycle(Kicked(), hj.Guess("a", (0.5, 0.1), 0.5))
 kicks = eqx.filter_vmap(lambda k: Kicked(kick=k))(jnp.linspace(0.5, 1.5, 500))
-print(hj.find_limit_cycles(kicks, cycle, execution=two).summary())
+print(hj.orbits.find_limit_cycles(kicks, cycle, execution=two).summary())
 u = 1e-3 * np.random.default_rng(0).normal(size=(500, 12, 1))
 print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), discard=0, execution=two).summary())
 """

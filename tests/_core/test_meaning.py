@@ -226,7 +226,7 @@ def test_values_that_are_not_named_are_refused(code):
 
 def test_systems_given_together_share_a_digest_if_they_differ_in_arrays_only():
     hopper = hj.models.VerticalHopper
-    given = [hopper(k=9.0), hopper(k=10.0), hopper(solver=hj.Radau())]
+    given = [hopper(k=9.0), hopper(k=10.0), hopper(solver=hj.systems.Radau())]
     taken = Items(Instance(hj.HybridSystem)).take(given)
     digests = [x.code_digest for x in taken]
     assert digests == [current(x).code_digest for x in given]

@@ -454,7 +454,7 @@ def digest_or_refusal(space):
     """The digest of a system, or the sentence that refuses it."""
     try:
         return code_digest(space["Uses"]())
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         return f"refused: {error}"
 
 
@@ -517,7 +517,9 @@ def test_numbers_follow_the_code_or_the_cycle_is_refused(kind, monkeypatch, tmp_
         exec(statement, space)
         k = float(space["f"](1.0))
         for cycle in cycles:
-            with pytest.raises(hj.DefinitionError, match="the field of chart 'line'"):
+            with pytest.raises(
+                hj.errors.DefinitionError, match="the field of chart 'line'"
+            ):
                 hj.linearize(cycle, sections)
         cycles.append(hj.find_limit_cycle(space["Uses"](), guess))
         model = hj.linearize(cycles[-1], sections)
@@ -590,7 +592,7 @@ class Both(hj.HybridSystem):
 
 class Uses:
     def __new__(cls):
-        return hj.Quotient(Both(), swap={"left": "right"})
+        return hj.systems.Symmetric(Both(), swap={"left": "right"})
 """
 
 

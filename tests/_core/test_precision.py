@@ -13,13 +13,13 @@ from ..conftest import ISOCHRONS, OUTPUTS
 DEFINITIONS = {
     "system": lambda: hj.models.VerticalHopper(k=10.1),
     "guess": lambda: hj.Guess("stance", (2.1, 1.9), time=0.1),
-    "settings": lambda: hj.Settings(1e-11, 1e-13, scale=np.full((2, 4), 0.1)),
+    "settings": lambda: hj.orbits.Settings(1e-11, 1e-13, scale=np.full((2, 4), 0.1)),
     "crossing": lambda: hj.Crossing("vM", "falling", value=0.1),
     "clock": lambda: hj.ClockPhase(8, anchor=0.1),
     "kinematic": lambda: hj.KinematicPhase(
         8, "yM", "vM", (1.9, 0.1), [0.3, 1.9], anchor=0.2
     ),
-    "schedule": lambda: hj.Scheduled(0.1, 0.7),
+    "schedule": lambda: hj.systems.Scheduled(0.1, 0.7),
 }
 
 
@@ -56,23 +56,23 @@ def late(hopper_cycle, placed_isochrons, isochron_ldtp):
     hopper = cycle.system
     design = hj.multisine()
     u = np.zeros((1, 32, 1))
-    response = hj.response_function(cycle, placed, OUTPUTS)
-    map = hj.section_map(cycle, placed, 0, 1)
+    response = hj.experiments.response_function(cycle, placed, OUTPUTS)
+    map = hj.sections.section_map(cycle, placed, 0, 1)
     htf = ldtp.htf([0.1])
     return {
         "simulate": lambda: hj.simulate(hopper, "stance", (2.0, 1.9), 1.0),
         "find_limit_cycle": lambda: hj.find_limit_cycle(hopper, cycle),
         "continuation": lambda: hj.continuation(cycle, "M", (1.9, 2.0)),
-        "place_sections": lambda: hj.place_sections(cycle, ISOCHRONS),
+        "place_sections": lambda: hj.sections.place_sections(cycle, ISOCHRONS),
         "linearize": lambda: hj.linearize(cycle, placed),
         "section_map": lambda: map(map.fixed_point),
         "observe": lambda: placed.observe(OUTPUTS),
         "run_experiments": lambda: hj.run_experiments(cycle, placed, design, OUTPUTS),
         "response": lambda: response(u),
-        "LDTP": lambda: hj.LDTP(ldtp.A, ldtp.B, ldtp.C),
+        "LDTP": lambda: hj.linear.LDTP(ldtp.A, ldtp.B, ldtp.C),
         "LDTP.simulate": lambda: ldtp.simulate(u[0]),
         "LDTP.htf": lambda: ldtp.htf([0.1]),
-        "HTF": lambda: hj.HTF([0.1], np.ones((1, 1, 1, 1)), [0], 4),
+        "HTF": lambda: hj.linear.HTF([0.1], np.ones((1, 1, 1, 1)), [0], 4),
         "HTF.error": lambda: htf.error(htf),
     }
 

@@ -97,7 +97,8 @@ def test_what_is_in_the_way_stays(full, block, early):
     block(full)
     before = tree(full.parent)
     with pytest.raises(
-        hj.DefinitionError, match="is in the way, and was not written by hybridjax"
+        hj.errors.DefinitionError,
+        match="is in the way, and was not written by hybridjax",
     ):
         with results_folder(full, "report", RESULTS if early else ()) as new:
             assert not early
@@ -109,7 +110,7 @@ def test_what_is_in_the_way_stays(full, block, early):
 
 def test_nothing_is_written_through_a_link_to_a_folder(full):
     before = tree(full.parent / "away")
-    with pytest.raises(hj.DefinitionError, match="is a link or a device"):
+    with pytest.raises(hj.errors.DefinitionError, match="is a link or a device"):
         write(full / "link", RESULTS)
     assert tree(full.parent / "away") == before
 
@@ -154,10 +155,10 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     ]
 
 
-DESIGN = hj.multisine(n_sections=4, periods=4, band=(0.25, 0.5))
+DESIGN = hj.multisine(n_sections=4, periods=4, frequencies=(0.25, 0.5))
 WRITERS = {
     "save": (lambda path: hj.save(path, DESIGN), "x.npz"),
-    "write_design": (lambda path: hj.recordings.write_design(path, DESIGN), "x.csv"),
+    "Design.write": (lambda path: DESIGN.write(path), "x.csv"),
     "plot.save": (lambda path: hj.plot.save(path, Figure()), "x.png"),
 }
 
@@ -168,14 +169,14 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
     folder.mkdir()
     (tmp_path / "away").write_text("mine")
     os.symlink(tmp_path / "away", folder / name)
-    with pytest.raises(hj.DefinitionError, match="is a link"):
+    with pytest.raises(hj.errors.DefinitionError, match="is a link"):
         writer(folder / name)
     assert (tmp_path / "away").read_text() == "mine"
     assert (folder / name).is_symlink()
     assert not [path for path in folder.iterdir() if path.name.startswith(".")]
     (folder / name).unlink()
     os.mkfifo(folder / name)
-    with pytest.raises(hj.DefinitionError, match="is a link or a device"):
+    with pytest.raises(hj.errors.DefinitionError, match="is a link or a device"):
         writer(folder / name)
     (folder / name).unlink()
     writer(folder / name)

@@ -19,7 +19,7 @@ def model():
     x = np.ones((8, 2))
     v = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     C = np.stack([x, v], axis=1)
-    return hj.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
+    return hj.linear.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
 
 
 @pytest.fixture(scope="session")
@@ -30,13 +30,13 @@ def two():
 
 @pytest.fixture(scope="session")
 def two_usual(two):
-    return hj.multisine(6, 32, band=(0, 3), inputs=two.inputs)
+    return hj.multisine(6, 32, frequencies=(0, 3), inputs=two.inputs)
 
 
 @pytest.fixture(scope="session")
 def optimal_two(two, two_usual):
     """Plans for the two inputs, by default for multipliers of both."""
-    goal = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+    goal = hj.designs.MultiplierGoal(harmonics=(-1, 0, 1))
     default = {"goal": goal, "noise": TWO_NOISE, "limit": {"u0": 0.1, "u1": 0.05}}
     return lambda **options: hj.optimal_design(two, two_usual, **(default | options))
 

@@ -74,10 +74,10 @@ def test_several_limits(linear, quadratic):
 def test_unidentifiable_unknowns_are_named():
     same = criterion(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
     with pytest.raises(
-        hj.DefinitionError, match=r"no response changes along .*x0 .*x1"
+        hj.errors.DefinitionError, match=r"no response changes along .*x0 .*x1"
     ):
         allocate(same, limits(np.ones(3)), np.ones(3))
-    with pytest.raises(hj.DefinitionError, match="x1 changes no response"):
+    with pytest.raises(hj.errors.DefinitionError, match="x1 changes no response"):
         allocate(
             criterion(np.array([[1.0, 2], [0, 0]])), limits(np.ones(2)), np.ones(2)
         )

@@ -21,8 +21,8 @@ Distortion = hj.designs.Distortion
 KINEMATIC = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 LEVEL = {"yM": 6e-6, "vM": 1.2e-5}
 NOISE = {"yM": 6e-6, "vM": 1.2e-5}
-EXPERIMENTS = hj.multisine(8, periods=8, band=(0.0, 1.0))
-GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+EXPERIMENTS = hj.multisine(8, periods=8, frequencies=(0.0, 1.0))
+GOAL = hj.designs.MultiplierGoal(harmonics=(-1, 0, 1))
 
 
 class Quadratic(hj.HybridSystem):
@@ -40,7 +40,11 @@ class Quadratic(hj.HybridSystem):
         def reset(t, q, u):
             return (0.6 * q[0] + u[0] + self.b * q[0] ** 2,)
 
-        return (hj.Transition("tick", "rest", "rest", hj.Scheduled(1.0), reset=reset),)
+        return (
+            hj.Transition(
+                "tick", "rest", "rest", hj.systems.Scheduled(1.0), reset=reset
+            ),
+        )
 
     def outputs(self):
         return (hj.Output("z", lambda t, q, u: q[0] + u[0] ** 2),)
@@ -72,8 +76,8 @@ def two_charts():
         "two": Field(("x", "v"), two_rates),
     }
     transitions = (
-        hj.Transition("up", "one", "two", hj.Scheduled(1.0), reset=up),
-        hj.Transition("down", "two", "one", hj.Scheduled(1.0, 0.5), reset=down),
+        hj.Transition("up", "one", "two", hj.systems.Scheduled(1.0), reset=up),
+        hj.Transition("down", "two", "one", hj.systems.Scheduled(1.0, 0.5), reset=down),
     )
     return toy(
         charts, transitions, 1.0, (hj.Output("z", shown),), inputs=("push", "pull")
@@ -119,7 +123,7 @@ def test_the_even_part_of_the_hopper(hopper_cycle):
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
     left = []
     for rms in (0.02, 0.04):
-        u = EXPERIMENTS.scaled(rms=rms).inputs()
+        u = EXPERIMENTS.scaled(rms=rms).signals()
         even = even_part(hopper_cycle, sections, u, OUTPUTS)
         wrong = even - quadratic.second_order(u)
         left.append(np.sqrt(np.mean(wrong**2) / np.mean(even**2)))
@@ -132,7 +136,7 @@ def test_without_a_clock(vanderpol_cycle):
     """Sections on which no time is kept, and the direction of the flow means nothing."""
     sections = hj.KinematicPhase(4, "x", "v", anchor=hj.Crossing("v", "falling"))
     quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
-    u = hj.multisine(4, periods=4, band=(0.0, 2.0)).scaled(rms=1e-3).inputs()
+    u = hj.multisine(4, periods=4, frequencies=(0.0, 2.0)).scaled(rms=1e-3).signals()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
     error = np.abs(even - quadratic.second_order(u)).max()
     assert error < 1e-4 * np.abs(even).max()
@@ -144,8 +148,8 @@ def test_two_inputs(two, inputs):
     """Inputs in any order; charts with one and two states; outputs that depend on the inputs."""
     cycle, sections, _ = two
     quadratic = second_order(cycle, sections, ("x", "z"), inputs)
-    everything = SHORT.inputs()
-    u = everything[:, :, [SHORT.input_names.index(name) for name in inputs]]
+    everything = SHORT.signals()
+    u = everything[:, :, [SHORT.inputs.index(name) for name in inputs]]
     of_system = np.zeros_like(everything)
     for k, name in enumerate(inputs):
         of_system[:, :, ("push", "pull").index(name)] = u[:, :, k]
@@ -175,7 +179,7 @@ def test_the_expected_size_with_two_inputs(two):
     count = 400
     _, form = products_of(two)
     drawn = SHORT.realizations(count)
-    outputs = form.quadratic.second_order(drawn.inputs())
+    outputs = form.quadratic.second_order(drawn.signals())
     require_mean_square(outputs, count, form.rms(SHORT) ** 2, 0.02)
 
 
@@ -187,7 +191,7 @@ def test_the_expected_size_of_gaussian_inputs(two):
     rng = np.random.default_rng(0)
     size = np.sqrt(rng.exponential(size=len(drawn.line)))
     drawn = dataclasses.replace(drawn, amplitude=drawn.amplitude * size)
-    outputs = form.quadratic.second_order(drawn.inputs())
+    outputs = form.quadratic.second_order(drawn.signals())
     matrix = form.quadratic.products(cosines.f, cosines.channel).gaussian()
     expected = [matrix @ power @ power for power in cosines.powers_in(SHORT)]
     require_mean_square(outputs, count, np.mean(expected, axis=0), 0.05)
@@ -199,7 +203,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     the square of the input, too."""
     cycle, sections, _ = quadratic
     amplitude = 0.01
-    design = hj.Design.from_lines(
+    design = hj.experiments.Design.from_lines(
         [[f]], amplitude, 0.4, n_sections=4, periods=8, inputs="u"
     )
     cosines = Candidates.of(design)
@@ -213,7 +217,7 @@ def test_one_cosine_in_closed_form(quadratic, f):
     rms_of_x = np.sqrt(mean**2 + twice**2 / 2)
     assert found.rms(design)[0] == pytest.approx(rms_of_x, rel=1e-9)
     assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
-    u = design.inputs()
+    u = design.signals()
     x, z = found.quadratic.second_order(u)[0].T
     assert_allclose(z, x + u[0, :, 0] ** 2, atol=1e-15)
 
@@ -238,7 +242,7 @@ def test_designs_within_a_distortion(hopper_cycle):
     assert max(shares(plan.usual_rms).values()) == pytest.approx(1)
     assert plan.saved > 1.2
     assert 1 <= plan.certificate < 1.1
-    assert f"With the {' and '.join(plan.limited)} limited, one stride" in plan.advice
+    assert f"With the {' and '.join(plan.limited)} limited, one cycle" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
 
     # Twice what is allowed: twice the power, half of the strides.
@@ -249,7 +253,7 @@ def test_designs_within_a_distortion(hopper_cycle):
 
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
-    outputs = quadratic.second_order(plan.design.inputs())
+    outputs = quadratic.second_order(plan.design.signals())
     rms = np.sqrt(np.mean(outputs**2, axis=(0, 1)))
     expected = [plan.rms[f"distortion of {name}"] for name in OUTPUTS]
     assert_allclose(rms, expected, rtol=0.1)
@@ -263,7 +267,7 @@ def test_beside_other_limits(quadratic):
     options = dict(noise={"x": 1e-4}, goal=GOAL)
     limit = Limits(peak={"u": 0.05}, distortion=distortion)
     peaked = hj.optimal_design(model, usual, limit=limit, **options)
-    assert np.abs(peaked.design.inputs()).max() <= 0.05 * (1 + 1e-9)
+    assert np.abs(peaked.design.signals()).max() <= 0.05 * (1 + 1e-9)
     assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
     assert peaked.certificate >= 1
     both = hj.optimal_design(
@@ -286,7 +290,7 @@ def test_without_distortion(quadratic):
     linear = Distortion(cycle, sections, {"x": 1e-3})
     options = dict(noise={"x": 1e-4}, goal=GOAL)
     with pytest.raises(
-        hj.DefinitionError, match="moves no signal of `limit`: limit the input"
+        hj.errors.DefinitionError, match="moves no signal of `limit`: limit the input"
     ):
         hj.optimal_design(model, usual, limit=Limits(distortion=linear), **options)
     both = Limits(rms={"u": 0.01}, distortion=linear)
@@ -298,11 +302,11 @@ def test_without_distortion(quadratic):
 
 def test_bad_distortions(quadratic):
     cycle, sections, model = quadratic
-    twice = hj.LDTP(model.A, 2 * model.B, model.C, outputs="x")
+    twice = hj.linear.LDTP(model.A, 2 * model.B, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
         (sections, "differ in H_0 .to x, by 50%"),
     ):
         limit = Limits(distortion=Distortion(cycle, family, {"x": 1.0}))
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.optimal_design(twice, hj.multisine(4, periods=16), limit=limit)

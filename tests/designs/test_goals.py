@@ -13,7 +13,7 @@ from .conftest import TWO_NOISE, expected_htf, random_designs, total_variance
 
 N = 4
 NOISE = {"y": 0.02}
-GOAL = hj.designs.Multipliers(harmonics=(-1, 0, 1))
+GOAL = hj.designs.MultiplierGoal(harmonics=(-1, 0, 1))
 
 
 @pytest.fixture(scope="module")
@@ -30,17 +30,17 @@ def model():
     rng = np.random.default_rng(1)
     B = rng.normal(size=(N, 2, 1))
     C = rng.normal(size=(N, 1, 2))
-    return hj.LDTP(A, B, C)
+    return hj.linear.LDTP(A, B, C)
 
 
 @pytest.fixture(scope="module")
 def usual():
-    return hj.multisine(N, 16, band=(0, 2), amplitude=0.1)
+    return hj.multisine(N, 16, frequencies=(0, 2), amplitude=0.1)
 
 
 def test_transfer_functions_in_a_band(model, usual):
     """Their mean variance is that of `fit_ldtp`."""
-    goal = hj.designs.FrequencyResponse((0.2, 0.8), wanted=(0, 1))
+    goal = hj.designs.ResponseGoal((0.2, 0.8), quantities=(0, 1))
     plan = hj.optimal_design(model, usual, goal=goal, noise=NOISE)
     assert plan.names == ("H_0 of y", "H_1 of y")
     assert plan.certificate < 1.03
@@ -49,7 +49,7 @@ def test_transfer_functions_in_a_band(model, usual):
     size = power.mean(axis=1).sum()
 
     def require_variances(design, said):
-        fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
+        fit = hj.fit_ldtp(expected_htf(model, design, NOISE), initial=model)
         variance = fit.htf(f, (0, 1)).variance[:, :, 0, 0]
         assert_allclose(said, variance.mean(axis=1) / size, rtol=0.02)
 
@@ -59,18 +59,18 @@ def test_transfer_functions_in_a_band(model, usual):
 
 @pytest.mark.parametrize("harmonics", [None, (-1, 0, 1)])
 def test_multipliers_by_fit_ldtp(two, two_usual, optimal_two, harmonics):
-    """Standard errors are those of `ldtp_bound`, which sums up all information; no other design is
+    """Standard errors are those of `cramer_rao`, which sums up all information; no other design is
     better than the certificate allows."""
-    goal = hj.designs.Multipliers(estimator="fit_ldtp", harmonics=harmonics)
+    goal = hj.designs.MultiplierGoal(estimator="fit_ldtp", harmonics=harmonics)
     plan = optimal_two(goal=goal, limit={"u0": 0.1, "u1": 0.1})
     assert plan.certificate < 1.03
-    bound = hj.identify.ldtp_bound(
-        two, expected_htf(two, plan.usual, TWO_NOISE, harmonics)
+    bound = hj.identify.cramer_rao(
+        two, expected_htf(two, plan.usual, TWO_NOISE, harmonics), estimator="fit_ldtp"
     )
     assert_allclose(plan.usual_variances.sum(), total_variance(bound), rtol=1e-5)
-    for other in random_designs(3, 0.1, 6, 32, band=(0, 3), inputs=two.inputs):
-        bound = hj.identify.ldtp_bound(
-            two, expected_htf(two, other, TWO_NOISE, harmonics)
+    for other in random_designs(3, 0.1, 6, 32, frequencies=(0, 3), inputs=two.inputs):
+        bound = hj.identify.cramer_rao(
+            two, expected_htf(two, other, TWO_NOISE, harmonics), estimator="fit_ldtp"
         )
         assert total_variance(bound) > plan.criterion / plan.certificate
     assert (
@@ -84,36 +84,40 @@ def test_multipliers_keep_the_numbers_of_the_model():
     """Three multipliers, the first of which no input excites."""
     A = np.diag([0.9, 0.6, 0.3])
     ones = np.array([0.0, 1.0, 1.0])
-    model = hj.LDTP(
+    model = hj.linear.LDTP(
         np.stack([A, np.eye(3)]), np.stack([ones, ones])[..., None], np.ones((2, 1, 3))
     )
-    usual = hj.multisine(2, 32, band=(0, 1))
+    usual = hj.multisine(2, 32, frequencies=(0, 1))
 
     def plan(which):
-        goal = hj.designs.Multipliers(which, estimator="fit_ldtp")
+        goal = hj.designs.MultiplierGoal(which, estimator="fit_ldtp")
         return hj.optimal_design(model, usual, goal=goal, noise={"y": 0.01})
 
     assert plan(1).names == ("0.6",)
     assert plan(2).names == ("0.3",)
-    with pytest.raises(hj.DefinitionError, match=r"no input excites.*multiplier 0\.9"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"no input excites.*multiplier 0\.9"
+    ):
         plan(0)
 
 
 def test_bad_goals(model, usual):
     close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
-    double = hj.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
-    M = hj.designs.Multipliers
+    double = hj.linear.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
+    M = hj.designs.MultiplierGoal
     walker = hj.models.SimplestWalker()
     at = hj.AtEvent("heelstrike")
     short = hj.find_limit_cycle(walker, walker.short_gait(), section=at)
     cases = (
-        (model, hj.designs.Parameters(short, at, "slope"), "a stable `cycle`"),
-        (model, hj.designs.FrequencyResponse((1.0, 3.0)), "must lie within 0 and 2"),
+        (model, hj.designs.ParameterGoal(short, at, "slope"), "a stable `cycle`"),
+        (model, hj.designs.ResponseGoal((1.0, 3.0)), "must lie within 0 and 2"),
         (double, M(harmonics=0), "is double"),
     )
     for system, goal, message in cases:
-        design = usual if system.n_sections == N else hj.multisine(2, 32, band=(0, 1))
-        with pytest.raises(hj.DefinitionError, match=message):
+        design = (
+            usual if system.n_sections == N else hj.multisine(2, 32, frequencies=(0, 1))
+        )
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.optimal_design(system, design, goal=goal, noise=NOISE)
 
 
@@ -131,13 +135,13 @@ def with_angle(angle):
     )
     B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])
     C = np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])
-    return hj.LDTP(A, B[:, :, None], C[:, None])
+    return hj.linear.LDTP(A, B[:, :, None], C[:, None])
 
 
 def variance(model, design):
-    """Return that of the multipliers by `multiplier_bound`."""
+    """Return that of the multipliers by `cramer_rao`."""
     htf = expected_htf(model, design, NOISE, (-1, 0, 1))
-    return total_variance(hj.identify.multiplier_bound(model, htf))
+    return total_variance(hj.identify.cramer_rao(model, htf))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +154,7 @@ def three():
 def test_several_models(robust, exponent, three):
     """The certificate bounds all designs for the mean of powers, and standard errors of 1e-15 have
     no effect (their 16th powers are zero)."""
-    usual = hj.multisine(N, 32, band=(0, 2))
+    usual = hj.multisine(N, 32, frequencies=(0, 2))
     about = dict(goal=GOAL, limit={"u": 0.1}, robust=robust)
     plan = hj.optimal_design(three, usual, noise=NOISE, **about)
     assert plan.certificate < 1.05
@@ -161,7 +165,7 @@ def test_several_models(robust, exponent, three):
         return np.mean(powers) ** (1 / exponent)
 
     assert mean(plan.design) == pytest.approx(plan.criterion, rel=2e-3)
-    for other in random_designs(5, 0.1, N, 32, band=(0, 2)):
+    for other in random_designs(5, 0.1, N, 32, frequencies=(0, 2)):
         assert mean(other) > plan.criterion / plan.certificate
     for_one = hj.optimal_design(
         three[0], usual, noise=NOISE, goal=GOAL, limit={"u": 0.1}
@@ -172,7 +176,7 @@ def test_several_models(robust, exponent, three):
 
 
 def test_limits_hold_for_each_of_several_models(three):
-    usual = hj.multisine(N, 32, band=(0, 2))
+    usual = hj.multisine(N, 32, frequencies=(0, 2))
     limit = {"u": 9.0, "y": 0.1}
     plan = hj.optimal_design(three, usual, goal=GOAL, noise=NOISE, limit=limit)
     rms = []
@@ -183,24 +187,24 @@ def test_limits_hold_for_each_of_several_models(three):
 
 
 def test_several_models_that_do_not_fit_together(three):
-    usual = hj.multisine(N, 32, band=(0, 2))
+    usual = hj.multisine(N, 32, frequencies=(0, 2))
     with pytest.raises(
-        hj.DefinitionError, match="model 1 and model 0 have different n_sections"
+        hj.errors.DefinitionError, match="model 1 and model 0 have different n_sections"
     ):
         hj.optimal_design([three[0], hj.testing.synthetic_ldtp()], usual)
     unstable = dataclasses.replace(three[1], A=1.1 * three[1].A)
-    with pytest.raises(hj.DefinitionError, match="model 1 is unstable"):
+    with pytest.raises(hj.errors.DefinitionError, match="model 1 is unstable"):
         hj.optimal_design([three[0], unstable], usual)
-    with pytest.raises(hj.DefinitionError, match="not an empty list"):
+    with pytest.raises(hj.errors.DefinitionError, match="not an empty list"):
         hj.optimal_design([], usual)
 
 
 def test_draws_have_the_covariance_of_the_fit():
     model = with_angle(1.0)
-    design = hj.multisine(N, 32, band=(0, 2), amplitude=0.05)
-    fit = hj.fit_ldtp(expected_htf(model, design, NOISE), model)
+    design = hj.multisine(N, 32, frequencies=(0, 2), amplitude=0.05)
+    fit = hj.fit_ldtp(expected_htf(model, design, NOISE), initial=model)
     coefficients = []
-    for draw in hj.designs.draws(fit, 400):
+    for draw in hj.designs.draw_models(fit, 400):
         coefficients.append(np.poly(draw.multipliers).real[1:])
     covariance = np.cov(np.transpose(coefficients))
     tolerance = 0.3 * fit.covariance.max()
@@ -216,7 +220,7 @@ def test_physical_parameters():
     usual = hj.multisine(8, periods=16).scaled(0.001)
     free = ("damping", "amplitude")
     harmonics = (-1, 0, 1)
-    goal = hj.designs.Parameters(cycle, sections, free, harmonics=harmonics)
+    goal = hj.designs.ParameterGoal(cycle, sections, free, harmonics=harmonics)
     plan = hj.optimal_design(model, usual, goal=goal, noise={"x": 1e-4})
     assert plan.certificate < 1.03
     assert plan.saved > 10
@@ -224,8 +228,12 @@ def test_physical_parameters():
     exact = model.htf(usual.frequencies, harmonics)
     H = exact.H[:, :, :1]
     variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], H.shape)
-    htf = hj.HTF(exact.f, H, harmonics, 8, exact.inputs, "x", variance=variance)
-    observed = hj.ObservedHTF(htf, sections)
-    S = hj.identifiability(cycle.system, observed, free, guess=cycle).sensitivity
+    htf = hj.linear.HTF(
+        exact.frequencies, H, harmonics, 8, exact.inputs, "x", variance=variance
+    )
+    observed = hj.fitting.ObservedHTF(htf, sections)
+    S = hj.fitting.identifiability(
+        cycle.system, observed, free, guess=cycle
+    ).sensitivity
     bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
     assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -18,7 +18,7 @@ RMS = {"u0": 0.1, "u1": 0.05}
 def test_peaks_hold_in_every_experiment(optimal_two):
     free = optimal_two()
     plan = optimal_two(limit=Limits(rms={"u1": 0.05}, peak={"u0": 0.1}))
-    u = plan.design.inputs()
+    u = plan.design.signals()
     peaks = np.abs(u).max(axis=1)[:, 0]
     assert_allclose(peaks, 0.1)
     rms = np.sqrt(np.mean(u[..., 1] ** 2))
@@ -28,14 +28,14 @@ def test_peaks_hold_in_every_experiment(optimal_two):
     assert 1.5 < plan.criterion / free.criterion < 5
     assert plan.certificate > 1.5
     # The usual amplitudes get phases for low peaks, too: the design saves strides by its powers.
-    usual_peaks = np.abs(plan.usual.inputs()).max(axis=1)[:, 0]
+    usual_peaks = np.abs(plan.usual.signals()).max(axis=1)[:, 0]
     assert set(usual_peaks.round(6)) == {0.0, 0.1}
 
 
 def test_rates(optimal_two):
     """The change from one section to the next, also from the last one to the first."""
     plan = optimal_two(limit=Limits(rms=RMS, rate={"u0": 0.03}))
-    change = np.diff(plan.design.inputs(33), axis=1)[:, : 6 * 32]
+    change = np.diff(plan.design.signals(33), axis=1)[:, : 6 * 32]
     measured = np.sqrt(np.mean(change[..., 0] ** 2))
     assert measured == pytest.approx(0.03, rel=1e-3)
     assert plan.certificate < 1.03
@@ -44,10 +44,10 @@ def test_rates(optimal_two):
 
 def test_strides(optimal_two, two_usual):
     """A smaller number of experiments holds fewer lines; words and strides go together."""
-    plan = optimal_two(limit=Limits(rms="input", strides=300))
+    plan = optimal_two(limit=Limits(rms="input", cycles=300))
     assert plan.design.experiments == 300 // 32
-    assert plan.strides <= 300
-    power = np.sqrt(np.mean(two_usual.inputs() ** 2, axis=(0, 1)))
+    assert plan.cycles <= 300
+    power = np.sqrt(np.mean(two_usual.signals() ** 2, axis=(0, 1)))
     assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
 
 
@@ -58,7 +58,7 @@ def test_a_peak_that_nothing_exceeds_changes_nothing(optimal_two):
 
 
 def test_noise_that_differs_between_harmonics(two, optimal_two):
-    """Against `multiplier_bound`, which takes numerators out in another way."""
+    """Against `cramer_rao`, which takes numerators out in another way."""
 
     def red(std):
         return lambda f: std / np.sqrt(0.2 + f**2)
@@ -71,12 +71,12 @@ def test_noise_that_differs_between_harmonics(two, optimal_two):
     harmonics = np.array([-1, 0, 1])
     htf = two.htf(plan.usual.frequencies, harmonics)
     # Harmonic m of an output is seen at f + m, of which lines between sections are mirrored.
-    shifted = htf.f + harmonics[:, None]
+    shifted = htf.frequencies + harmonics[:, None]
     seen_at = np.abs((shifted + N / 2) % N - N / 2)
     spectra = [level(seen_at) ** 2 for level in noise.values()]
     spectrum = np.stack(spectra, axis=2)[..., None]
     variance = spectrum * plan.usual.expected_variance()[:, None, :]
     uncertain = dataclasses.replace(htf, source="estimate", variance=variance)
-    bound = hj.identify.multiplier_bound(two, uncertain)
+    bound = hj.identify.cramer_rao(two, uncertain)
     total = np.trace(bound.multiplier_covariances[0])
     assert plan.usual_criterion == pytest.approx(total, rel=1e-6)

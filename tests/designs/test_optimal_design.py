@@ -30,18 +30,18 @@ def plan(isochron_ldtp, usual):
 
 
 def test_standard_errors_are_the_cramer_rao_bound(plan, isochron_ldtp):
-    """That of `multiplier_bound`; for any weights of H_m and H_{-m}."""
+    """That of `cramer_rao`; for any weights of H_m and H_{-m}."""
     for design, said in (
         (plan.usual, plan.usual_variances),
         (plan.design, plan.variances),
     ):
         htf = with_variance(isochron_ldtp, design)
-        bound = hj.identify.multiplier_bound(isochron_ldtp, htf)
+        bound = hj.identify.cramer_rao(isochron_ldtp, htf)
         assert_allclose(said, bound.standard_errors[:1] ** 2, rtol=2e-3)
         unequal = dataclasses.replace(
             htf, variance=(htf.variance.T * (1 + 1e-6 * np.arange(5))).T
         )
-        other = hj.identify.multiplier_bound(isochron_ldtp, unequal)
+        other = hj.identify.cramer_rao(isochron_ldtp, unequal)
         assert_allclose(other.covariance, bound.covariance, rtol=2e-3)
 
 
@@ -54,11 +54,11 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
     assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
     assert (
-        f"stride of this design replaces {plan.saved:.2g} with equal amplitudes."
+        f"cycle of this design replaces {plan.saved:.2g} with equal amplitudes."
         in repr(plan)
     )
     assert re.search(
-        r"strides +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
+        r"cycles +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
     )
     assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 
@@ -80,15 +80,15 @@ def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
 
 def test_experiments_are_as_promised(plan, isochron_ldtp):
     """Power and deviations are those of the signals themselves, the same in all experiments."""
-    powers = np.mean(plan.design.inputs() ** 2, axis=(1, 2))
+    powers = np.mean(plan.design.signals() ** 2, axis=(1, 2))
     assert_allclose(powers, plan.rms["u"] ** 2, rtol=1e-3)
     data = hj.experiments.simulate_experiments(
         isochron_ldtp, plan.design, start="periodic"
     )
     rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
     assert_allclose(rms, [plan.rms["yM"], plan.rms["vM"]], rtol=1e-3)
-    assert plan.strides == plan.usual.cycles(0)
-    assert plan.strides_for(plan.standard_errors.max() / 2) == 4 * plan.strides
+    assert plan.cycles == plan.usual.cycles(0)
+    assert plan.cycles_for(plan.standard_errors.max() / 2) == 4 * plan.cycles
 
 
 def test_fits_reach_what_is_promised(model):
@@ -120,7 +120,7 @@ def test_units_and_estimates(isochron_ldtp, usual):
         (b.certificate, b.criterion), rel=1e-6
     )
     fit = hj.fit_multipliers(with_variance(isochron_ldtp, usual), 2)
-    for goal in ("multipliers", hj.designs.Multipliers(0, "modulus")):
+    for goal in ("multipliers", hj.designs.MultiplierGoal(0, "modulus")):
         estimated = hj.optimal_design(fit, usual, goal=goal, noise=NOISE)
         assert estimated.saved > 5
         assert estimated.certificate < 1.1

@@ -16,7 +16,7 @@ ASKED = 7e-5
 
 @pytest.fixture(scope="module")
 def first():
-    return hj.multisine(8, periods=32, lines="odd", band=(0, 4)).scaled(0.001)
+    return hj.multisine(8, periods=32, lines="odd", frequencies=(0, 4)).scaled(0.001)
 
 
 def measured(model, design, seed=0, factor=1.0):
@@ -30,7 +30,7 @@ def measured(model, design, seed=0, factor=1.0):
 @pytest.fixture(scope="module")
 def studies(model, first):
     """One, after each of its blocks."""
-    study = hj.designs.Study(first, order=2, standard_error=ASKED)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=ASKED)
     found = [study]
     while not study.done:
         data = measured(model, study.design, seed=len(found))
@@ -50,10 +50,10 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
     plan = hj.optimal_design(model, first, noise=NOISE)
     error = end.standard_errors[-1, 0]
     strides_of_first = plan.usual_criterion * plan.usual.cycles(0) / error**2
-    assert strides_of_first > 4 * end.strides[-1]
+    assert strides_of_first > 4 * end.cycles[-1]
     # The bound of as many strides, all of them with the best design for the true model.
     bound_of_plan = np.linalg.norm(plan.standard_errors)
-    bound = bound_of_plan * np.sqrt(plan.strides / end.strides[-1])
+    bound = bound_of_plan * np.sqrt(plan.cycles / end.cycles[-1])
     assert error > 0.95 * bound
 
 
@@ -63,9 +63,9 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     assert studies[0].design is first
     assert studies[0].fit is None
     cycles = [study.design.cycles(0) for study in studies[:-1]]
-    assert_array_equal(studies[-1].strides, np.cumsum(cycles))
+    assert_array_equal(studies[-1].cycles, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
-        assert after.strides[-1] <= 3 * before.strides[-1]
+        assert after.cycles[-1] <= 3 * before.cycles[-1]
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
@@ -75,7 +75,7 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
 
 def test_too_much_noise_to_begin_with(model, first):
     """The first design is repeated with other phases."""
-    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=1e-3)
     lost = study.add(measured(model, first, factor=1e4))
     assert not lost.done
     assert np.isnan(lost.standard_errors).all()
@@ -95,7 +95,9 @@ def test_too_much_noise_to_begin_with(model, first):
     "goal", [dict(which=0), dict(part="modulus", harmonics=(-1, 0, 1))]
 )
 def test_goals(model, first, goal):
-    study = hj.designs.Study(first, 2, 1e-4, goal=hj.designs.Multipliers(**goal))
+    study = hj.designs.SequentialDesign(
+        first, 2, 1e-4, goal=hj.designs.MultiplierGoal(**goal)
+    )
     study = study.add(measured(model, first))
     assert study.standard_errors.shape == (1, 1)
     assert study.plan.saved > 3
@@ -108,34 +110,34 @@ def test_repeated_windows_count(model, first):
         model, first, discard=32, start="periodic"
     )
     noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
-    study = hj.designs.Study(first, 2, 1e-5)
+    study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
-    assert once.strides[0] == twice.strides[0] == 2 * first.cycles(0)
+    assert once.cycles[0] == twice.cycles[0] == 2 * first.cycles(0)
     assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
 
 def test_an_order_that_is_too_low_is_named(model, first):
-    study = hj.designs.Study(first, 1, 1e-5)
-    with pytest.raises(hj.DefinitionError, match="show more than 1 multipliers"):
+    study = hj.designs.SequentialDesign(first, 1, 1e-5)
+    with pytest.raises(hj.errors.DefinitionError, match="show more than 1 multipliers"):
         for k in range(4):
             study = study.add(measured(model, study.design, seed=k))
 
 
 def test_bad_data(model, first):
     with pytest.raises(
-        hj.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
+        hj.errors.DefinitionError, match="`limit` .*no signal 'nope'; signals are u"
     ):
-        hj.designs.Study(first, 2, 1e-4, limit={"nope": 1.0})
-    study = hj.designs.Study(first, 2, 1e-4)
+        hj.designs.SequentialDesign(first, 2, 1e-4, limit={"nope": 1.0})
+    study = hj.designs.SequentialDesign(first, 2, 1e-4)
     data = measured(model, first)
     for change, message in (
         (dict(outputs=("a", "b")), "blocks of one study have different outputs"),
         (dict(result=[3] * len(data.u)), "no experiment ran to its end \\(0/8 ok"),
         (dict(n_sections=4), "have different n_sections: 4 and 8"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             study.add(data).add(dataclasses.replace(data, **change))
 
 
@@ -147,8 +149,10 @@ def from_the_cycle(model, first):
 
 
 def test_what_is_left_of_the_start_is_refused(model, first, from_the_cycle):
-    study = hj.designs.Study(first, 2, 1e-3)
-    with pytest.raises(hj.DefinitionError, match="of the start's transient is left"):
+    study = hj.designs.SequentialDesign(first, 2, 1e-3)
+    with pytest.raises(
+        hj.errors.DefinitionError, match="of the start's transient is left"
+    ):
         study.add(from_the_cycle)
     found = study.add(hj.identify.remove_transient(from_the_cycle, 2).data)
     assert found.fit.contains(model.multipliers, 0.999).all()
@@ -158,18 +162,18 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     """Where Student's intervals are half as wide again, a study is not done at the standard error
     that was asked, and the next block is longer by 1.5 squared, or as long as it may be."""
     data = measured(model, first)
-    error = hj.designs.Study(first, 2, 1.0).add(data).standard_errors[0, 0]
+    error = hj.designs.SequentialDesign(first, 2, 1.0).add(data).standard_errors[0, 0]
     # The scatter of few lines understates the error of a first block, but the noise level does not.
     plan = hj.optimal_design(model, first, noise=NOISE)
     assert error > 0.95 * np.linalg.norm(plan.usual_standard_errors)
     asked = 1.2 * error
-    assert hj.designs.Study(first, 2, asked).add(data).done
-    half = hj.designs.Study(first, 2, 0.4 * error).add(data)
+    assert hj.designs.SequentialDesign(first, 2, asked).add(data).done
+    half = hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
-    assert not hj.designs.Study(first, 2, asked).add(data).done
+    assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
     assert (
-        hj.designs.Study(first, 2, 0.4 * error).add(data).plan.strides
-        > half.plan.strides
+        hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.cycles
+        > half.plan.cycles
     )
 
 
@@ -180,7 +184,7 @@ MULTIPLIERS = np.array([0.8, 0.3 + 0j])
 
 
 def test_an_unstable_estimate_repeats_the_first_design(model, first):
-    study = hj.designs.Study(first, order=2, standard_error=1e-3)
+    study = hj.designs.SequentialDesign(first, order=2, standard_error=1e-3)
     unstable = dataclasses.replace(model, A=1.05 * model.A)
     study = study.add(measured(unstable, first))
     assert "again, since the estimate is unstable" in repr(study)
@@ -196,7 +200,7 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     rng = np.random.default_rng(seed)
     y = y + noise * rng.normal(size=(S, *y.shape))
     u = np.zeros((S, len(cycle), 1))
-    return hj.ExperimentData(u, y, n_sections=N, periods=P)
+    return hj.experiments.ExperimentData(u, y, n_sections=N, periods=P)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +216,9 @@ def test_a_transient_in_the_window_is_refused(before, repeats, left):
     data = records(size, before=before, repeats=repeats)
     no_noise = np.zeros(2)
     refuse_transient(data, repeats, MULTIPLIERS, no_noise, 1.05 * size * left)
-    with pytest.raises(hj.DefinitionError, match=f"after {before} discarded cycles"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=f"after {before} discarded cycles"
+    ):
         refuse_transient(data, repeats, MULTIPLIERS, no_noise, 0.95 * size * left)
     refuse_transient(records(1.0, before=0), 1, MULTIPLIERS, no_noise, 0.0)
 
@@ -225,5 +231,5 @@ def test_noise_is_no_transient():
     size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)
-        with pytest.raises(hj.DefinitionError, match="transient is left"):
+        with pytest.raises(hj.errors.DefinitionError, match="transient is left"):
             refuse_transient(records(size, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)

@@ -33,7 +33,7 @@ class Converter(hj.HybridSystem):
         return {"off": circuit(0.0), "on": circuit(1.0)}
 
     def transitions(self):
-        tick = hj.Scheduled(1.0)
+        tick = hj.systems.Scheduled(1.0)
 
         def anew(t, q, u):
             return (q[0], 0.0)
@@ -44,7 +44,7 @@ class Converter(hj.HybridSystem):
                 return self.duty - q[1]
 
         else:
-            trip = hj.Scheduled(1.0, 1.0 * self.duty)
+            trip = hj.systems.Scheduled(1.0, 1.0 * self.duty)
         return (
             hj.Transition("trip", "on", "off", trip),
             hj.Transition("tick", "off", "on", tick, reset=anew),
@@ -76,7 +76,9 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
     chart = "off" if duty <= 0.5 else "on"
     guess = hj.Guess(chart, (0.3, 0.9), time=0.6 if duty == 0.5 else 0.9)
     if by_ramp and duty > 1 - 1e-8:
-        with pytest.raises(hj.ComputationError, match="'trip' and 'tick' coincide"):
+        with pytest.raises(
+            hj.errors.ComputationError, match="'trip' and 'tick' coincide"
+        ):
             hj.find_limit_cycle(system, guess)
         return
     cycle = hj.find_limit_cycle(system, guess)
@@ -145,7 +147,9 @@ def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_befor
 def test_schedules_whose_order_is_not_defined():
     """At duty 0, both begin their period at the same time."""
     system = Converter(0.0, by_ramp=False)
-    refused = pytest.raises(hj.DefinitionError, match="'trip' and 'tick' are scheduled")
+    refused = pytest.raises(
+        hj.errors.DefinitionError, match="'trip' and 'tick' are scheduled"
+    )
     with refused:
         hj.simulate(system, "off", (0.0, 0.5), 3.0, time=0.5)
     with refused:
@@ -167,7 +171,7 @@ class PeakCurrent(hj.HybridSystem):
 
     def transitions(self):
         below = (lambda t, q, u: q[0] < self.limit) if self.allows else None
-        tick = hj.Scheduled(1.0)
+        tick = hj.systems.Scheduled(1.0)
 
         def trip_guard(t, q, u):
             return self.limit - q[0]
@@ -231,7 +235,7 @@ def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
     period = np.log((1.5 - push) / 0.5)
     assert_allclose(cycle.period, period, rtol=1e-10)
     assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
-    assert hj.coincidences(cycle) == []
+    assert hj.orbits.simultaneous_events(cycle) == []
 
 
 class Kicked(hj.HybridSystem):
@@ -262,7 +266,9 @@ class Kicked(hj.HybridSystem):
             return 1.2 - q[0]
 
         return (
-            hj.Transition("kick", "calm", "kicked", hj.Scheduled(1.0), reset=kick),
+            hj.Transition(
+                "kick", "calm", "kicked", hj.systems.Scheduled(1.0), reset=kick
+            ),
             hj.Transition("halve", "kicked", "calm", halve_guard, reset=halve),
         )
 
@@ -318,7 +324,7 @@ def test_events_that_take_each_others_place_at_once():
             hj.Transition("down", "off", "on", down_guard),
         ],
     )
-    with pytest.raises(hj.ComputationError, match="events accumulate"):
+    with pytest.raises(hj.errors.ComputationError, match="events accumulate"):
         hj.simulate(relay, "on", (0.0,), 2.0)
 
 
@@ -334,8 +340,8 @@ def test_a_guard_that_both_charts_have_happens_once():
         [
             hj.Transition("by day", "day", "day", cross, "rising"),
             hj.Transition("by night", "night", "night", cross, "rising"),
-            hj.Transition("dusk", "day", "night", hj.Scheduled(1.0)),
-            hj.Transition("dawn", "night", "day", hj.Scheduled(1.0)),
+            hj.Transition("dusk", "day", "night", hj.systems.Scheduled(1.0)),
+            hj.Transition("dawn", "night", "day", hj.systems.Scheduled(1.0)),
         ],
         period=2.0,
     )
@@ -346,7 +352,9 @@ def test_a_guard_that_both_charts_have_happens_once():
 def test_a_turn_cannot_begin_between_events_at_once():
     """Right after the spike of x that y follows at once; that of y may begin a turn."""
     guess = hj.Guess("rest", (0.4, 0.1))
-    with pytest.raises(hj.ComputationError, match="event .Y. coincides with .X."):
+    with pytest.raises(
+        hj.errors.ComputationError, match="event .Y. coincides with .X."
+    ):
         hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("X"))
     cycle = hj.find_limit_cycle(neurons(0.3), guess, section=hj.AtEvent("Y"))
     assert_allclose(cycle.period, np.log(1.2 / 0.5), rtol=1e-10)
@@ -359,7 +367,10 @@ def test_programs_refuse_events_that_coincide():
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
     measured = result(jnp.array([0.95, 0.99, 1 - 1e-10]))
-    assert_array_equal(measured, [hj.Result.OK, hj.Result.OK, hj.Result.COINCIDENCE])
+    assert_array_equal(
+        measured,
+        [hj.errors.Result.OK, hj.errors.Result.OK, hj.errors.Result.SIMULTANEOUS],
+    )
 
 
 def test_experiments_near_full_and_zero_duty():

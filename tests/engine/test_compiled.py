@@ -27,7 +27,7 @@ def test_no_operation_outside_of_programs_compiles_one():
             data = hj.run_experiments(cycle, FAMILY, u, OUTPUTS, start=start, discard=0)
         trajectory = cycle.trajectory()
         trajectory(*OUTPUTS)
-        placed = hj.place_sections(cycle, FAMILY)
+        placed = hj.sections.place_sections(cycle, FAMILY)
         print(
             cycle,
             model,
@@ -44,15 +44,20 @@ def test_harmonic_transfer_functions_compile_nothing():
     f = np.arange((SECTIONS + 1) // 2)
     rng = np.random.default_rng(0)
     A, B, C, D = 0.1 * rng.normal(size=(4, SECTIONS, 2, 2))
-    model = hj.LDTP(A, B, C, D, **ports)
+    model = hj.linear.LDTP(A, B, C, D, **ports)
     with compiled() as names:
         exact = model.htf(f)
         loop = model.feedback(np.eye(2)).inverse()
         size = np.ones(exact.H.shape)
         more = {"n_sections": SECTIONS, **ports}
-        scatter = hj.Scatter(np.full(len(f), 4.0), size)
-        htf = hj.HTF(
-            f, exact.H, exact.harmonics, **more, variance=size, scatter=scatter
+        variance_dof = hj.linear.VarianceDof(np.full(len(f), 4.0), size)
+        htf = hj.linear.HTF(
+            f,
+            exact.H,
+            exact.harmonics,
+            **more,
+            variance=size,
+            variance_dof=variance_dof,
         )
         print(htf @ exact, htf.feedback(exact).inverse(), (htf + exact)[0], loop)
         print(htf.error(exact), htf.select(1).confidence_radius())

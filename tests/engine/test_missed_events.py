@@ -142,7 +142,9 @@ def test_a_guard_that_is_faster_than_the_state():
         return (1.0,)
 
     system = toy({"a": Field(("x",), rates)}, (fall,))
-    found = hj.simulate(system, "a", (0.0,), 1.0, settings=hj.Settings(1e-6, 1e-6))
+    found = hj.simulate(
+        system, "a", (0.0,), 1.0, settings=hj.orbits.Settings(1e-6, 1e-6)
+    )
     truth = (np.pi + np.arcsin(0.3) + 2 * np.pi * np.arange(80)) / 500
     truth = truth[truth < 1]
     assert_allclose([e.time for e in found.events], truth, atol=1e-9)
@@ -151,7 +153,7 @@ def test_a_guard_that_is_faster_than_the_state():
 METHODS = [
     (VERNER76, 5),
     (as_method(diffrax.Dopri8()), 5),
-    (as_method(hj.Radau()), 5),
+    (as_method(hj.systems.Radau()), 5),
     (as_method(diffrax.Tsit5()), 4),
     (as_method(diffrax.Dopri5()), 4),
     (as_method(diffrax.Kvaerno5()), 3),

@@ -71,9 +71,9 @@ def test_lanes_fail_one_by_one():
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
     moved = move(s, lanes, u, until(end), tight(s)).moved
-    bad = hj.Result.BAD_INPUT
-    zeno = hj.Result.ZENO
-    assert moved.result.tolist() == [hj.Result.OK, bad, zeno, bad]
+    bad = hj.errors.Result.BAD_INPUT
+    zeno = hj.errors.Result.ZENO
+    assert moved.result.tolist() == [hj.errors.Result.OK, bad, zeno, bad]
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
     assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
 

@@ -39,7 +39,7 @@ class Ball(hj.HybridSystem):
                 "kick",
                 "flight",
                 "flight",
-                hj.Scheduled(1.0),
+                hj.systems.Scheduled(1.0),
                 reset=lambda t, q, u: (q[0], q[1] + 2.0 * q[0]),
             ),
         ]

@@ -131,12 +131,12 @@ def test_a_hundred_bounces():
 def test_zeno_is_seen_before_its_limit(e):
     found = ball(e, throw=False)
     limit = FALL * (1 + e) / (1 - e)
-    assert found.result == hj.Result.ZENO
+    assert found.result == hj.errors.Result.ZENO
     assert limit * (1 - 1e-3) < found.t[-1] < limit
     expected = FALL * (1 + 2 * e * (1 - e ** np.arange(len(found.events))) / (1 - e))
     assert_allclose(times(found), expected, rtol=1e-10)
     with pytest.raises(
-        hj.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"
+        hj.errors.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"
     ):
         ball(e)
 
@@ -148,10 +148,10 @@ def test_grazing(gap):
     found = hj.simulate(system, "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
     hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
     if abs(gap) < 1e-10:
-        assert found.result == hj.Result.GRAZING
+        assert found.result == hj.errors.Result.GRAZING
         assert np.all(np.abs(times(found) - hit) < 1e-6)
     else:
-        assert found.result == hj.Result.OK
+        assert found.result == hj.errors.Result.OK
         assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
 
 
@@ -164,15 +164,15 @@ def test_a_guard_that_dips_within_a_step_fires(exponent):
     assert_allclose(times(found), [1 - np.sqrt(depth)], atol=1e-11)
     above = hj.simulate(Toys(dip, [-depth]), "dip", (1.0 + depth, 0.0), 3.0)
     assert not above.events
-    assert above.result == hj.Result.OK
+    assert above.result == hj.errors.Result.OK
 
 
 def test_blow_up():
     found = hj.simulate(BLOWUP, "x", (1.0,), 2.0, throw=False)
-    assert found.result == hj.Result.BLOW_UP
+    assert found.result == hj.errors.Result.BLOW_UP
     error = abs(found.t[-1] - 1.0)
     assert error < 1e-6
-    with pytest.raises(hj.ComputationError, match="the state left all bounds"):
+    with pytest.raises(hj.errors.ComputationError, match="the state left all bounds"):
         hj.simulate(BLOWUP, "x", (1.0,), 2.0)
     decay = hj.simulate(BLOWUP, "x", (-1.0,), 2.0)
     assert_allclose(decay.after[-1], [-1 / 3], rtol=1e-10)
@@ -220,7 +220,7 @@ def tick_reset(t, q, u):
     return q + 1
 
 
-COUNT = hj.Transition("tick", "a", "a", hj.Scheduled(0.1), reset=tick_reset)
+COUNT = hj.Transition("tick", "a", "a", hj.systems.Scheduled(0.1), reset=tick_reset)
 
 
 def a_rates(t, q, u):
@@ -329,7 +329,7 @@ def test_an_event_at_a_tick():
     def tick_reset(t, q, u):
         return q + count
 
-    tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=tick_reset)
+    tick = hj.Transition("tick", "a", "a", hj.systems.Scheduled(1.0), reset=tick_reset)
 
     def rates(t, q, u):
         return (-1.0, 0.0, 0.0)

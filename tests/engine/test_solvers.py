@@ -55,7 +55,7 @@ def exact(a=20.0):
 
 @pytest.mark.parametrize("stages", [3, 5, 7])
 def test_radau_is_a_collocation_method(stages):
-    method = as_method(hj.Radau(stages))
+    method = as_method(hj.systems.Radau(stages))
     a = np.array(method.a)
     b = np.array(method.b)
     c = np.array(method.c)
@@ -79,7 +79,7 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
 
     excited = np.array([[0.0, 1.0, 1e-4, 1e-8]])
     h = 0.4
-    radau = as_method(hj.Radau())
+    radau = as_method(hj.systems.Radau())
     step = take_step(radau, field, jnp.zeros(4), 1.0 + excited, jnp.array([h]))
     expected = np.cos(h) + excited * np.exp(-rate * h)
     error = np.abs(np.asarray(step.q) - expected)
@@ -96,13 +96,13 @@ RAMP = toy({"a": Field(("x", "v"), a_rates)})
 
 def test_a_landing_is_as_stiff_as_its_chart():
     """The last part of the way, five decay times long, is no explicit step."""
-    s = Structure(integrated(RAMP, hj.Radau()))
+    s = Structure(integrated(RAMP, hj.systems.Radau()))
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
     one = np.ones(1)
     none = np.zeros(1, np.int32)
     lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
     target = Target(
-        np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.Result.OK
+        np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.errors.Result.OK
     )
     settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
     stride = Stride(one, 0.9975 * one, 1e7 * one)
@@ -110,7 +110,9 @@ def test_a_landing_is_as_stiff_as_its_chart():
     assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
 
 
-@pytest.mark.parametrize("solver", [hj.Radau(3), hj.Radau(5), diffrax.Kvaerno3()])
+@pytest.mark.parametrize(
+    "solver", [hj.systems.Radau(3), hj.systems.Radau(5), diffrax.Kvaerno3()]
+)
 def test_estimates_are_of_the_size_of_errors(solver):
     """Of a step whose end is known, one of its modes stiff."""
     method = as_method(solver)
@@ -136,7 +138,8 @@ def test_inverses_of_many_matrices():
 
 
 @pytest.mark.parametrize(
-    "solver", [hj.Radau(3), pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow)]
+    "solver",
+    [hj.systems.Radau(3), pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow)],
 )
 def test_derivatives_of_implicit_steps(solver):
     """First and second, by the implicit function theorem, against differences of long steps."""
@@ -166,7 +169,7 @@ def test_derivatives_of_implicit_steps(solver):
 @pytest.fixture(scope="module")
 def damped():
     guess = hj.Guess("a", (0.01, 0.02))
-    return hj.find_limit_cycle(integrated(DAMPED, hj.Radau()), guess)
+    return hj.find_limit_cycle(integrated(DAMPED, hj.systems.Radau()), guess)
 
 
 def test_a_stiff_cycle_with_default_settings(damped):

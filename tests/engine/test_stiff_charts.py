@@ -23,7 +23,9 @@ class Thermostat(hj.HybridSystem):
         def sensed(heat, rate):
             return lambda t, q, u: (heat - q[0] + u[0], rate * (q[0] - q[1]))  # noqa: E731
 
-        heated = FieldChart(sensed(1.0, self.fast), ("x", "z"), solver=hj.Radau())
+        heated = FieldChart(
+            sensed(1.0, self.fast), ("x", "z"), solver=hj.systems.Radau()
+        )
         return {"on": heated, "off": FieldChart(sensed(0.0, self.slow), ("x", "z"))}
 
     def transitions(self):
@@ -101,7 +103,7 @@ def test_derivatives_under_all_transformations(cycle):
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
 def test_experiments(cycle, start):
-    placed = hj.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
+    placed = hj.sections.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
     model = hj.linearize(cycle, placed, outputs="x")
     u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
     data = hj.run_experiments(
@@ -110,5 +112,5 @@ def test_experiments(cycle, start):
     assert (data.result == 0).all()
     x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
     assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
-    there = hj.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
+    there = hj.sections.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
     assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)

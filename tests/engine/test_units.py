@@ -56,7 +56,7 @@ def flow(length, time, scale, tangents):
 )
 def test_the_same_steps_in_all_units(tangents):
     h, code, q, result = flow(1.0, 1.0, SIZES, tangents)
-    assert_array_equal(result, hj.Result.OK)
+    assert_array_equal(result, hj.errors.Result.OK)
     assert jnp.max(code) >= 0, "there are events"
     for length, time in UNITS:
         scale = SIZES * sizes(length, time)
@@ -114,5 +114,5 @@ def test_a_chain_of_integrators_from_zero():
 
 
 def test_derivatives_need_sizes():
-    with pytest.raises(hj.DefinitionError, match="need the sizes of states"):
+    with pytest.raises(hj.errors.DefinitionError, match="need the sizes of states"):
         flow(1.0, 1.0, None, True)

@@ -11,12 +11,12 @@ from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
-DESIGN = hj.multisine(n_sections=4, periods=5, band=(0, 2.0), inputs=("a", "b"))
+DESIGN = hj.multisine(n_sections=4, periods=5, frequencies=(0, 2.0), inputs=("a", "b"))
 
 
 @pytest.fixture(scope="module")
 def model():
-    return hj.LDTP.from_blocks(*BLOCKS, inputs=("a", "b"))
+    return hj.linear.LDTP.from_blocks(*BLOCKS, inputs=("a", "b"))
 
 
 def test_simulation_from_the_cycle_is_the_definition(model):
@@ -30,13 +30,13 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     for start, cycles in (("cycle", 25), ("periodic", 5)):
         data = hj.experiments.simulate_experiments(model, DESIGN, start=start)
         assert data.u.shape[1] == cycles * 4
-    unstable = hj.LDTP(
+    unstable = hj.linear.LDTP(
         2 * np.ones((4, 1, 1)),
         np.ones((4, 1, 2)),
         np.ones((4, 2, 1)),
         inputs=("a", "b"),
     )
-    with pytest.raises(hj.DefinitionError, match="the model is unstable"):
+    with pytest.raises(hj.errors.DefinitionError, match="the model is unstable"):
         hj.experiments.simulate_experiments(unstable, DESIGN)
 
 
@@ -45,10 +45,10 @@ def test_failed_experiments_are_named():
     y[17, 41 * 32 + 21 :] = np.nan
     result = np.zeros(80, int)
     failed_at = np.full(80, -1)
-    result[17] = hj.Result.SECTION_MISSED
+    result[17] = hj.errors.Result.SECTION_MISSED
     failed_at[17] = 41 * 32 + 21
     usual = dict(n_sections=32, periods=64, result=result)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         np.ones_like(y), y, **usual, simulated=Simulated(failed_at)
     )
     assert data.summary() == (
@@ -57,7 +57,9 @@ def test_failed_experiments_are_named():
     assert data.ok.sum() == 79
     assert not data.ok[17]
     assert "79/80 ok" in repr(data)
-    result[:8] = hj.Result.BLOW_UP
+    result[:8] = hj.errors.Result.BLOW_UP
     assert (
-        hj.ExperimentData(np.ones_like(y), y, **usual).summary().endswith("and 4 more")
+        hj.experiments.ExperimentData(np.ones_like(y), y, **usual)
+        .summary()
+        .endswith("and 4 more")
     )

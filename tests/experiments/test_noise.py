@@ -49,7 +49,7 @@ def test_process_noise_has_the_color_that_it_says(std, memory):
 def data():
     u = np.ones((COUNT, N * CYCLES, 1))
     y = np.zeros((COUNT, N * CYCLES, 2))
-    return hj.ExperimentData(u, y, n_sections=N, periods=CYCLES)
+    return hj.experiments.ExperimentData(u, y, n_sections=N, periods=CYCLES)
 
 
 @pytest.mark.parametrize("memory", [0.0, 2.0])

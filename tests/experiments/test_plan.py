@@ -30,7 +30,7 @@ MODELS = (
 def test_host_and_program_try_the_same_ways(name, monkeypatch):
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
     family = FAMILIES.get(name, hj.ClockPhase(7))
-    placed = hj.place_sections(cycle, family)
+    placed = hj.sections.place_sections(cycle, family)
     settings = Settings(1e-9, 1e-9, PATIENCE, cycle.settings.scale)
     no_input = np.zeros((1, len(cycle.system.inputs)))
     host = plan._try_ways(placed, settings, no_input)

@@ -24,12 +24,12 @@ from ..toys import RESTING, Field
 FAMILIES = ("isochron", pytest.param("kinematic", marks=pytest.mark.slow))
 N = 32
 CYCLES = 84
-BATCH = dict(execution=hj.Execution(batch=40))
+BATCH = dict(execution=hj.scale.Execution(batch=40))
 
 
 @pytest.fixture(scope="session")
 def design():
-    return hj.paper_design()
+    return hj.experiments.paper_design()
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -87,7 +87,7 @@ def test_records_agree_with_scipy(family, design):
 
 def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, design):
     _, placed, _, data = family
-    u = design.inputs(CYCLES)
+    u = design.signals(CYCLES)
     u[17, 3 * N : 4 * N] = 60.0
     broken = hj.run_experiments(hopper_cycle, placed, u, OUTPUTS, discard=20, **BATCH)
     assert list(np.flatnonzero(~broken.ok)) == [17]
@@ -100,25 +100,27 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     assert np.all(np.isfinite(broken.y[17, :after]))
     assert np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
-    lost = design.f[design.experiment == 17]
-    assert_array_equal(estimate.f, np.setdiff1d(design.frequencies, lost))
+    lost = design.frequency[design.experiment == 17]
+    assert_array_equal(estimate.frequencies, np.setdiff1d(design.frequencies, lost))
 
 
 def test_large_inputs_that_change_the_order_of_events_are_reported(
     hopper_cycle, placed_isochrons, design
 ):
-    u = design.inputs(CYCLES) * 100
+    u = design.signals(CYCLES) * 100
     data = hj.run_experiments(
         hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH
     )
     assert 0 < data.ok.sum() < 80
-    measured = {hj.Result(int(r)) for r in data.result[~data.ok]}
-    assert measured == {hj.Result.EVENT_ORDER}
+    measured = {hj.errors.Result(int(r)) for r in data.result[~data.ok]}
+    assert measured == {hj.errors.Result.EVENT_ORDER}
 
 
 def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     unstable = dataclasses.replace(hopper_cycle, factors=1.1 * hopper_cycle.factors)
-    with pytest.raises(hj.ComputationError, match="not stable .largest multiplier 3.4"):
+    with pytest.raises(
+        hj.errors.ComputationError, match="not stable .largest multiplier 3.4"
+    ):
         hj.run_experiments(unstable, placed_isochrons, design, OUTPUTS, **BATCH)
 
 
@@ -126,7 +128,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
     ("change", "message"),
     [
         (
-            dict(design=hj.multisine(16, band=(0, 7.0))),
+            dict(design=hj.multisine(16, frequencies=(0, 7.0))),
             "different n_sections: 16 and 32",
         ),
         (dict(design=np.zeros((2, 33, 1))), "periods x 32, 1"),
@@ -136,7 +138,7 @@ def test_an_unstable_cycle_is_refused(hopper_cycle, placed_isochrons, design):
 )
 def test_bad_input(hopper_cycle, placed_isochrons, design, change, message):
     arguments = dict(sections=placed_isochrons, design=design, outputs=OUTPUTS) | change
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         hj.run_experiments(hopper_cycle, **arguments)
 
 
@@ -179,7 +181,7 @@ def scipy_speeds(v, inputs):
 @pytest.mark.slow
 def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     """No few equal steps will do: they are adapted, and the estimate still bounds the error."""
-    placed = hj.place_sections(vanderpol_cycle, [hj.Crossing("x", "falling")])
+    placed = hj.sections.place_sections(vanderpol_cycle, [hj.Crossing("x", "falling")])
     rng = np.random.default_rng(0)
     u = 0.1 * rng.standard_normal((3, 6, 1))
     data = hj.run_experiments(vanderpol_cycle, placed, u, ("v",), discard=0)
@@ -200,9 +202,9 @@ def test_sections_that_are_too_far_apart_for_the_steps_allowed(
     hopper_cycle, monkeypatch
 ):
     monkeypatch.setattr("hybridjax.experiments.plan.PATIENCE", 3)
-    settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
+    settings = hj.orbits.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     cycle = dataclasses.replace(hopper_cycle, settings=settings)
-    with pytest.raises(hj.ComputationError, match="too few steps .*max_steps"):
+    with pytest.raises(hj.errors.ComputationError, match="too few steps .*max_steps"):
         hj.run_experiments(
             cycle, hj.ClockPhase(3), np.zeros((1, 6, 1)), "yM", discard=0
         )
@@ -211,16 +213,17 @@ def test_sections_that_are_too_far_apart_for_the_steps_allowed(
 @pytest.mark.slow
 def test_clock_sections_of_an_autonomous_system(vanderpol_cycle):
     family = hj.ClockPhase(8, anchor=hj.Crossing("v", "falling"))
-    design = hj.multisine(n_sections=8, periods=4, band=(0, 2.0))
+    design = hj.multisine(n_sections=8, periods=4, frequencies=(0, 2.0))
     with pytest.raises(
-        hj.DefinitionError, match=r"has no clock.*multiplier of exactly 1.*Kinemat"
+        hj.errors.DefinitionError,
+        match=r"has no clock.*multiplier of exactly 1.*Kinemat",
     ):
         hj.run_experiments(vanderpol_cycle, family, design, "x")
     # Between such sections the multiplier 1 is there, and makes whole frequencies resonant.
     model = hj.linearize(vanderpol_cycle, family, "x")
     assert abs(model.multipliers[0] - 1) < 1e-9
     with pytest.raises(
-        hj.DefinitionError, match="use sections that depend on the state"
+        hj.errors.DefinitionError, match="use sections that depend on the state"
     ):
         model.htf([1.0])
     model.htf([0.5])
@@ -230,14 +233,14 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
     guess = hj.Guess("all", (0.0, 0.0, 0.0))
     resting = hj.find_limit_cycle(RESTING, guess, scale={"w": 1.0})
     family = hj.ClockPhase(4)
-    design = hj.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
+    design = hj.experiments.Design.from_lines([[0.25], [0.75]], n_sections=4, periods=4)
     data = hj.run_experiments(resting, family, design, ("x", "w"))
     assert data.summary() == "2/2 ok"
     assert np.all(data.error < 1e-8)
     model = hj.linearize(resting, family, ("x", "w"))  # the system is linear
     expected = hj.experiments.simulate_experiments(model, design).y
     assert_allclose(data.y, expected, atol=1e-9)
-    scales = hj.response_function(resting, family, "x").stepping.scales
+    scales = hj.experiments.response_function(resting, family, "x").stepping.scales
     sizes = [float(resting.period), *(resting.scale[name] for name in "xv"), 1.0]
     assert_array_equal(scales, np.tile(sizes, (4, 1)))
 
@@ -254,7 +257,9 @@ def central(f, x, e=1e-4):
 @pytest.mark.parametrize("family", (ISOCHRONS, KINEMATIC))
 def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
     family = dataclasses.replace(family, n_sections=4)
-    response = hj.response_function(lossy_cycle, family, OUTPUTS, accuracy=1e-11)
+    response = hj.experiments.response_function(
+        lossy_cycle, family, OUTPUTS, accuracy=1e-11
+    )
     x = jnp.stack(pick(lossy_cycle.system))
     rng = np.random.default_rng(0)
     u = 0.1 * jnp.asarray(rng.standard_normal(12))
@@ -266,7 +271,7 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
 
     value = jax.jit(loss)
     _, result = value(x, u)
-    assert result == hj.Result.OK
+    assert result == hj.errors.Result.OK
     reverse_mode = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))
     (by_x, by_u), _ = reverse_mode(x, u)
     forward_mode = jax.jit(jax.jacfwd(loss, has_aux=True))
@@ -313,7 +318,9 @@ class Restarted(hj.HybridSystem):
 
         return (
             hj.Transition("fall", "run", "run", fall_guard),
-            hj.Transition("restart", "run", "run", hj.Scheduled(1.0), reset=back),
+            hj.Transition(
+                "restart", "run", "run", hj.systems.Scheduled(1.0), reset=back
+            ),
         )
 
     def period(self):

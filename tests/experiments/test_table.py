@@ -10,7 +10,7 @@ from hybridjax._core.compilation import Program
 from hybridjax.experiments.passage import program
 from hybridjax.experiments.response import flow_batch
 from hybridjax.experiments.rows import tables
-from hybridjax.experiments.run import Options, prepare
+from hybridjax.experiments.run import RunOptions, prepare
 
 from ..conftest import APEX
 
@@ -27,7 +27,7 @@ def campaign():
     sizes = np.linspace(0.005, 0.3, EXPERIMENTS)[:, None, None]
     rng = np.random.default_rng(1)
     u = sizes * rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
-    return prepare(cycle, FAMILY, u, ("yM", "vM"), Options(discard=0))
+    return prepare(cycle, FAMILY, u, ("yM", "vM"), RunOptions(discard=0))
 
 
 @pytest.fixture(scope="module")

@@ -47,8 +47,10 @@ def hopper_htf(hopper_cycle):
 
 @pytest.fixture(scope="session")
 def seen_in_htf(hopper_cycle, hopper_htf):
-    data = hj.ObservedHTF(hopper_htf, SECTIONS)
-    return hj.identifiability(hopper_cycle.system, data, HOPPER, guess=hopper_cycle)
+    data = hj.fitting.ObservedHTF(hopper_htf, SECTIONS)
+    return hj.fitting.identifiability(
+        hopper_cycle.system, data, HOPPER, guess=hopper_cycle
+    )
 
 
 @pytest.fixture(scope="session")
@@ -56,13 +58,13 @@ def hopper_observed(hopper_cycle):
     """All that is to be seen of the limit cycle: states at sections, times of events."""
     events = [hj.AtEvent("liftoff"), hj.AtEvent("touchdown")]
     return [
-        hj.ObservedCycle.of(hopper_cycle, SECTIONS, OUTPUTS),
-        hj.ObservedCycle.of(hopper_cycle, events),
+        hj.fitting.ObservedCycle.of(hopper_cycle, SECTIONS, OUTPUTS),
+        hj.fitting.ObservedCycle.of(hopper_cycle, events),
     ]
 
 
 @pytest.fixture(scope="session")
 def seen_in_cycle(hopper_cycle, hopper_observed):
-    return hj.identifiability(
+    return hj.fitting.identifiability(
         hopper_cycle.system, hopper_observed, HOPPER, guess=hopper_cycle
     )

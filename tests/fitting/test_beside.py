@@ -20,7 +20,7 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     cycle = hj.find_limit_cycle(TRUE)
     lines = np.linspace(0.02, 0.48, 12)
     htf = hj.linearize(cycle, SECTIONS, OUTPUTS).htf(lines, (-1, 0, 1))
-    data = hj.ObservedHTF(htf, SECTIONS)
+    data = hj.fitting.ObservedHTF(htf, SECTIONS)
     start = hj.models.VerticalHopper(k=1.08 * TRUE.k, b=0.95 * TRUE.b)
     expected = hj.fit_model(start, data, ("k", "b"))
 
@@ -30,7 +30,7 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     monkeypatch.setattr(beside, "WORTH_COMPILING", 0)
     monkeypatch.setattr(beside, "evaluate", no_search)
     fit = hj.fit_model(start, data, ("k", "b"))
-    assert fit.result == hj.Result.OK
+    assert fit.result == hj.errors.Result.OK
     np.testing.assert_allclose(fit.values, [TRUE.k, TRUE.b], rtol=1e-8)
     np.testing.assert_allclose(fit.values, expected.values, rtol=1e-8)
     # (The Jacobian, by relative changes of the parameters.)

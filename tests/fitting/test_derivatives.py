@@ -40,7 +40,7 @@ def by_differences(cycle, look):
 
 def test_htfs(hopper_htf, seen_in_htf):
     S = seen_in_htf.sensitivity
-    weights = np.asarray(hj.ObservedHTF(hopper_htf, SECTIONS).weights)
+    weights = np.asarray(hj.fitting.ObservedHTF(hopper_htf, SECTIONS).weights)
     scaled = flat(np.asarray(hopper_htf.H) * weights)
     size = np.abs(S).max()
     assert_allclose(S[:, FORCES].sum(axis=1), -scaled, atol=1e-9 * size)
@@ -58,7 +58,7 @@ def test_states_on_sections_and_times_of_events(
     def look(cycle):
         parts = []
         for one in hopper_observed:
-            now = hj.ObservedCycle.of(cycle, one.sections, one.outputs)
+            now = hj.fitting.ObservedCycle.of(cycle, one.sections, one.outputs)
             scales = one.prepare(hopper_cycle).scales
             parts += [
                 np.ravel(x / s) for x, s in zip(now.measured, scales, strict=True)
@@ -70,7 +70,7 @@ def test_states_on_sections_and_times_of_events(
 
 def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
     """The gradient of a loss is the sum of its residuals' derivatives."""
-    weights = hj.ObservedHTF(hopper_htf, SECTIONS).weights
+    weights = hj.fitting.ObservedHTF(hopper_htf, SECTIONS).weights
     direction = np.random.default_rng(0).normal(size=(2, *hopper_htf.H.shape))
 
     @eqx.filter_jit
@@ -78,7 +78,7 @@ def test_reverse_mode_gives_the_same(hopper_cycle, hopper_htf, seen_in_htf):
     def gradient(system):
         cycle = hj.find_limit_cycle(system, hopper_cycle)
         model = hj.linearize(cycle, SECTIONS, OUTPUTS)
-        H = model.htf(hopper_htf.f, hopper_htf.harmonics).H * weights
+        H = model.htf(hopper_htf.frequencies, hopper_htf.harmonics).H * weights
         return (direction[0] * H.real + direction[1] * H.imag).sum()
 
     slopes = gradient(hopper_cycle.system)

@@ -17,10 +17,12 @@ STD = {"std": 1e-3, "period_std": 1e-3}
 
 def observed(cycle, noise=0.0):
     """Outputs at four phases, and the period."""
-    values, _, period = hj.ObservedCycle.of(cycle, PHASES, ("x", "v")).measured
+    values, _, period = hj.fitting.ObservedCycle.of(cycle, PHASES, ("x", "v")).measured
     drawn = noise * np.random.default_rng(0).normal(size=9)
     values = values + drawn[:8].reshape(4, 2)
-    return hj.ObservedCycle(PHASES, ("x", "v"), values, period=period + drawn[8], **STD)
+    return hj.fitting.ObservedCycle(
+        PHASES, ("x", "v"), values, period=period + drawn[8], **STD
+    )
 
 
 def test_a_fit_that_stops_where_cycles_end_has_not_converged():
@@ -51,22 +53,24 @@ def test_the_unit_of_residuals_does_not_count():
 
 def test_errors_that_no_residual_shows_are_unknown():
     juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
-    fit = hj.fit_model(juggler, hj.ObservedCycle(impact, times=[0.15]), "A")
-    assert fit.result == hj.Result.OK and np.isnan(fit.standard_errors).all()
-    with pytest.raises(hj.DefinitionError, match="no residual is left"):
+    fit = hj.fit_model(juggler, hj.fitting.ObservedCycle(impact, times=[0.15]), "A")
+    assert fit.result == hj.errors.Result.OK and np.isnan(fit.standard_errors).all()
+    with pytest.raises(hj.errors.DefinitionError, match="no residual is left"):
         fit.contains({"A": 0.2})
-    speed = hj.ObservedCycle(
+    speed = hj.fitting.ObservedCycle(
         impact, "v", [[-3.0]]
     )  # which is g T / 2 for any amplitude
     fit = hj.fit_model(juggler, speed, "A")
     assert (
-        fit.result == hj.Result.OK
+        fit.result == hj.errors.Result.OK
         and fit.identifiability.rank == 0
         and fit.contains({"A": 0.2})
     )
-    with pytest.raises(hj.DefinitionError, match="of all data, or of none"):
-        hj.identifiability(
-            juggler, [speed, hj.ObservedCycle(impact, period=1, period_std=1)], "A"
+    with pytest.raises(hj.errors.DefinitionError, match="of all data, or of none"):
+        hj.fitting.identifiability(
+            juggler,
+            [speed, hj.fitting.ObservedCycle(impact, period=1, period_std=1)],
+            "A",
         )
 
 
@@ -74,24 +78,30 @@ def test_errors_that_no_residual_shows_are_unknown():
 def test_times_of_autonomous_cycles_count_from_any_moment():
     where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
     cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
-    (gap,), (other,) = (np.diff(hj.place_sections(x, where).lanes.t) for x in cycles)
+    (gap,), (other,) = (
+        np.diff(hj.sections.place_sections(x, where).lanes.t) for x in cycles
+    )
     error, rough = (
         np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3,
         [],
     )  # of a difference of two times
     for begin in (0.0, 9.0):
-        data = hj.ObservedCycle(where, times=[begin, begin + gap], times_std=0.1)
+        data = hj.fitting.ObservedCycle(
+            where, times=[begin, begin + gap], times_std=0.1
+        )
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
         assert fit.dof == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
-        data = hj.ObservedCycle(where, "x", [[0.1], [-2.0]], times=[begin, begin + gap])
+        data = hj.fitting.ObservedCycle(
+            where, "x", [[0.1], [-2.0]], times=[begin, begin + gap]
+        )
         rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
     assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
     assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(
         rough[0]
     )
     with pytest.raises(
-        hj.DefinitionError, match="another 'mass', which was not fitted"
+        hj.errors.DefinitionError, match="another 'mass', which was not fitted"
     ):
         rough[0].chi_square({"mu": 1.1, "mass": 1.0})
 
@@ -100,7 +110,7 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
     fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
-    assert fit.result == hj.Result.OK and fit.cost < 1e-12
+    assert fit.result == hj.errors.Result.OK and fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p / fit.system.q == pytest.approx(
@@ -120,7 +130,7 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
     fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
-    assert fit.weighted and fit.dof == 7 and fit.result == hj.Result.OK
+    assert fit.weighted and fit.dof == 7 and fit.result == hj.errors.Result.OK
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
@@ -136,10 +146,12 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     J = np.stack([numbers(p=0.501) - usual, numbers(w=1.001) - usual], axis=1) / 1e-3
     errors = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
     assert fit.standard_errors[2] == pytest.approx(errors[1], rel=0.02)
-    with pytest.raises(hj.DefinitionError, match="`true` must have a value of 'w'"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="`true` must have a value of 'w'"
+    ):
         fit.contains({"p": 0.5, "q": 2.0})
     unseen = eqx.tree_at(lambda o: o.measured[1], data, np.nan * data.measured[1])
-    with pytest.raises(hj.ComputationError, match="residuals are not finite"):
+    with pytest.raises(hj.errors.ComputationError, match="residuals are not finite"):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
@@ -148,19 +160,20 @@ def test_advice_about_searches_names_their_function(oscillation):
     far, free = hj.Guess("charge", (9e9, 0.0)), ("p",)
     for call in (
         lambda: hj.fit_model(still, data, free, guess=far),
-        lambda: hj.identifiability(still, data, free, guess=oscillation),
+        lambda: hj.fitting.identifiability(still, data, free, guess=oscillation),
         lambda: hj.sweep(still, {"p": [1.0, 2.0]}),
         lambda: hj.explore(still, "p"),
     ):
         with pytest.raises(
-            hj.ComputationError, match=r"\(These arguments .*`find_limit_cycle`: "
+            hj.errors.ComputationError,
+            match=r"\(These arguments .*`find_limit_cycle`: ",
         ):
             call()
 
 
 @pytest.mark.slow
 def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
-    nothing_fits = hj.ObservedCycle(
+    nothing_fits = hj.fitting.ObservedCycle(
         PHASES,
         ("x", "v"),
         np.arange(8.0).reshape(4, 2) - 3.0,
@@ -201,7 +214,10 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
     )
     wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
     true = np.array([getattr(hopper_cycle.system, name) for name in HOPPER])
-    observed = hj.ObservedHTF(hopper_htf, SECTIONS), hj.ObservedSeries(data, SECTIONS)
+    observed = (
+        hj.fitting.ObservedHTF(hopper_htf, SECTIONS),
+        hj.fitting.ObservedSeries(data, SECTIONS),
+    )
     by_htf, by_series = (
         hj.fit_model(wrong, x, HOPPER, guess=hopper_cycle, guesses=4) for x in observed
     )
@@ -216,7 +232,7 @@ def fitted(hopper_cycle):
     """A fit of a stiffness and both delays, which begins near the cycle of another stiffness."""
     lines = np.arange(1, 33) / 16 + 0.01
     htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
-    data = hj.ObservedHTF(
+    data = hj.fitting.ObservedHTF(
         htf, SECTIONS, delay=(0.0625, 0.0625)
     )  # (together a whole section)
     free = "k", "input_delay", "output_delay"
@@ -229,11 +245,15 @@ def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
     np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)
     # (Without noise, a region is as small as rounding errors, which are not independent.)
     assert not fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.082})
-    with pytest.raises(hj.DefinitionError, match="must have a value of 'input_delay'"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="must have a value of 'input_delay'"
+    ):
         fit.contains(hopper_cycle.system)
-    with pytest.raises(hj.DefinitionError, match="no data have a delay"):
+    with pytest.raises(hj.errors.DefinitionError, match="no data have a delay"):
         hj.fit_model(
-            hopper_cycle.system, hj.ObservedHTF(hopper_htf, SECTIONS), "input_delay"
+            hopper_cycle.system,
+            hj.fitting.ObservedHTF(hopper_htf, SECTIONS),
+            "input_delay",
         )
 
 

@@ -48,7 +48,7 @@ TIMES = np.arange(8.0)
 def records(**options):
     y = np.random.default_rng(0).normal(size=(2, 16, 1))
     y[:, 0] = options.pop("begin", 0.0)
-    return hj.ExperimentData(
+    return hj.experiments.ExperimentData(
         np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options
     )
 
@@ -57,50 +57,62 @@ def records(**options):
     "make, message",
     [
         (
-            lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 16), SECTIONS),
+            lambda: hj.fitting.ObservedHTF(hj.linear.HTF(F, H, 0, 16), SECTIONS),
             "different n_sections: 16 and 8",
         ),
         (
-            lambda: hj.ObservedHTF(hj.HTF(F, H, 0, 8, variance=-H.real), SECTIONS),
+            lambda: hj.fitting.ObservedHTF(
+                hj.linear.HTF(F, H, 0, 8, variance=-H.real), SECTIONS
+            ),
             "variance",
         ),
         (
-            lambda: hj.ObservedSeries(records(), hj.ClockPhase(4)),
+            lambda: hj.fitting.ObservedSeries(records(), hj.ClockPhase(4)),
             "different n_sections: 8 and 4",
         ),
         (
-            lambda: hj.ObservedSeries(records(result=[1, 1]), SECTIONS),
+            lambda: hj.fitting.ObservedSeries(records(result=[1, 1]), SECTIONS),
             "no experiment ran to",
         ),
         (
-            lambda: hj.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)),
+            lambda: hj.fitting.ObservedSeries(records(), SECTIONS, std=(1.0, 2.0)),
             r"of shape \(1 outputs\)",
         ),
         (
-            lambda: hj.ObservedSeries(records(y=np.zeros((2, 16, 1))), SECTIONS),
+            lambda: hj.fitting.ObservedSeries(
+                records(y=np.zeros((2, 16, 1))), SECTIONS
+            ),
             "zero throughout",
         ),
         (
-            lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS),
+            lambda: hj.fitting.ObservedSeries(records(begin=0.8), SECTIONS),
             "do not begin on the cycle",
         ),
         (
-            lambda: hj.ObservedSeries(records(begin=0.8), SECTIONS, 0.1),
+            lambda: hj.fitting.ObservedSeries(records(begin=0.8), SECTIONS, 0.1),
             "do not begin on the cycle",
         ),
-        (lambda: hj.ObservedCycle(SECTIONS), "`times`, or a `period`"),
-        (lambda: hj.ObservedCycle(SECTIONS, "yM"), "`outputs` with their `values`"),
+        (lambda: hj.fitting.ObservedCycle(SECTIONS), "`times`, or a `period`"),
         (
-            lambda: hj.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
+            lambda: hj.fitting.ObservedCycle(SECTIONS, "yM"),
+            "`outputs` with their `values`",
+        ),
+        (
+            lambda: hj.fitting.ObservedCycle(SECTIONS, "yM", np.ones((4, 1))),
             r"shape \(8 sections, 1 out",
         ),
-        (lambda: hj.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))), "zero throughout"),
         (
-            lambda: hj.ObservedCycle(SECTIONS, times=TIMES, period=1.0, period_std=0.1),
+            lambda: hj.fitting.ObservedCycle(SECTIONS, "yM", np.zeros((8, 1))),
+            "zero throughout",
+        ),
+        (
+            lambda: hj.fitting.ObservedCycle(
+                SECTIONS, times=TIMES, period=1.0, period_std=0.1
+            ),
             "or of none",
         ),
     ],
 )
 def test_bad_data_are_refused(make, message):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         make()

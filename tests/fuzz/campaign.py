@@ -88,7 +88,7 @@ def check(name: str, numbers, seed: int = 0, accuracy: float = ACCURACY) -> Repo
             continue
         report.events += len(run.events)
         full = len(run.events) == EVENTS
-        if result != hj.Result.OK:
+        if result != hj.errors.Result.OK:
             report.failures[k] = f"{result.name} at t = {trial.t:.9g}"
         elif order(trial) != order(run):
             report.failures[k] = f"events {order(trial)}, but {order(run)} by scipy"
@@ -141,7 +141,7 @@ def difference(a: Run, b: Run, end: bool) -> tuple[float, float]:
 
 def engine(
     plan: Plan, samples: list[Sample], ends: list[float], accuracy: float
-) -> list[tuple[hj.Result, Run]]:
+) -> list[tuple[hj.errors.Result, Run]]:
     """Results and trajectories by hybridjax, up to the wanted number of events.
 
     The one place that knows how the flow is called.
@@ -165,7 +165,7 @@ def engine(
                 for at, code, b, after in zip(*events, strict=True)
             ]
             run = Run(events[:count], float(t), int(chart), q[: plan.dims[chart]])
-            out.append((hj.Result(int(result)), run))
+            out.append((hj.errors.Result(int(result)), run))
     return out
 
 

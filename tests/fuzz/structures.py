@@ -108,7 +108,7 @@ class Random(hj.HybridSystem):
             f"event {g}",
             f"chart {arrow.source}",
             f"chart {arrow.target}",
-            hj.Scheduled(x["period"], x["offset"]) if by_clock else guard,
+            hj.systems.Scheduled(x["period"], x["offset"]) if by_clock else guard,
             "falling" if by_clock else arrow.kind,
             reset,
             enabled if arrow.gated else None,

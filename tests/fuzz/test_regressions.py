@@ -51,7 +51,7 @@ def rounded(level):
 
 def test_a_guard_that_the_input_makes_negative_is_not_armed():
     run = hj.simulate(THRESHOLD, "line", (0.5,), 1.0, input=-1.0, throw=False)
-    assert run.result == hj.Result.OK
+    assert run.result == hj.errors.Result.OK
     assert not run.events
 
 
@@ -66,11 +66,11 @@ def two_pieces(x, first, second):
         ).moved
         lanes = moved.lanes
         h = moved.h
-    return hj.Result(int(moved.result[0])), int(lanes.events[0])
+    return hj.errors.Result(int(moved.result[0])), int(lanes.events[0])
 
 
 def test_a_guard_that_a_new_input_makes_positive_is_armed():
-    assert two_pieces(-0.5, 0.0, 1.6) == (hj.Result.OK, 1)
+    assert two_pieces(-0.5, 0.0, 1.6) == (hj.errors.Result.OK, 1)
 
 
 @pytest.mark.parametrize("size, time", [(1e4, 0.0), (1.0, 3e3)])
@@ -78,7 +78,7 @@ def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32
     result, events = across(size * jnp.linspace(0.5, 2.0, 100), time, duration)
-    assert_array_equal(result, hj.Result.OK)
+    assert_array_equal(result, hj.errors.Result.OK)
     assert_array_equal(events, 1)
 
 

@@ -25,10 +25,10 @@ def positional(function):
 
 
 def scale(t):
-    yield hj.sweep, dict(model=t.system, over={"nope": [1.0]}, guess=t.cycle)
-    yield hj.monte_carlo, dict(function=lambda rng: "no number", draws=3)
-    yield hj.Points, dict(values={"x": [1.0]})
-    yield hj.Points.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
+    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, guess=t.cycle)
+    yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
+    yield hj.scale.SweepPoints, dict(values={"x": [1.0]})
+    yield hj.scale.SweepPoints.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
 
 
 def systems(t):
@@ -41,47 +41,47 @@ def systems(t):
     yield hj.Output("z", flow).in_chart, dict(name="plane")
     ends = dict(name="hit", source="flow", target="flow", guard=flow)
     yield hj.Transition, ends | dict(direction="falling", reset=flow)
-    yield hj.Scheduled, dict(period=1.0, offset=0.0)
+    yield hj.systems.Scheduled, dict(period=1.0, offset=0.0)
     yield hj.parameter, dict(default=1.0)
     yield hj.models.VerticalHopper, dict(k=10.0)
     yield hj.models.BouncingChain, dict(n=2)
-    yield hj.enable_progress, dict(enabled=False)
-    yield hj.enable_compilation_cache, dict(folder=None)
-    yield hj.Settings, dict(rtol=1e-09, atol=1e-09)
+    yield hj.scale.enable_progress, dict(enabled=False)
+    yield hj.scale.enable_compilation_cache, dict(folder=None)
+    yield hj.orbits.Settings, dict(rtol=1e-09, atol=1e-09)
     begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
     yield hj.simulate, dict(system=t.system) | begin
 
 
 def sections(t):
-    yield hj.Crossing, dict(function="y", direction="falling", value=0.0)
+    yield hj.Crossing, dict(signal="y", direction="falling", value=0.0)
     yield hj.AtEvent, dict(name="hit")
     yield hj.ClockPhase, dict(n_sections=8, anchor=0.0)
     turn = dict(
         n_sections=8, position="x", velocity="y", center=(0.0, 0.0), scale=(1.0, 1.0)
     )
     yield hj.KinematicPhase, turn
-    yield hj.SectionList, dict(items=[APEX])
-    yield hj.place_sections, dict(cycle=t.cycle, sections=PHASE)
+    yield hj.sections.SectionList, dict(items=[APEX])
+    yield hj.sections.place_sections, dict(cycle=t.cycle, sections=PHASE)
     yield t.placed.observe, dict(outputs=STATES)
     yield hj.linearize, dict(cycle=t.cycle, sections=t.placed, outputs=STATES)
-    yield hj.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
+    yield hj.sections.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
     yield t.map, dict(q=t.map.fixed_point)
 
 
 def cycles(t):
     yield hj.find_limit_cycle, dict(system=t.system, guess=t.cycle)
-    yield hj.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
+    yield hj.orbits.find_limit_cycles, dict(systems=[t.system, t.system], guess=t.cycle)
     yield t.cycles.__getitem__, dict(i=0)
     yield (
         hj.continuation,
-        dict(cycle=t.cycle, parameter="mu", values=(0.1, 0.2), step=0.05),
+        dict(cycle=t.cycle, parameter="mu", range=(0.1, 0.2), step=0.05),
     )
     yield t.cycle.responses, dict(modes=0)
     yield (
         t.cycle.asymptotic_phase,
-        dict(chart="plane", state=np.array([2.0, 0.1]), turns=9),
+        dict(chart="plane", state=np.array([2.0, 0.1]), cycles=9),
     )
-    yield t.cycle.htf, dict(f=np.array([0.3]), harmonics=0, outputs=STATES)
+    yield t.cycle.htf, dict(frequencies=np.array([0.3]), harmonics=0, outputs=STATES)
     yield t.cycle.sensitivity, dict(parameter="mu")
     yield t.cycle.fluctuations, dict(white={"v": 0.1}, guards={}, resets={})
     yield t.cycle.sensitivity("mu").shape, dict(phase=np.array([0.3]))
@@ -94,35 +94,40 @@ def linear(t):
     B = np.asarray(t.model.B)
     C = np.asarray(t.model.C)
     D = np.asarray(t.model.D)
-    yield hj.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
+    yield hj.linear.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
     square = [np.eye(2)] * 3
-    yield hj.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
+    yield hj.linear.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
     u = np.ones((12, 2))
     for name in ("states", "simulate"):
         yield getattr(t.model, name), dict(u=u)
     for name, v in (("periodic_state", u), ("periodic_states", u[None])):
         yield getattr(t.model, name), dict(u=v, periods=2)
     yield t.model.impulse_response, dict(n_lags=3)
-    yield t.model.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.model.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield (
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
-    f = np.asarray(t.estimate.f)
+    f = np.asarray(t.estimate.frequencies)
     H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
-    scatter = hj.Scatter(f, size)
+    variance_dof = hj.linear.VarianceDof(f, size)
     errors = dict(
-        variance=size, noise_variance=size, scatter=hj.Scatter(np.ones(len(f)), size)
+        variance=size,
+        noise_variance=size,
+        variance_dof=hj.linear.VarianceDof(np.ones(len(f)), size),
     )
-    yield hj.HTF, dict(f=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors
-    yield hj.Scatter, dict(freedom=f, roundness=size)
-    yield scatter.quantile, dict(level=0.9)
-    yield scatter.sources, dict(f=f)
+    yield (
+        hj.linear.HTF,
+        dict(frequencies=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors,
+    )
+    yield hj.linear.VarianceDof, dict(dof=f, roundness=size)
+    yield variance_dof.quantile, dict(level=0.9)
+    yield variance_dof.sources, dict(frequencies=f)
     lines = np.arange(12) / 4 + 0.125
     signals = dict(inputs=t.model.outputs, outputs=t.model.inputs)
     gain = np.zeros((6, len(t.model.inputs), len(t.model.outputs)))
-    still = hj.LDTP(
+    still = hj.linear.LDTP(
         np.zeros((6, 1, 1)), 0 * gain[:, :1], 0 * gain[:, :, :1], gain, **signals
     )
     yield t.model.htf(lines).feedback, dict(controller=still.htf(lines))
@@ -136,18 +141,18 @@ def linear(t):
 
 
 def designs(t):
-    lines = dict(n_sections=6, periods=16, band=(0.0, 3.0), amplitude=0.01)
+    lines = dict(n_sections=6, periods=16, frequencies=(0.0, 3.0), amplitude=0.01)
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield (
-        hj.paper_design,
+        hj.experiments.paper_design,
         dict(n_sections=20, periods=16, experiments=40, division="random"),
     )
     cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
-    yield hj.Design.from_lines, cosines | dict(n_sections=6, periods=16)
+    yield hj.experiments.Design.from_lines, cosines | dict(n_sections=6, periods=16)
     good = {
         name: getattr(t.one_input, name) for name in t.one_input.__dataclass_fields__
     }
-    yield hj.Design, good
+    yield hj.experiments.Design, good
     yield t.design.scaled, dict(rms=1.0)
     yield t.design.realizations, dict(count=2)
     yield hj.experiments.optimize_phases, dict(design=t.design)
@@ -156,10 +161,9 @@ def designs(t):
 def experiments(t):
     to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
     yield hj.run_experiments, to_run
-    yield hj.experiments.stream_experiments, to_run
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield (
-        hj.response_function,
+        hj.experiments.response_function,
         {name: to_run[name] for name in ("cycle", "sections", "outputs")},
     )
     yield t.response, dict(u=np.zeros((1, 8, 1)))
@@ -167,74 +171,87 @@ def experiments(t):
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
     y = np.ones(t.data.y.shape)
-    yield hj.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
+    yield hj.experiments.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
     one = t.record
-    yield hj.Record, dict(u=one.u, y=one.y, n_sections=6)
+    yield hj.experiments.SectionSeries, dict(u=one.u, y=one.y, n_sections=6)
     yield one.part, dict(first=0, stop=12)
 
 
 def estimates(t):
     yield hj.estimate_htf, dict(data=t.data, harmonics=0)
-    yield hj.identify.loop, dict(data=t.data, at_input=t.data.inputs[1])
+    yield hj.identify.estimate_loop, dict(data=t.data, at_input=t.data.inputs[1])
     yield hj.identify.remove_transient, dict(data=t.repeated, order=2)
     yield hj.identify.fit_rational, dict(htf=t.estimate, output=0)
-    yield t.rational.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.rational.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield t.rational.compare, dict(true=[0.5])
-    yield hj.fit_multipliers, dict(htf=t.estimate, order=2, overhang=6)
-    yield t.structured.htf, dict(f=np.array([0.1, 0.2]))
+    yield hj.fit_multipliers, dict(htf=t.estimate, order=2, extra_lags=6)
+    yield t.structured.htf, dict(frequencies=np.array([0.1, 0.2]))
     true = np.asarray(t.model.multipliers)
     yield t.structured.distance, dict(true=true)
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
     yield t.structured.interval, dict(level=0.9)
-    yield hj.select_order, dict(htf=t.estimate, overhang=6)
-    yield hj.identify.multiplier_bound, dict(model=t.model, htf=t.uncertain)
-    yield hj.fit_ldtp, dict(data=t.uncertain, guess=t.model)
-    yield t.joint.htf, dict(f=np.array([0.1, 0.2]))
-    yield t.driven.noise_spectrum, dict(f=np.array([0.1, 0.2]))
-    yield hj.identify.ldtp_bound, dict(model=t.model, htf=t.uncertain)
+    yield hj.select_order, dict(data=t.estimate, extra_lags=6)
+    yield hj.identify.cramer_rao, dict(model=t.model, htf=t.uncertain)
+    yield hj.fit_ldtp, dict(data=t.uncertain, initial=t.model)
+    yield t.joint.htf, dict(frequencies=np.array([0.1, 0.2]))
+    yield t.driven.noise_spectrum, dict(frequencies=np.array([0.1, 0.2]))
+    yield (
+        hj.identify.cramer_rao,
+        dict(estimator="fit_ldtp", model=t.model, htf=t.uncertain),
+    )
 
 
 def series(t):
     yield hj.fit_series, dict(data=t.record, order=2)
     yield t.fit.impulse_response, dict(n_lags=3)
     yield t.fit.interval, dict(level=0.9)
-    yield t.fit.htf, dict(f=np.array([0.1, 0.2]))
+    yield t.fit.htf, dict(frequencies=np.array([0.1, 0.2]))
     yield hj.validate, dict(model=t.fit, data=t.record)
 
 
 def fitting(t):
     both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
     yield hj.fit_model, both
-    yield hj.identifiability, both
-    yield hj.spectral_radius, dict(model=t.model)
-    yield hj.ObservedHTF, dict(htf=t.htf, sections=PHASE)
-    yield hj.ObservedSeries, dict(data=t.series, sections=PHASE)
+    yield hj.fitting.identifiability, both
+    yield hj.fitting.spectral_radius, dict(model=t.model)
+    yield hj.fitting.ObservedHTF, dict(htf=t.htf, sections=PHASE)
+    yield hj.fitting.ObservedSeries, dict(data=t.series, sections=PHASE)
     seen = dict(
         outputs=STATES, values=np.ones((4, 2)), times=np.arange(4.0), period=1.0
     )
-    yield hj.ObservedCycle, dict(sections=PHASE) | seen
-    yield hj.ObservedCycle.of, dict(cycle=t.cycle, sections=PHASE, outputs=STATES)
+    yield hj.fitting.ObservedCycle, dict(sections=PHASE) | seen
+    yield (
+        hj.fitting.ObservedCycle.of,
+        dict(cycle=t.cycle, sections=PHASE, outputs=STATES),
+    )
     for name in ("ObservedCycle", "ObservedHTF"):
-        made = t.observed if name == "ObservedCycle" else hj.ObservedHTF(t.htf, PHASE)
+        made = (
+            t.observed
+            if name == "ObservedCycle"
+            else hj.fitting.ObservedHTF(t.htf, PHASE)
+        )
         for method in ("residuals", "prepare"):
             yield getattr(made, method), dict(cycle=t.cycle)
 
 
 def designs_data(t):
-    ask = hj.designs.Multipliers(harmonics=0, overhang=6)
+    ask = hj.designs.MultiplierGoal(harmonics=0, extra_lags=6)
     yield hj.optimal_design, dict(model=t.model, design=t.design, goal=ask)
-    yield hj.designs.Parameters, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
-    yield hj.designs.FrequencyResponse, dict(band=(0.1, 1.0))
+    yield hj.designs.ParameterGoal, dict(cycle=t.cycle, sections=PHASE, free=("mu",))
+    yield hj.designs.ResponseGoal, dict(frequencies=(0.1, 1.0))
     yield hj.designs.Limits, dict(rms={"u0": 1.0})
-    limits = hj.designs.Limits(rms={"u0": 1.0}, strides=64)
+    limits = hj.designs.Limits(rms={"u0": 1.0}, cycles=64)
     yield limits.require_inputs, dict(inputs=("u0",))
     yield limits.experiments, dict(design=t.design, cosines=4)
     yield hj.designs.Distortion, dict(cycle=t.cycle, sections=PHASE, rms={"x": 1.0})
-    yield hj.designs.Study, dict(first=t.one_input, order=1, standard_error=1.0)
+    yield (
+        hj.designs.SequentialDesign,
+        dict(first=t.one_input, order=1, standard_error=1.0),
+    )
     yield t.study.add, dict(data=t.block)
-    yield hj.designs.draws, dict(fit=t.joint, count=1)
-    yield t.plan.strides_for, dict(standard_error=1.0)
+    yield hj.designs.draw_models, dict(fit=t.joint, count=1)
+    yield t.plan.cycles_for, dict(standard_error=1.0)
 
 
 def recordings(t):
@@ -249,23 +266,23 @@ def recordings(t):
     yield t.recording.mark, dict(event="e", crossing=rises)
     for name in ("column", "samples", "unit"):
         yield getattr(t.recording, name), dict(name="x")
-    yield hj.recordings.estimate_phase, dict(recording=t.recording, definition=angle)
+    yield hj.recordings.estimate_phase, dict(recording=t.recording, sections=angle)
     take = dict(
         recording=t.recording,
-        phase=t.phase,
+        sections=t.phase,
         inputs="f",
         outputs=("x", "v"),
         n_sections=2,
     )
-    yield hj.recordings.section_data, take
+    yield hj.recordings.sample_sections, take
     yield hj.identify_recording, take | dict(order=1)
     yield t.section_data.experiments, dict(periods=4)
     yield (
-        hj.recordings.inspect,
+        hj.recordings.check_recording,
         dict(recording=t.recording, inputs="f", outputs=("x", "v")),
     )
-    yield hj.recordings.advise, dict(data=t.section_data, fit=t.found.fit)
-    yield hj.recordings.choose_order, dict(data=t.section_data)
+    yield hj.recordings.diagnose, dict(data=t.section_data, fit=t.found.fit)
+    yield hj.select_order, dict(data=t.section_data)
     yield hj.recordings.hold_out, dict(data=t.section_data, order=1)
     yield hj.recordings.impulse_responses, dict(fit=t.found.fit, data=t.found.data)
     yield t.found.responses.of_model, dict(model=t.model)
@@ -274,8 +291,8 @@ def recordings(t):
         dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
-    yield hj.recordings.add_command, table
-    yield hj.recordings.write_design, dict(path="missing/d.csv", design=t.one_input)
+    yield hj.recordings.attach_design, table
+    yield t.one_input.write, dict(path="missing/d.csv")
     yield positional(hj.read_recording), dict(values="nope.csv")
 
 
@@ -299,7 +316,7 @@ def subjects(t):
 
 def plants(t):
     yield (
-        hj.plants.settle,
+        hj.plants.find_cycle,
         dict(plant=t.plant, sections=hj.ClockPhase(4), outputs=("x", "v")),
     )
     yield t.settled.run_experiments, dict(design=np.zeros((1, 88, 1)))
@@ -312,8 +329,8 @@ def plants(t):
 
 
 def testing(t):
-    yield hj.testing.spoil, dict(recording=t.recording, signals=("x",))
-    yield hj.testing.random_force, dict(duration=10, rate=50, bandwidth=5)
+    yield hj.testing.add_artifacts, dict(recording=t.recording, signals=("x",))
+    yield hj.experiments.random_input, dict(duration=10, rate=50, bandwidth=5)
     force = np.zeros((1, 50, 1))
     yield (
         hj.testing.simulate_recording,
@@ -324,7 +341,7 @@ def testing(t):
 def files(t):
     yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
-    yield hj.write_report, dict(folder="report", result=t.found)
+    yield t.found.write_report, dict(folder="report")
 
 
 def conversions(t):
@@ -340,11 +357,11 @@ def conversions(t):
 def plots(t):
     plot = hj.plot
     yield positional(plot.bode), dict(values=t.estimate)
-    yield plot.bodes, dict(families={"a": t.estimate})
-    yield plot.harmonics, dict(families={"a": t.estimate})
-    yield positional(plot.magnitude), dict(values=t.estimate)
+    yield positional(plot.bode), dict(values={"a": t.estimate})
+    yield positional(plot.htf), dict(values={"a": t.estimate})
+    yield positional(plot.htf), dict(values=t.estimate)
     yield plot.spectrum, dict(plan=t.plan, model=t.model)
-    yield plot.strides, dict(plan=t.plan, studies={"a": t.studied})
+    yield plot.standard_errors, dict(plan=t.plan, studies={"a": t.studied})
     yield plot.cycle, dict(cycle=t.cycle)
     yield plot.animate, dict(motion=t.cycle)
     yield hj.explore, dict(system=t.cycle, ranges={"a": (-9.0, 9.0)})
@@ -366,9 +383,9 @@ def rhythms(t):
     def surface(time, q):
         return q[0]
 
-    yield hj.sliding, dict(charts=charts, surface=surface)
-    yield hj.coincidences, dict(cycle=t.cycle)
-    about = dict(recording=t.recording, phase=BEAT, input="f")
+    yield hj.systems.filippov, dict(charts=charts, surface=surface)
+    yield hj.orbits.simultaneous_events, dict(cycle=t.cycle)
+    about = dict(recording=t.recording, sections=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(curve=t.beats)
     at = dict(phase=[0.1, 0.2])
@@ -383,9 +400,8 @@ def without_arguments(t):
     data = t.data
     design = t.design
     for call in (
-        hj.Execution,
-        hj.designs.Multipliers,
-        hj.experiments.Options,
+        hj.scale.Execution,
+        hj.designs.MultiplierGoal,
         natural.interval,
         t.trajectory,
         t.trajectory.dense,
@@ -394,7 +410,7 @@ def without_arguments(t):
         t.model.monodromy,
         t.model.rank,
         t.estimate.confidence_radius,
-        design.inputs,
+        design.signals,
         design.expected_variance,
         design.cycles,
         data.windows,

@@ -69,7 +69,7 @@ VALUES = [
     np.full((8, 2), NAN),
     np.array(["a"]),
     Other(),
-    hj.Execution(),
+    hj.scale.Execution(),
     lambda *_: "x",
     TRACED,
 ]
@@ -78,7 +78,6 @@ CALLED = {
     "frequencies": "f =",
     "line": "f =",
     "frame": "column|signals",
-    "definition": "phase",
 }
 # What compiles, or computes for seconds, where a value is right: a value must be wrong by its kind.
 SLOW = {
@@ -100,10 +99,9 @@ SLOW = {
     "section_map",
     "simulate",
     "simulate_recording",
-    "stream_experiments",
     "sweep",
     "monte_carlo",
-    "write_report",
+    "Identification.write_report",
     "ObservedCycle.prepare",
     "ObservedCycle.residuals",
     "ObservedHTF.prepare",
@@ -163,7 +161,7 @@ def attempt(function, good: dict, name: str, value) -> str:
                 call(value)
     except Hang:
         return "HANG"
-    except hj.HybridJaxError as error:
+    except hj.errors.HybridJaxError as error:
         return wrong_with(error, good, name, value)
     except Exception as error:
         if isinstance(error, IndexError) and function.__name__ == "__getitem__":
@@ -183,7 +181,7 @@ def traceable(value):
     )
 
 
-def wrong_with(error: hj.HybridJaxError, good: dict, name: str, value) -> str:
+def wrong_with(error: hj.errors.HybridJaxError, good: dict, name: str, value) -> str:
     """What is wrong with a refusal. It is one line of text, which names the argument, another with
     which it does not agree, or a part of the value, and is raised by this package. (Only a value
     that is wrong by its kind must be named.)"""

@@ -31,25 +31,25 @@ class Neuron(hj.HybridSystem):
 
 
 def refused(match, call):
-    with pytest.raises(hj.DefinitionError, match=match):
+    with pytest.raises(hj.errors.DefinitionError, match=match):
         call()
 
 
 @pytest.mark.parametrize(
     "call",
     [
-        lambda: hj.Drawing(3),
-        lambda: hj.Drawing([[0, 0], [1, 1]]),
-        lambda: hj.Drawing({1: [[0, 0], [1, 1]]}),
-        lambda: hj.Drawing({"leg": "x"}),
-        lambda: hj.Drawing({"leg": None}),
-        lambda: hj.Drawing({"leg": [[0, 0], [1]]}),
-        lambda: hj.Drawing({}, circles=3),
-        lambda: hj.Drawing({}, velocity="x"),
-        lambda: hj.Drawing({}, body=["x"]),
-        lambda: hj.Drawing.spring("a", (1, 2)),
-        lambda: hj.Drawing.spring((0, 0), (1, 2), "wide"),
-        lambda: hj.Drawing.spring((0, 0, 0), (1, 2, 3)),
+        lambda: hj.systems.Drawing(3),
+        lambda: hj.systems.Drawing([[0, 0], [1, 1]]),
+        lambda: hj.systems.Drawing({1: [[0, 0], [1, 1]]}),
+        lambda: hj.systems.Drawing({"leg": "x"}),
+        lambda: hj.systems.Drawing({"leg": None}),
+        lambda: hj.systems.Drawing({"leg": [[0, 0], [1]]}),
+        lambda: hj.systems.Drawing({}, circles=3),
+        lambda: hj.systems.Drawing({}, velocity="x"),
+        lambda: hj.systems.Drawing({}, body=["x"]),
+        lambda: hj.systems.Drawing.spring("a", (1, 2)),
+        lambda: hj.systems.Drawing.spring((0, 0), (1, 2), "wide"),
+        lambda: hj.systems.Drawing.spring((0, 0, 0), (1, 2, 3)),
     ],
 )
 def test_drawings(call):
@@ -69,7 +69,7 @@ def test_amplitudes(amplitude):
     refused("`amplitude` must", lambda: hj.multisine(4, 8, amplitude=amplitude))
 
 
-@pytest.mark.parametrize("solver", [3, [], {"below": 3}, np.zeros(3), hj.Radau])
+@pytest.mark.parametrize("solver", [3, [], {"below": 3}, np.zeros(3), hj.systems.Radau])
 def test_solvers(solver):
     class Stiff(Leaky):
         pass
@@ -81,7 +81,7 @@ def test_solvers(solver):
     Stiff.solver = solver
     for system in (lambda: Neuron(solver=solver), Other):
         refused(
-            "a solver must be `hj.Radau",
+            "a solver must be `hj.systems.Radau",
             lambda system=system: hj.find_limit_cycle(
                 system(), hj.Guess("below", (0.5,))
             ),
@@ -92,7 +92,8 @@ def test_sweeps_of_systems_without_parameters():
     cycle = hj.find_limit_cycle(Neuron(), hj.Guess("below", (0.5,)))
     for systems in ([Neuron(), Neuron()], Neuron()):
         refused(
-            "Neuron has no parameters", lambda x=systems: hj.find_limit_cycles(x, cycle)
+            "Neuron has no parameters",
+            lambda x=systems: hj.orbits.find_limit_cycles(x, cycle),
         )
 
 
@@ -122,7 +123,9 @@ def test_bandwidths_and_drifts_beyond_all_records():
     assert_allclose(*slopes, atol=2e-4)
     refused(
         "`drift` must be two cycles or more",
-        lambda: hj.Record(np.ones((8, 1)), np.ones((8, 1)), n_sections=4, drift=1e-20),
+        lambda: hj.experiments.SectionSeries(
+            np.ones((8, 1)), np.ones((8, 1)), n_sections=4, drift=1e-20
+        ),
     )
 
 

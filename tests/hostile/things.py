@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 
 import hybridjax as hj
-from hybridjax.orbits.continuation import Branch, BranchEnd
+from hybridjax.orbits.branches import Branch, BranchEnd
 
 from ..toys import many
 
@@ -16,27 +16,31 @@ TIME = np.linspace(0.0, 60.0, 2401)
 APEX = hj.Crossing("y", "falling")
 RISES = hj.Crossing("x", "rising")
 PHASE = hj.KinematicPhase(4, position="x", velocity="y", anchor=APEX)
-CURVE = hj.designs.Multipliers(harmonics=0, overhang=6)
-GOAL = hj.designs.Multipliers(harmonics=0)
+CURVE = hj.designs.MultiplierGoal(harmonics=0, extra_lags=6)
+GOAL = hj.designs.MultiplierGoal(harmonics=0)
 
 
 def repeated(t):
     u = np.concatenate([t.data.u, t.data.u], axis=1)
     y = np.concatenate([t.data.y, t.data.y], axis=1)
-    return hj.ExperimentData(u, y, n_sections=6, periods=16, result=t.data.result)
+    return hj.experiments.ExperimentData(
+        u, y, n_sections=6, periods=16, result=t.data.result
+    )
 
 
 def record(t):
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = np.asarray(t.model.simulate(u))
     rng = np.random.default_rng(1)
-    return hj.Record(u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6)
+    return hj.experiments.SectionSeries(
+        u, y + 1e-3 * rng.normal(size=y.shape), n_sections=6
+    )
 
 
 def run(t, u):
     y = np.stack([t.model.simulate(x) for x in u])
     noise = 1e-3 * np.random.default_rng(2).normal(size=y.shape)
-    return hj.ExperimentData(u, y + noise, n_sections=6, periods=16)
+    return hj.experiments.ExperimentData(u, y + noise, n_sections=6, periods=16)
 
 
 def recording(t):
@@ -55,12 +59,13 @@ def recording(t):
 
 def section_data(t, inputs, **options):
     about = dict(inputs=inputs, outputs=("x", "v"), n_sections=2)
-    return hj.recordings.section_data(t.recording, t.phase, **about, **options)
+    return hj.recordings.sample_sections(t.recording, t.phase, **about, **options)
 
 
 def branch(t):
     ends = [
-        BranchEnd(mu, hj.Result.OK, "end of the parameter range") for mu in (0.1, 0.2)
+        BranchEnd(mu, hj.errors.Result.OK, "end of the parameter range")
+        for mu in (0.1, 0.2)
     ]
     return Branch("mu", np.array([0.1, 0.2]), t.cycles, (), tuple(ends))
 
@@ -124,18 +129,18 @@ MAKE = {
     "population": population,
     "maps": maps,
     "plant": plant,
-    "settled": lambda t: hj.plants.settle(t.plant, hj.ClockPhase(4), ("x", "v")),
+    "settled": lambda t: hj.plants.find_cycle(t.plant, hj.ClockPhase(4), ("x", "v")),
     "system": lambda t: hj.models.HopfOscillator(),
     "cycle": lambda t: hj.find_limit_cycle(t.system),
     "cycles": lambda t: many(t.cycle, 2),
     "branch": branch,
-    "placed": lambda t: hj.place_sections(t.cycle, PHASE),
-    "map": lambda t: hj.section_map(t.cycle, t.placed, 0, 1),
-    "response": lambda t: hj.response_function(t.cycle, t.placed, NAMES),
+    "placed": lambda t: hj.sections.place_sections(t.cycle, PHASE),
+    "map": lambda t: hj.sections.section_map(t.cycle, t.placed, 0, 1),
+    "response": lambda t: hj.experiments.response_function(t.cycle, t.placed, NAMES),
     "trajectory": lambda t: t.cycle.trajectory(),
     "model": lambda t: hj.testing.synthetic_ldtp(),
-    "design": lambda t: hj.multisine(6, 16, band=(0, 3.0), inputs=2),
-    "one_input": lambda t: hj.multisine(4, 16, band=(0, 2.0)),
+    "design": lambda t: hj.multisine(6, 16, frequencies=(0, 3.0), inputs=2),
+    "one_input": lambda t: hj.multisine(4, 16, frequencies=(0, 2.0)),
     "data": lambda t: hj.experiments.simulate_experiments(
         t.model, t.design, start="periodic"
     ),
@@ -144,26 +149,26 @@ MAKE = {
     "uncertain": lambda t: dataclasses.replace(
         t.estimate, variance=np.full(t.estimate.H.shape, 1e-6)
     ),
-    "exact": lambda t: t.model.htf(t.estimate.f, (-1, 0, 1)),
+    "exact": lambda t: t.model.htf(t.estimate.frequencies, (-1, 0, 1)),
     "rational": lambda t: hj.identify.fit_rational(
         t.estimate, output=0, poles=1, zeros=1
     ),
-    "structured": lambda t: hj.fit_multipliers(t.estimate, 2, overhang=6),
+    "structured": lambda t: hj.fit_multipliers(t.estimate, 2, extra_lags=6),
     "plan": lambda t: hj.optimal_design(t.model, t.design, goal=CURVE),
-    "decaying": lambda t: hj.LDTP(
+    "decaying": lambda t: hj.linear.LDTP(
         np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1))
     ),
     "block": lambda t: hj.experiments.add_noise(
         hj.experiments.simulate_experiments(t.decaying, t.one_input, start="periodic"),
         snr=30,
     ),
-    "study": lambda t: hj.designs.Study(
+    "study": lambda t: hj.designs.SequentialDesign(
         t.one_input, order=1, standard_error=1e-9, goal=GOAL
     ),
     "studied": lambda t: t.study.add(t.block),
-    "joint": lambda t: hj.fit_ldtp(t.uncertain, t.model),
+    "joint": lambda t: hj.fit_ldtp(t.uncertain, initial=t.model),
     "record": record,
-    "driven": lambda t: hj.fit_ldtp(t.record, t.model, noise="innovations"),
+    "driven": lambda t: hj.fit_ldtp(t.record, initial=t.model, noise="innovations"),
     "fit": lambda t: hj.fit_series(t.record, 2),
     "validation": lambda t: hj.validate(t.fit, t.record),
     "run": lambda t: lambda u: run(t, u),
@@ -181,7 +186,7 @@ MAKE = {
     "series": lambda t: hj.experiments.simulate_experiments(
         hj.linearize(t.cycle, PHASE, NAMES), t.one_input
     ),
-    "observed": lambda t: hj.ObservedCycle.of(t.cycle, PHASE, NAMES),
+    "observed": lambda t: hj.fitting.ObservedCycle.of(t.cycle, PHASE, NAMES),
     "plot": plot,
 }
 

@@ -13,8 +13,8 @@ SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 def scaled(seed, dims, ny, nu, modulus=0.7):
     """A random system whose largest multiplier has this modulus."""
     A, B, C, D = blocks_at_random(seed, dims, ny, nu)
-    size = np.abs(hj.LDTP.from_blocks(A, B, C, D).multipliers[0])
-    return hj.LDTP.from_blocks(
+    size = np.abs(hj.linear.LDTP.from_blocks(A, B, C, D).multipliers[0])
+    return hj.linear.LDTP.from_blocks(
         [a * (modulus / size) ** (1 / len(dims)) for a in A], B, C, D
     )
 
@@ -30,7 +30,9 @@ def exact(reference):
     """The hopper's HTFs from the independent computation: 620 frequencies, all harmonics."""
     data = reference("htf_exact_isochron")
     H = data["H"].transpose(1, 0, 2)[..., None]
-    return hj.HTF(data["f"], H, tuple(range(-16, 16)), 32, "u", ("yM", "vM"), "exact")
+    return hj.linear.HTF(
+        data["f"], H, tuple(range(-16, 16)), 32, "u", ("yM", "vM"), "exact"
+    )
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +44,7 @@ def multipliers():
 @pytest.fixture(scope="session")
 def paper_data(hopper):
     """The paper's protocol on the linear model: 84 cycles from rest, the last 64 kept."""
-    return hj.experiments.simulate_experiments(hopper, hj.paper_design())
+    return hj.experiments.simulate_experiments(hopper, hj.experiments.paper_design())
 
 
 @pytest.fixture(scope="session")

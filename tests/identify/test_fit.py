@@ -21,7 +21,7 @@ def plant():
     root = np.diag(np.array(MULTIPLIERS) ** (1 / N))
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
 
 
 def recorded(plant, noise=0.1, cycles=300, drift=0.0):
@@ -29,7 +29,7 @@ def recorded(plant, noise=0.1, cycles=300, drift=0.0):
     u = rng.normal(size=(N * cycles, 1))
     y = np.asarray(plant.simulate(u)) + noise * rng.normal(size=u.shape)
     slow = drift * np.linspace(-1, 1, len(y)) ** 3
-    return hj.Record(u, y + slow[:, None], n_sections=N)
+    return hj.experiments.SectionSeries(u, y + slow[:, None], n_sections=N)
 
 
 def uncertain(plant):
@@ -41,8 +41,12 @@ def uncertain(plant):
     error = (
         size * np.sqrt(0.5) * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape))
     )
-    return hj.HTF(
-        exact.f, H + error, exact.harmonics, N, variance=np.full(H.shape, size**2)
+    return hj.linear.HTF(
+        exact.frequencies,
+        H + error,
+        exact.harmonics,
+        N,
+        variance=np.full(H.shape, size**2),
     )
 
 
@@ -109,7 +113,9 @@ def test_an_order_that_is_too_high_is_a_finding(plant):
     assert causes(fit) == {"order"}
     assert "order" in causes(hj.fit_series(recorded(plant), 3, check=False))
     assert causes(hj.fit_ldtp(recorded(plant, noise=0.3), 3)) == {"order"}
-    with pytest.raises(hj.DefinitionError, match="support 2 multipliers.*check=False"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="support 2 multipliers.*check=False"
+    ):
         hj.fit_series(recorded(plant), 3)
 
 
@@ -130,11 +136,11 @@ def test_a_controller_is_a_finding(plant):
         signals.append((u, y))
         x = A[n] @ x + B[n] @ u
     u, y = np.swapaxes(signals, 0, 1)
-    data = hj.Record(u, y, n_sections=N, inputs="force")
+    data = hj.experiments.SectionSeries(u, y, n_sections=N, inputs="force")
     for fit in (hj.fit_series(data, 2, check=False), hj.fit_ldtp(data, 2, check=False)):
         assert "feedback" in causes(fit)
         text = next(f.text for f in fit.findings if f.cause == "feedback")
-        assert "(force)" in text and "name their `reference`" in text
+        assert "(force)" in text and "name their `references`" in text
 
 
 def test_a_misfit_is_a_finding(plant):

@@ -22,7 +22,7 @@ def plant():
     turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
 
 
 GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
@@ -49,34 +49,36 @@ def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
     u, y = run(model, r, 0 * r, rng, **options)
-    return hj.Record(
+    return hj.experiments.SectionSeries(
         np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
     )
 
 
 def experiments(model, seed, count, noise=0.0, discard=30, together=False):
     design = hj.multisine(
-        N, 8, band=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
+        N, 8, frequencies=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
     )
-    z = design.realizations(count, seed).inputs(8 + discard)
+    z = design.realizations(count, seed).signals(8 + discard)
     r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
     u, y = run(model, r, d, np.random.default_rng(seed), noise)
     inputs = np.concatenate(
         [u[..., None], z * [1, 1e-9]], axis=2
     )  # (a unit of its own)
-    return hj.ExperimentData(inputs, y[..., None], n_sections=N, periods=8, inputs=SEEN)
+    return hj.experiments.ExperimentData(
+        inputs, y[..., None], n_sections=N, periods=8, inputs=SEEN
+    )
 
 
 def controller():
     zero = np.zeros((N, 1, 1))
-    return hj.LDTP(zero, zero, zero, GAIN, inputs="y", outputs="u")
+    return hj.linear.LDTP(zero, zero, zero, GAIN, inputs="y", outputs="u")
 
 
 def test_plant_and_controller_of_exact_data(plant):
-    loop = hj.identify.loop(
+    loop = hj.identify.estimate_loop(
         experiments(plant, 0, 2, discard=200), at_input="r", at_output="d"
     )
-    f, exact = loop.plant.f, plant.feedback(GAIN)
+    f, exact = loop.plant.frequencies, plant.feedback(GAIN)
     assert len(f) == 12 and not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
@@ -86,42 +88,50 @@ def test_plant_and_controller_of_exact_data(plant):
     entered[loop.closed.harmonics.index(0)] += 1
     np.testing.assert_allclose(loop.sensitivity.H, entered, atol=1e-9)
     both = hj.estimate_htf(
-        experiments(plant, 0, 2, 0, 200, together=True), reference=SEEN[1:]
+        experiments(plant, 0, 2, 0, 200, together=True), references=SEEN[1:]
     )
-    assert both.error(plant.htf(both.f)) < 1e-9
+    assert both.error(plant.htf(both.frequencies)) < 1e-9
     fit = hj.fit_multipliers(loop.plant, 2, check=False)  # (of exact data)
     assert fit.compare(plant.multipliers).max_error < 1e-8
     closed = hj.fit_multipliers(loop.closed, 2, check=False)
     assert closed.compare(exact.multipliers).max_error < 1e-8
     data = experiments(plant, 0, 2)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
     )
-    one = hj.identify.loop(data, at_input="r")
+    one = hj.identify.estimate_loop(data, at_input="r")
     assert one.controller is None and "controller is not estimated" in repr(one)
 
 
 def test_faint_lines_of_a_reference_are_left_out(plant):
-    design = hj.multisine(N, 8, band=(0, N / 2), amplitude=1.0).realizations(6, 0)
-    r, faint = design.inputs(208)[..., 0], np.ones(8 * N)
+    design = hj.multisine(N, 8, frequencies=(0, N / 2), amplitude=1.0).realizations(
+        6, 0
+    )
+    r, faint = design.signals(208)[..., 0], np.ones(8 * N)
     faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0))
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
     inputs = np.stack([u, r], axis=2)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         inputs, y[..., None], n_sections=N, periods=8, inputs=("u", "r")
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
-        htf = hj.estimate_htf(data, reference="r", threshold=threshold)
-        assert len(htf.f) == lines and htf.error(plant.htf(htf.f)) < 1e-9
+        htf = hj.estimate_htf(data, references="r", threshold=threshold)
+        assert (
+            len(htf.frequencies) == lines
+            and htf.error(plant.htf(htf.frequencies)) < 1e-9
+        )
 
 
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     truth, held, regions = None, [], []
     for seed in range(20):
         data = experiments(plant, seed, 5, noise=0.5)
-        loop = hj.identify.loop(data, at_input="r", at_output="d")
-        truth = truth or (plant.htf(loop.plant.f), controller().htf(loop.plant.f))
+        loop = hj.identify.estimate_loop(data, at_input="r", at_output="d")
+        truth = truth or (
+            plant.htf(loop.plant.frequencies),
+            controller().htf(loop.plant.frequencies),
+        )
         for htf, true in zip((loop.plant, loop.controller), truth, strict=True):
             held.append(np.mean(np.abs(htf.H - true.H) <= htf.confidence_radius()))
         fit = hj.fit_multipliers(loop.plant, 2, check=False)
@@ -133,7 +143,7 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
 @pytest.mark.slow
 def test_regions_of_series_hold_in_the_loop(plant):
     fits = (
-        hj.fit_ldtp(series(plant, k, noise=0.5), 2, reference="r") for k in range(20)
+        hj.fit_ldtp(series(plant, k, noise=0.5), 2, references="r") for k in range(20)
     )
     assert (
         sum(fit.contains(plant.multipliers)[0] for fit in fits) >= 16
@@ -141,16 +151,16 @@ def test_regions_of_series_hold_in_the_loop(plant):
 
 
 def test_instruments_of_series_hold_in_the_loop(plant):
-    fit = hj.fit_series(series(plant, 0), 2, reference="r")
+    fit = hj.fit_series(series(plant, 0), 2, references="r")
     assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
     held, discs, off, truth = [], [], [], plant.htf(np.arange(1, 9) / 4)
     for seed in range(30):
-        fit = hj.fit_series(series(plant, seed, noise=0.7), 2, reference="r")
+        fit = hj.fit_series(series(plant, seed, noise=0.7), 2, references="r")
         held.append(fit.contains(plant.multipliers)[0])
-        htf = fit.htf(truth.f)
+        htf = fit.htf(truth.frequencies)
         discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
         few = hj.fit_series(
-            series(plant, seed, 40, noise=0.5), 2, reference="r", check=False
+            series(plant, seed, 40, noise=0.5), 2, references="r", check=False
         )
         off.append(
             abs(few.multipliers[0] - plant.multipliers[0]) / few.standard_errors[0]
@@ -164,11 +174,11 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
     moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
-    assert hj.fit_series(moved, 2, reference="r").standard_errors[0] < 0.2
+    assert hj.fit_series(moved, 2, references="r").standard_errors[0] < 0.2
     with pytest.raises(
-        hj.DefinitionError, match="the reference determines 2 multipliers, not 3"
+        hj.errors.DefinitionError, match="the reference determines 2 multipliers, not 3"
     ):
-        hj.fit_series(series(plant, 0, noise=0.7), 3, reference="r")
+        hj.fit_series(series(plant, 0, noise=0.7), 3, references="r")
     assert best_order(series(plant, 0), ("r",), 4) == (2, "")
     assert (
         "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
@@ -179,10 +189,12 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     rng, root = np.random.default_rng(1), np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
-    data = series(hj.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0)
-    (low,) = hj.fit_series(data, 2, reference="r").findings
+    data = series(
+        hj.linear.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0
+    )
+    (low,) = hj.fit_series(data, 2, references="r").findings
     assert "3 gives other" in low.text
-    assert not hj.fit_series(data, 3, reference="r").findings
+    assert not hj.fit_series(data, 3, references="r").findings
 
 
 @pytest.mark.slow
@@ -190,17 +202,19 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     held = []
     for seed in range(8):
         data = series(plant, seed, noise=1.0)
-        data = hj.Record(data.u[:, :1], data.y, n_sections=N, inputs="u")
+        data = hj.experiments.SectionSeries(
+            data.u[:, :1], data.y, n_sections=N, inputs="u"
+        )
         fit = hj.fit_ldtp(data, 2, noise="innovations")
         assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
         biased = hj.fit_series(data, 2, check=False)
         (doubt,) = (x for x in biased.findings if x.cause == "feedback")
-        assert "(u): the fit is biased; name their `reference`" in doubt.text
+        assert "(u): the fit is biased; name their `references`" in doubt.text
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
-    data = hj.Record(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    data = hj.experiments.SectionSeries(data.u[:, 1:], data.y, n_sections=N, inputs="r")
     assert not hj.fit_series(data, 2, check=False).findings
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
@@ -210,7 +224,7 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
         noise = 0.1 * np.random.default_rng(0).normal(size=data.y.shape)
         moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
-        fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, reference="r")
+        fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
         assert bool(np.asarray(fit.model.D).any()) == bool(through)
         np.testing.assert_allclose(fit.model.D, through, atol=0.1)
         assert fit.contains(plant.multipliers, 0.999).all()
@@ -218,26 +232,30 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         None
     ]  # (a statistic of -5e-4, by rounding)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
-    data = hj.Record(np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r"))
-    assert "not determine D" in repr(hj.fit_ldtp(data, 2, reference="r", check=False))
+    data = hj.experiments.SectionSeries(
+        np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
+    )
+    assert "not determine D" in repr(hj.fit_ldtp(data, 2, references="r", check=False))
     data = series(plant, 5, noise=0.5, waits=True, through=1.0)
-    with pytest.raises(hj.DefinitionError, match="tells the two directions apart"):
-        hj.fit_ldtp(data, 2, reference="r")
+    with pytest.raises(
+        hj.errors.DefinitionError, match="tells the two directions apart"
+    ):
+        hj.fit_ldtp(data, 2, references="r")
 
 
 def test_a_plant_that_is_stable_in_its_loop_only():
     # x[n + 1] = 1.2 x + u, u = r - 0.9 y
     one = np.ones((N, 1, 1))
-    plant = hj.LDTP(1.2 * one, one, one)
+    plant = hj.linear.LDTP(1.2 * one, one, one)
     r, e = np.random.default_rng(0).normal(size=(2, N * 400))
     x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
     y = x + 0.3 * e
-    data = hj.Record(
+    data = hj.experiments.SectionSeries(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
     )
     for fit in (
-        hj.fit_ldtp(data, 1, reference="r"),
-        hj.fit_series(data, 1, reference="r"),
+        hj.fit_ldtp(data, 1, references="r"),
+        hj.fit_series(data, 1, references="r"),
     ):
         assert fit.contains(plant.multipliers, 0.999).all()
         assert abs(fit.multipliers[0] - 1.2**N) < 0.1
@@ -245,13 +263,15 @@ def test_a_plant_that_is_stable_in_its_loop_only():
 
 def test_residuals_tell_of_the_loop(plant):
     early, late = (series(plant, seed, noise=0.5) for seed in (5, 6))
-    fit = hj.fit_ldtp(early, 2, reference="r")
-    true = hj.validate(fit, late, reference="r")
+    fit = hj.fit_ldtp(early, 2, references="r")
+    true = hj.validate(fit, late, references="r")
     assert true.independent and true.white  # (of other strides)
     # (the ratio of y to u is no model of the plant, and the reference shows it)
-    alone = hj.Record(early.u[:, :1], early.y, n_sections=N, inputs="u")
+    alone = hj.experiments.SectionSeries(
+        early.u[:, :1], early.y, n_sections=N, inputs="u"
+    )
     biased = hj.fit_series(alone, 2, check=False)
-    assert not hj.validate(biased, late, reference="r").independent
+    assert not hj.validate(biased, late, references="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
     for record, answers in (alone, True), (driven, False):
         fit, grid = (
@@ -261,34 +281,42 @@ def test_residuals_tell_of_the_loop(plant):
         assert (
             feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3
         ) == answers
-    unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
+    unstable = hj.linear.LDTP(
+        1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1))
+    )
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)
-    with pytest.raises(hj.DefinitionError, match="grows without bound: validate"):
-        hj.validate(unstable, late, reference="r")
+    with pytest.raises(
+        hj.errors.DefinitionError, match="grows without bound: validate"
+    ):
+        hj.validate(unstable, late, references="r")
 
 
 def test_what_does_not_fit_is_refused(plant):
     data, record = experiments(plant, 0, 2), series(plant, 0)
-    refused = lambda text: pytest.raises(hj.DefinitionError, match=text)  # noqa: E731
+    refused = lambda text: pytest.raises(hj.errors.DefinitionError, match=text)  # noqa: E731
     with refused("there is no input 'q'; inputs are u, r, d"):
-        hj.estimate_htf(data, reference="q")
+        hj.estimate_htf(data, references="q")
     with refused("2 inputs of the plant need as many references"):
-        hj.estimate_htf(data, reference="r")
+        hj.estimate_htf(data, references="r")
     with refused("all inputs are references"):
-        hj.fit_ldtp(record, 2, reference=("u", "r"))
-    same = hj.Record(record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r"))
+        hj.fit_ldtp(record, 2, references=("u", "r"))
+    same = hj.experiments.SectionSeries(
+        record.u[:, [1, 1]], record.y, n_sections=N, inputs=("u", "r")
+    )
     with refused("u and r are equal"):
-        hj.fit_ldtp(same, 2, reference="r")
+        hj.fit_ldtp(same, 2, references="r")
     shape = {"n_sections": N, "periods": 8, "inputs": ("u", "r")}
     with refused("u and r are equal"):
-        hj.identify.loop(
-            hj.ExperimentData(data.u[..., [1, 1]], data.y, **shape), at_input="r"
+        hj.identify.estimate_loop(
+            hj.experiments.ExperimentData(data.u[..., [1, 1]], data.y, **shape),
+            at_input="r",
         )
     with refused("name those that enter at the plant's input"):
-        hj.identify.loop(data)
+        hj.identify.estimate_loop(data)
     with refused("excites too little: at f = .* tells 2 of 4 components apart"):
         hj.estimate_htf(
-            hj.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape), reference="r"
+            hj.experiments.ExperimentData(data.u[:2, :, :2], data.y[:2], **shape),
+            references="r",
         )
-    with refused("`reference`, `noise` and `start` are for time series"):
-        hj.fit_ldtp(plant.htf([0.3]), 2, reference="r")
+    with refused("`references`, `noise` and `start` are for time series"):
+        hj.fit_ldtp(plant.htf([0.3]), 2, references="r")

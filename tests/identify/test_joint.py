@@ -122,8 +122,8 @@ def test_derivatives_are_those_of_jax(model, errors):
 @pytest.mark.parametrize("variance", (None, 4e-4))
 def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
-    fit = hj.fit_ldtp(htf, shaken(model, np.random.default_rng(1)))
-    assert fit.result == hj.Result.OK and "too few dimensions" not in repr(fit)
+    fit = hj.fit_ldtp(htf, initial=shaken(model, np.random.default_rng(1)))
+    assert fit.result == hj.errors.Result.OK and "too few dimensions" not in repr(fit)
     assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1).findings)
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
@@ -140,7 +140,9 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
 def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     """20 dB, at which the misfit is 1.6 times the expected one."""
     model = hj.linearize(hopper_cycle, hj.ClockPhase(8), ("yM", "vM"))
-    design = hj.multisine(8, periods=16, band=(0, 4)).scaled(rms=0.05).realizations(4)
+    design = (
+        hj.multisine(8, periods=16, frequencies=(0, 4)).scaled(rms=0.05).realizations(4)
+    )
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=20, seed=0))
     for dims, named in ((2, True), (model.dims, False)):
@@ -153,7 +155,7 @@ def test_undetermined_responses_have_infinite_variance():
     f = np.arange(1, 40) / 80
     htf = small.htf(f, (-1, 0, 1))
     draw = noisy(htf, np.full(htf.H.shape, 1e-6), np.random.default_rng(0))
-    fit = hj.fit_ldtp(draw, shaken(small, np.random.default_rng(1)))
+    fit = hj.fit_ldtp(draw, initial=shaken(small, np.random.default_rng(1)))
     variance = fit.htf(f, (-2, -1, 0, 1)).variance
     assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
     assert fit.contains(small.multipliers[:2], 0.999).all()
@@ -163,8 +165,11 @@ def test_undetermined_responses_have_infinite_variance():
 def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
     rng, draws = np.random.default_rng(3), 40
-    bound = hj.identify.ldtp_bound(model, exact)
-    fits = [hj.fit_ldtp(noisy(exact, exact.variance, rng), model) for _ in range(draws)]
+    bound = hj.identify.cramer_rao(model, exact, estimator="fit_ldtp")
+    fits = [
+        hj.fit_ldtp(noisy(exact, exact.variance, rng), initial=model)
+        for _ in range(draws)
+    ]
     error = np.array([fit.coefficients - bound.coefficients for fit in fits])
     square = np.einsum("si,ij,sj->", error, np.linalg.inv(bound.covariance), error)
     assert 1e-3 < stats.chi2(2 * draws).cdf(square) < 1 - 1e-3
@@ -178,18 +183,18 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     assert abs(np.mean(square / variance) - 1) < 0.1
     # Without variances, the residuals give them.
     draw = noisy(exact, exact.variance, np.random.default_rng(4))
-    fit = hj.fit_ldtp(with_values(draw, draw.H), model)
+    fit = hj.fit_ldtp(with_values(draw, draw.H), initial=model)
     np.testing.assert_allclose(fit.standard_errors, fits[0].standard_errors, rtol=0.2)
     assert fit.cost == pytest.approx(fit.dof)
 
 
 def test_with_one_section_the_bound_is_that_of_free_numerators():
     """Then both have as many unknowns, and describe the same systems."""
-    one = hj.LDTP(
+    one = hj.linear.LDTP(
         [[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]]
     )
     f = np.linspace(0.02, 0.48, 30)
     htf = with_values(one.htf(f), one.htf(f).H, 1e-4)
-    free = hj.identify.multiplier_bound(one, htf, overhang=0)
-    joint = hj.identify.ldtp_bound(one, htf)
+    free = hj.identify.cramer_rao(one, htf, extra_lags=0)
+    joint = hj.identify.cramer_rao(one, htf, estimator="fit_ldtp")
     np.testing.assert_allclose(joint.covariance, free.covariance, rtol=1e-8)

@@ -30,7 +30,7 @@ def driven(model, size, sensor=0.1):
     still = np.broadcast_to(sensor * np.eye(2), (model.n_sections, 2, 2))
     B = np.concatenate([size * model.B, np.zeros((*model.B.shape[:2], 2))], axis=2)
     D = np.concatenate([size * model.D, still], axis=2)
-    return hj.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
+    return hj.linear.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
 
 
 def noisy(model, noise, cycles, seed):
@@ -39,7 +39,7 @@ def noisy(model, noise, cycles, seed):
     u, w = (rng.normal(size=(n + before, len(x.inputs))) for x in (model, noise))
     y = np.asarray(model.simulate(u) + noise.simulate(w))
     about = dict(n_sections=model.n_sections, outputs=model.outputs)
-    return hj.Record(u[before:], y[before:], **about)
+    return hj.experiments.SectionSeries(u[before:], y[before:], **about)
 
 
 def with_gaps(whole, share, seed):
@@ -100,7 +100,7 @@ def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None
     data = with_gaps(record(small, 4 * 60 + 3, 0, first_section=1, x0=x0), 0.02, 0)
     fit = hj.fit_ldtp(
-        data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start
+        data, initial=eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start
     )
     assert fit.compare(small.multipliers).max_error < 1e-9
     f = np.array([0.1, 0.4])
@@ -112,9 +112,11 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     """A constant at each section, of each output."""
     whole = record(small, 4 * 60, 0)
     y = whole.y + np.tile(np.arange(8.0).reshape(4, 2), (60, 1))
-    data = with_gaps(hj.Record(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0)
+    data = with_gaps(
+        hj.experiments.SectionSeries(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0
+    )
     fit = hj.fit_ldtp(
-        data, eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle"
+        data, initial=eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle"
     )
     assert fit.compare(small.multipliers).max_error < 1e-9
     assert fit.dof == np.isfinite(data.y).sum() - 8 - fit.unknowns  # (8 constants)
@@ -141,7 +143,9 @@ def test_inputs_that_their_past_determines(through):
         axis=1, keepdims=True
     )
     noise = 0.03 * np.random.default_rng(0).normal(size=u.shape)
-    data = hj.Record(u, np.asarray(model.simulate(u)) + noise, n_sections=3)
+    data = hj.experiments.SectionSeries(
+        u, np.asarray(model.simulate(u)) + noise, n_sections=3
+    )
     fit = hj.fit_ldtp(data, 2, noise="innovations", check=False)
     assert bool(np.asarray(fit.model.D).any()) == bool(through)
 
@@ -161,30 +165,34 @@ def test_residuals_of_exact_data_tell_nothing(small):
 
 def test_outputs_that_do_not_answer_are_refused(small):
     data = record(small, 4 * 60, 0)
-    noise = hj.Record(
+    noise = hj.experiments.SectionSeries(
         data.u, np.random.default_rng(0).normal(size=data.y.shape), n_sections=4
     )
     with pytest.raises(
-        hj.DefinitionError, match="the outputs do not answer the inputs"
+        hj.errors.DefinitionError, match="the outputs do not answer the inputs"
     ):
-        hj.fit_ldtp(noise, small)
+        hj.fit_ldtp(noise, initial=small)
 
 
 def test_periodic_series_and_their_htfs_agree(small):
     """One steady window of a multisine, in the time and in the frequency domain."""
-    design = hj.multisine(periods=32, n_sections=4, band=(0, 2), lines="odd", seed=0)
+    design = hj.multisine(
+        periods=32, n_sections=4, frequencies=(0, 2), lines="odd", seed=0
+    )
     data = hj.experiments.simulate_experiments(small, design, start="periodic")
     rng = np.random.default_rng(0)
     data = eqx.tree_at(
         lambda d: d.y, data, data.y + 0.05 * rng.normal(size=data.y.shape)
     )
-    in_time = hj.fit_ldtp(data, small)
+    in_time = hj.fit_ldtp(data, initial=small)
     htf = hj.estimate_htf(data)
-    sigma = np.sqrt(in_time.noise_spectrum(htf.f[:1], (0,))[0, 0])
+    sigma = np.sqrt(in_time.noise_spectrum(htf.frequencies[:1], (0,))[0, 0])
     each = design.expected_variance(1.0)[:, None, :] * sigma[:, None] ** 2
     each = np.broadcast_to(each, htf.H.shape)
-    htf = hj.HTF(htf.f, htf.H, htf.harmonics, 4, htf.inputs, htf.outputs, variance=each)
-    in_frequency = hj.fit_ldtp(htf, small)
+    htf = hj.linear.HTF(
+        htf.frequencies, htf.H, htf.harmonics, 4, htf.inputs, htf.outputs, variance=each
+    )
+    in_frequency = hj.fit_ldtp(htf, initial=small)
     apart = np.abs(in_time.multipliers - in_frequency.multipliers).max()
     assert apart < 0.5 * in_time.standard_errors[0]
     np.testing.assert_allclose(
@@ -201,8 +209,8 @@ def test_noise_that_drives_the_system_is_found(small):
     ratio = fit.noise_spectrum(f) / noise_spectrum(noise, f)
     assert np.abs(np.log(ratio)).max() < 0.6 and abs(np.log(ratio).mean()) < 0.1
     assert fit.contains(small.multipliers, 0.999).all()
-    assert hj.validate(fit, other, level=1e-3).white
-    assert not hj.validate(fit.model, other, level=1e-3).white
+    assert hj.validate(fit, other, alpha=1e-3).white
+    assert not hj.validate(fit.model, other, alpha=1e-3).white
 
 
 @pytest.mark.slow
@@ -210,7 +218,7 @@ def test_errors_are_as_large_as_said(small):
     """The distances of 24 fits, in units of their covariance, and the coverage, at 0.1 %."""
     noise, runs = driven(small, 0.3), 24
     fits = [
-        hj.fit_ldtp(noisy(small, noise, 150, seed), small, noise="innovations")
+        hj.fit_ldtp(noisy(small, noise, 150, seed), initial=small, noise="innovations")
         for seed in range(runs)
     ]
     square = [fit.distance(small.multipliers)[0] for fit in fits]
@@ -224,7 +232,7 @@ def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
     assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
     f, N = np.array([0.1, 0.3]), 4
-    white = hj.LDTP(
+    white = hj.linear.LDTP(
         np.zeros((N, 1, 1)),
         np.zeros((N, 1, 2)),
         np.zeros((N, 2, 1)),

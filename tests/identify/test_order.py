@@ -42,7 +42,7 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
             data = with_variance(htf, data.H, rough, np.full(80, 3.0))
         try:
             hj.fit_multipliers(data, 3)
-        except hj.DefinitionError as error:
+        except hj.errors.DefinitionError as error:
             refused += "the data support 2 multipliers, not 3" in str(error)
     assert hj.select_order(data, 4).by_rank == 2
     assert covered(refused, runs, 0.98)
@@ -51,7 +51,7 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
 def test_exact_htfs_have_no_more_multipliers(small):
     _, htf = small
     with pytest.raises(
-        hj.DefinitionError, match="the data support 2 multipliers, not 3"
+        hj.errors.DefinitionError, match="the data support 2 multipliers, not 3"
     ):
         hj.fit_multipliers(htf, 3)
     spurious = hj.fit_multipliers(htf, 3, check=False)

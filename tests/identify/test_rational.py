@@ -10,7 +10,7 @@ def test_the_bias_on_exact_data(exact, multipliers):
     fit = hj.identify.fit_rational(exact)
     errors = [fit.compare(multipliers, name).max_error for name in fit.outputs]
     np.testing.assert_allclose(errors, (2.6e-3, 1.07e-2), atol=0.05e-3)
-    assert np.all(fit.result == hj.Result.OK) and fit.outputs == ("yM", "vM")
+    assert np.all(fit.result == hj.errors.Result.OK) and fit.outputs == ("yM", "vM")
     np.testing.assert_array_equal(fit.multipliers, fit.poles**32)
 
 
@@ -23,7 +23,7 @@ def rational(f, numerator, denominator, sections):
 def test_no_start_finds_a_better_fit(exact):
     """Against scipy's solver over all coefficients, from 20 random pairs of poles."""
     fit = hj.identify.fit_rational(exact, output="vM")
-    f, h = np.asarray(exact.f), np.asarray(exact[0])[:, 1, 0]
+    f, h = np.asarray(exact.frequencies), np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
         e = (h - rational(f, x[2:], [1, *x[:2]], 32)) / np.linalg.norm(h)
@@ -53,7 +53,7 @@ def test_a_rational_function_is_found_exactly():
     poles = np.array([0.9 + 0.3j, 0.9 - 0.3j, -0.5])
     h = rational(f, numerator, np.poly(poles).real, 5)
     fit = hj.identify.fit_rational(
-        hj.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2
+        hj.linear.HTF(f, h[None, :, None, None], 0, 5), poles=3, zeros=2
     )
     np.testing.assert_allclose(fit.poles[0], poles, atol=1e-7)
     np.testing.assert_allclose(fit.numerator[0], numerator, atol=1e-6)
@@ -64,6 +64,6 @@ def test_a_rational_function_is_found_exactly():
     assert fit.residual[0] < 1e-7
     # More poles than there are: the fit stays good and the true ones are among them.
     more = hj.identify.fit_rational(
-        hj.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3
+        hj.linear.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3
     )
     assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)

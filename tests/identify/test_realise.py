@@ -39,7 +39,9 @@ def test_random_systems(shape, seed):
         assert np.all(np.asarray(found.dims) <= np.asarray(model.dims))
         assert (
             found.htf(f)
-            .error(hj.HTF(f, htf.H, htf.harmonics, N, found.inputs, found.outputs))
+            .error(
+                hj.linear.HTF(f, htf.H, htf.harmonics, N, found.inputs, found.outputs)
+            )
             .max()
             < 1e-7
         )
@@ -51,7 +53,9 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     y = data.y + 0.01 * data.y.std(axis=0) * np.random.default_rng(4).normal(
         size=data.y.shape
     )
-    fit = hj.fit_series(hj.Record(data.u, y, n_sections=32, outputs=("yM", "vM")), 2)
+    fit = hj.fit_series(
+        hj.experiments.SectionSeries(data.u, y, n_sections=32, outputs=("yM", "vM")), 2
+    )
     model = fit.model
     assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
     assert model.htf(F).error(hopper.htf(F)).max() < 2e-3

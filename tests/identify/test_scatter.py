@@ -17,7 +17,7 @@ LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 def model():
     rng = np.random.default_rng(0)
     A = 0.6 * rng.normal(size=(N, 2, 2))
-    return hj.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
+    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
 
 
 def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
@@ -34,7 +34,7 @@ def inside(model, count, repeats, variance, runs=40, **more):
     for seed in range(runs):
         data = realized(model, count, repeats, seed=seed, **more)
         estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
-        error = np.abs(estimate[0] - model.htf(estimate.f, 0)[0])
+        error = np.abs(estimate[0] - model.htf(estimate.frequencies, 0)[0])
         hits.append((error <= estimate.confidence_radius()[0])[::3])
     return np.sum(hits), np.size(hits)
 
@@ -74,9 +74,9 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     residuals = np.sqrt(shares) * (error - mean)
     square, turned = (np.abs(residuals) ** 2).sum(axis=0), (residuals**2).sum(axis=0)
     shape = roundness(square, turned, np.full(runs, 1.0 * R))[None, :, None, None]
-    scatter = hj.Scatter(np.full(runs, R - 1.0), shape)
+    variance_dof = hj.linear.VarianceDof(np.full(runs, R - 1.0), shape)
     for level in (0.5, 0.8, 0.95, 0.99):
-        square = np.asarray(scatter.quantile(level))[0, :, 0, 0] * variance
+        square = np.asarray(variance_dof.quantile(level))[0, :, 0, 0] * variance
         inside = np.abs(mean) ** 2 <= square
         if constant == 0:
             assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
@@ -90,23 +90,25 @@ def test_the_parts_of_the_variance(model):
     """White noise: both parts are the same; their mean is the formula of the design."""
     data = realized(model, 40, 8, noise=0.2)
     estimate = hj.estimate_htf(data, repeats=8)
-    np.testing.assert_array_equal(estimate.scatter.freedom, 39)
+    np.testing.assert_array_equal(estimate.variance_dof.dof, 39)
     once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
     np.testing.assert_allclose(np.mean(estimate.variance), once, rtol=0.03)
     np.testing.assert_allclose(np.mean(estimate.noise_variance), once, rtol=0.03)
     alone = hj.estimate_htf(data, repeats=8, variance="noise")
     np.testing.assert_array_equal(alone.variance, estimate.noise_variance)
-    np.testing.assert_array_equal(alone.scatter.freedom, 40 * 7)
+    np.testing.assert_array_equal(alone.variance_dof.dof, 40 * 7)
     assert alone.noise_variance is None
 
 
 def test_distortion_is_what_noise_is_not(model):
     """y = linear + cube of the input: realizations scatter, repeated periods do not."""
     data = realized(model, 20, 2)
-    bent = hj.ExperimentData(data.u, data.y + 5 * data.u**3, n_sections=N, periods=P)
+    bent = hj.experiments.ExperimentData(
+        data.u, data.y + 5 * data.u**3, n_sections=N, periods=P
+    )
     estimate = hj.estimate_htf(bent, (0,), repeats=2)
     assert np.all(estimate.noise_variance < 1e-25) and np.all(estimate.variance > 1e-8)
-    exact = model.htf(estimate.f, 0)[0]
+    exact = model.htf(estimate.frequencies, 0)[0]
     # The best linear approximation is not the linear part, by 3 u^3 -> 9 var(u) u for many lines.
     assert np.all(np.abs(estimate[0] - exact) > estimate.confidence_radius()[0])
 
@@ -114,30 +116,37 @@ def test_distortion_is_what_noise_is_not(model):
 def test_sums_of_parts_are_those_of_the_whole(model):
     data = realized(model, 4, 2, noise=0.1)
     parts = [
-        hj.ExperimentData(data.u[k : k + 4], data.y[k : k + 4], n_sections=N, periods=P)
+        hj.experiments.ExperimentData(
+            data.u[k : k + 4], data.y[k : k + 4], n_sections=N, periods=P
+        )
         for k in range(0, 16, 4)
     ]
     one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
-    np.testing.assert_array_equal(many.scatter.freedom, one.scatter.freedom)
-    np.testing.assert_allclose(many.scatter.roundness, one.scatter.roundness, rtol=1e-9)
+    np.testing.assert_array_equal(many.variance_dof.dof, one.variance_dof.dof)
+    np.testing.assert_allclose(
+        many.variance_dof.roundness, one.variance_dof.roundness, rtol=1e-9
+    )
 
 
 def test_a_failed_realization_leaves_the_others(model):
     data = realized(model, 2, noise=0.1)
     result = np.zeros(len(data.u), int)
-    result[0] = hj.Result.BLOW_UP
-    data = hj.ExperimentData(data.u, data.y, n_sections=N, periods=P, result=result)
+    result[0] = hj.errors.Result.BLOW_UP
+    data = hj.experiments.ExperimentData(
+        data.u, data.y, n_sections=N, periods=P, result=result
+    )
     estimate = hj.estimate_htf(data)
-    lost = np.isin(estimate.f, LINES.f[LINES.experiment == 0])
+    lost = np.isin(estimate.frequencies, LINES.frequency[LINES.experiment == 0])
     ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
     assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
     np.testing.assert_array_equal(
-        estimate.scatter.freedom, np.where(lost, (~lost).sum(), 1)
+        estimate.variance_dof.dof, np.where(lost, (~lost).sum(), 1)
     )
     with pytest.raises(
-        hj.DefinitionError, match="single realization, as at f = .* does not show"
+        hj.errors.DefinitionError,
+        match="single realization, as at f = .* does not show",
     ):
         hj.estimate_htf(data, variance="total")
 
@@ -145,10 +154,14 @@ def test_a_failed_realization_leaves_the_others(model):
 def test_pairs_cancel_even_distortion(model):
     design = LINES.realizations(3).with_negatives()
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
-    bent = hj.ExperimentData(data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P)
+    bent = hj.experiments.ExperimentData(
+        data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P
+    )
     estimate = hj.estimate_htf(bent.odd_part())
-    assert estimate.error(model.htf(estimate.f)).max() < 1e-12
-    with pytest.raises(hj.DefinitionError, match="experiments 0 and 1 are no pair"):
+    assert estimate.error(model.htf(estimate.frequencies)).max() < 1e-12
+    with pytest.raises(
+        hj.errors.DefinitionError, match="experiments 0 and 1 are no pair"
+    ):
         realized(model, 2).odd_part()
 
 
@@ -162,21 +175,22 @@ def test_noise_by_its_ratio(model):
 def test_repeated_phases_show_no_distortion(model):
     data = realized(model, 1, noise=0.1)
     twice = [np.concatenate([x, x + 1e-3 * k]) for k, x in ((0, data.u), (1, data.y))]
-    with pytest.raises(hj.DefinitionError, match="repeat the same phases"):
+    with pytest.raises(hj.errors.DefinitionError, match="repeat the same phases"):
         hj.estimate_htf(
-            hj.ExperimentData(*twice, n_sections=N, periods=P), variance="total"
+            hj.experiments.ExperimentData(*twice, n_sections=N, periods=P),
+            variance="total",
         )
 
 
-@pytest.mark.parametrize("freedom", [3, 8])
-def test_weights_from_estimated_variances_widen_the_errors_of_fits(freedom):
+@pytest.mark.parametrize("dof", [3, 8])
+def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
     """One unknown, 300 lines: the misfit shows the factor of the variance of its estimate."""
     rng = np.random.default_rng(0)
-    weight = freedom / rng.gamma(freedom, size=(4000, 300))
+    weight = dof / rng.gamma(dof, size=(4000, 300))
     error = rng.normal(size=weight.shape)
     estimate = (weight * error).sum(axis=1) / weight.sum(axis=1)
     misfit = np.mean(weight * (error - estimate[:, None]) ** 2) * 300 / 299
-    _, deviation = estimated_noise(freedom / (freedom - 1), misfit)
+    _, deviation = estimated_noise(dof / (dof - 1), misfit)
     actual = np.mean(estimate**2) / np.mean(1 / weight.sum(axis=1))
     assert actual == pytest.approx(
         deviation**2, rel=0.12
@@ -190,8 +204,8 @@ def test_fits_know_of_estimated_variances(model):
     variance = 0.1 * np.random.default_rng(1).gamma(4, size=H.shape)
     fits = [
         hj.fit_ldtp(
-            hj.HTF(
-                exact.f,
+            hj.linear.HTF(
+                exact.frequencies,
                 H + np.sqrt(0.2) * (drawn[0] + 1j * drawn[1]),
                 exact.harmonics,
                 N,
@@ -199,11 +213,11 @@ def test_fits_know_of_estimated_variances(model):
                 exact.outputs,
                 "estimate",
                 variance=variance,
-                scatter=scatter,
+                variance_dof=variance_dof,
             ),
             2,
         )
-        for scatter in (hj.Scatter(np.full(31, x)) for x in (4.0, 1e9))
+        for variance_dof in (hj.linear.VarianceDof(np.full(31, x)) for x in (4.0, 1e9))
     ]
     level = fits[0].cost / fits[0].dof
     ratio = fits[0].covariance / fits[1].covariance

@@ -37,16 +37,18 @@ def record(model, samples, seed=0, noise=0.0, first_section=0, x0=None, **about)
     about |= dict(
         n_sections=model.n_sections, inputs=model.inputs, outputs=model.outputs
     )
-    return hj.Record(u, y, first_section=first_section, **about)
+    return hj.experiments.SectionSeries(u, y, first_section=first_section, **about)
 
 
 def with_outputs(data, y):
-    return hj.Record(data.u, y, n_sections=data.n_sections, drift=data.drift)
+    return hj.experiments.SectionSeries(
+        data.u, y, n_sections=data.n_sections, drift=data.drift
+    )
 
 
-def problem_of(data, order, overhang, free_start=True):
+def problem_of(data, order, extra_lags, free_start=True):
     return OutputErrorProblem.from_data(
-        PreparedRecords(data), order, overhang, free_start
+        PreparedRecords(data), order, extra_lags, free_start
     )
 
 
@@ -60,7 +62,7 @@ def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
     np.testing.assert_allclose(
         fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12
     )
-    assert fit.result == hj.Result.OK and np.all(fit.noise < 1e-14)
+    assert fit.result == hj.errors.Result.OK and np.all(fit.noise < 1e-14)
 
 
 @settings(max_examples=6)
@@ -90,7 +92,7 @@ def test_inputs_before_the_start_act_through_all_lags():
     """A register of one cycle beside a multiplier of 0.7; records begin in any section."""
     A = np.diag([0.7**0.25, 0, 0, 0, 0]) + np.diag([0.0, 1, 1, 1], -1)
     B, C = np.array([[1.0], [1], [0], [0], [0]]), np.array([[1.0, 0, 0, 0, 1]])
-    model = hj.LDTP.from_blocks(*([x] * 4 for x in (A, B, C, np.zeros((1, 1)))))
+    model = hj.linear.LDTP.from_blocks(*([x] * 4 for x in (A, B, C, np.zeros((1, 1)))))
     data = [record(model, 240, k, first_section=k, x0=np.ones(5)) for k in range(1, 4)]
     rough = total_least_squares(late_outputs(problem_of(data, 1, 4), 1))
     fit = hj.fit_series(data, 1)
@@ -100,7 +102,9 @@ def test_inputs_before_the_start_act_through_all_lags():
 
 def test_outputs_that_depend_on_later_inputs(small):
     data, f = record(small, 400), np.array([0.1, 0.9])
-    fit = hj.fit_series(hj.Record(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2)
+    fit = hj.fit_series(
+        hj.experiments.SectionSeries(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
+    )
     expected = np.roll(small.impulse_response(22), -2, axis=0)[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
     ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[
@@ -142,7 +146,7 @@ def test_the_covariance_of_the_gradient_with_process_noise():
     """Numerators take much of such errors, and blocks of cycles depend on each other."""
     unit, cycles, N, true = np.ones((1, 1)), 250, 2, 0.8
     blocks = [true * unit, unit], [unit, unit / 2], [unit, unit], [0 * unit] * N
-    model = hj.LDTP.from_blocks(*blocks)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(0)
 
     def noise():
@@ -165,10 +169,10 @@ def test_the_covariance_of_the_gradient_with_process_noise():
 
 def test_experiments_are_used_from_their_start(small):
     """The transient is information; failed experiments are left out; all data are records."""
-    design = hj.multisine(n_sections=4, periods=24, band=(0, 2.0))
+    design = hj.multisine(n_sections=4, periods=24, frequencies=(0, 2.0))
     data = hj.experiments.simulate_experiments(small, design, discard=0)
     y, result = np.array(data.y), np.zeros(len(data.y), int)
-    y[-1], result[-1] = 1e3, hj.Result.BLOW_UP
+    y[-1], result[-1] = 1e3, hj.errors.Result.BLOW_UP
     data = dataclasses.replace(data, y=y, result=result)
     fit = hj.fit_series(data, 2)
     assert fit.compare(small.multipliers).max_error < 1e-8
@@ -188,7 +192,7 @@ def test_spurious_multipliers_raise_an_error(small):
     for seed in range(4):
         data = record(small, 400, seed, 0.3)
         with pytest.raises(
-            hj.DefinitionError, match="the data support 2 multipliers, not 3"
+            hj.errors.DefinitionError, match="the data support 2 multipliers, not 3"
         ):
             hj.fit_series(data, 3)
     assert "support 2 multipliers, not 3" in repr(hj.fit_series(data, 3, check=False))
@@ -242,13 +246,13 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     ):
         assert not hj.fit_series(data, 2).findings
         fit = hj.fit_ldtp(data, small.dims, noise="innovations")
-        assert fit.result == hj.Result.OK
+        assert fit.result == hj.errors.Result.OK
         assert {x.cause for x in fit.findings} <= {"feedback"}  # (D was fitted)
     assert (
         first.call_count == 8
     )  # (Fits, smaller ones; trials of a drift begin at the fit.)
     with pytest.raises(
-        hj.DefinitionError, match="not 2.*outputs may drift: `with_drift"
+        hj.errors.DefinitionError, match="not 2.*outputs may drift: `with_drift"
     ):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
@@ -259,10 +263,12 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
     """A multiplier of 0.98 is none; one of 1 may be, but then no input acts in the trial."""
     B, C, D = np.ones((2, 1)), np.array([[0.1, 0.5]]), np.zeros((1, 1))
     for multiplier, late in (0.98, 0), (1.0, 50):
-        model = hj.LDTP.from_blocks([np.diag([multiplier, -0.7])], [B], [C], [D])
+        model = hj.linear.LDTP.from_blocks([np.diag([multiplier, -0.7])], [B], [C], [D])
         data = record(model, 400, noise=0.2)
         signals = (np.pad(x, ((late, 0), (0, 0))) for x in (data.u, data.y))
-        fit = hj.fit_series(hj.Record(*signals, n_sections=1), 2, check=False)
+        fit = hj.fit_series(
+            hj.experiments.SectionSeries(*signals, n_sections=1), 2, check=False
+        )
         assert late or not fit.findings
         monkeypatch.setattr("hybridjax.identify.series.records.SLOW", 1)
 
@@ -304,14 +310,17 @@ def test_bad_records(small, monkeypatch):
         "section 0 was sampled 14 times, too few.* 5 or more cycles": record(small, 56),
         "y1 is constant or missing": with_outputs(good, good.y * [1, np.nan]),
         "y0 is constant or missing": with_outputs(good, good.y * [0, 1] + [2, 0]),
-        "the same sections, inputs": [good, hj.Record(good.u, good.y, n_sections=5)],
+        "the same sections, inputs": [
+            good,
+            hj.experiments.SectionSeries(good.u, good.y, n_sections=5),
+        ],
     }
     for message, data in cases.items():
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.fit_series(data, 2)
     monkeypatch.setattr("hybridjax.identify.series.output_error.on_all_cores", None)
     with pytest.raises(
-        hj.DefinitionError, match="sampled 10 times, too few.* 9 or more cycles"
+        hj.errors.DefinitionError, match="sampled 10 times, too few.* 9 or more cycles"
     ):
         hj.fit_series(record(small, 40), 2)
 
@@ -319,7 +328,9 @@ def test_bad_records(small, monkeypatch):
 def test_absolute_outputs_are_refused(small):
     """At each door where they would spoil the result; HTFs only at multiples of f = 1."""
     lines = dict(frequencies=[[0.25, 1.0]] * 2, phases=[[0.0, 0.0], [0.0, np.pi / 2]])
-    design = hj.Design.from_lines(**lines, amplitudes=0.1, n_sections=4, periods=8)
+    design = hj.experiments.Design.from_lines(
+        **lines, amplitudes=0.1, n_sections=4, periods=8
+    )
     good = hj.experiments.simulate_experiments(small, design, start="periodic")
     data = dataclasses.replace(
         good, y=good.y + 1e2 * np.tile([[0], [1], [2], [1]], (8, 1))
@@ -329,10 +340,10 @@ def test_absolute_outputs_are_refused(small):
         (hj.fit_ldtp, data, 2),
         (hj.validate, small, data),
         (hj.estimate_htf, data),
-        (hj.ObservedSeries, data, hj.ClockPhase(4)),
-        (hj.designs.Study(hj.multisine(4, 8), 2, 0.1).add, data),
+        (hj.fitting.ObservedSeries, data, hj.ClockPhase(4)),
+        (hj.designs.SequentialDesign(hj.multisine(4, 8), 2, 0.1).add, data),
     ):
-        with pytest.raises(hj.DefinitionError, match="subtract the limit cycle"):
+        with pytest.raises(hj.errors.DefinitionError, match="subtract the limit cycle"):
             door(*arguments)
     assert hj.estimate_htf(good).error(small.htf([0.25, 1.0])).max() < 1e-9
 
@@ -346,7 +357,10 @@ def test_inputs_have_units_of_their_own(unit):
         size=(400, 2)
     )
     units = np.array([1, unit])
-    fits = [hj.fit_series(hj.Record(v, y, n_sections=4), 2) for v in (u, u * units)]
+    fits = [
+        hj.fit_series(hj.experiments.SectionSeries(v, y, n_sections=4), 2)
+        for v in (u, u * units)
+    ]
     htfs = [fit.htf([0.3]).H for fit in fits]
     np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
     found = [fit.model.multipliers for fit in fits]
@@ -357,11 +371,15 @@ def test_inputs_have_units_of_their_own(unit):
         dataclasses.replace(data, u=data.u * units), 2
     ).data
     htf = hj.estimate_htf(data)
-    np.testing.assert_allclose(htf.f, design.frequencies)
-    np.testing.assert_allclose(htf.H * units, two_inputs.htf(htf.f).H, atol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="are no pair"):
-        hj.ExperimentData(
+    np.testing.assert_allclose(htf.frequencies, design.frequencies)
+    np.testing.assert_allclose(
+        htf.H * units, two_inputs.htf(htf.frequencies).H, atol=1e-9
+    )
+    with pytest.raises(hj.errors.DefinitionError, match="are no pair"):
+        hj.experiments.ExperimentData(
             units * [u, [-1, 1] * u], [y, y], n_sections=4, periods=8
         ).odd_part()
-    with pytest.raises(hj.DefinitionError, match="u0, u1 cannot be told apart"):
-        hj.fit_series(hj.Record(u[:, :1] * units, y, n_sections=4), 2)
+    with pytest.raises(hj.errors.DefinitionError, match="u0, u1 cannot be told apart"):
+        hj.fit_series(
+            hj.experiments.SectionSeries(u[:, :1] * units, y, n_sections=4), 2
+        )

@@ -28,11 +28,11 @@ def test_the_paper_protocol(paper_estimate, multipliers):
 def test_random_systems(shape, seed):
     """The state beyond the rank dies within one period, as dimensions fall to 2 or less."""
     dims, ny, nu = shape
-    model = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu, gain=0.95))
+    model = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu, gain=0.95))
     N = len(dims)
     htf = model.htf(np.linspace(0.01, N / 2 - 0.01, 12 * N))
     fit = hj.fit_multipliers(htf, model)
     true = model.multipliers
     assert_allclose(fit.coefficients, np.poly(true).real[1:], atol=1e-8)
-    assert fit.htf(htf.f).error(htf).max() < 1e-8
+    assert fit.htf(htf.frequencies).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)

@@ -10,18 +10,18 @@ from ..linear.conftest import hopper as hopper
 
 @pytest.fixture(scope="module")
 def full():
-    return hj.multisine(periods=12, band=(0, 3.0))
+    return hj.multisine(periods=12, frequencies=(0, 3.0))
 
 
 def errors(model, data, harmonics=(-1, 0, 1)):
     estimate = hj.estimate_htf(data, harmonics)
-    exact = model.htf(estimate.f, harmonics)
+    exact = model.htf(estimate.frequencies, harmonics)
     return float(np.abs(estimate.H - exact.H).max() / np.abs(exact.H).max())
 
 
 def test_the_transient_of_a_linear_system_is_removed_exactly(hopper, full):
     """The window begins one period after the start."""
-    odd = hj.Design.from_lines(
+    odd = hj.experiments.Design.from_lines(
         [[j / 16] for j in range(1, 48, 2)], n_sections=32, periods=16
     )
     for design, discard in ((full, 10), (odd, 1)):
@@ -43,7 +43,7 @@ def test_noise_is_not_mistaken_for_a_transient(hopper, full):
     still = hj.experiments.simulate_experiments(
         hopper, full, start="periodic", discard=12
     )
-    still = hj.ExperimentData(
+    still = hj.experiments.ExperimentData(
         still.u, still.y + data.y - rest.y, n_sections=32, periods=12
     )
     fit = hj.identify.remove_transient(data)
@@ -57,12 +57,14 @@ def test_failed_experiments_stay_out(hopper, full):
     data = hj.experiments.simulate_experiments(hopper, full, discard=10)
     result = np.zeros(len(data.u), int)
     y = data.y.copy()
-    result[2] = hj.Result.BLOW_UP
+    result[2] = hj.errors.Result.BLOW_UP
     y[2, 50:] = np.nan
-    data = hj.ExperimentData(data.u, y, n_sections=32, periods=12, result=result)
+    data = hj.experiments.ExperimentData(
+        data.u, y, n_sections=32, periods=12, result=result
+    )
     fit = hj.identify.remove_transient(data, 2)
     assert np.isnan(fit.removed[2]).all()
     assert np.isfinite(fit.removed[3]).all()
     estimate = hj.estimate_htf(fit.data, 0)
-    error = np.abs(estimate[0] - hopper.htf(estimate.f, 0)[0]).max()
+    error = np.abs(estimate[0] - hopper.htf(estimate.frequencies, 0)[0]).max()
     assert error < 1e-9

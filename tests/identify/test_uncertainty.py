@@ -28,9 +28,9 @@ def noisy(htf, variance, rng, correlation=0.0):
     )
 
 
-def with_variance(htf, H, variance, freedom=None):
-    scatter = None if freedom is None else hj.Scatter(freedom)
-    return dataclasses.replace(htf, H=H, variance=variance, scatter=scatter)
+def with_variance(htf, H, variance, dof=None):
+    variance_dof = None if dof is None else hj.linear.VarianceDof(dof)
+    return dataclasses.replace(htf, H=H, variance=variance, variance_dof=variance_dof)
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +59,21 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
     true, runs = model.multipliers, 60
-    bound = hj.identify.multiplier_bound(
+    bound = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
     draws = (
         noisy(htf, variance, np.random.default_rng(k), correlation) for k in range(runs)
     )
-    fits = [hj.fit_multipliers(draw, 2, errors=errors) for draw in draws]
+    fits = [hj.fit_multipliers(draw, 2, covariance=errors) for draw in draws]
     assert covered(sum(fit.contains(true).all() for fit in fits), runs)
     rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
     said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
     np.testing.assert_allclose(said, rms, rtol=0.25)
     if not correlation:
         np.testing.assert_allclose(rms, bound, rtol=0.25)
-        freedom = np.sqrt(2 * fits[0].dof * runs)
-        assert abs(sum(fit.cost - fit.dof for fit in fits)) < 4 * freedom
+        dof = np.sqrt(2 * fits[0].dof * runs)
+        assert abs(sum(fit.cost - fit.dof for fit in fits)) < 4 * dof
 
 
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
@@ -85,7 +85,7 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         fit = hj.fit_multipliers(with_variance(htf, data.H, rough, np.full(80, 2.0)), 2)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(model.multipliers).error[0] ** 2 for f in (fit, raw)]
-    bound = hj.identify.multiplier_bound(model, with_variance(htf, htf.H, variance))
+    bound = hj.identify.cramer_rao(model, with_variance(htf, htf.H, variance))
     ratio = np.sqrt(square / 25) / bound.standard_errors[0]
     assert ratio[0] < 1.2 < ratio[1]
 
@@ -94,7 +94,7 @@ def test_without_variances_the_misfit_tells(small):
     """One output is a hundred times as noisy, which nobody said."""
     model, htf = small
     variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
-    said = hj.identify.multiplier_bound(
+    said = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
     data = noisy(htf, variance, np.random.default_rng(0))
@@ -106,7 +106,7 @@ def test_without_variances_the_misfit_tells(small):
 def test_the_spectrum_of_errors_is_found(small):
     """On average, of each output and at each frequency, whatever it was supposed to be."""
     model, htf = small
-    f = np.asarray(htf.f)
+    f = np.asarray(htf.frequencies)
     c = np.poly(model.multipliers).real[1:]
     chi = np.polyval(np.append(1, c)[::-1], np.exp(-2j * np.pi * f))
     true = np.array([3e-3, 1e-2]) + np.array([1e-2, 2e-3]) / np.abs(chi[:, None]) ** 2
@@ -150,12 +150,12 @@ def test_first_order_covariances_and_regions(pair_and_real):
     radius = np.sqrt(np.mean(np.abs(roots - true) ** 2, axis=0))
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
-    for i, degrees, freedom in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
-        border = dataclasses.replace(estimate, covariance_dof=freedom).ellipse(i, 0.9)
+    for i, degrees, dof in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
+        border = dataclasses.replace(estimate, covariance_dof=dof).ellipse(i, 0.9)
         if degrees == 1:
             border = border[[np.argmin(border.real), np.argmax(border.real)]].real
-        left = freedom - degrees + 1  # Hotelling's distribution
-        quantile = degrees * freedom / left * stats.f(degrees, left).ppf(0.9)
+        left = dof - degrees + 1  # Hotelling's distribution
+        quantile = degrees * dof / left * stats.f(degrees, left).ppf(0.9)
         np.testing.assert_allclose(estimate.distance(border), quantile, rtol=0.05)
     # The share of draws that a region around the truth holds.
     held = [

@@ -22,7 +22,7 @@ def test_the_true_model_leaves_white_noise(small):
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
         other = record(small, 4 * 60, 100 + seed, 0.3)
-        for fit in (hj.fit_series(other, 2), hj.fit_ldtp(other, small)):
+        for fit in (hj.fit_series(other, 2), hj.fit_ldtp(other, initial=small)):
             found = hj.validate(fit, data)
             of_fits.append([found.whiteness, found.independence])
             correlations.append(found.cross_correlation)
@@ -56,9 +56,11 @@ def test_a_wrong_model_is_refused(small):
     )
     turned = hj.validate(eqx.tree_at(lambda m: m.C, small, -small.C), data)
     assert "no better than by the mean cycle: y0, y1" in repr(turned)
-    with pytest.raises(hj.DefinitionError, match="unstable plant grows without bound"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="unstable plant grows without bound"
+    ):
         hj.validate(eqx.tree_at(lambda m: m.A, small, 9 * small.A), data)
-    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, overhang=0, check=False)
+    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, extra_lags=0, check=False)
     assert not hj.validate(low, data).independent
 
 
@@ -72,7 +74,7 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         size = np.sqrt(np.mean(np.asarray(small.simulate(data.u))[:, 1] ** 2))
         found = hj.validate(small, data)
         data.y[:, 1] += found.visible[1] * size * hidden / np.sqrt(np.mean(hidden**2))
-        noticed += hj.validate(small, data).independence[1] < found.level / 2
+        noticed += hj.validate(small, data).independence[1] < found.alpha / 2
     assert covered(noticed, runs, 0.8)
     assert "detectable with 80 % power: " in repr(found)
     few, more = (
@@ -90,13 +92,18 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
     about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
     drift = wave[:, None] * [1.0, -2.0]
-    records = (hj.Record(plain.u, plain.y + k * drift, **about) for k in (0, 1))
+    records = (
+        hj.experiments.SectionSeries(plain.u, plain.y + k * drift, **about)
+        for k in (0, 1)
+    )
     still, moved = (hj.validate(small, x, start=start) for x in records)
     np.testing.assert_allclose(moved.noise, still.noise, rtol=1e-3)
     np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
     assert moved.white and moved.independent
     np.testing.assert_allclose(still.noise, 0.3, rtol=0.1)
-    unsaid = hj.Record(plain.u, plain.y + wave[:, None], **dict(about, drift=None))
+    unsaid = hj.experiments.SectionSeries(
+        plain.u, plain.y + wave[:, None], **dict(about, drift=None)
+    )
     assert not hj.validate(small, unsaid, start=start).white
 
 
@@ -110,12 +117,15 @@ def test_records_shorter_than_the_lags(small):
     assert found.white and found.independent
     assert hj.validate(small, pieces, start="cycle").left_out == 0
     with pytest.raises(
-        hj.DefinitionError, match="0.75 cycles without gaps are too few"
+        hj.errors.DefinitionError, match="0.75 cycles without gaps are too few"
     ):
         hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
-    with pytest.raises(hj.DefinitionError, match="^u is zero or missing"):
+    with pytest.raises(hj.errors.DefinitionError, match="^u is zero or missing"):
         hj.validate(
-            small, hj.Record(0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs)
+            small,
+            hj.experiments.SectionSeries(
+                0 * whole.u, whole.y, n_sections=4, outputs=whole.outputs
+            ),
         )
     many = [whole.part(k, k + 2) for k in range(0, 400, 2)]
     assert hj.validate(small, many, start="cycle").autocorrelation.shape[1] == 1
@@ -123,7 +133,9 @@ def test_records_shorter_than_the_lags(small):
 
 def test_nothing_is_simulated_beyond_the_known_inputs(small):
     data = record(small, 4 * 100, 0, 0.3)
-    ahead = hj.Record(data.u, data.y, n_sections=4, outputs=data.outputs, lead=5)
+    ahead = hj.experiments.SectionSeries(
+        data.u, data.y, n_sections=4, outputs=data.outputs, lead=5
+    )
     found = hj.validate(small, ahead)
     assert found.simulated.shape == found.measured.shape == (395, 2)
     assert np.isfinite(found.measured).all()

@@ -38,7 +38,7 @@ def synthetic():
 @pytest.fixture(scope="session")
 def hopper(reference):
     data = reference("ldtp_isochron")
-    return hj.LDTP(
+    return hj.linear.LDTP(
         data["A"],
         data["B"][..., None],
         data["C"],

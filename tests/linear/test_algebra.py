@@ -22,7 +22,9 @@ F = np.array([0, 0.5, 1, 1.5, 2, 0.3, 1.3, 0.7, 1.7, -0.2, 0.8, 1.8, -1.2])
 
 def system(seed, dims, inputs=IN, outputs=OUT, through=1.0):
     A, B, C, D = blocks_at_random(seed, dims, len(outputs), len(inputs))
-    return hj.LDTP.from_blocks(A, B, C, [through * d for d in D], inputs, outputs)
+    return hj.linear.LDTP.from_blocks(
+        A, B, C, [through * d for d in D], inputs, outputs
+    )
 
 
 def lifted(ldtp, z):
@@ -96,7 +98,7 @@ def test_transfer_functions_against_systems(pair):
 
 @pytest.mark.parametrize(
     "operation",
-    [hj.HTF.__matmul__, lambda H, G: H.inverse(), hj.HTF.feedback],
+    [hj.linear.HTF.__matmul__, lambda H, G: H.inverse(), hj.linear.HTF.feedback],
     ids=["series", "inverse", "feedback"],
 )
 def test_variances_are_those_of_draws(operation, pair):
@@ -135,7 +137,7 @@ def test_what_does_not_fit_is_refused(pair):
     P, K = pair
 
     def refused(text):
-        return pytest.raises(hj.DefinitionError, match=text)
+        return pytest.raises(hj.errors.DefinitionError, match=text)
 
     with refused(r"'y' \(m\).*'y' \(mm\)"):
         P.feedback(system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN))

@@ -26,7 +26,7 @@ def test_three_ways_agree(seed, shape, f):
     dims, ny, nu = shape
     N = len(dims)
     blocks = blocks_at_random(seed, dims, ny, nu)
-    ldtp = hj.LDTP.from_blocks(*blocks)
+    ldtp = hj.linear.LDTP.from_blocks(*blocks)
     htf = ldtp.htf([f])
     m = np.array(htf.harmonics)
     H = np.asarray(htf.H)[:, 0]
@@ -62,7 +62,7 @@ def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
     N = len(dims)
     periods = 4
-    ldtp = hj.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    ldtp = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(periods * N, nu))
     start = ldtp.periodic_state(u, periods)
@@ -75,7 +75,7 @@ def test_prediction_is_the_periodic_response(seed, shape):
 def test_derivatives_by_matrices_and_frequencies(synthetic):
     @jax.jit
     def values(A, B, C, D, f):
-        htf = hj.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
+        htf = hj.linear.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
 
     f = np.array([0.4, 1.7])
@@ -107,23 +107,26 @@ def test_a_multiplier_on_the_unit_circle_is_named():
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     B = np.ones((2, 1))
     C = np.ones((1, 2))
-    ldtp = hj.LDTP.from_blocks([turn] * 3, [B] * 3, [C] * 3)
+    ldtp = hj.linear.LDTP.from_blocks([turn] * 3, [B] * 3, [C] * 3)
     resonance = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
     beside = ldtp.htf([0.1, resonance + 1e-6])
     assert np.all(np.isfinite(beside.H))
     with pytest.raises(
-        hj.DefinitionError, match=rf"f = {resonance:g} .* unbounded: the multiplier"
+        hj.errors.DefinitionError,
+        match=rf"f = {resonance:g} .* unbounded: the multiplier",
     ):
         ldtp.htf([0.1, resonance])
 
     ones = np.ones((4, 1, 1))
-    integrator = hj.LDTP(ones, ones, ones)
+    integrator = hj.linear.LDTP(ones, ones, ones)
     with pytest.raises(
-        hj.DefinitionError, match="f = 2 cycles per period is unbounded"
+        hj.errors.DefinitionError, match="f = 2 cycles per period is unbounded"
     ):
         integrator.htf([0.3, 2.0, 0.7])
 
 
 def test_frequencies_are_given_once():
-    with pytest.raises(hj.DefinitionError, match="`f` holds 0.1 .* twice"):
-        hj.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)
+    with pytest.raises(
+        hj.errors.DefinitionError, match="`frequencies` holds 0.1 .* twice"
+    ):
+        hj.linear.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)

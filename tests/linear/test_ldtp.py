@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32)
 def test_simulation_follows_the_definition(seed, shape, first_section):
     dims, ny, nu = shape
     blocks = blocks_at_random(seed, dims, ny, nu, gain=1.0)
-    ldtp = hj.LDTP.from_blocks(*blocks)
+    ldtp = hj.linear.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(11, nu))
     x0 = rng.normal(size=dims[first_section % len(dims)])
@@ -43,7 +43,7 @@ def test_periodic_state_of_an_unstable_system():
     # A^20 has the entries 1e20 and 1e-20; the stable part must not drown.
     A = np.array([[10.0, 0.0], [3.0, 0.1]])
     B = np.ones((2, 1))
-    ldtp = hj.LDTP.from_blocks([A], [B], [np.eye(2)])
+    ldtp = hj.linear.LDTP.from_blocks([A], [B], [np.eye(2)])
     rng = np.random.default_rng(0)
     u = rng.normal(size=(20, 1))
     # One linear system for the states of all periods: x[k+1] = A x[k] + B u[k], cyclically.
@@ -57,7 +57,9 @@ def test_periodic_state_of_an_unstable_system():
 def test_jit_vmap_and_gradients(synthetic):
     u = np.random.default_rng(1).normal(size=(18, 2))
     plain = synthetic.simulate(u)
-    assert_allclose(eqx.filter_jit(hj.LDTP.simulate)(synthetic, u), plain, atol=1e-14)
+    assert_allclose(
+        eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u), plain, atol=1e-14
+    )
     many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
     assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
@@ -68,7 +70,7 @@ def test_jit_vmap_and_gradients(synthetic):
 
     @jax.jit
     def scaled(s):
-        ldtp = hj.LDTP(
+        ldtp = hj.linear.LDTP(
             s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
         )
         return jnp.concatenate([ldtp.simulate(u)[-1], ldtp.periodic_state(u, 3)])
@@ -80,7 +82,7 @@ def test_jit_and_vmap(synthetic):
     rng = np.random.default_rng(1)
     u = rng.normal(size=(18, 2))
     plain = synthetic.simulate(u)
-    compiled = eqx.filter_jit(hj.LDTP.simulate)(synthetic, u)
+    compiled = eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u)
     assert_allclose(compiled, plain, atol=1e-14)
     two_inputs = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
     assert_allclose(two_inputs, np.stack([plain, 2 * plain]), atol=1e-13)
@@ -100,7 +102,7 @@ def test_gradients(synthetic):
     @jax.jit
     def response(s):
         A = s * synthetic.A
-        ldtp = hj.LDTP(A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
+        ldtp = hj.linear.LDTP(A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims)
         last = ldtp.simulate(u)[-1]
         periodic = ldtp.periodic_state(u, 3)
         return jnp.concatenate([last, periodic])
@@ -115,7 +117,7 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
 
     @jax.jit
     def inside(u):
-        ldtp = hj.LDTP(s.A, s.B, s.C, s.D, s.dims)
+        ldtp = hj.linear.LDTP(s.A, s.B, s.C, s.D, s.dims)
         htf = ldtp.htf(f, harmonics)
         for printed in (ldtp, htf, s.htf([0.3])):
             repr(printed)
@@ -153,20 +155,20 @@ GOOD = {"A": A, "B": B, "C": C}
     ],
 )
 def test_bad_definitions(change, message):
-    with pytest.raises(hj.DefinitionError, match=message):
-        hj.LDTP(**(GOOD | change))
+    with pytest.raises(hj.errors.DefinitionError, match=message):
+        hj.linear.LDTP(**(GOOD | change))
 
 
 def test_single_precision_is_refused():
     with pytest.raises(hj.errors.PrecisionError, match="A.*float32"):
-        hj.LDTP(**(GOOD | {"A": jnp.zeros((2, 3, 3), jnp.float32)}))
+        hj.linear.LDTP(**(GOOD | {"A": jnp.zeros((2, 3, 3), jnp.float32)}))
 
 
 def test_a_response_without_bounds_is_refused():
     quarter_turn = [[[0.0, -1.0], [1.0, 0.0]]]
-    rotation = hj.LDTP(quarter_turn, np.ones((1, 2, 1)), np.ones((1, 1, 2)))
+    rotation = hj.linear.LDTP(quarter_turn, np.ones((1, 2, 1)), np.ones((1, 1, 2)))
     rotation.periodic_state(np.ones((3, 1)), 3)
     with pytest.raises(
-        hj.DefinitionError, match="f = 0.25 cycles per period is unbounded"
+        hj.errors.DefinitionError, match="f = 0.25 cycles per period is unbounded"
     ):
         rotation.periodic_state(np.ones((4, 1)), 4)

@@ -191,13 +191,15 @@ def test_characteristic_polynomial(synthetic, hopper):
 
 def test_factors_that_are_not_finite():
     for function in (product_eigenvalues, product_rank):
-        with pytest.raises(hj.ComputationError, match="1\\] holds NaN or infinity"):
+        with pytest.raises(
+            hj.errors.ComputationError, match="1\\] holds NaN or infinity"
+        ):
             function([np.eye(2), np.full((2, 2), np.nan)], RTOL)
 
 
 def test_multipliers_refuse_to_be_traced(synthetic):
-    with pytest.raises(hj.DefinitionError, match="works on the host"):
+    with pytest.raises(hj.errors.DefinitionError, match="works on the host"):
         jax.jit(lambda ldtp: ldtp.multipliers)(synthetic)
-    with pytest.raises(hj.DefinitionError, match="one LDTP at a time"):
+    with pytest.raises(hj.errors.DefinitionError, match="one LDTP at a time"):
         batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
         batch.rank()

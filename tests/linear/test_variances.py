@@ -15,24 +15,29 @@ F = np.arange(1, 20) / 20
 def an_htf(**more):
     rng = np.random.default_rng(0)
     H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
-    return hj.HTF(F, H, (-1, 0, 1), 4, **more)
+    return hj.linear.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
 @pytest.fixture(scope="module")
 def htf():
     rng = np.random.default_rng(1)
     size = rng.uniform(1, 2, (3, len(F), 2, 1))
-    scatter = hj.Scatter(np.full(len(F), 4.0), size)
-    return an_htf(variance=2 * size, noise_variance=size, scatter=scatter)
+    variance_dof = hj.linear.VarianceDof(np.full(len(F), 4.0), size)
+    return an_htf(variance=2 * size, noise_variance=size, variance_dof=variance_dof)
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
     expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
-    plain = an_htf(variance=htf.variance, scatter=hj.Scatter(htf.scatter.freedom))
+    plain = an_htf(
+        variance=htf.variance, variance_dof=hj.linear.VarianceDof(htf.variance_dof.dof)
+    )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
-    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.scatter.roundness) - 1))
+    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.variance_dof.roundness) - 1))
     expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
-    for radius in (hj.HTF.confidence_radius, jax.jit(hj.HTF.confidence_radius)):
+    for radius in (
+        hj.linear.HTF.confidence_radius,
+        jax.jit(hj.linear.HTF.confidence_radius),
+    ):
         assert_allclose(radius(htf), expected, rtol=1e-9)
     known = an_htf(variance=htf.variance).confidence_radius(0.9)
     assert_allclose(
@@ -46,6 +51,6 @@ def test_variances_go_along(htf):
     one = htf.select((0, 1))
     assert_array_equal(one.variance, htf.variance[1:])
     assert_array_equal(one.noise_variance, htf.noise_variance[1:])
-    assert_array_equal(one.scatter.freedom, htf.scatter.freedom)
-    assert_array_equal(one.scatter.roundness, htf.scatter.roundness[1:])
+    assert_array_equal(one.variance_dof.dof, htf.variance_dof.dof)
+    assert_array_equal(one.variance_dof.roundness, htf.variance_dof.roundness[1:])
     assert an_htf().select(0).variance is None

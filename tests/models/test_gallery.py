@@ -215,7 +215,9 @@ def test_cycle_and_multipliers(name):
 def test_where_no_section_is_met_again_one_is_asked_for():
     wheel = m.RimlessWheel()
     after_impact = hj.Guess("swing", (float(wheel.slope - wheel.alpha), 0.45))
-    with pytest.raises(hj.ComputationError, match=r"section=AtEvent\('impact'\)"):
+    with pytest.raises(
+        hj.errors.ComputationError, match=r"section=AtEvent\('impact'\)"
+    ):
         hj.find_limit_cycle(wheel, after_impact)
     cycle = hj.find_limit_cycle(wheel, after_impact, section=hj.AtEvent("impact"))
     assert_allclose(cycle.multipliers, [wheel.exact()[1]], rtol=1e-9)

@@ -14,7 +14,7 @@ SMALL = [2.05187165619280217e-9, 1.16996080957107642e-15]
 @pytest.fixture(scope="module")
 def placed():
     cycle = hj.find_limit_cycle(hj.models.HopperPair())
-    return hj.place_sections(cycle, hj.ClockPhase(16, anchor=0.5))
+    return hj.sections.place_sections(cycle, hj.ClockPhase(16, anchor=0.5))
 
 
 @pytest.mark.slow
@@ -40,6 +40,6 @@ def test_both_inputs_are_told_apart(placed, amplitude, accuracy):
     assert data.ok.all(), data.summary()
     estimate = hj.estimate_htf(data, harmonics=(-1, 0, 1))
     ldtp = hj.linearize(placed.cycle, placed, OUTPUTS)
-    exact = ldtp.htf(estimate.f, harmonics=(-1, 0, 1))
+    exact = ldtp.htf(estimate.frequencies, harmonics=(-1, 0, 1))
     assert estimate.H.shape[-2:] == (2, 2)
     assert np.max(estimate.error(exact)) < accuracy

@@ -13,14 +13,14 @@ RISING = hj.Crossing("v", "rising")
 # Period, largest value of the first state (at the section), logarithm of the multiplier.
 PLANAR = {
     "van der Pol, mu = 100": (
-        lambda: m.VanDerPol(100.0, solver=hj.Radau()),
+        lambda: m.VanDerPol(100.0, solver=hj.systems.Radau()),
         hj.Crossing("v", "falling"),
         162.83707109237002,
         2.001318681177219,
         -28997.98845728604,
     ),
     "van der Pol, mu = 1000": (
-        lambda: m.VanDerPol(1000.0, solver=hj.Radau()),
+        lambda: m.VanDerPol(1000.0, solver=hj.systems.Radau()),
         hj.Crossing("v", "falling"),
         1614.401125808362,
         2.0000729660025987,
@@ -62,8 +62,8 @@ def _top(cycle, near):
     def level(t, q):
         return q[0] - q[0] ** 3 / 3 - q[1] + 0.5
 
-    falls = hj.SectionList([hj.Crossing(level, "falling")])
-    return float(hj.place_sections(cycle, falls).lanes.q[0, 0])
+    falls = hj.sections.SectionList([hj.Crossing(level, "falling")])
+    return float(hj.sections.place_sections(cycle, falls).lanes.q[0, 0])
 
 
 def test_the_hopper_on_a_compliant_ground():

@@ -27,7 +27,7 @@ def placed(name):
 
     levels = [hj.Crossing(angle, "rising", level) for level in levels]
     cycle = hj.find_limit_cycle(getattr(hj.models, name)())
-    return hj.place_sections(cycle, [hj.AtEvent("touchdown"), *levels])
+    return hj.sections.place_sections(cycle, [hj.AtEvent("touchdown"), *levels])
 
 
 def along_section(left_out, leg):

@@ -44,28 +44,29 @@ KICKED = toy({"fall": Field(("x",), fall_rates)}, period=1.0)
     ],
 )
 def test_another_period_or_none(system, state, message):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         hj.find_limit_cycle(system, hj.Guess("fall", state, 0.1))
 
 
 def test_a_period_that_does_not_follow_a_parameter():
     fixed = type("Fixed", (hj.models.Duffing,), {"period": lambda self: 4 * np.pi})
     with pytest.raises(
-        hj.DefinitionError, match="does not have the period 12.5664 that Fixed"
+        hj.errors.DefinitionError, match="does not have the period 12.5664 that Fixed"
     ):
         hj.continuation(hj.find_limit_cycle(fixed()), "rate", (0.5, 0.51))
 
     def every(self):
-        return hj.Scheduled(20 * np.pi * self.damping, 1.0)
+        return hj.systems.Scheduled(20 * np.pi * self.damping, 1.0)
 
     tick = {
         "transitions": lambda self: [hj.Transition("tick", "line", "line", every(self))]
     }
     ticks = type("Ticks", (hj.models.Duffing,), tick)
     with pytest.raises(
-        hj.DefinitionError, match="the schedule of 'tick' must divide the clock's"
+        hj.errors.DefinitionError,
+        match="the schedule of 'tick' must divide the clock's",
     ):
-        hj.find_limit_cycles(
+        hj.orbits.find_limit_cycles(
             [ticks(), ticks(damping=0.11)], hj.find_limit_cycle(ticks())
         )
 
@@ -81,7 +82,7 @@ def test_a_force_that_jumps_with_the_clock():
 
     charts = {"a": Field(("x",), rates)}
     square = toy(
-        charts, [hj.Transition("half", "a", "a", hj.Scheduled(0.5))], period=1.0
+        charts, [hj.Transition("half", "a", "a", hj.systems.Scheduled(0.5))], period=1.0
     )
     cycle = hj.find_limit_cycle(square, hj.Guess("a", (0.3,), 0.25))
     x = (1 - np.exp(-0.5)) * np.exp(-0.5) / (1 - np.exp(-1.0))

@@ -59,11 +59,13 @@ def ticked(height=1.0, other=0.0):
 
     transitions = [
         hj.Transition("full", "a", "a", full_guard, "rising", back),
-        hj.Transition("tick", "a", "a", hj.Scheduled(1.0), reset=back),
+        hj.Transition("tick", "a", "a", hj.systems.Scheduled(1.0), reset=back),
     ]
     if other:
         transitions.append(
-            hj.Transition("tock", "a", "a", hj.Scheduled(0.5, other), reset=back)
+            hj.Transition(
+                "tock", "a", "a", hj.systems.Scheduled(0.5, other), reset=back
+            )
         )
 
     def rates(t, q, u):
@@ -96,7 +98,7 @@ def race():
         hj.Transition("y", "a", "y first", y, "rising"),
         hj.Transition("y second", "x first", "c", y, "rising"),
         hj.Transition("x second", "y first", "c", x, "rising"),
-        hj.Transition("start", "c", "a", hj.Scheduled(1.0), reset=again),
+        hj.Transition("start", "c", "a", hj.systems.Scheduled(1.0), reset=again),
     )
     return toy(charts, transitions, period=1.0)
 
@@ -104,8 +106,8 @@ def race():
 def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
     cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
-    assert cycle.result == hj.Result.COINCIDENCE
-    (found,) = hj.coincidences(cycle)
+    assert cycle.result == hj.errors.Result.SIMULTANEOUS
+    (found,) = hj.orbits.simultaneous_events(cycle)
     assert found.time % 1.0 == pytest.approx(0.5)
     assert not found.commute
     exact = {
@@ -119,7 +121,7 @@ def test_derivatives_of_both_orders():
 
 def test_an_event_that_coincides_with_the_one_at_the_anchor():
     with pytest.raises(
-        hj.ComputationError, match="'y' coincides with 'x', its beginning"
+        hj.errors.ComputationError, match="'y' coincides with 'x', its beginning"
     ):
         hj.find_limit_cycle(PAIR, hj.Guess("a", (0.1, 0.1)), section=hj.AtEvent("x"))
 
@@ -129,9 +131,9 @@ def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     """Clocks of their own, whose events commute, and such that do not."""
     systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(jnp.array([0.0, 0.2, 0.4]))
     begin = hj.find_limit_cycle(Balls(), BALLS)
-    found = hj.find_limit_cycles(systems, begin)
-    ok = hj.Result.OK
-    not_ok = hj.Result.COINCIDENCE
+    found = hj.orbits.find_limit_cycles(systems, begin)
+    ok = hj.errors.Result.OK
+    not_ok = hj.errors.Result.SIMULTANEOUS
     assert_array_equal(found.result, [ok, not_ok, not_ok])
     branch = hj.continuation(begin, "coupling", (0.0, 0.1), step=0.5)
     assert branch.cycles.result[0] == ok
@@ -143,13 +145,13 @@ def test_an_event_that_coincides_with_a_schedule():
     """Without the clock, it would be full at the time 1: which of the two sets it back?"""
     height = 10 - 9.8 * np.exp(-0.1)
     with pytest.raises(
-        hj.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
+        hj.errors.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
     ):
         hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
 
 
 def test_two_schedules_for_one_time():
     with pytest.raises(
-        hj.DefinitionError, match="'tick' and 'tock' are scheduled for the same"
+        hj.errors.DefinitionError, match="'tick' and 'tock' are scheduled for the same"
     ):
         hj.find_limit_cycle(ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))

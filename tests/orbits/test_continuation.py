@@ -161,11 +161,11 @@ def test_bad_input(juggling):
         "ascending": (0.1, 0.3, 0.2),
         "outside of the": (0.2, 0.3),
     }.items():
-        with pytest.raises(hj.DefinitionError, match=words):
+        with pytest.raises(hj.errors.DefinitionError, match=words):
             follow(juggling, "A", values)
-    with pytest.raises(hj.DefinitionError, match="outside of jit"):
+    with pytest.raises(hj.errors.DefinitionError, match="outside of jit"):
         eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
-    with pytest.raises(hj.DefinitionError, match="has multiplicity 1, not 2"):
+    with pytest.raises(hj.errors.DefinitionError, match="has multiplicity 1, not 2"):
         hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
 
@@ -198,7 +198,7 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     """Driven less, the hopper stops hopping: the force of the ground, (m + M) g plus a sine of
     amplitude a r / (r - k), r = M w^2, just reaches zero."""
     branch = hj.continuation(hopper_cycle, "a", (1.0, 30.0))
-    assert branch.ends[0].result == hj.Result.GRAZING
+    assert branch.ends[0].result == hj.errors.Result.GRAZING
     r = 2 * (2 * np.pi) ** 2
     assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
@@ -230,7 +230,9 @@ class Maps(hj.HybridSystem):
             r = self.growth.r + jnp.array([0.0, 0.0, 0.0, 0.01])
             return *(r * q[:4] * (1 - q[jnp.array([0, 1, 4, 5])])), q[2], q[3]
 
-        return [hj.Transition("step", "a", "a", hj.Scheduled(1.0, 0.5), reset=step)]
+        return [
+            hj.Transition("step", "a", "a", hj.systems.Scheduled(1.0, 0.5), reset=step)
+        ]
 
     def period(self):
         return 1.0
@@ -241,7 +243,9 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
     """Test functions do not change their signs, or are small. The parameter is that of a part."""
     guess = hj.Guess("a", (0.47,) * 6)
     cycle = hj.find_limit_cycle(Maps(), guess)
-    with pytest.raises(hj.DefinitionError, match="'growth.c'; parameters are growth.r"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="'growth.c'; parameters are growth.r"
+    ):
         hj.continuation(cycle, "growth.c", (1.0, 2.0))
     branch = hj.continuation(cycle, "growth.r", (1.9, 3.1), step=1.0)
     kinds = [point.kind for point in branch.points]
@@ -258,7 +262,7 @@ def test_a_cycle_that_shrinks_to_an_equilibrium():
     cycle = hj.find_limit_cycle(m.HopfOscillator())
     branch = hj.continuation(cycle, "mu", (-0.05, 0.12), step=0.2)
     begin, _ = branch.ends
-    assert begin.result == hj.Result.EQUILIBRIUM
+    assert begin.result == hj.errors.Result.EQUILIBRIUM
     assert "shrinks to an equilibrium" in begin.message
     assert 0 < begin.value < 1e-4
     wide = branch.values > 1e-3
@@ -308,7 +312,7 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
 
     begin, end = branch.ends
     assert end.message == "end of the parameter range"
-    assert begin.result == hj.Result.GRAZING
+    assert begin.result == hj.errors.Result.GRAZING
     assert "'spike' is touched tangentially" in begin.message
 
     # The potential between two spikes of the last cycle, in closed form.
@@ -356,9 +360,9 @@ class Boost(hj.HybridSystem):
         def begins(t, q, u):
             return q[0], 0.0
 
-        tick = hj.Scheduled(20e-6)
+        tick = hj.systems.Scheduled(20e-6)
         return [
-            hj.Transition("opens", "on", "off", hj.Scheduled(20e-6, 10e-6)),
+            hj.Transition("opens", "on", "off", hj.systems.Scheduled(20e-6, 10e-6)),
             hj.Transition("closes", "off", "on", tick),
             hj.Transition("is empty", "off", "idle", current, reset=without),
             hj.Transition("closes again", "idle", "on", tick, reset=begins),
@@ -391,7 +395,7 @@ def test_the_border_of_continuous_conduction():
     ):
         cycle = hj.find_limit_cycle(Boost(R=R))
         end = hj.continuation(cycle, "R", values, step=0.5).ends[side]
-        assert end.result == hj.Result.EVENT_ORDER
+        assert end.result == hj.errors.Result.EVENT_ORDER
         assert words in end.message
         assert_allclose(end.value, border, rtol=1e-4)
 

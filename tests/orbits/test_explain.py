@@ -85,7 +85,7 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     if not by_rough_turns:
         monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
     cycle = hj.find_limit_cycle(Balls(), BALLS)
-    (both,) = hj.coincidences(cycle)
+    (both,) = hj.orbits.simultaneous_events(cycle)
     assert both.commute
     assert set(both.orders) == {
         ("impact0", "impact1"),
@@ -100,11 +100,13 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     """A ball that lands is pushed in proportion to the height of the other, which is zero."""
     system = Balls(coupling=0.5)
     begin = hj.find_limit_cycle(Balls(), BALLS)
-    with pytest.raises(hj.ComputationError, match="'impact.' and 'impact.' coincide"):
+    with pytest.raises(
+        hj.errors.ComputationError, match="'impact.' and 'impact.' coincide"
+    ):
         hj.find_limit_cycle(system, begin)
     cycle = hj.find_limit_cycle(system, begin, throw=False)
-    assert cycle.result == hj.Result.COINCIDENCE
-    (both,) = hj.coincidences(cycle)
+    assert cycle.result == hj.errors.Result.SIMULTANEOUS
+    (both,) = hj.orbits.simultaneous_events(cycle)
     assert not both.commute
 
     # The balls from half a tenth of a second before the impacts to as long after them.
@@ -154,7 +156,7 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
 )
 def test_causes(system, guess, message, steps):
     *_, chart = system.charts()
-    with pytest.raises(hj.ComputationError, match=message):
+    with pytest.raises(hj.errors.ComputationError, match=message):
         hj.find_limit_cycle(
-            system, hj.Guess(chart, guess), settings=hj.Settings(max_steps=steps)
+            system, hj.Guess(chart, guess), settings=hj.orbits.Settings(max_steps=steps)
         )

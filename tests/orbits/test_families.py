@@ -39,7 +39,7 @@ def test_one_cycle_of_a_family(running):
 
 @pytest.mark.slow
 def test_what_is_not_conserved_is_refused():
-    with pytest.raises(hj.DefinitionError, match="'y' is not conserved"):
+    with pytest.raises(hj.errors.DefinitionError, match="'y' is not conserved"):
         hj.find_limit_cycle(hj.models.SLIPRunner(), section=APEX, conserved={"y": 0.94})
 
 
@@ -84,5 +84,7 @@ def test_the_circle_of_an_energy():
 
 
 def test_what_could_be_given_is_said():
-    with pytest.raises(hj.ComputationError, match=r"conserved=\{'energy': 0\.605"):
+    with pytest.raises(
+        hj.errors.ComputationError, match=r"conserved=\{'energy': 0\.605"
+    ):
         find()

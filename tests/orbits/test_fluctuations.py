@@ -160,19 +160,20 @@ def test_a_million_simulated_bounces_scatter_as_computed(juggler):
 
 def test_noise_that_does_not_fit_is_refused(juggler):
     with pytest.raises(
-        hj.DefinitionError, match="`white`: there is no state or input 'w'"
+        hj.errors.DefinitionError, match="`white`: there is no state or input 'w'"
     ):
         juggler.fluctuations({"w": 1.0})
     with pytest.raises(
-        hj.DefinitionError, match="`guards`: there is no transition 'bounce'"
+        hj.errors.DefinitionError, match="`guards`: there is no transition 'bounce'"
     ):
         juggler.fluctuations(guards={"bounce": 1.0})
     with pytest.raises(
-        hj.DefinitionError, match="`resets`: after 'impact' there is no state 'w'"
+        hj.errors.DefinitionError,
+        match="`resets`: after 'impact' there is no state 'w'",
     ):
         juggler.fluctuations(resets={"impact": {"w": 1.0}})
     unstable = hj.find_limit_cycle(hj.models.BuckConverter(Vin=26.0))
-    with pytest.raises(hj.ComputationError, match="not stable"):
+    with pytest.raises(hj.errors.ComputationError, match="not stable"):
         unstable.fluctuations({"v": 1.0})
 
 

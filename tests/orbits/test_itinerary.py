@@ -67,8 +67,8 @@ class Pulses(hj.HybridSystem):
         return {"off": Circuit(0.0), "on": Circuit(1.0)}
 
     def transitions(self):
-        up = hj.Scheduled(1.0, self.rise)
-        down = hj.Scheduled(1.0, self.fall)
+        up = hj.systems.Scheduled(1.0, self.rise)
+        down = hj.systems.Scheduled(1.0, self.fall)
         return [
             hj.Transition("up", "off", "on", up),
             hj.Transition("down", "on", "off", down),
@@ -126,8 +126,8 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
     def result(drive):
         return hj.find_limit_cycle(Rebound(drive=drive), free).result
 
-    assert result(0.5) == hj.Result.OK
-    assert result(2.0) == hj.Result.EVENT_ORDER
+    assert result(0.5) == hj.errors.Result.OK
+    assert result(2.0) == hj.errors.Result.EVENT_ORDER
 
 
 def test_gradients_inside_of_programs_are_differences(free):
@@ -157,7 +157,7 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
     systems = make(jnp.asarray(k.ravel()), jnp.asarray(b.ravel()))
     guess = hj.find_limit_cycle(hj.models.VerticalHopper())
-    cycles = hj.find_limit_cycles(systems, guess)
+    cycles = hj.orbits.find_limit_cycles(systems, guess)
     assert cycles.ok.all()
     charts = np.asarray(cycles.anchor.chart)[:, 0]
     assert len(np.unique(charts)) == 2

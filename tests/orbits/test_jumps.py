@@ -50,7 +50,7 @@ def smooth():
 def is_refused(cycle, further):
     try:
         check_jumps(dataclasses.replace(cycle, system=current(Turns(further))))
-    except hj.DefinitionError as error:
+    except hj.errors.DefinitionError as error:
         assert "test_jumps.py:" in str(error)
         return True
     return False
@@ -105,7 +105,7 @@ def test_kinks_have_the_steps_that_they_need():
     kinked = hj.find_limit_cycle(
         Turns(lambda x: 1e-2 * jnp.interp(x, GRID, jnp.sin(GRID)))
     )
-    assert kinked.result == hj.Result.OK
+    assert kinked.result == hj.errors.Result.OK
 
 
 def test_simulations_end_at_what_steps_pass_over():
@@ -121,7 +121,7 @@ def test_simulations_end_at_what_steps_pass_over():
     dips = type("Dips", (Turns,), {"transitions": lambda self: [event]})(lambda x: 0.0)
     for system in (pulse, dips):
         path = hj.simulate(system, "on", (2.0, -0.1), 6.0, throw=False)
-        assert path.result == hj.Result.PULSE_PASSED
+        assert path.result == hj.errors.Result.PULSE_PASSED
 
 
 def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
@@ -136,7 +136,7 @@ def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
         lambda x: 0.0
     )
     path = hj.simulate(stops, "on", (0.6, 2.0), 6.0, throw=False)
-    assert path.result == hj.Result.FIELD_NOT_FINITE
+    assert path.result == hj.errors.Result.FIELD_NOT_FINITE
 
 
 class Pushed(Turning):
@@ -154,7 +154,7 @@ def test_a_pulse_in_the_gain_of_an_input_is_refused():
     make = {"charts": lambda self: {"on": Pushed(None)}, "period": lambda self: 1.3}
     system = type("Pushes", (Turns,), make)(None)
     with pytest.raises(
-        hj.DefinitionError, match="the gain from 'u' to the rate of 'v' .* pulse"
+        hj.errors.DefinitionError, match="the gain from 'u' to the rate of 'v' .* pulse"
     ):
         hj.find_limit_cycle(system, hj.Guess("on", (1.0, 0.0)), settle=10.0)
 
@@ -171,7 +171,13 @@ class Switched(Turns):
 @SLOW
 def test_a_jump_beside_a_cycle_without_one_is_refused():
     first = hj.find_limit_cycle(Switched(None), section=RISES)
-    with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="has a pulse, a jump .*test_jumps.py"
+    ):
         hj.continuation(first, "height", (0.0, 0.01))
-    with pytest.raises(hj.DefinitionError, match="has a pulse, a jump .*test_jumps.py"):
-        hj.find_limit_cycles([Switched(None, x) for x in (0.0, 1e-3, 0.0)], guess=first)
+    with pytest.raises(
+        hj.errors.DefinitionError, match="has a pulse, a jump .*test_jumps.py"
+    ):
+        hj.orbits.find_limit_cycles(
+            [Switched(None, x) for x in (0.0, 1e-3, 0.0)], guess=first
+        )

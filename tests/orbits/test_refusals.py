@@ -17,7 +17,7 @@ def kicked(beat=1.0, schedule=0.0):
     def guard(t, q, u):
         return jnp.cos(2 * jnp.pi * t)
 
-    guard = hj.Scheduled(schedule, 0.1) if schedule else guard
+    guard = hj.systems.Scheduled(schedule, 0.1) if schedule else guard
 
     def kick_reset(t, q, u):
         return (q[0] + 1.0,)
@@ -56,7 +56,7 @@ def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
 )
 def test_what_is_no_cycle(system, guess, options, message):
     x, *time = guess
-    with pytest.raises(hj.HybridJaxError, match=message):
+    with pytest.raises(hj.errors.HybridJaxError, match=message):
         hj.find_limit_cycle(system, hj.Guess("a", (x,), *time), **options)
 
 
@@ -74,7 +74,7 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
         still = {"a": Field(("x",), rates)}
         return (
             still,
-            [hj.Transition("grow", "a", "a", hj.Scheduled(1, 0.5), reset=grow)],
+            [hj.Transition("grow", "a", "a", hj.systems.Scheduled(1, 0.5), reset=grow)],
             1.0,
         )
 
@@ -84,8 +84,8 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
     measured = [result(np.array([r])) for r in (3.3, 2.8)]
     assert measured == [
-        hj.Result.OK,
-        hj.Result.EXTRA_TURNS,
+        hj.errors.Result.OK,
+        hj.errors.Result.EXTRA_TURNS,
     ]
 
 
@@ -96,7 +96,7 @@ def test_outputs_of_a_call_have_the_period_of_the_clock():
         lambda t, q, u: u[0] * jnp.cos(1.3 * t),
     ):
         with pytest.raises(
-            hj.DefinitionError, match="output 'z' does not have the period 1"
+            hj.errors.DefinitionError, match="output 'z' does not have the period 1"
         ):
             hj.linearize(cycle, hj.ClockPhase(4), hj.Output("z", value))
 
@@ -104,13 +104,13 @@ def test_outputs_of_a_call_have_the_period_of_the_clock():
 def test_a_ball_does_not_fall_through_the_floor():
     ball = hj.models.BouncingBall(restitution=0.0)
     path = hj.simulate(ball, "fall", (1.0, 0.0), 2.0, throw=False)
-    assert path.result == hj.Result.GUARD_PASSED
+    assert path.result == hj.errors.Result.GUARD_PASSED
     assert len(path.events) == 1
 
 
 def test_a_cycle_of_another_kind_is_no_guess(hopper_cycle):
     refused = pytest.raises(
-        hj.DefinitionError, match=r"charts and states: \(2, 4\) and \(1, 2\)"
+        hj.errors.DefinitionError, match=r"charts and states: \(2, 4\) and \(1, 2\)"
     )
     juggler = hj.models.PaddleJuggler()
     with refused:
@@ -118,7 +118,7 @@ def test_a_cycle_of_another_kind_is_no_guess(hopper_cycle):
     with refused:
         hj.sweep(juggler, {"restitution": [0.7, 0.8]}, guess=hopper_cycle)
     with refused:
-        data = hj.ObservedCycle(hj.ClockPhase(1), period=1.0)
+        data = hj.fitting.ObservedCycle(hj.ClockPhase(1), period=1.0)
         hj.fit_model(juggler, data, "g", guess=hopper_cycle)
 
 
@@ -127,7 +127,7 @@ def test_a_cycle_as_the_guess_begins_at_the_same_phase(hopper_cycle):
     slower = hj.models.VerticalHopper(omega=2 * jnp.pi / 1.05)
     cycle = hj.find_limit_cycle(slower, hopper_cycle)
     assert_allclose(cycle.anchor.t, 1.05 * hopper_cycle.anchor.t, rtol=1e-14)
-    assert cycle.result == hj.Result.OK
+    assert cycle.result == hj.errors.Result.OK
     assert cycle.event_sequence == hopper_cycle.event_sequence
 
 
@@ -153,7 +153,7 @@ def test_failed_cycles_of_a_sweep_have_no_period():
     section = hj.Crossing("x", "falling")
     guess = hj.Guess("a", (0.1, 1.0))
     cycle = hj.find_limit_cycle(Toys(make, [1.0]), guess, section=section)
-    found = hj.find_limit_cycles([Toys(make, [mu]) for mu in (1.0, -1.0)], cycle)
+    found = hj.orbits.find_limit_cycles([Toys(make, [mu]) for mu in (1.0, -1.0)], cycle)
     assert_array_equal(found.ok, [True, False])
     assert_allclose(found.period, [2 * np.pi, np.nan], rtol=1e-8)
 
@@ -184,7 +184,7 @@ def test_time_times_zero_is_no_clock(force):
 )
 def test_a_field_in_float32_is_named(force):
     with pytest.raises(
-        hj.DefinitionError, match="field of chart 'a' is computed in float32"
+        hj.errors.DefinitionError, match="field of chart 'a' is computed in float32"
     ):
         hj.find_limit_cycle(oscillator(force), hj.Guess("a", (2.0, 0.0)))
 
@@ -214,5 +214,5 @@ def test_zeno_is_named_although_newton_went_elsewhere():
         hj.Transition("y low", "first", "second", y_low_guard),
         hj.Transition("x low", "second", "first", x_low_guard),
     ]
-    with pytest.raises(hj.ComputationError, match="accumulate in finite time"):
+    with pytest.raises(hj.errors.ComputationError, match="accumulate in finite time"):
         hj.find_limit_cycle(toy(charts, events), hj.Guess("first", (1.5, 1.5)))

@@ -188,7 +188,7 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
     def field(t, q, u):
         return (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
 
-    tick = hj.Scheduled(1.0, 0.5)
+    tick = hj.systems.Scheduled(1.0, 0.5)
 
     def tick_reset(t, q, u):
         return (-q[0],)
@@ -238,7 +238,7 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     ]
     assert_allclose(leads, [0.9999, 0.4999], rtol=1e-9)
     with pytest.raises(
-        hj.DefinitionError, match="`harmonics` = 64 does not resolve jumps"
+        hj.errors.DefinitionError, match="`harmonics` = 64 does not resolve jumps"
     ):
         hj.find_limit_cycle(Neuron(grip=0.3)).responses().coupling("v")
 
@@ -254,7 +254,7 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     (impulse,) = leaky.impulses()
     assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
     assert "inputs act at spike" in str(leaky)
-    with pytest.raises(hj.DefinitionError, match="acts at events alone"):
+    with pytest.raises(hj.errors.DefinitionError, match="acts at events alone"):
         leaky.curve("u")
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
     system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
@@ -355,7 +355,7 @@ def test_mathieus_equation_has_the_published_continuous_htf():
     held = ldtp.htf(0.25, (-1, 0, 1)).H
     x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
     assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
-    with pytest.raises(hj.DefinitionError, match="takes HTFs between sections"):
+    with pytest.raises(hj.errors.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
 
 
@@ -380,7 +380,9 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
     assert space.error < 1e-12
     assert space.order == 8
     assert hj.convert.to_harmonic_state_space(cycle, 1).error > 1e-3
-    with pytest.raises(hj.DefinitionError, match="has events at which deviations jump"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="has events at which deviations jump"
+    ):
         hj.convert.to_harmonic_state_space(hj.find_limit_cycle(Neuron()))
 
 
@@ -511,45 +513,47 @@ def test_bad_questions_are_refused_in_one_sentence():
     hopper = hj.find_limit_cycle(hj.models.VerticalHopper())
     wheel = hj.find_limit_cycle(Neuron())
     with pytest.raises(
-        hj.DefinitionError, match="has no phase response: its phase is that"
+        hj.errors.DefinitionError, match="has no phase response: its phase is that"
     ):
         hopper.responses().phase([0.1])
     with pytest.raises(
-        hj.DefinitionError, match="has no phase response: its phase is that"
+        hj.errors.DefinitionError, match="has no phase response: its phase is that"
     ):
         hopper.asymptotic_phase("flight", [0.0] * hopper.structure.dims[0])
     with pytest.raises(
-        hj.DefinitionError, match="for the 1 states v of chart 'membrane'"
+        hj.errors.DefinitionError, match="for the 1 states v of chart 'membrane'"
     ):
         wheel.asymptotic_phase("membrane", (0.3, 0.5))
     with pytest.raises(
-        hj.DefinitionError, match="no mode with an amplitude 2: there are 2"
+        hj.errors.DefinitionError, match="no mode with an amplitude 2: there are 2"
     ):
         hopper.responses().amplitude(2, [0.1])
     with pytest.raises(
-        hj.DefinitionError, match="3 modes were asked for; 2 have amplitudes"
+        hj.errors.DefinitionError, match="3 modes were asked for; 2 have amplitudes"
     ):
         hopper.responses(modes=3)
     with pytest.raises(
-        hj.DefinitionError, match="pole of the cycle, which lie at every whole"
+        hj.errors.DefinitionError, match="pole of the cycle, which lie at every whole"
     ):
         wheel.htf([0.3, 2.0])
-    with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
+    with pytest.raises(hj.errors.DefinitionError, match="there is no input 'force'"):
         wheel.htf(0.3, inputs="force")
     with pytest.raises(
-        hj.DefinitionError, match=r"need 2.4e\+10 pieces of the cycle: lower"
+        hj.errors.DefinitionError, match=r"need 2.4e\+10 pieces of the cycle: lower"
     ):
         wheel.htf(1e10)
-    with pytest.raises(hj.DefinitionError, match="there is no parameter 'speed'"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="there is no parameter 'speed'"
+    ):
         wheel.sensitivity("speed")
-    with pytest.raises(hj.DefinitionError, match="there is no input 'force'"):
+    with pytest.raises(hj.errors.DefinitionError, match="there is no input 'force'"):
         wheel.responses().curve("force")
-    with pytest.raises(hj.DefinitionError, match="call (it|them) outside"):
+    with pytest.raises(hj.errors.DefinitionError, match="call (it|them) outside"):
         eqx.filter_jit(lambda cycle: cycle.htf(0.3))(wheel)
     apex = hj.Crossing("vy", "falling")
     family = dict(section=apex, conserved={"energy": 1784.8})
     runner = hj.find_limit_cycle(hj.models.SLIPRunner(), **family)
     with pytest.raises(
-        hj.ComputationError, match="has no defined phase: its multiplier 1 is"
+        hj.errors.ComputationError, match="has no defined phase: its multiplier 1 is"
     ):
         runner.responses()

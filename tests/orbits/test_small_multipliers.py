@@ -50,7 +50,7 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
     def reset(t, q, u):
         return (q[0], 0.0)
 
-    tick = hj.Transition("tick", "a", "a", hj.Scheduled(1.0, 0.5), reset=reset)
+    tick = hj.Transition("tick", "a", "a", hj.systems.Scheduled(1.0, 0.5), reset=reset)
     system = toy({"a": Field(("x", "y"), field)}, [tick], period=1.0)
     guess = hj.Guess("a", (small, large))
     cycle = hj.find_limit_cycle(system, guess)

@@ -60,7 +60,7 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     length, time = UNITS[unit]
     sizes = dimensions(length, time)
     cycle = hopper_cycle_in(length, time)
-    assert cycle.result == hj.Result.OK
+    assert cycle.result == hj.errors.Result.OK
     assert cycle.event_sequence == hopper_cycle.event_sequence
     assert cycle.iterations == hopper_cycle.iterations
     assert cycle.residual < 1e-12
@@ -88,7 +88,7 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     """The plane through the guess, its time to return, and the flow out of the multipliers."""
     length, time = UNITS[unit]
     cycle = relaxation_in(length, time)
-    assert cycle.result == hj.Result.OK
+    assert cycle.result == hj.errors.Result.OK
     assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
     assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
 

@@ -152,10 +152,10 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
     ghost = ghost_beside(cycle)
     widths = jnp.linspace(0.297, 0.303, 4)
     systems = eqx.filter_vmap(lambda w: SchmittTrigger(width=w))(widths)
-    cycles = hj.find_limit_cycles(systems, cycle)
+    cycles = hj.orbits.find_limit_cycles(systems, cycle)
     assert cycles.ok.all()
     assert ((cycles.codes >= 0).sum(axis=1) == 2).all()
-    ghosts = hj.find_limit_cycles(systems, ghost)
+    ghosts = hj.orbits.find_limit_cycles(systems, ghost)
     assert (ghosts.result == Result.GUARD_BEYOND).all()
     with pytest.raises(hj.errors.DefinitionError, match="guess is none"):
         hj.sweep(SchmittTrigger(), {"width": np.asarray(widths)}, guess=ghost)

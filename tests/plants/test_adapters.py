@@ -74,7 +74,7 @@ def fmu(tmp_path_factory):
 
 def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     plant = hj.plants.FMUPlant(fmu, "u", ("x", "v"), dt=0.02)
-    cycle = hj.plants.settle(plant, SECTIONS, "x", cycles=8)
+    cycle = hj.plants.find_cycle(plant, SECTIONS, "x", cycles=8)
     exact = hj.find_limit_cycle(hj.models.VanDerPol(mu=2.0))
     assert (
         abs(cycle.period - exact.period) < 0.2 * plant.dt**2
@@ -85,9 +85,9 @@ def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     assert np.array_equal(data.y, again.y)
     assert data.ok.all()
     assert np.abs(data.y).max() > 1e-3
-    with pytest.raises(hj.DefinitionError, match="whose state can be set"):
+    with pytest.raises(hj.errors.DefinitionError, match="whose state can be set"):
         cycle.perturbed_returns()
-    with pytest.raises(hj.DefinitionError, match="no real variable 'z'"):
+    with pytest.raises(hj.errors.DefinitionError, match="no real variable 'z'"):
         hj.plants.FMUPlant(fmu, "u", ("z",), dt=0.05)
 
 
@@ -98,14 +98,14 @@ def gymnasium_circle():
 
 def test_sections_are_interpolated_between_fixed_steps(gymnasium_circle):
     sections = hj.KinematicPhase(8, "x", "y")
-    cycle = hj.plants.settle(gymnasium_circle, sections, "x", cycles=10)
+    cycle = hj.plants.find_cycle(gymnasium_circle, sections, "x", cycles=10)
     assert_allclose(cycle.period, 2 * np.pi, rtol=0, atol=1e-4)
     rng = np.random.default_rng(0)
     u = 0.05 * rng.standard_normal((1, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     assert data.ok.all()
     assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
-    exact_cycle = hj.plants.settle(Circle(), sections, "x", cycles=10)
+    exact_cycle = hj.plants.find_cycle(Circle(), sections, "x", cycles=10)
     exact = exact_cycle.run_experiments(u, discard=0, processes=0)
     tolerance = 0.05 * np.abs(exact.y).max()
     assert_allclose(data.y, exact.y, rtol=0, atol=tolerance)
@@ -125,13 +125,13 @@ def ground():
         substeps=20,
     )
     sections = hj.ClockPhase(10, anchor=0.7)
-    return hj.plants.settle(plant, sections, ("yM", "yM_rate"), cycles=32)
+    return hj.plants.find_cycle(plant, sections, ("yM", "yM_rate"), cycles=32)
 
 
 def test_mujoco_continues_from_its_state(ground):
     """On soft ground the paper's hopper settles near its cycle on hard ground."""
     hard = hj.find_limit_cycle(hj.models.VerticalHopper())
-    at = hj.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
+    at = hj.sections.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
     error = np.abs(ground.cycle_outputs - np.asarray(at.observe(("yM", "vM")))).max()
     assert error < 0.05
     plant = ground.plant
@@ -169,7 +169,7 @@ def test_a_controller_may_keep_memory_in_userdata():
 
 def test_an_event_is_interpolated_between_fixed_steps(gymnasium_circle):
     section = hj.Crossing("y", "rising")
-    cycle = hj.plants.settle(gymnasium_circle, section, ("x", "y"), cycles=10)
+    cycle = hj.plants.find_cycle(gymnasium_circle, section, ("x", "y"), cycles=10)
     assert_allclose(cycle.period, 2 * np.pi, rtol=0, atol=1e-4)
     assert abs(cycle.cycle_outputs[0, 1]) < 1e-9
     rng = np.random.default_rng(0)
@@ -188,7 +188,7 @@ class SteppedCircle(Circle):
 
 
 def test_no_section_of_a_clock_is_late_where_steps_end():
-    cycle = hj.plants.settle(SteppedCircle(), hj.ClockPhase(8), "x", cycles=10)
+    cycle = hj.plants.find_cycle(SteppedCircle(), hj.ClockPhase(8), "x", cycles=10)
     rng = np.random.default_rng(0)
     u = 0.05 * rng.standard_normal((1, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
@@ -200,7 +200,7 @@ def test_a_walker_in_mujoco():
     """Perturbed returns at clock sections and at the touchdown agree with experiments."""
     plant = walker()
     outputs = ("x_rate", "pitch")
-    cycle = hj.plants.settle(plant, hj.ClockPhase(8), outputs, cycles=40)
+    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(8), outputs, cycles=40)
     returns = cycle.perturbed_returns(coordinates(plant))
     design = hj.multisine(n_sections=8, periods=16, amplitude=0.1, lines="odd")
     data = cycle.run_experiments(design, discard=24)
@@ -210,7 +210,7 @@ def test_a_walker_in_mujoco():
     assert returns.contains(fit.multipliers).all()
 
     touchdown = hj.Crossing("left_foot[2]", "falling")
-    at_touchdown = hj.plants.settle(plant, touchdown, outputs, cycles=40)
+    at_touchdown = hj.plants.find_cycle(plant, touchdown, outputs, cycles=40)
     with_time = [*coordinates(plant), "time"]
     there = at_touchdown.perturbed_returns(with_time).multipliers
     error = np.abs(there[:2] - returns.multipliers[:2])
@@ -219,7 +219,7 @@ def test_a_walker_in_mujoco():
     push = np.zeros((44, 1))
     push[3] = -200.0
     falls = cycle.trajectory(u=push)
-    assert falls.result == hj.Result.PLANT_STOPPED
+    assert falls.result == hj.errors.Result.PLANT_STOPPED
     assert 1 < falls.t[-1] < 3
 
 

@@ -24,7 +24,7 @@ DESIGN = hj.multisine(16, periods=16, amplitude=0.002)
 
 @pytest.fixture(scope="module")
 def circle():
-    return hj.plants.settle(Circle(), ANGLE, ("x", "y"), cycles=20)
+    return hj.plants.find_cycle(Circle(), ANGLE, ("x", "y"), cycles=20)
 
 
 MULTIPLIER = math.exp(-0.4 * math.pi)  # of the circle's radius
@@ -70,7 +70,7 @@ def test_sections_at_events():
     level = math.sin(0.2)
     rising = hj.Crossing("y", "rising", level)
     falling = hj.Crossing("y", "falling", level)
-    cycle = hj.plants.settle(Circle(), [rising, falling], ("x", "y"), cycles=20)
+    cycle = hj.plants.find_cycle(Circle(), [rising, falling], ("x", "y"), cycles=20)
     assert_allclose(cycle.period, math.tau, rtol=0, atol=1e-9)
     places = [[math.cos(0.2), level], [-math.cos(0.2), level]]
     assert_allclose(cycle.cycle_outputs, places, rtol=0, atol=1e-8)
@@ -80,7 +80,7 @@ def test_sections_at_events():
 
 def test_a_motion_is_recorded_up_to_a_fall(circle):
     def picture(z):
-        return hj.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
+        return hj.systems.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
 
     motion = circle.trajectory(picture)
     t, x = motion("x")
@@ -95,12 +95,16 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     class Falls(Circle):
         def step(self, u, duration):
             if u[0] > 1:
-                raise hj.ComputationError("fell") if u[0] == 2 else ZeroDivisionError
+                raise (
+                    hj.errors.ComputationError("fell")
+                    if u[0] == 2
+                    else ZeroDivisionError
+                )
             return super().step(u, duration)
 
-    cycle = hj.plants.settle(Falls(), ANGLE, "x", cycles=20)
+    cycle = hj.plants.find_cycle(Falls(), ANGLE, "x", cycles=20)
     fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
-    assert fall.result == hj.Result.PLANT_STOPPED
+    assert fall.result == hj.errors.Result.PLANT_STOPPED
     error = abs(fall.t[-1] - math.pi / 2)
     assert error < 1e-8
     with pytest.raises(ZeroDivisionError):  # a mistake in the plant is no fall
@@ -111,7 +115,7 @@ def test_an_unstable_cycle_is_found_from_a_guess():
     class Unstable(Circle):
         rate = -0.2
 
-    cycle = hj.plants.settle(Unstable(), ANGLE, "x", guess=(1.02, 0.0))
+    cycle = hj.plants.find_cycle(Unstable(), ANGLE, "x", guess=(1.02, 0.0))
     error = abs(cycle.period - 2 * math.pi)
     assert error < 1e-6
     error = abs(cycle.cycle_outputs[0, 0] - 1)
@@ -122,7 +126,7 @@ def test_an_unstable_cycle_is_found_from_a_guess():
 
 
 def test_failures_are_named_and_the_others_go_on():
-    cycle = hj.plants.settle(Troubled(), ANGLE, "x", cycles=20)
+    cycle = hj.plants.find_cycle(Troubled(), ANGLE, "x", cycles=20)
     data = cycle.run_experiments(
         np.zeros((9, 24, 1)), discard=0, processes=2, limit=15.0
     )
@@ -140,7 +144,7 @@ def test_failures_are_named_and_the_others_go_on():
         "",
     )
     assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
-    assert (data.result[1:8] == 7 * [hj.Result.PLANT_STOPPED]).all()
+    assert (data.result[1:8] == 7 * [hj.errors.Result.PLANT_STOPPED]).all()
     assert np.isfinite(data.y[[0, 8]]).all()
     assert np.isnan(data.y[1, data.failed_at[1] :]).all()
     assert "#1: section" in data.summary(9)
@@ -188,26 +192,26 @@ def test_what_does_not_fit_is_refused(circle):
             "use KinematicPhase",
         ),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            hj.plants.settle(Circle(), sections, "x")
-    with pytest.raises(hj.DefinitionError, match="no output 'z'"):
-        hj.plants.settle(Circle(), hj.KinematicPhase(8, "x", "y"), "z")
+        with pytest.raises(hj.errors.DefinitionError, match=message):
+            hj.plants.find_cycle(Circle(), sections, "x")
+    with pytest.raises(hj.errors.DefinitionError, match="no output 'z'"):
+        hj.plants.find_cycle(Circle(), hj.KinematicPhase(8, "x", "y"), "z")
 
     class Slow(Circle):
         rate = 0.01
 
-    with pytest.raises(hj.ComputationError, match="has not settled"):
-        hj.plants.settle(Slow(), ANGLE, "x", cycles=8)
+    with pytest.raises(hj.errors.ComputationError, match="has not settled"):
+        hj.plants.find_cycle(Slow(), ANGLE, "x", cycles=8)
 
     class Forgetful(Circle):
         def step(self, u, duration):  # (`get_state` lacks the number of steps)
             return super().step([0.05 * math.sin(0.03 * self.steps)], duration)
 
-    with pytest.raises(hj.DefinitionError, match="does not continue as before"):
-        hj.plants.settle(Forgetful(), ANGLE, "x", cycles=20)
-    with pytest.raises(hj.DefinitionError, match="as `get_state` returns it"):
-        hj.plants.settle(Circle(), ANGLE, "x", guess=(1.0, 0.0, 0.0))
-    with pytest.raises(hj.DefinitionError, match="no coordinate 'z'"):
+    with pytest.raises(hj.errors.DefinitionError, match="does not continue as before"):
+        hj.plants.find_cycle(Forgetful(), ANGLE, "x", cycles=20)
+    with pytest.raises(hj.errors.DefinitionError, match="as `get_state` returns it"):
+        hj.plants.find_cycle(Circle(), ANGLE, "x", guess=(1.0, 0.0, 0.0))
+    with pytest.raises(hj.errors.DefinitionError, match="no coordinate 'z'"):
         circle.perturbed_returns("z")
 
 
@@ -220,7 +224,7 @@ def test_a_lasting_push_leads_to_another_cycle():
     """The radius tends to 1.05 by the multiplier."""
     level = math.sin(0.2)
     section = hj.Crossing("y", "rising", level)
-    cycle = hj.plants.settle(Circle(), section, "x", cycles=20)
+    cycle = hj.plants.find_cycle(Circle(), section, "x", cycles=20)
     assert cycle.perturbed_returns().contains(MULTIPLIER).all()
     push = np.full((1, 8, 1), 0.01)
     data = cycle.run_experiments(push, discard=0, processes=0)
@@ -237,7 +241,7 @@ def test_a_lasting_push_leads_to_another_cycle():
 def test_the_hopper_is_that_of_the_equations(hopper, family):
     """Perturbed returns against the exact multipliers; records against exact experiments."""
     outputs = ("yM", "vM")
-    cycle = hj.plants.settle(Hopper(), SECTIONS[family], outputs)
+    cycle = hj.plants.find_cycle(Hopper(), SECTIONS[family], outputs)
     returns = cycle.perturbed_returns()
     assert len(returns.multipliers) == 2
     assert returns.compare(hopper.multipliers).max_error < 1e-7

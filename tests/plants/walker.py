@@ -18,7 +18,7 @@ def control(model, data):
     _, z, pitch, left, _, right, _ = data.qpos
     speed, _, rate, left_rate, _, right_rate, _ = data.qvel
     if z < 0.7 or abs(pitch) > 1:
-        raise hj.ComputationError("fell")
+        raise hj.errors.ComputationError("fell")
     phase = math.sin(2 * math.pi * data.time / PERIOD)
     swings = 0.5 + 0.5 * math.tanh(4 * phase)  # 1: left, 0: right
     ahead = speed * PERIOD / 4 + 0.3 * (speed - 0.4)

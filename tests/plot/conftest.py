@@ -7,14 +7,14 @@ from ..linear.conftest import hopper as hopper
 
 @pytest.fixture(scope="session")
 def estimate(hopper):
-    design = hj.multisine(periods=16, band=(0, 4.0))
+    design = hj.multisine(periods=16, frequencies=(0, 4.0))
     data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
     return hj.estimate_htf(data, (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")
 def exact(hopper, estimate):
-    return hopper.htf(estimate.f, (-1, 0, 1))
+    return hopper.htf(estimate.frequencies, (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")
@@ -24,4 +24,4 @@ def rational(estimate):
 
 @pytest.fixture(scope="session")
 def structured(estimate):
-    return hj.fit_multipliers(estimate, 2, overhang=16)
+    return hj.fit_multipliers(estimate, 2, extra_lags=16)

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 import hybridjax as hj
 
 
-MODEL = hj.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
-USUAL = hj.multisine(4, 16, band=(0, 2.0))
-GOAL = hj.designs.Multipliers(harmonics=0)
+MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+USUAL = hj.multisine(4, 16, frequencies=(0, 2.0))
+GOAL = hj.designs.MultiplierGoal(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
 
 
@@ -35,21 +35,21 @@ def test_the_spectrum_of_a_design(plan):
     legend = [text.get_text() for text in below.get_legend().get_texts()]
     assert legend == ["equal amplitudes", "optimal"]
     with pytest.raises(
-        hj.DefinitionError, match="not the one that the plan was made for"
+        hj.errors.DefinitionError, match="not the one that the plan was made for"
     ):
         hj.plot.spectrum(plan, hj.testing.synthetic_ldtp())
 
 
 def test_what_strides_buy(plan):
-    study = hj.designs.Study(USUAL, 1, 1e-9, goal=GOAL)
+    study = hj.designs.SequentialDesign(USUAL, 1, 1e-9, goal=GOAL)
     data = hj.experiments.simulate_experiments(MODEL, USUAL, start="periodic")
     noisy = hj.experiments.add_noise(data, std=1e-3)
     studied = study.add(noisy)
     more_than_colors = {f"there {k}": studied for k in range(8)}
     studies = {"here": [studied, studied], **more_than_colors}
-    ax = hj.plot.strides(plan, studies).ax
+    ax = hj.plot.standard_errors(plan, studies).ax
     lines = {line.get_label(): line for line in ax.get_lines()}
-    assert lines["here"].get_xdata() == studied.strides
+    assert lines["here"].get_xdata() == studied.cycles
     assert lines["here"].get_ydata() == np.linalg.norm(studied.standard_errors)
 
     strides, errors = lines["equal amplitudes"].get_data()
@@ -57,5 +57,5 @@ def test_what_strides_buy(plan):
     log_error = np.interp(of_usual, np.log(strides), np.log(errors))
     expected = np.linalg.norm(plan.usual_standard_errors)
     assert np.exp(log_error) == pytest.approx(expected)
-    with pytest.raises(hj.DefinitionError, match="without a block"):
-        hj.plot.strides(plan, {"here": study})
+    with pytest.raises(hj.errors.DefinitionError, match="without a block"):
+        hj.plot.standard_errors(plan, {"here": study})

@@ -71,7 +71,7 @@ def test_the_widget_sends_pictures():
     ],
 )
 def test_what_is_refused(names, options, message):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         hj.explore(hj.models.VanDerPol(), *names, **options)
 
 

@@ -27,7 +27,7 @@ def test_states_at_times_lie_on_the_trajectory(walk):
     found = path.at(t[once])
     assert_array_equal(found[0], chart[once])
     assert_allclose(found[1], q[once], rtol=0, atol=1e-12)
-    with pytest.raises(hj.DefinitionError, match="times must lie between"):
+    with pytest.raises(hj.errors.DefinitionError, match="times must lie between"):
         path.at([path.t[-1] + 1])
 
 
@@ -65,16 +65,16 @@ def test_files_and_refusals(walk, tmp_path):
     assert first == shown[0]
     for frame, over in zip(motion._frames(107), shown, strict=True):
         assert Image.alpha_composite(still, over) == frame.convert("RGBA")
-    with pytest.raises(hj.DefinitionError, match="name it .gif, .html or .mp4"):
+    with pytest.raises(hj.errors.DefinitionError, match="name it .gif, .html or .mp4"):
         motion.save(tmp_path / "walk.avi")
-    with pytest.raises(hj.DefinitionError, match="animate the cycle"):
+    with pytest.raises(hj.errors.DefinitionError, match="animate the cycle"):
         hj.plot.animate(walk.trajectory(), perturbed=walk.trajectory())
 
 
 def test_both_halves_of_a_cycle_are_drawn():
     duffing = hj.models.Duffing()
     half = hj.find_limit_cycle(
-        hj.Quotient(duffing, flipped=("x", "v"), half_period=True)
+        hj.systems.Symmetric(duffing, flipped=("x", "v"), half_period=True)
     )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]
@@ -83,11 +83,11 @@ def test_both_halves_of_a_cycle_are_drawn():
 
 def test_no_input_gives_the_cycle():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
-    placed = hj.place_sections(cycle, hj.ClockPhase(4))
+    placed = hj.sections.place_sections(cycle, hj.ClockPhase(4))
     path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
     end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
     assert_allclose(end, 0, atol=1e-9)
-    data = hj.ExperimentData(
+    data = hj.experiments.ExperimentData(
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
     )
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
@@ -97,5 +97,5 @@ def test_no_input_gives_the_cycle():
     assert all(
         motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes
     )
-    with pytest.raises(hj.DefinitionError, match="and their `sections`"):
+    with pytest.raises(hj.errors.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)

@@ -31,9 +31,9 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
 def test_a_cycle_that_was_not_found_is_refused():
     far = hj.Guess("flight", (1e3, 30.0, 1.0, 5.0))
     failed = hj.find_limit_cycle(hj.models.VerticalHopper(), far, throw=False)
-    for function in (hj.plot.cycle, hj.coincidences):
+    for function in (hj.plot.cycle, hj.orbits.simultaneous_events):
         with pytest.raises(
-            hj.DefinitionError, match="the search for this cycle failed"
+            hj.errors.DefinitionError, match="the search for this cycle failed"
         ):
             function(failed)
 
@@ -60,7 +60,7 @@ def test_bars_lie_on_their_sections(hopper_cycle, placed_kinematic):
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
-    placed = hj.place_sections(vanderpol_cycle, hj.ClockPhase(6))
+    placed = hj.sections.place_sections(vanderpol_cycle, hj.ClockPhase(6))
     ax = hj.plot.cycle(vanderpol_cycle, "v", sections=placed).ax
     assert ax.get_xlabel() == "v"
     assert ax.get_ylabel() == "x"

@@ -22,11 +22,11 @@ def labeled(ax):
 
 
 def test_magnitude_draws_the_values(estimate, exact):
-    ax = hj.plot.magnitude(estimate, exact, output="vM").ax
+    ax = hj.plot.htf(estimate, exact, output="vM").ax
     lines = labeled(ax)
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
-    assert_array_equal(drawn.get_xdata(), estimate.f)
+    assert_array_equal(drawn.get_xdata(), estimate.frequencies)
     assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
     assert (
         drawn.get_color()
@@ -42,21 +42,21 @@ def test_magnitude_draws_the_values(estimate, exact):
 
 def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
     def harmonics(*given):
-        return hj.plot.harmonics({"a": given})
+        return hj.plot.htf({"a": given})
 
-    for draw in (hj.plot.magnitude, hj.plot.bode, harmonics):
+    for draw in (hj.plot.htf, hj.plot.bode, harmonics):
         from_model = draw(estimate, hopper).ax.lines
         from_htf = draw(estimate, exact).ax.lines
         for line, expected in zip(from_model, from_htf, strict=True):
             assert_allclose(line.get_xydata(), expected.get_xydata(), rtol=1e-9)
-    with pytest.raises(hj.DefinitionError, match="model alone"):
+    with pytest.raises(hj.errors.DefinitionError, match="model alone"):
         hj.plot.bode(hopper)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
 def test_harmonics_is_a_grid_of_outputs_and_families(estimate, exact):
     families = {"isochron": (estimate, exact), "again": exact}
-    figure = hj.plot.harmonics(families).figure
+    figure = hj.plot.htf(families).figure
     assert isinstance(figure, Figure)
     upper_left, upper_right, lower_left, lower_right = figure.axes
     assert upper_left.get_title() == "isochron"
@@ -84,7 +84,7 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
-    fitted = rational.htf(estimate.f).H[0, :, 0, 0]
+    fitted = rational.htf(estimate.frequencies).H[0, :, 0, 0]
     assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
     assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
@@ -94,8 +94,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
     exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
-    swapped = hj.HTF(
-        exact.f,
+    swapped = hj.linear.HTF(
+        exact.frequencies,
         exact.H[..., ::-1, ::-1],
         0,
         exact.n_sections,
@@ -103,27 +103,33 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         exact.outputs[::-1],
         "exact",
     )
-    renamed = hj.HTF(
-        exact.f, exact.H, 0, exact.n_sections, ("r", "s"), exact.outputs, "exact"
+    renamed = hj.linear.HTF(
+        exact.frequencies,
+        exact.H,
+        0,
+        exact.n_sections,
+        ("r", "s"),
+        exact.outputs,
+        "exact",
     )
-    for draw, shown in ((hj.plot.magnitude, {"harmonics": [0]}), (hj.plot.bode, {})):
+    for draw, shown in ((hj.plot.htf, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
         assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
         assert_array_equal(first.get_ydata(), second.get_ydata())
     fit = hj.identify.fit_rational(exact, input=1)
     with pytest.raises(
-        hj.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
+        hj.errors.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
         hj.plot.bode(exact, fits=fit, input=0)
 
 
 def bodes(*given, **options):
-    return hj.plot.bodes({"a": given}, **options)
+    return hj.plot.bode({"a": given}, **options)
 
 
 def harmonics(*given, **options):
-    return hj.plot.harmonics({"a": given}, **options)
+    return hj.plot.htf({"a": given}, **options)
 
 
 @pytest.fixture
@@ -151,11 +157,11 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
 
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
-    figure = hj.plot.bodes(families, fits={"b": rational}).figure
+    figure = hj.plot.bode(families, fits={"b": rational}).figure
     measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
     assert measured == [4, 4]
-    with pytest.raises(hj.DefinitionError, match="`fits`: there is no name 'c'"):
-        hj.plot.bodes(families, fits={"c": rational})
+    with pytest.raises(hj.errors.DefinitionError, match="`fits`: there is no name 'c'"):
+        hj.plot.bode(families, fits={"c": rational})
 
 
 # The complex plane
@@ -169,7 +175,7 @@ def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
     assert len(fitted) == len(two_inputs.outputs)
 
 
-@pytest.mark.parametrize("draw", [hj.plot.magnitude, harmonics])
+@pytest.mark.parametrize("draw", [hj.plot.htf, harmonics])
 def test_the_name_of_a_single_input_is_on_the_axis(draw, two_inputs):
     output = two_inputs.outputs[0]
     first, second = two_inputs.inputs
@@ -214,12 +220,12 @@ def test_poles_and_zeros(rational):
         assert_array_equal(poles[:, 1], rational.poles[i].imag)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
-    with pytest.raises(hj.DefinitionError, match="one or more fits"):
+    with pytest.raises(hj.errors.DefinitionError, match="one or more fits"):
         hj.plot.poles_zeros({})
 
 
 def test_experiment(hopper):
-    design = hj.multisine(periods=4, band=(0, 2.0))
+    design = hj.multisine(periods=4, frequencies=(0, 2.0))
     data = hj.experiments.simulate_experiments(hopper, design, discard=2)
     figure = hj.plot.experiment(data, -1).figure
     assert [ax.get_ylabel() for ax in figure.axes] == [
@@ -231,7 +237,7 @@ def test_experiment(hopper):
     assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
     assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
-    with pytest.raises(hj.DefinitionError, match="no experiment 99"):
+    with pytest.raises(hj.errors.DefinitionError, match="no experiment 99"):
         hj.plot.experiment(data, 99)
 
 
@@ -248,7 +254,7 @@ def test_saved_in_several_formats(tmp_path):
     assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
-    with pytest.raises(hj.DefinitionError, match="x.bmp': formats are png"):
+    with pytest.raises(hj.errors.DefinitionError, match="x.bmp': formats are png"):
         hj.plot.save(tmp_path / "x.bmp", plot)
 
 
@@ -261,13 +267,13 @@ def test_a_crowd_of_multipliers_has_no_inset():
 
 def test_bands_hold_the_values(estimate):
     """Where there is a variance; the phase is drawn where it is known."""
-    assert not hj.plot.magnitude(estimate).ax.collections
+    assert not hj.plot.htf(estimate).ax.collections
     variance = np.full(estimate.H.shape, 1e-6)
     sure = dataclasses.replace(estimate, variance=variance)
     radius = float(sure.confidence_radius().max())
     modulus = np.abs(sure[0][:, 0, 0])
 
-    (band,) = hj.plot.magnitude(sure, harmonics=(0,), output="yM").ax.collections
+    (band,) = hj.plot.htf(sure, harmonics=(0,), output="yM").ax.collections
     heights = band.get_paths()[0].vertices[:, 1]
     assert_allclose(heights.max(), modulus.max() + radius)
 
@@ -284,7 +290,9 @@ def found(hopper):
     y = np.asarray(hopper.simulate(u))
     rng = np.random.default_rng(1)
     y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
-    return hj.validate(hopper, hj.Record(u, y, n_sections=32, outputs=("yM", "vM")))
+    return hj.validate(
+        hopper, hj.experiments.SectionSeries(u, y, n_sections=32, outputs=("yM", "vM"))
+    )
 
 
 def test_validation_draws_signals_and_correlations(found):

@@ -13,7 +13,7 @@ MULTIPLIER = np.exp(-2 * DECAY)
 @pytest.fixture(scope="session")
 def hopper_recording(hopper_cycle):
     """200 strides of the paper's hopper under a random force, without noise."""
-    force = hj.testing.random_force(200, 64, 8, rms=0.02, seed=0)
+    force = hj.experiments.random_input(200, 64, 8, rms=0.02, seed=0)
     return hj.testing.simulate_recording(
         hopper_cycle, force[None], ("yM", "vM"), rate=64, steps=1
     )
@@ -44,7 +44,7 @@ def rhythm():
     z' = (2 pi i + a (1 - |z|^2)) z + f by Runge-Kutta's method, f linear between samples. It turns
     with the clock of a drive: its angle is pulled towards 2 pi t at the same rate.
     """
-    force = hj.testing.random_force(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
+    force = hj.experiments.random_input(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
     steps = 2  # from one sample to the next
     h = 1 / RATE / steps
     sampled = np.arange(len(force)) / RATE

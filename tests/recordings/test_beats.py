@@ -78,7 +78,7 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     heights = drawn.collections[0].get_paths()[0].vertices[:, 1]
     assert heights.min() == pytest.approx(band.min() / 1000)
     other = [PhaseCurve(X, CURVE, Signal("u", unit)) for unit in ("nA", "pA")]
-    with pytest.raises(hj.DefinitionError, match="different units: nA and pA"):
+    with pytest.raises(hj.errors.DefinitionError, match="different units: nA and pA"):
         hj.plot.phase_response(other[0], model=other[1])
 
 
@@ -121,8 +121,8 @@ def test_events_alone_are_identified(noisy, tmp_path):
     assert (
         found.fit.outputs == ("duration",) and np.isfinite(found.fit.numerators).all()
     )
-    assert (hj.write_report(tmp_path, found).parent / "figures" / "curve.png").exists()
-    assert any("Resolution: the jitter" in repr(x) for x in found.advice.findings)
+    assert (found.write_report(tmp_path).parent / "figures" / "curve.png").exists()
+    assert any("Resolution: the jitter" in repr(x) for x in found.diagnosis.findings)
 
 
 def test_what_is_refused(noisy):
@@ -145,5 +145,5 @@ def test_what_is_refused(noisy):
             if phase is not angle
             else hj.recordings.estimate_phase(recording, angle)
         )
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.recordings.phase_response(recording, phase, input="u")

@@ -92,13 +92,16 @@ def test_matlab(tmp_path, write):
     write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
     refused("'f' has the shape .*190.*, but its group 20 times", tmp_path / "y.mat")
     refused(
-        "no times 't' for '[ftx]", tmp_path / "y.mat", time="t", kind=hj.DefinitionError
+        "no times 't' for '[ftx]",
+        tmp_path / "y.mat",
+        time="t",
+        kind=hj.errors.DefinitionError,
     )
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
     assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
     says = "no signal 'f'; it has .*force.f"
-    refused(says, tmp_path / "x.mat", signals="f", kind=hj.DefinitionError)
+    refused(says, tmp_path / "x.mat", signals="f", kind=hj.errors.DefinitionError)
 
 
 def test_arrays_of_structs(tmp_path):
@@ -163,11 +166,11 @@ def test_feather(tmp_path):
         "no signal 'z'; it has ",
         tmp_path / "x.feather",
         signals="z",
-        kind=hj.DefinitionError,
+        kind=hj.errors.DefinitionError,
     )
-    with pytest.raises(hj.DefinitionError, match="different indices"):
+    with pytest.raises(hj.errors.DefinitionError, match="different indices"):
         hj.Recording(table()["time"], {"y": table()["x (m)"][::-1]})
-    with pytest.raises(hj.DefinitionError, match="different indices"):
+    with pytest.raises(hj.errors.DefinitionError, match="different indices"):
         hj.Recording.from_frame({"time": table()["time"], "y": table()["x (m)"][::-1]})
     (tmp_path / "x.feather").write_bytes(b"ARROW1" + bytes(100))
     refused("no feather file, or damaged", tmp_path / "x.feather")
@@ -271,7 +274,10 @@ def test_c3d(tmp_path):
     analog = hj.read_recording(path, signals="Fz1")
     assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
     refused(
-        "no signal 'EMG1'; it has LASI.x", path, signals="EMG1", kind=hj.DefinitionError
+        "no signal 'EMG1'; it has LASI.x",
+        path,
+        signals="EMG1",
+        kind=hj.errors.DefinitionError,
     )
     path.write_bytes(path.read_bytes()[:2500])
     refused("frames, its header 20", path)
@@ -285,7 +291,7 @@ def test_c3d(tmp_path):
     refused(
         "all events 'Left Strike' .* are",
         tmp_path / "late.c3d",
-        kind=hj.DefinitionError,
+        kind=hj.errors.DefinitionError,
     )
     path.write_bytes(b"no")
     refused("no C3D file, or damaged", path)
@@ -357,7 +363,7 @@ def test_bags(tmp_path, version):
         "no signal 'imu.x'; it has body, count",
         path,
         signals="imu.x",
-        kind=hj.DefinitionError,
+        kind=hj.errors.DefinitionError,
     )
     if version != "bag":
         (single,) = (x for x in path.iterdir() if x.suffix != ".yaml")
@@ -382,7 +388,7 @@ def test_libraries_that_are_not_there(tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, library, None)
         (tmp_path / f"x{suffix}").write_bytes(b"x")
         with pytest.raises(
-            hj.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"
+            hj.errors.DefinitionError, match=rf"pip install 'hybridjax\[{extra}\]'"
         ):
             hj.read_recording(tmp_path / f"x{suffix}")
 
@@ -398,7 +404,9 @@ def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
     refused("declares arrays of 1048576 bytes or more", tmp_path / "x.mat")
     monkeypatch.setattr(limits, "RECORDED", 100)
     parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
-    with pytest.raises(hj.DefinitionError, match="2 signals at 191 times are too many"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="2 signals at 191 times are too many"
+    ):
         hj.Recording.beside(parts)
 
 
@@ -502,7 +510,7 @@ def test_errors_of_the_computer_are_not_those_of_a_file(tmp_path, monkeypatch, e
     path = tmp_path / "x.mat"
     write_v5(path, {"time": SLOW, "x": X})
     monkeypatch.setattr(scipy_io, "loadmat", fails)
-    kind = MemoryError if isinstance(error, MemoryError) else hj.DefinitionError
+    kind = MemoryError if isinstance(error, MemoryError) else hj.errors.DefinitionError
     with pytest.raises(kind, match="no memory|cannot read .*: broken"):
         hj.read_recording(path)
 

@@ -11,22 +11,22 @@ import hybridjax as hj
 ABOUT = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16}
 
 
-def spoil(recording, signals=("yM", "vM"), **dirt):
-    return hj.testing.spoil(recording, signals, **dirt)
+def add_artifacts(recording, signals=("yM", "vM"), **dirt):
+    return hj.testing.add_artifacts(recording, signals, **dirt)
 
 
 def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angle):
     """At the sections of an angle of the two outputs, these are one number."""
-    noisy = spoil(hopper_recording, noise=1e-4)
+    noisy = add_artifacts(hopper_recording, noise=1e-4)
     apex = hj.Crossing("vM", "falling")
     data = [
-        hj.recordings.section_data(noisy, phase, **ABOUT) for phase in (angle, apex)
+        hj.recordings.sample_sections(noisy, phase, **ABOUT) for phase in (angle, apex)
     ]
     fits = [hj.fit_series(x.records, order=2) for x in data]
     assert fits[1].standard_errors[0] < fits[0].standard_errors[0] / 1.5
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     by_angle, by_apex = (
-        hj.recordings.advise(*x).findings for x in zip(data, fits, strict=True)
+        hj.recordings.diagnose(*x).findings for x in zip(data, fits, strict=True)
     )
     said = "Outputs: yM and vM carry the same information at sections"
     assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(
@@ -37,31 +37,31 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
 
 def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
     """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
-    clean = spoil(hopper_recording, noise=1e-4)
+    clean = add_artifacts(hopper_recording, noise=1e-4)
     fits, data, apex = [], [], hj.Crossing("vM", "falling")
-    dirty = spoil(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
+    dirty = add_artifacts(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
     for recording in (clean, dirty):
-        data.append(hj.recordings.section_data(recording, apex, **ABOUT))
+        data.append(hj.recordings.sample_sections(recording, apex, **ABOUT))
         fits.append(hj.fit_series(data[-1], order=2))
     changed = (clean.trials[0].values != dirty.trials[0].values).sum(axis=0)
     assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
     assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     assert any(
-        w.cause == "spikes" for w in hj.recordings.advise(data[1], fits[1]).findings
+        w.cause == "spikes" for w in hj.recordings.diagnose(data[1], fits[1]).findings
     )
 
 
 @pytest.mark.slow
 def test_responses_to_pushes(hopper_cycle, angle):
     """Against the exact linearization, averaged over the push, within the error of held inputs."""
-    force = hj.testing.random_force(200, 256, 8, rms=0.002, seed=0)
+    force = hj.experiments.random_input(200, 256, 8, rms=0.002, seed=0)
     recording = hj.testing.simulate_recording(
         hopper_cycle, force[None], ("yM", "vM"), rate=256
     )
     for N, most in ((16, 1e-3), (32, 2.5e-4)):
         sections = dataclasses.replace(angle, n_sections=N)
-        data = hj.recordings.section_data(
+        data = hj.recordings.sample_sections(
             recording, sections, **ABOUT | {"n_sections": N}
         )
         fit = hj.fit_series(data.records, order=2)

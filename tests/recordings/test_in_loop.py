@@ -33,7 +33,7 @@ def recording():
     rng = np.random.default_rng(1)
     n = 310 * RATE
     h = 1 / RATE
-    r, w = (hj.testing.random_force(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
+    r, w = (hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
     e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
     x = np.zeros(2)
     y = np.zeros((2, n))
@@ -56,7 +56,7 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     out = str(tmp_path / "o")
     np.savez(trial, **recording)
     options = (
-        "--input u --reference r --outputs x,v --crossing clock:rising --sections 16"
+        "--inputs u --references r --outputs x,v --crossing clock:rising --sections 16"
     )
     with pytest.warns(FindingWarning):
         assert not main(["identify", trial, *options.split(), "--out", out])
@@ -71,6 +71,6 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
     data = hj.Recording(
         recording["time"], {k: x for k, x in recording.items() if k != "time"}
     )
-    with pytest.raises(hj.DefinitionError, match="must name other signals"):
+    with pytest.raises(hj.errors.DefinitionError, match="must name other signals"):
         names = {"inputs": "u", "outputs": "x", "reference": "u"}
         hj.identify_recording(data, hj.Crossing("clock", "rising"), **names)

@@ -28,9 +28,9 @@ def made_up(seed, force=0.1, noise=1e-3):
     time = np.arange(STRIDES * RATE) / RATE
     trials = []
     for k in range(TRIALS):
-        f = hj.testing.random_force(STRIDES, RATE, 6, rms=force, seed=100 * seed + k)[
-            :, 0
-        ]
+        f = hj.experiments.random_input(
+            STRIDES, RATE, 6, rms=force, seed=100 * seed + k
+        )[:, 0]
         w = signal.lfilter([0, 1 / RATE], [1, -np.exp(-0.3 / RATE)], f)
         angle = 2 * np.pi * time
         x = 2.0 + np.cos(angle) + w + noise * rng.normal(size=len(f))
@@ -42,13 +42,15 @@ def made_up(seed, force=0.1, noise=1e-3):
 def findings(recording, phase=TOP):
     """All of them, or the sentence of what is refused."""
     names = {"inputs": "f", "outputs": ("x", "v")}
-    inspection = hj.recordings.inspect(recording, **names)
+    inspection = hj.recordings.check_recording(recording, **names)
     if any(f.action == "refused" for f in inspection.findings):
         return inspection.findings
     clean = inspection.recording
     found = hj.recordings.estimate_phase(clean, phase)
-    data = hj.recordings.section_data(clean, found, n_sections=16, **names)
-    return hj.recordings.inspect(recording, **names, phase=found, data=data).findings
+    data = hj.recordings.sample_sections(clean, found, n_sections=16, **names)
+    return hj.recordings.check_recording(
+        recording, **names, phase=found, data=data
+    ).findings
 
 
 def causes(recording, phase=TOP):
@@ -65,12 +67,12 @@ def test_findings_are_warnings_on_which_a_pipeline_can_stop():
     names = {"inputs": "f", "outputs": ("x", "v")}
     bad = mishandle(made_up(0), "clipped at the top", **NAMES)
     with pytest.warns(hj.errors.FindingWarning, match="^Clipp"):
-        hj.recordings.inspect(bad, **names)
+        hj.recordings.check_recording(bad, **names)
     with (
         pytest.raises(hj.errors.FindingWarning),
         warnings.catch_warnings(action="error"),
     ):
-        hj.recordings.inspect(bad, **names)
+        hj.recordings.check_recording(bad, **names)
 
 
 CAUSES = {
@@ -154,7 +156,7 @@ def test_an_order_that_is_too_low_is_named():
     ):
         result = hj.identify_recording(recording, TOP, **names)
         assert (
-            len([x for x in result.advice.findings if "Compare order=2" in x.text])
+            len([x for x in result.diagnosis.findings if "Compare order=2" in x.text])
             == named
         )
     names |= {"order": None, "n_sections": 32}
@@ -170,23 +172,28 @@ def test_an_order_that_is_too_low_is_named():
     assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
     constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
     with pytest.raises(
-        hj.DefinitionError, match="no trial has samples of all .*x does not change"
+        hj.errors.DefinitionError,
+        match="no trial has samples of all .*x does not change",
     ):
         hj.identify_recording(constant, TOP, **names)
-    with pytest.raises(hj.DefinitionError, match="'f' is in `inputs` and in `outputs`"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="'f' is in `inputs` and in `outputs`"
+    ):
         hj.identify_recording(twice, TOP, inputs="f", outputs=("f", "x"))
     text = "129 cycles (a quarter is held out) are too few for order 2 with 32 sections: record 28"
-    assert f"since {text} more, or take 21 sections." in untried.advice.findings[1].text
+    assert (
+        f"since {text} more, or take 21 sections." in untried.diagnosis.findings[1].text
+    )
     with pytest.warns(
         hj.errors.FindingWarning, match="orders above 1 could not be tried"
     ):
-        hj.recordings.choose_order(untried.data)
+        hj.select_order(untried.data)
 
 
 @pytest.mark.slow
 def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_cycle):
     """A hundredth, which distortion of small pushes may be, is no reason to doubt; a third is."""
-    force = hj.testing.random_force(100, 100, 8, rms=0.02, seed=0)
+    force = hj.experiments.random_input(100, 100, 8, rms=0.02, seed=0)
     made = hj.testing.simulate_recording(
         hopper_cycle, force[None], ("yM", "vM"), rate=100
     )
@@ -201,14 +208,14 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
         )
         causes = [
             x.cause
-            for x in hj.recordings.advise(result.data, result.fit, worse).findings
+            for x in hj.recordings.diagnose(result.data, result.fit, worse).findings
         ]
         assert ("left over" in causes) == ("no fit" in causes) == named
     # So many strides as give no finite standard error are left out of the report.
     few = eqx.tree_at(
-        lambda x: x.advice.expected, result, result.advice.expected.copy()
+        lambda x: x.diagnosis.expected, result, result.diagnosis.expected.copy()
     )
-    few.advice.expected[0] = np.inf
+    few.diagnosis.expected[0] = np.inf
     assert "<td>300</td>" in _page(few, {}) and "<td>inf" not in _page(few, {})
 
 
@@ -219,12 +226,14 @@ APEX = hj.Crossing("vM", "falling")
 @pytest.mark.parametrize("mishap", [*MISHAPS, *EVENT_MISHAPS])
 def test_none_is_silently_wrong(hopper_cycle, mishap):
     """Four trials of 75 strides, with noise, in which each apex is an event."""
-    force = [hj.testing.random_force(75, 128, 8, rms=0.02, seed=k) for k in range(4)]
+    force = [
+        hj.experiments.random_input(75, 128, 8, rms=0.02, seed=k) for k in range(4)
+    ]
     outputs = ("yM", "vM")
     made = hj.testing.simulate_recording(
         hopper_cycle, np.stack(force), outputs, rate=128, steps=1
     )
-    trials = hj.testing.spoil(made, outputs, noise=1e-4).mark(
+    trials = hj.testing.add_artifacts(made, outputs, noise=1e-4).mark(
         "apex", APEX, bandwidth=16
     )
     phase = hj.AtEvent("apex") if mishap in EVENT_MISHAPS else APEX
@@ -232,6 +241,6 @@ def test_none_is_silently_wrong(hopper_cycle, mishap):
         dirty = mishandle(trials, mishap, input="u", outputs=outputs, event="apex")
         names = {"inputs": "u", "outputs": outputs, "n_sections": 16}
         found = hj.identify_recording(dirty, phase, order=2, **names)
-    except hj.DefinitionError:
+    except hj.errors.DefinitionError:
         return
     assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()

@@ -74,7 +74,9 @@ def test_a_signal_that_crosses_at_several_angles_is_no_anchor(wave):
     thrice = np.cos(6 * np.pi * trial.time)
     recording = hj.Recording(trial.time, {"x": x, "v": v, "w": thrice})
     family = dataclasses.replace(CIRCLE, anchor=hj.Crossing("w", "falling"))
-    with pytest.raises(hj.DefinitionError, match="w falling, .* all around the cycle"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="w falling, .* all around the cycle"
+    ):
         hj.recordings.estimate_phase(recording, family)
 
 
@@ -128,7 +130,7 @@ def test_what_is_no_phase(wave):
             "must name a signal, and no charts",
         ),
     ]:
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.recordings.estimate_phase(still, definition)
 
 

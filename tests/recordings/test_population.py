@@ -110,13 +110,13 @@ def test_complete_pairs_give_the_paired_t_test():
     table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
     row = Population(table, {"q": y}, {"q": error}).difference("q", "a", "b")
     assert row["p"][0] == pytest.approx(stats.ttest_rel(y[:N], y[N:]).pvalue, rel=1e-3)
-    assert row["freedom"][0] == pytest.approx(N - 1, rel=1e-3)
+    assert row["dof"][0] == pytest.approx(N - 1, rel=1e-3)
     y[N:] *= 3
     row = study(y, error, group=labels).difference("gain", "a", "b")
     welch = stats.ttest_ind(y[:N], y[N:], equal_var=False)
     size = abs(y[:N].mean() - y[N:].mean()) / abs(welch.statistic)
     assert row["standard_error"][0] == pytest.approx(size, rel=1e-3)
-    assert row["freedom"][0] == pytest.approx(welch.df, rel=0.02)
+    assert row["dof"][0] == pytest.approx(welch.df, rel=0.02)
 
 
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
@@ -160,11 +160,11 @@ def test_predictions_shrink_and_covariates_explain():
 
 
 def test_moderated_variances_are_closer_to_the_true_ones():
-    strides, freedom = RNG.uniform(60, 300, 400), np.full(400, 6.0)
+    strides, dof = RNG.uniform(60, 300, 400), np.full(400, 6.0)
     true = 1 / strides
     v = true * RNG.chisquare(6, 400) / 6
     trend = np.column_stack([np.ones(400), np.log(strides)])
-    better = moderated(v, freedom, trend)
+    better = moderated(v, dof, trend)
     assert np.std(np.log(better / true)) < 0.2 * np.std(np.log(v / true))
     assert abs(np.log(better / true).mean()) < 0.1
     np.testing.assert_array_equal(moderated(v, np.full(400, np.inf), trend), v)
@@ -189,7 +189,7 @@ def test_plans_agree_with_closed_forms():
     y = 1 + 0.2 * RNG.normal(size=12)
     people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
     with pytest.raises(
-        hj.DefinitionError, match="subjects differ in 'gain' by no more than"
+        hj.errors.DefinitionError, match="subjects differ in 'gain' by no more than"
     ):
         study(y, np.ones(12), strides=np.full(12, 100)).allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
@@ -300,7 +300,7 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     }.items(),
 )
 def test_refusals(sentence, call):
-    with pytest.raises(hj.DefinitionError, match=sentence):
+    with pytest.raises(hj.errors.DefinitionError, match=sentence):
         call()
 
 
@@ -313,7 +313,9 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     """Each subject has a report, failures are named, and a second call computes nothing anew."""
     rows = ["file,subject,group,age"]
     for k in range(6):
-        (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3, seed=k).trials
+        (trial,) = hj.testing.add_artifacts(
+            rhythm, ("x", "v"), noise=1e-3, seed=k
+        ).trials
         table = np.column_stack([trial.time, trial.values])
         np.savetxt(
             tmp_path / f"{k}.csv",
@@ -330,7 +332,7 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     # The figures of single reports are tested elsewhere and take long.
     monkeypatch.setattr(subjects, "write_results", write_numbers)
     monkeypatch.chdir(tmp_path)
-    options = "--input force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
+    options = "--inputs force --outputs x,v --phase x,v --sections 8 --order 1 --out out".split()
     assert main(["identify", "--table", "subjects.csv", *options]) == 1
     printed = capsys.readouterr().out
     assert "S9-a failed: cannot read" in printed and "a - b" in printed.replace(

@@ -32,7 +32,7 @@ GOOD = {"a": T, "b": 2 * T}
     ],
 )
 def test_bad_recordings(time, signals, options, message):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         hj.Recording(time, signals, **options)
 
 
@@ -43,11 +43,11 @@ def test_trials_must_belong_together():
     np.testing.assert_array_equal(both.trials[1].values[:, both.column("b")], T)
     assert "Recording(2 trials: a (N), b)" in repr(both)
     with pytest.raises(
-        hj.DefinitionError, match="'two' have different units of a: N and kN"
+        hj.errors.DefinitionError, match="'two' have different units of a: N and kN"
     ):
         hj.Recording.join([one, hj.Recording(T, GOOD, units={"a": "kN"}, name="two")])
     with pytest.raises(
-        hj.DefinitionError, match="different signals: ..a', 'b'. and ..a"
+        hj.errors.DefinitionError, match="different signals: ..a', 'b'. and ..a"
     ):
         hj.Recording.join([one, hj.Recording(T, {"a": T})])
 
@@ -191,7 +191,7 @@ def test_vicon(tmp_path, separator):
 def test_bad_csv(tmp_path, text, message):
     path = tmp_path / "x.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(hj.HybridJaxError, match=message) as error:
+    with pytest.raises(hj.errors.HybridJaxError, match=message) as error:
         hj.read_recording(path)
     assert "\n" not in str(error.value)
 
@@ -214,15 +214,17 @@ def test_the_unit_of_time(tmp_path):
     assert "the times in 'frame' have no unit: taken as seconds" in repr(both)
     assert "every 1 s (1 Hz, longest 1 s)" in repr(both) and len(both.findings) == 1
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
-    with pytest.raises(hj.DefinitionError, match="are in 'samples': convert them"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="are in 'samples': convert them"
+    ):
         hj.read_recording(tmp_path / "y.csv")
 
 
 def test_other_bad_files(tmp_path):
     (tmp_path / "x.xls").write_bytes(b"?")
-    with pytest.raises(hj.HybridJaxError, match="ends in '.xls'"):
+    with pytest.raises(hj.errors.HybridJaxError, match="ends in '.xls'"):
         hj.read_recording(tmp_path / "x.xls")
-    with pytest.raises(hj.DefinitionError, match="cannot read .*No such file"):
+    with pytest.raises(hj.errors.DefinitionError, match="cannot read .*No such file"):
         hj.read_recording(tmp_path / "none.csv")
 
 
@@ -234,5 +236,5 @@ def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
     short = hj.Recording(trial.time[kept], signals)
     inputs, *outputs = rhythm.signals
     names = dict(inputs=inputs, outputs=outputs, n_sections=8)
-    with pytest.raises(hj.DefinitionError, match="too few|reach beyond"):
+    with pytest.raises(hj.errors.DefinitionError, match="too few|reach beyond"):
         hj.identify_recording(short, hj.Crossing(outputs[0], "rising"), **names)

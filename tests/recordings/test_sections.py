@@ -24,7 +24,7 @@ CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(
 
 def sample(recording, phase=CIRCLE, **options):
     options = {"inputs": "f", "outputs": ("x", "v")} | options
-    return hj.recordings.section_data(recording, phase, **options)
+    return hj.recordings.sample_sections(recording, phase, **options)
 
 
 def test_a_circle(wave):
@@ -45,16 +45,19 @@ def test_a_circle(wave):
     assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
     assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
-    with pytest.raises(hj.DefinitionError, match="different n_sections: 16 and 8"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="different n_sections: 16 and 8"
+    ):
         sample(wave, n_sections=16)
     with pytest.raises(
-        hj.DefinitionError, match="events alone determine no multipliers"
+        hj.errors.DefinitionError, match="events alone determine no multipliers"
     ):
         sample(wave, inputs=(), outputs=())
     for phase in (CIRCLE, hj.Crossing("v", "rising")):
         for call in (sample, hj.recordings.estimate_phase):
             with pytest.raises(
-                hj.DefinitionError, match="`bandwidth` removes the rhythm of 1 Hz"
+                hj.errors.DefinitionError,
+                match="`bandwidth` removes the rhythm of 1 Hz",
             ):
                 call(wave, phase, bandwidth=0.9)
     assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
@@ -65,7 +68,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
     t, z = trial.time, np.exp(2j * np.pi * trial.time)
     for inputs in ((), "force"):
         with pytest.raises(
-            hj.DefinitionError, match="^x is the same in all cycles, but for round"
+            hj.errors.DefinitionError,
+            match="^x is the same in all cycles, but for round",
         ):
             exact = hj.Recording(
                 t, {"force": trial.values[:, 0], "x": z.real, "v": -z.imag}
@@ -80,7 +84,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             [rhythm, hj.Recording(t, {"clock": np.sin(rate * t)})]
         )
         with pytest.raises(
-            hj.DefinitionError, match="deviate only by rounding and interpolation"
+            hj.errors.DefinitionError,
+            match="deviate only by rounding and interpolation",
         ):
             sample(both, hj.Crossing("clock", "rising"), inputs="force", timing="clock")
     for step, few in ((13, True), (5, False)):
@@ -88,8 +93,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             t[::step], dict(zip(names, trial.values[::step].T, strict=True))
         )
         data = sample(thin, inputs="force")
-        advice = hj.recordings.advise(data, hj.fit_series(data, 1, check=False))
-        assert any(w.cause == "sampling" for w in advice.findings) == few
+        diagnosis = hj.recordings.diagnose(data, hj.fit_series(data, 1, check=False))
+        assert any(w.cause == "sampling" for w in diagnosis.findings) == few
 
 
 def test_gaps_are_masked_and_cut(wave):
@@ -118,7 +123,7 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     """They count where they can; what is left out is counted and said."""
     marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)
     dirty = mishandle(
-        hj.testing.spoil(marked, ("x", "v"), noise=1e-3),
+        hj.testing.add_artifacts(marked, ("x", "v"), noise=1e-3),
         misjudged(lost=0.05, doubled=0.05),
         input="force",
         outputs=("x", "v"),
@@ -189,17 +194,15 @@ def test_slow_drift_is_taken_out(wave):
             "numbers of trials: 0 and 1",
         ),
     ]:
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             without_drift(wave, phase, "x", cycles)
 
 
 def test_designs_as_tables(tmp_path, wave):
-    design = hj.multisine(n_sections=8, periods=16, band=(0, 2.0))
-    hj.recordings.write_design(tmp_path / "phase.csv", design, cycles=19)
+    design = hj.multisine(n_sections=8, periods=16, frequencies=(0, 2.0))
+    design.write(tmp_path / "phase.csv", cycles=19)
     for period, rows in ((0.2901, 465), (0.29, 16 * 29)):  # (0.29 * 100 is 28.999...)
-        hj.recordings.write_design(
-            tmp_path / "time.csv", design, period=period, rate=100
-        )
+        design.write(tmp_path / "time.csv", period=period, rate=100)
         assert (tmp_path / "time.csv").read_text().count(
             "\n"
         ) - 1 == design.experiments * rows
@@ -207,26 +210,26 @@ def test_designs_as_tables(tmp_path, wave):
         (None, "both the period and the rate"),
         (15.9, "must be 16 or more"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            hj.recordings.write_design(
-                tmp_path / "time.csv", design, period=0.5, rate=rate
-            )
+        with pytest.raises(hj.errors.DefinitionError, match=message):
+            design.write(tmp_path / "time.csv", period=0.5, rate=rate)
     # Applied at the phases of the recording, and found again in its section data.
     phase = hj.recordings.estimate_phase(wave, CIRCLE)
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
-        hj.recordings.add_command(wave, phase, tmp_path / "time.csv")
+        hj.recordings.attach_design(wave, phase, tmp_path / "time.csv")
     lines = (tmp_path / "phase.csv").read_text().splitlines()
     (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
-    told = hj.recordings.add_command(wave, phase, tmp_path / "one.csv")
+    told = hj.recordings.attach_design(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
     section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
     u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(
-        u[first : first + 150], design.inputs(19)[0, :150, 0], atol=1e-9
+        u[first : first + 150], design.signals(19)[0, :150, 0], atol=1e-9
     )
-    with pytest.raises(hj.DefinitionError, match="different numbers of trials: 1 and "):
-        hj.recordings.add_command(wave, phase, tmp_path / "phase.csv")
+    with pytest.raises(
+        hj.errors.DefinitionError, match="different numbers of trials: 1 and "
+    ):
+        hj.recordings.attach_design(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
     assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
 
@@ -234,7 +237,7 @@ def test_designs_as_tables(tmp_path, wave):
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
-    (trial,) = hj.testing.spoil(rhythm, ("x", "v"), noise=1e-3).trials
+    (trial,) = hj.testing.add_artifacts(rhythm, ("x", "v"), noise=1e-3).trials
     half = len(trial.time) // 2
     for k, rows in enumerate((slice(0, half), slice(half, None))):
         table = np.column_stack([trial.time[rows], trial.values[rows]])
@@ -252,7 +255,7 @@ def files(tmp_path_factory, rhythm):
 def identify(files, out, *more):
     trials = [str(files / f"trial{k}.csv") for k in (0, 1)]
     options = [
-        "--input",
+        "--inputs",
         "force",
         "--outputs",
         "x,v",
@@ -340,7 +343,7 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
         np.array([5.0, 7.0, 11.0, 13.0]),
     )
     columns = (x[:, None, None] for x in (b, c))
-    model = hj.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
+    model = hj.linear.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
     zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
     times = np.cumsum(np.tile(np.roll(steps, 1), 60))
@@ -357,7 +360,10 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     for _ in range(60):
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
-        record, cycle = hj.Record(u, y, n_sections=N, **about), np.zeros((N, 1))
+        record, cycle = (
+            hj.experiments.SectionSeries(u, y, n_sections=N, **about),
+            np.zeros((N, 1)),
+        )
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
         found = impulse_responses(
             hj.fit_series(record, 1, check=False), data, 4, width=0.0

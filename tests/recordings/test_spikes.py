@@ -74,7 +74,7 @@ def test_pulses_are_the_input_and_spikes_are_not():
     assert (input_spikes(noisy(WAVE) + single) != 0)[single > 0].all()
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
-    assert not input_spikes(hj.testing.random_force(40, 500, 8)[:, 0]).any()
+    assert not input_spikes(hj.experiments.random_input(40, 500, 8)[:, 0]).any()
     rng = np.random.default_rng(0)
     assert not input_spikes(np.repeat(rng.normal(size=5000), 4)).any()
 
@@ -92,7 +92,7 @@ def test_impacts_are_part_of_the_motion(wave):
 
     def sampled(more):
         recording = hj.Recording(t, {"f": f, "x": x + more, "v": v})
-        return hj.recordings.section_data(recording, phase, **options)
+        return hj.recordings.sample_sections(recording, phase, **options)
 
     assert sampled(impact).spikes == (0, 0, 0)
     both = sampled(impact + spikes)

@@ -35,7 +35,7 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         "n_sections": N,
         "bandwidth": np.inf,
     }
-    return hj.recordings.section_data(recording, hj.AtEvent("e"), **options)
+    return hj.recordings.sample_sections(recording, hj.AtEvent("e"), **options)
 
 
 @pytest.mark.slow
@@ -79,12 +79,12 @@ def test_intervals_of_few_blocks_are_wider_than_percentiles():
 
 
 def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
-    sections = {"phase": hj.AtEvent("turn"), "n_sections": N}
+    sections = {"sections": hj.AtEvent("turn"), "n_sections": N}
     marked = rhythm.mark("turn", hj.Crossing("v", "falling"))
-    given = hj.recordings.section_data(
+    given = hj.recordings.sample_sections(
         marked, inputs="force", outputs=("x", "v"), **sections
     )
     assert list(feedback(given)) == []
-    loop = hj.recordings.section_data(marked, inputs="x", outputs="v", **sections)
+    loop = hj.recordings.sample_sections(marked, inputs="x", outputs="v", **sections)
     (finding,) = feedback(loop)
     assert finding.cause == "feedback" and "repeats with the cycle" in finding.text

@@ -49,7 +49,7 @@ def walk(rng):
 def fails(rng):
     value = rng.uniform()
     if value < 0.5:
-        raise hj.ComputationError("too small")
+        raise hj.errors.ComputationError("too small")
     return value
 
 
@@ -65,7 +65,7 @@ def client():
 
 @pytest.fixture(scope="module")
 def whole():
-    return hj.monte_carlo(walk, DRAWS, seed=7, chunk=2)
+    return hj.scale.monte_carlo(walk, DRAWS, seed=7, chunk=2)
 
 
 def test_draws_have_streams_of_their_own(whole):
@@ -74,11 +74,11 @@ def test_draws_have_streams_of_their_own(whole):
         expected = walk(np.random.default_rng(stream))
         assert_array_equal(whole.end[i], expected["end"])
         assert whole.far[i] == expected["far"]
-    assert_array_equal(hj.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
+    assert_array_equal(hj.scale.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
 
 
 def test_draws_that_fail_are_named():
-    found = hj.monte_carlo(fails, 20, seed=1)
+    found = hj.scale.monte_carlo(fails, 20, seed=1)
     assert 0 < found.failed.sum() < 20
     assert_array_equal(np.isnan(found.value), found.failed == 1)
 
@@ -99,10 +99,10 @@ def test_an_interruption_leaves_whole_pieces(tmp_path):
         return value
 
     with pytest.raises(KeyboardInterrupt):
-        hj.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
+        hj.scale.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
     assert len(list(tmp_path.glob("draws.zarr/value/c/*"))) == 3
     again.touch()
-    draws = hj.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
+    draws = hj.scale.monte_carlo(drawn, 10, chunk=2, store=tmp_path / "draws.zarr")
     assert_array_equal(draws.value, expected)
 
 
@@ -113,16 +113,18 @@ def test_draws_must_stay_alike():
         (lambda rng: next(turns), "one type and shape: first <f8"),
         (lambda rng: next(turns), "same names: `value` is in some draws only"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            hj.monte_carlo(function, 2)
+        with pytest.raises(hj.errors.DefinitionError, match=message):
+            hj.scale.monte_carlo(function, 2)
 
 
 def test_a_store_knows_its_function(tmp_path):
     first, other = (partial(np.random.Generator.normal, scale=x) for x in (1.0, 2.0))
     for _ in range(2):
-        hj.monte_carlo(first, 2, store=tmp_path / "draws.zarr")
-    with pytest.raises(hj.DefinitionError, match="its `function` is not the same"):
-        hj.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
+        hj.scale.monte_carlo(first, 2, store=tmp_path / "draws.zarr")
+    with pytest.raises(
+        hj.errors.DefinitionError, match="its `function` is not the same"
+    ):
+        hj.scale.monte_carlo(other, 2, store=tmp_path / "draws.zarr")
 
 
 @pytest.mark.parametrize(
@@ -133,7 +135,7 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     first = partial(np.random.Generator.normal)
     victim = tmp_path / "x"
     store = tmp_path / "s.zarr"
-    hj.monte_carlo(first, 4, chunk=2, store=store)
+    hj.scale.monte_carlo(first, 4, chunk=2, store=store)
     values = store / "value"
     victim.mkdir()
     (victim / "1").write_text("mine")
@@ -154,13 +156,15 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         (values / "c/1").symlink_to(victim / "1") if harm == "link" else os.mkfifo(
             values / "c/1"
         )
-    with pytest.raises(hj.DefinitionError, match=r"s\.zarr"):
-        hj.monte_carlo(first, 4, chunk=2, store=store)
+    with pytest.raises(hj.errors.DefinitionError, match=r"s\.zarr"):
+        hj.scale.monte_carlo(first, 4, chunk=2, store=store)
     assert (victim / "1").read_text() == "mine"
 
 
 def test_a_cluster_gives_the_same_numbers(client, whole):
-    assert hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client).identical(whole)
+    assert hj.scale.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client).identical(
+        whole
+    )
 
 
 def test_a_killed_worker_takes_nothing_with_it(client, whole, tmp_path):
@@ -174,13 +178,15 @@ def test_a_killed_worker_takes_nothing_with_it(client, whole, tmp_path):
 
     killer = threading.Thread(target=watched, args=(4,))
     killer.start()
-    draws = hj.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client, store=store)
+    draws = hj.scale.monte_carlo(
+        walk, DRAWS, seed=7, chunk=2, client=client, store=store
+    )
     killer.join()
     assert draws.load().identical(whole)
     times = {path: path.stat().st_mtime_ns for path in store.glob("far/c/*[0-9]")}
     assert len(times) == DRAWS // 2  # (beside them, the victim may leave a `.partial`)
     (store / "end/c/3/0").unlink()
-    again = hj.monte_carlo(
+    again = hj.scale.monte_carlo(
         walk, DRAWS, seed=7, chunk=2, store=store
     )  # goes on without a cluster
     assert again.load().identical(whole)
@@ -195,9 +201,9 @@ def test_workers_with_another_version_are_refused(client, whole, monkeypatch):
     versions["client"]["packages"]["jax"] = "9.9"
     monkeypatch.setattr(client, "get_versions", lambda packages: versions)
     with pytest.raises(
-        hj.DefinitionError, match="has jax .*, and this process has 9.9"
+        hj.errors.DefinitionError, match="has jax .*, and this process has 9.9"
     ):
-        hj.monte_carlo(walk, DRAWS, client=client)
+        hj.scale.monte_carlo(walk, DRAWS, client=client)
 
 
 def test_workers_with_other_code_are_refused(client, monkeypatch):
@@ -205,14 +211,14 @@ def test_workers_with_other_code_are_refused(client, monkeypatch):
         """One that workers cannot import."""
 
     with pytest.raises(
-        hj.DefinitionError, match="`Mine` is defined in the script or notebook"
+        hj.errors.DefinitionError, match="`Mine` is defined in the script or notebook"
     ):
-        hj.monte_carlo(lambda rng: Mine().period(), 2, client=client)
+        hj.scale.monte_carlo(lambda rng: Mine().period(), 2, client=client)
     monkeypatch.setitem(globals(), "STEPS", 50)
     with pytest.raises(
-        hj.DefinitionError, match="`walk` on a Dask worker is not what it is in"
+        hj.errors.DefinitionError, match="`walk` on a Dask worker is not what it is in"
     ):
-        hj.monte_carlo(walk, DRAWS, client=client)
+        hj.scale.monte_carlo(walk, DRAWS, client=client)
 
 
 @pytest.fixture(scope="module")
@@ -226,10 +232,11 @@ def experiments():
 
 @pytest.mark.slow
 def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
-    call = {"options": hj.experiments.Options(discard=2), "chunk": 2}
-    stream = hj.experiments.stream_experiments
-    stored = stream(*experiments, store=tmp_path / "a.zarr", client=client, **call)
-    alone = stream(*experiments, store=tmp_path / "b.zarr", **call)
+    call = {"discard": 2, "chunk": 2}
+    stored = hj.run_experiments(
+        *experiments, store=tmp_path / "a.zarr", client=client, **call
+    )
+    alone = hj.run_experiments(*experiments, store=tmp_path / "b.zarr", **call)
     assert len(stored) == 3
     assert stored.missing() == []
     for mine, theirs in zip(alone, stored, strict=True):

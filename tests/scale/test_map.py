@@ -14,14 +14,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 import hybridjax as hj
 from hybridjax.apps.cli import main
 from hybridjax.orbits import batches
-from hybridjax.scale.family import Points
+from hybridjax.scale.family import SweepPoints
 
 
 pytest.importorskip("xarray")
 pytest.importorskip("zarr")
 
 # In pieces of four.
-FOUR = hj.Execution(batch=4)
+FOUR = hj.scale.Execution(batch=4)
 OVER = {"slope": np.array([0.075, 0.08, 0.09]), "spokes": np.array([8.0, 8.5, 9.0])}
 WANT = ("period", "spectral_radius", "state", "multipliers", "residual")
 
@@ -33,7 +33,7 @@ def wheel():
 
 @pytest.fixture(scope="module")
 def options(wheel):
-    return {"want": WANT, "guess": wheel, "chunk": 4}
+    return {"quantities": WANT, "guess": wheel, "chunk": 4}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
 
 def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     """With so few spokes on so flat a slope, a wheel does not get over its next spoke."""
-    points = Points(
+    points = SweepPoints(
         {"slope": [0.075, 0.08, 0.03, 0.09], "spokes": [8.0, 8.5, 7.0, 9.0]}
     )
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
@@ -95,25 +95,28 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
         return hj.sweep(system, over, store=store, **options | change)
 
     run()
-    with pytest.raises(hj.DefinitionError, match=r"`over.slope` is not the same"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"`values.slope` is not the same"
+    ):
         run(over=small | {"slope": np.array([0.071, 0.08])})
     with pytest.raises(
-        hj.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
+        hj.errors.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
     ):
         run(hj.models.RimlessWheel(rate=1.1))
     with pytest.raises(
-        hj.DefinitionError, match=r"`want` is \['period', .*, not \['period'\]"
+        hj.errors.DefinitionError,
+        match=r"`quantities` is \['period', .*, not \['period'\]",
     ):
-        run(want="period")
+        run(quantities="period")
     shutil.rmtree(store)
     store.mkdir()
     (store / "mine.txt").write_text("")
-    with pytest.raises(hj.DefinitionError, match="is no store of results"):
+    with pytest.raises(hj.errors.DefinitionError, match="is no store of results"):
         run()
 
 
 def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
-    points = Points(
+    points = SweepPoints(
         {"slope": [0.075, 0.09, 0.075, 0.09], "spokes": [8.0, 8.0, 9.0, 9.0]}
     )
 
@@ -122,7 +125,7 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
 
     def twice(cycle):
         if float(cycle.system.slope) > 0.08:
-            raise hj.ComputationError("too steep")
+            raise hj.errors.ComputationError("too steep")
         return jnp.stack([cycle.period, cycle.trajectory(2.0).t[-1]])
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
@@ -137,13 +140,13 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
         (lambda x: x, "a function of parameters that returns one"),
         (lambda x, y: x, "needs `y`: give it an axis"),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
+        with pytest.raises(hj.errors.DefinitionError, match=message):
             hj.sweep(wrong, {"x": [1.0]}, guess=wheel)
 
 
 def test_points_of_sobol_fill_the_box_and_are_always_the_same():
     ranges = {"k": (8.0, 13.0), "b": (3.0, 7.0)}
-    points = Points.sobol(ranges, 48, seed=3)
+    points = SweepPoints.sobol(ranges, 48, seed=3)
     for name, (low, high) in ranges.items():
         values = points.values[name]
         assert len(points) == 48
@@ -151,7 +154,7 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert values.max() <= high
         measured = np.histogram(values, 4, (low, high))[0].tolist()
         assert measured == (pytest.approx([12] * 4, abs=2))
-        assert_array_equal(values, Points.sobol(ranges, 48, seed=3).values[name])
+        assert_array_equal(values, SweepPoints.sobol(ranges, 48, seed=3).values[name])
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
@@ -160,15 +163,21 @@ def test_sweep_draws_a_map(tmp_path, capsys):
     )
     model = f"{tmp_path}/my_wheel.py:Mine"
     out = str(tmp_path / "map.zarr")
-    axes = ["--over", "slope=0.075:0.09:2", "--over", "spokes=8:9:2"]
-    assert main(["sweep", model, *axes, "--want", "spectral_radius", "--out", out]) == 0
+    axes = ["--values", "slope=0.075:0.09:2", "--values", "spokes=8:9:2"]
+    assert (
+        main(["sweep", model, *axes, "--quantities", "spectral_radius", "--out", out])
+        == 0
+    )
     assert "4 of 4 points have a limit cycle" in capsys.readouterr().out
     assert (tmp_path / "map-spectral_radius.png").stat().st_size > 5_000
     for wrong, says in (
-        ([model, "--over", "slop=0:1:2"], "there is no parameter 'slop'"),
+        ([model, "--values", "slop=0:1:2"], "there is no parameter 'slop'"),
         ([model.replace("my_", "no_"), *axes], "there is no file"),
         ([model, *axes, *axes], "has two axes"),
-        ([model, *axes, "--want", "period"], "holds other results: its `want`"),
+        (
+            [model, *axes, "--quantities", "period"],
+            "holds other results: its `quantities`",
+        ),
     ):
         with pytest.raises(SystemExit, match=says):
             main(["sweep", *wrong, "--out", out])
@@ -182,7 +191,7 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
     k = jnp.array([8.0, 10.0, 13.0, 13.0, 0.0])
     b = jnp.array([3.0, 5.0, 7.0, 3.0, 5.0])
     hoppers = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))(k, b)
-    found = hj.find_limit_cycles(hoppers, hopper_cycle)
+    found = hj.orbits.find_limit_cycles(hoppers, hopper_cycle)
     for i in range(4):
         cycle = found[i]
         alone = hj.find_limit_cycle(cycle.system, cycle)
@@ -200,7 +209,7 @@ def test_without_a_clock_and_in_waves(wheel):
     much shorter than the guess's that the flow from one impact passes the next."""
     slopes = np.linspace(0.08, 0.16, 11)
     systems = [hj.models.RimlessWheel(slope=x) for x in slopes]
-    found = hj.find_limit_cycles(systems, wheel, execution=FOUR)
+    found = hj.orbits.find_limit_cycles(systems, wheel, execution=FOUR)
     assert found.ok.all()
     assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
@@ -212,12 +221,14 @@ def test_systems_that_are_alike_or_undefined(wheel):
     """Neither takes the others down with it."""
     slopes = jnp.array([0.08] * 9 + [np.nan, 0.08])
     wheels = eqx.filter_vmap(lambda x: hj.models.RimlessWheel(slope=x))(slopes)
-    found = hj.find_limit_cycles(wheels, wheel, execution=FOUR)
+    found = hj.orbits.find_limit_cycles(wheels, wheel, execution=FOUR)
     assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all()
     assert np.isfinite(found.multipliers[:9]).all()
     assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
-    assert hj.find_limit_cycles([found[0].system] * 6, wheel, execution=FOUR).ok.all()
+    assert hj.orbits.find_limit_cycles(
+        [found[0].system] * 6, wheel, execution=FOUR
+    ).ok.all()
 
 
 def test_a_guess_with_too_long_a_period(wheel):

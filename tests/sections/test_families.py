@@ -14,7 +14,7 @@ import hybridjax as hj
 from ..conftest import APEX, OUTPUTS
 
 
-class Chosen(hj.AbstractSections):
+class Chosen(hj.sections.AbstractSections):
     """Sections at chosen phases of the clock, in periods."""
 
     label: ClassVar[str] = "chosen"
@@ -32,13 +32,13 @@ class Chosen(hj.AbstractSections):
         pass
 
     def bind(self, s, orbit):
-        return hj.BoundSections.at_times(self.values * orbit.period)
+        return hj.sections.BoundSections.at_times(self.values * orbit.period)
 
     def describe(self, i):
         return f"section {i} (at {float(self.values[i]):.3g})"
 
 
-class Levels(hj.AbstractLevels):
+class Levels(hj.sections.AbstractLevels):
     values: Float[Array, " N"]
 
     def present(self, s, a):
@@ -52,11 +52,11 @@ class FallingPast(Chosen):
     """Sections where the first state falls past each of some values."""
 
     def bind(self, s, orbit):
-        return hj.BoundSections.at_levels(Levels(self.values), self.n_sections)
+        return hj.sections.BoundSections.at_levels(Levels(self.values), self.n_sections)
 
 
 def test_a_family_of_clock_phases(hopper_cycle):
-    placed = hj.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
+    placed = hj.sections.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
     assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
     assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
@@ -66,8 +66,8 @@ def test_a_family_of_clock_phases(hopper_cycle):
 def test_a_family_of_levels(vanderpol_cycle):
     family = FallingPast([1.0, 0.0, -1.0])
     one_by_one = [hj.Crossing("x", "falling", value=float(x)) for x in family.values]
-    own = hj.place_sections(vanderpol_cycle, family)
-    listed = hj.place_sections(vanderpol_cycle, one_by_one)
+    own = hj.sections.place_sections(vanderpol_cycle, family)
+    listed = hj.sections.place_sections(vanderpol_cycle, one_by_one)
     assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
     assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
     a = hj.linearize(vanderpol_cycle, own, "v")
@@ -78,8 +78,8 @@ def test_a_family_of_levels(vanderpol_cycle):
 def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
     """Measured along a trajectory that is sampled densely, between its events."""
     scale = np.array([0.3, 1.9])
-    family = hj.ArcLength(8, OUTPUTS, APEX, scale=scale)
-    placed = hj.place_sections(hopper_cycle, family)
+    family = hj.sections.ArcLength(8, OUTPUTS, APEX, scale=scale)
+    placed = hj.sections.place_sections(hopper_cycle, family)
     t, *signals = hopper_cycle.trajectory(3.0)(*OUTPUTS, per_step=200)
     steps = np.diff(np.stack(signals) / scale[:, None], axis=1)
     length = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=0)))

@@ -149,7 +149,7 @@ def test_a_touchdown_that_loses_speed_agrees_with_scipy(kind, lossy_cycle):
 
 def test_a_jump_that_goes_back_over_a_section_is_reported(lossy_cycle):
     with pytest.raises(
-        hj.ComputationError,
+        hj.errors.ComputationError,
         match=r"section 19 .* is crossed .* t = 1.34 in stance\. Choose",
     ):
         hj.linearize(lossy_cycle, KINEMATIC, OUTPUTS)
@@ -190,7 +190,9 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late_input, late_output)
 
 
 def test_delays_at_sections_of_the_state_are_refused(hopper_cycle):
-    with pytest.raises(hj.DefinitionError, match="needs sections at equal times"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="needs sections at equal times"
+    ):
         hj.linearize(hopper_cycle, KINEMATIC, OUTPUTS, delay=(0.1, 0.0))
 
 
@@ -254,9 +256,9 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, di
 def test_a_section_map_waits_for_late_arrivals():
     """A ball 3 m/s faster than on the cycle flies for two periods: alone and inside of programs."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
-    paddle = hj.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
+    paddle = hj.sections.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
     state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
-    placed = hj.place_sections(cycle, [hj.AtEvent("impact")])
+    placed = hj.sections.place_sections(cycle, [hj.AtEvent("impact")])
     begin = float(placed.lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
     alone = paddle(state)

@@ -22,9 +22,9 @@ def analyze(lossy_cycle, k):
     """Numbers of the lossy hopper with stiffness k: states, A, B, a section map, a mean."""
     hopper = eqx.tree_at(lambda s: s.k, lossy_cycle.system, k)
     cycle = hj.find_limit_cycle(hopper, lossy_cycle)
-    placed = hj.place_sections(cycle, SECTIONS)
+    placed = hj.sections.place_sections(cycle, SECTIONS)
     ldtp = hj.linearize(cycle, placed, outputs="yM")
-    P = hj.section_map(cycle, placed, 1, 3)
+    P = hj.sections.section_map(cycle, placed, 1, 3)
     arrival = P(P.fixed_point + 1e-3 * (P.fixed_point != 0), 0.1)
     return {
         "result": cycle.result,
@@ -43,6 +43,6 @@ def test_many_systems_side_by_side(lossy_cycle):
     mapped = jax.jit(jax.vmap(jax.vmap(one)))(STIFFNESS)
     for index in np.ndindex(*STIFFNESS.shape):
         alone = loop(STIFFNESS[index])
-        assert alone["result"] == hj.Result.OK
+        assert alone["result"] == hj.errors.Result.OK
         for name, value in alone.items():
             assert_allclose(mapped[name][index], value, atol=1e-9, err_msg=name)

@@ -86,7 +86,7 @@ def agrees(system, measure, rtol):
 FAMILIES = {
     "clock": hj.ClockPhase(4, anchor=0.3),
     "angle": hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX),
-    "arc": hj.ArcLength(4, ("yM", "vM"), APEX),
+    "arc": hj.sections.ArcLength(4, ("yM", "vM"), APEX),
     "event": [hj.AtEvent("touchdown"), APEX],
 }
 

@@ -33,7 +33,7 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
         (AtEvent("liftoff"), 1.51631443, ("t", "yM", "vM", "ym", "vm")),
     ]
     sections, times, coordinates = zip(*table, strict=True)
-    placed = hj.place_sections(hopper_cycle, sections)
+    placed = hj.sections.place_sections(hopper_cycle, sections)
     assert_allclose(placed.lanes.t, times, atol=1e-8)
 
     ldtp = hj.linearize(hopper_cycle, placed, ("yM", "vM"))
@@ -47,7 +47,7 @@ def test_a_list_of_sections_of_every_kind(hopper_cycle):
 def test_a_number_as_the_anchor(hopper_cycle):
     # By rounding, this is before the cycle begins.
     first = np.nextafter(hopper_cycle.anchor.t[0], 0.0)
-    clock = hj.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
+    clock = hj.sections.place_sections(hopper_cycle, hj.ClockPhase(3, anchor=first))
     expected = (first + np.arange(3) / 3) % 1
     assert_allclose(clock.lanes.t % 1, expected, atol=1e-12)
 
@@ -55,14 +55,14 @@ def test_a_number_as_the_anchor(hopper_cycle):
 def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
     """On which side of it is no matter; it was taken for a section that is touched."""
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, -0.3), (0.3, 1.9), anchor=APEX)
-    placed = hj.place_sections(hopper_cycle, family)
+    placed = hj.sections.place_sections(hopper_cycle, family)
     assert_allclose(np.sum(placed.duration), 1.0, atol=1e-12)
     assert abs(placed.lanes.q[1, 0]) < 1e-12
 
 
 def test_an_angle_as_the_anchor(hopper_cycle):
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
-    placed = hj.place_sections(hopper_cycle, family)
+    placed = hj.sections.place_sections(hopper_cycle, family)
     height, speed = np.asarray(placed.lanes.q)[:2]
     angle = np.unwrap(np.arctan2(speed / 1.9, (height - 1.9) / 0.3))
     expected = 0.3 - np.pi / 2 * np.arange(4)
@@ -125,8 +125,8 @@ TOP = Crossing("v", "falling")
     ],
 )
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
-    with pytest.raises(hj.ComputationError, match=message):
-        hj.place_sections(vanderpol_cycle, sections)
+    with pytest.raises(hj.errors.ComputationError, match=message):
+        hj.sections.place_sections(vanderpol_cycle, sections)
 
 
 def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
@@ -134,11 +134,11 @@ def test_a_section_that_is_crossed_again_after_a_jump(hopper_cycle):
         return jnp.sin(4 * jnp.pi * t)
 
     with pytest.raises(
-        hj.ComputationError,
+        hj.errors.ComputationError,
         match=r"section 0 \(twice falling\) is crossed more than once in one period, "
         "at t = 0.75 in flight and t = 1.25 in flight",
     ):
-        hj.place_sections(hopper_cycle, Crossing(twice, "falling"))
+        hj.sections.place_sections(hopper_cycle, Crossing(twice, "falling"))
 
 
 def test_a_section_takes_the_time_and_the_state(hopper_cycle):
@@ -146,9 +146,9 @@ def test_a_section_takes_the_time_and_the_state(hopper_cycle):
         return q[0]
 
     with pytest.raises(
-        hj.DefinitionError, match=r"'level falling' .*`Crossing`.* \(t, q\)"
+        hj.errors.DefinitionError, match=r"'level falling' .*`Crossing`.* \(t, q\)"
     ):
-        hj.place_sections(hopper_cycle, Crossing(level, "falling"))
+        hj.sections.place_sections(hopper_cycle, Crossing(level, "falling"))
 
 
 def test_sections_out_of_order_have_no_matrices_in_programs(vanderpol_cycle):
@@ -164,13 +164,13 @@ def test_sections_out_of_order_have_no_matrices_in_programs(vanderpol_cycle):
 
 @pytest.mark.slow
 def test_sections_of_another_cycle(placed_isochrons, lossy_cycle):
-    with pytest.raises(hj.DefinitionError, match="placed on another cycle"):
+    with pytest.raises(hj.errors.DefinitionError, match="placed on another cycle"):
         hj.linearize(lossy_cycle, placed_isochrons)
 
 
 def test_equal_sections_are_located_once(hopper_cycle):
     def at(phase):
-        return hj.place_sections(hopper_cycle, hj.ClockPhase(2, phase))
+        return hj.sections.place_sections(hopper_cycle, hj.ClockPhase(2, phase))
 
     assert at(0.3) is at(0.3)
     assert at(0.4) is not at(0.3)
@@ -179,7 +179,7 @@ def test_equal_sections_are_located_once(hopper_cycle):
 def test_an_output_that_a_chart_does_not_define(hopper_cycle, placed_isochrons):
     foot = hj.Output("foot", {"flight": lambda t, q, u: q[2]})
     with pytest.raises(
-        hj.DefinitionError, match="'foot' is not defined in chart 'stance'"
+        hj.errors.DefinitionError, match="'foot' is not defined in chart 'stance'"
     ):
         hj.linearize(hopper_cycle, placed_isochrons, foot)
 
@@ -205,11 +205,12 @@ def test_outputs_of_any_kind_and_feedthrough(
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
     monkeypatch.setattr("hybridjax.sections.place.PATIENCE", 3)
-    settings = hj.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
+    settings = hj.orbits.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     with pytest.raises(
-        hj.ComputationError, match="max_steps.* Give them to the search for the cy"
+        hj.errors.ComputationError,
+        match="max_steps.* Give them to the search for the cy",
     ):
-        hj.place_sections(
+        hj.sections.place_sections(
             dataclasses.replace(hopper_cycle, settings=settings), hj.ClockPhase(2)
         )
 
@@ -229,7 +230,7 @@ def families_of(cycle):
         falling = Crossing(state, "falling", level)
         families.append([rising, falling])
         families.append(hj.ClockPhase(5, falling))
-        families.append(hj.ArcLength(5, names[:1], rising))
+        families.append(hj.sections.ArcLength(5, names[:1], rising))
     if len(names) == 2:
         center = q[:, :2].mean(axis=0)
         families.append(hj.KinematicPhase(9, *names, center=center))
@@ -240,8 +241,8 @@ def place_or_say(cycle, family):
     """The sections, or the message if there are none."""
     place._recent.clear()
     try:
-        return hj.place_sections(cycle, family)
-    except hj.ComputationError as error:
+        return hj.sections.place_sections(cycle, family)
+    except hj.errors.ComputationError as error:
         return str(error)
 
 
@@ -303,18 +304,20 @@ def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     (impact, *_) = wheel.trajectory().events
     at_impact = hj.ClockPhase(2, anchor=float(impact.time / wheel.period))
-    with pytest.raises(hj.ComputationError, match="section coincides with an event"):
-        hj.place_sections(wheel, at_impact)
-    with pytest.raises(hj.ComputationError, match="does not reach section 0"):
-        hj.place_sections(wheel, hj.Crossing("th", "rising", 1.0))
+    with pytest.raises(
+        hj.errors.ComputationError, match="section coincides with an event"
+    ):
+        hj.sections.place_sections(wheel, at_impact)
+    with pytest.raises(hj.errors.ComputationError, match="does not reach section 0"):
+        hj.sections.place_sections(wheel, hj.Crossing("th", "rising", 1.0))
 
     # Section 2 is half a flight after the apex, at the impact.
     apex = hj.ClockPhase(4, anchor=hj.Crossing("v", "falling"))
     for amplitude in (0.16, 0.160001):
         juggling = hj.find_limit_cycle(hj.models.PaddleJuggler(A=amplitude))
         with pytest.raises(
-            hj.ComputationError, match="section 2 .*coincides with an event"
+            hj.errors.ComputationError, match="section 2 .*coincides with an event"
         ):
-            hj.place_sections(juggling, apex)
+            hj.sections.place_sections(juggling, apex)
     A = jax.jit(lambda cycle: hj.linearize(cycle, apex).A)(juggling)
     assert np.isnan(A).any()

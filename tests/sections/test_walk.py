@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.sections import linearize as module
+from hybridjax.sections import linearization as module
 
 
 HOPPER = hj.models.VerticalHopper()
@@ -16,7 +16,9 @@ APEX = hj.Crossing("vM", "falling")
 FAMILIES = {
     "phases of the clock": hj.ClockPhase(5),
     "angles": hj.KinematicPhase(5, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX),
-    "a list": hj.SectionList([hj.AtEvent("liftoff"), APEX, hj.AtEvent("touchdown")]),
+    "a list": hj.sections.SectionList(
+        [hj.AtEvent("liftoff"), APEX, hj.AtEvent("touchdown")]
+    ),
 }
 
 
@@ -67,9 +69,9 @@ def test_derivatives_of_a_traced_model_are_differences(known, no_search):
 
 def test_an_event_that_changes_places_with_a_section_is_no_number(known, no_search):
     """A section stays at its height; with another ground, liftoff is on its other side."""
-    at_liftoff = hj.place_sections(known, [hj.AtEvent("liftoff")])
+    at_liftoff = hj.sections.place_sections(known, [hj.AtEvent("liftoff")])
     height = float(at_liftoff.observe("yM")[0, 0])
-    family = hj.SectionList([hj.Crossing("yM", "rising", value=height + 1e-3)])
+    family = hj.sections.SectionList([hj.Crossing("yM", "rising", value=height + 1e-3)])
     traced = eqx.filter_jit(lambda system: model_of(system, known, family))
     assert np.isfinite(traced(HOPPER).A).all()
     beyond = traced(hj.models.VerticalHopper(k=1.2 * HOPPER.k))

@@ -79,10 +79,10 @@ def test_functions_that_are_made_anew_have_traces_of_their_own(monkeypatch):
         lambda cycle: hj.linearize(cycle, SECTIONS, "x"),
         lambda cycle: hj.run_experiments(cycle, SECTIONS, DESIGN, "x"),
         lambda cycle: hj.continuation(cycle, "wind", (0.0, 0.1)),
-        lambda cycle: hj.response_function(cycle, SECTIONS, "x"),
+        lambda cycle: hj.experiments.response_function(cycle, SECTIONS, "x"),
         lambda cycle: cycle.trajectory(),
         lambda cycle: cycle.multipliers,
-        lambda cycle: hj.spectral_radius(cycle),
+        lambda cycle: hj.fitting.spectral_radius(cycle),
     ],
 )
 def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
@@ -90,12 +90,13 @@ def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
     blown = eqx.tree_at(lambda x: x.system.wind, cycle, jnp.asarray(0.5))
     assert "find it again" in repr(blown)
     with pytest.raises(
-        hj.DefinitionError, match="`wind` of Slowed has changed since this limit"
+        hj.errors.DefinitionError, match="`wind` of Slowed has changed since this limit"
     ):
         use(blown)
     monkeypatch.setitem(globals(), "DRAG", 1.3)
     with pytest.raises(
-        hj.DefinitionError, match="the field of chart 'air' of Slowed has changed since"
+        hj.errors.DefinitionError,
+        match="the field of chart 'air' of Slowed has changed since",
     ):
         use(cycle)
     assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
@@ -109,7 +110,7 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
         return ldtp.A[0, 0, 0]
 
     for transform in (jax.jit, jax.grad, jax.vmap):
-        with pytest.raises(hj.DefinitionError, match="find it again"):
+        with pytest.raises(hj.errors.DefinitionError, match="find it again"):
             transform(decay)(jnp.zeros(1 if transform is jax.vmap else ()))
     model = eqx.filter_jit(hj.linearize)(hj.find_limit_cycle(Slowed()), SECTIONS)
     assert_allclose(model.A[:, 0, 0], np.exp(-DRAG / 2), rtol=1e-9)
@@ -117,7 +118,7 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
 
 def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
     changed = eqx.tree_at(lambda x: x.system.k, hopper_cycle, jnp.asarray(20.0))
-    with pytest.raises(hj.DefinitionError, match="with this one as the guess"):
+    with pytest.raises(hj.errors.DefinitionError, match="with this one as the guess"):
         changed.trajectory()
     again = hj.find_limit_cycle(changed.system, changed)
     other = hj.find_limit_cycle(changed.system, hopper_cycle)
@@ -125,10 +126,12 @@ def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
 
 
 def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
-    cycle = hj.find_limit_cycle(Slowed(), settings=hj.Settings(solver=hj.Radau()))
+    cycle = hj.find_limit_cycle(
+        Slowed(), settings=hj.orbits.Settings(solver=hj.systems.Radau())
+    )
     assert len(cycle.trajectory().t) > 2  # another solver is no other code
-    response = hj.response_function(cycle, SECTIONS, "x")
-    chunks = hj.experiments.stream_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
+    response = hj.experiments.response_function(cycle, SECTIONS, "x")
+    chunks = hj.run_experiments(cycle, SECTIONS, DESIGN, "x", chunk=1)
 
     def force(t):
         return DRAG * jnp.cos(t)
@@ -139,9 +142,9 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
         way = hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force)
         ends.append(way.after[-1, 1])
     assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
-    for use in (lambda: response(DESIGN.inputs(cycles=1)), lambda: next(chunks)):
+    for use in (lambda: response(DESIGN.signals(cycles=1)), lambda: next(chunks)):
         with pytest.raises(
-            hj.DefinitionError,
+            hj.errors.DefinitionError,
             match="the field of chart 'air' of Slowed has changed since",
         ):
             use()
@@ -169,7 +172,7 @@ class Turns(hj.HybridSystem):
     "search",
     [
         lambda guess: hj.find_limit_cycle(Turns(gain=0.1), section=TURN),
-        lambda guess: hj.find_limit_cycles(
+        lambda guess: hj.orbits.find_limit_cycles(
             [Turns(push=0.1), Turns(push=0.2)], guess=guess
         ),
         lambda guess: hj.sweep(Turns(), {"push": [0.1, 0.2]}, guess=guess),
@@ -177,7 +180,7 @@ class Turns(hj.HybridSystem):
 )
 def test_time_without_a_period_is_refused(search, vanderpol_cycle):
     with pytest.raises(
-        hj.DefinitionError, match=r"depends on t, but Turns states no period"
+        hj.errors.DefinitionError, match=r"depends on t, but Turns states no period"
     ):
         search(vanderpol_cycle)
 
@@ -194,7 +197,8 @@ class Pushed(Slowed):
 
 def test_the_gain_of_an_input_has_the_clocks_period():
     with pytest.raises(
-        hj.DefinitionError, match=r"does not have the period 1 that Pushed.period"
+        hj.errors.DefinitionError,
+        match=r"does not have the period 1 that Pushed.period",
     ):
         hj.find_limit_cycle(Pushed())
 
@@ -227,7 +231,7 @@ PLACES = hj.ClockPhase(2)
 
 
 def campaign(cycle):
-    return hj.experiments.stream_experiments(cycle, PLACES, PUSHES, "x", chunk=1)
+    return hj.run_experiments(cycle, PLACES, PUSHES, "x", chunk=1)
 
 
 # Objects that are made of a cycle, and a later call.
@@ -253,20 +257,20 @@ LATER = {
     "a trajectory": (lambda cycle: cycle.trajectory(), lambda x: x("x")),
     "its events": (lambda cycle: cycle.trajectory(), lambda x: x.events),
     "placed sections": (
-        lambda cycle: hj.place_sections(cycle, PLACES),
+        lambda cycle: hj.sections.place_sections(cycle, PLACES),
         lambda x: x.observe("x"),
     ),
     "sections for a model": (
-        lambda cycle: (cycle, hj.place_sections(cycle, PLACES)),
+        lambda cycle: (cycle, hj.sections.place_sections(cycle, PLACES)),
         lambda x: hj.linearize(x[0], x[1], "x"),
     ),
     "a map of sections": (
-        lambda cycle: hj.section_map(cycle, PLACES, 0, 1),
+        lambda cycle: hj.sections.section_map(cycle, PLACES, 0, 1),
         lambda x: x(x.fixed_point),
     ),
     "a response function": (
-        lambda cycle: hj.response_function(cycle, PLACES, "x"),
-        lambda x: x(PUSHES.inputs(cycles=1)),
+        lambda cycle: hj.experiments.response_function(cycle, PLACES, "x"),
+        lambda x: x(PUSHES.signals(cycles=1)),
     ),
     "a campaign": (campaign, next),
     "experiments": (
@@ -286,11 +290,11 @@ LATER = {
         lambda x: hj.continuation(x, "torque", (0.29, 0.31)),
     ),
     "cycles": (
-        lambda cycle: hj.find_limit_cycles([cycle.system] * 2, guess=cycle),
+        lambda cycle: hj.orbits.find_limit_cycles([cycle.system] * 2, guess=cycle),
         lambda x: x.multipliers,
     ),
     "one of several cycles": (
-        lambda cycle: hj.find_limit_cycles([cycle.system] * 2, guess=cycle),
+        lambda cycle: hj.orbits.find_limit_cycles([cycle.system] * 2, guess=cycle),
         lambda x: hj.linearize(x[1], PLACES, "x"),
     ),
     "sliders": (lambda cycle: cycle, lambda x: hj.explore(x, "torque")),
@@ -309,20 +313,20 @@ def test_each_later_call_names_what_has_changed(name, swinging, monkeypatch):
     made = make(swinging)
     monkeypatch.setitem(globals(), "DRAG", 0.9)
     sentence = "the field of chart 'free' of Swings has changed since"
-    with pytest.raises(hj.DefinitionError, match=sentence):
+    with pytest.raises(hj.errors.DefinitionError, match=sentence):
         use(made)
 
 
 def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypatch):
     level = hj.Crossing(lambda t, q: q[0] - 0.001 * GAIN, "rising")
-    response = hj.response_function(swinging, PLACES, SPEED)
-    chunks = hj.experiments.stream_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
-    placed = hj.place_sections(swinging, hj.ClockPhase(2, anchor=level))
+    response = hj.experiments.response_function(swinging, PLACES, SPEED)
+    chunks = hj.run_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
+    placed = hj.sections.place_sections(swinging, hj.ClockPhase(2, anchor=level))
     before = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     uses = {
         "Output 'speed' has changed since this response function was made": (
-            lambda: response(PUSHES.inputs(cycles=1))
+            lambda: response(PUSHES.signals(cycles=1))
         ),
         "Output 'speed' has changed since these experiments were planned": (
             lambda: next(chunks)
@@ -332,7 +336,7 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
         ),
     }
     for sentence, use in uses.items():
-        with pytest.raises(hj.DefinitionError, match=sentence):
+        with pytest.raises(hj.errors.DefinitionError, match=sentence):
             use()
     after = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
     assert_allclose(after, 2 * before, rtol=1e-12)

@@ -104,9 +104,13 @@ def test_an_input_with_the_name_of_a_state_or_an_output_is_refused():
             return {"plane": Lacking()}
 
     for system in (Clashing(), Output(), Absent()):
-        with pytest.raises(hj.DefinitionError, match="give the input another name"):
+        with pytest.raises(
+            hj.errors.DefinitionError, match="give the input another name"
+        ):
             _cycle(system)
-        with pytest.raises(hj.DefinitionError, match="give the input another name"):
+        with pytest.raises(
+            hj.errors.DefinitionError, match="give the input another name"
+        ):
             hj.simulate(system, "plane", (1.0, 0.0), 1.0)
 
 
@@ -117,9 +121,11 @@ def test_an_output_of_a_call_with_the_name_of_a_state_or_an_input_is_refused():
     def twice(t, q, u):
         return 2 * q[0]
 
-    with pytest.raises(hj.DefinitionError, match="'x' has the name of a state"):
+    with pytest.raises(hj.errors.DefinitionError, match="'x' has the name of a state"):
         hj.linearize(cycle, phase, outputs=(hj.Output("x", twice),))
-    with pytest.raises(hj.DefinitionError, match="'force' is an input and a state or"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="'force' is an input and a state or"
+    ):
         hj.linearize(cycle, phase, outputs=(hj.Output("force", twice),))
 
 

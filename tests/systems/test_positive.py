@@ -24,7 +24,7 @@ class Bouncing(hj.HybridSystem):
 
 
 def refused(match, call, *arguments, **options):
-    with pytest.raises(hj.DefinitionError, match=match):
+    with pytest.raises(hj.errors.DefinitionError, match=match):
         call(*arguments, **options)
 
 
@@ -38,7 +38,7 @@ def test_masses_must_be_positive(mass):
     hoppers = eqx.filter_vmap(lambda m: hj.models.VerticalHopper(M=m))
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     says = rf"parameter `M` of VerticalHopper is {mass:g}"
-    refused(says, hj.find_limit_cycles, hoppers(jnp.array([2.0, mass])), cycle)
+    refused(says, hj.orbits.find_limit_cycles, hoppers(jnp.array([2.0, mass])), cycle)
     refused("must be positive|`M` must be", hj.continuation, cycle, "M", (2.0, mass))
 
 

@@ -86,7 +86,7 @@ STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.s
     "steps, symmetry, section", [(1, MIRROR, hj.AtEvent("right lands")), STRIDE]
 )
 def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section):
-    walker = hj.Quotient(Full(), **symmetry, translation=("x",))
+    walker = hj.systems.Symmetric(Full(), **symmetry, translation=("x",))
     cycle = hj.find_limit_cycle(walker, section=section)
     assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
     expected = np.sort_complex(np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** steps)
@@ -115,8 +115,8 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
         hj.find_limit_cycle,
         lambda q: hj.simulate(q, "left stands", q.guess().state, 1),
     ):
-        with pytest.raises(hj.DefinitionError, match=message):
-            use(hj.Quotient(system, **symmetry))
+        with pytest.raises(hj.errors.DefinitionError, match=message):
+            use(hj.systems.Symmetric(system, **symmetry))
 
 
 def test_an_odd_oscillator_closes_after_half_a_period():
@@ -124,14 +124,14 @@ def test_an_odd_oscillator_closes_after_half_a_period():
     duffing = hj.models.Duffing()
     at = hj.AtEvent("half period")
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
-    folded = hj.Quotient(pol, flipped=("x", "v"), half_period="x")
+    folded = hj.systems.Symmetric(pol, flipped=("x", "v"), half_period="x")
     half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
     assert_allclose(2 * half.period, whole.period, rtol=1e-11)
     assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
     with pytest.raises(
-        hj.DefinitionError, match="must be True if a clock drives the system"
+        hj.errors.DefinitionError, match="must be True if a clock drives the system"
     ):
-        hj.Quotient(duffing, flipped=("x", "v"), half_period="x")
+        hj.systems.Symmetric(duffing, flipped=("x", "v"), half_period="x")
 
 
 class Biased(hj.models.Duffing):
@@ -143,27 +143,31 @@ class Biased(hj.models.Duffing):
 
 def test_the_symmetry_is_that_of_all_systems_in_all_units():
     def half(x):
-        return hj.Quotient(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)
+        return hj.systems.Symmetric(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)
 
     cycle = hj.find_limit_cycle(half(0.0), section=hj.AtEvent("half period"))
-    seen = hj.ObservedCycle(cycle.base, period=6.0)
+    seen = hj.fitting.ObservedCycle(cycle.base, period=6.0)
     for use in (
         lambda: hj.find_limit_cycle(half(1e-10), cycle),
-        lambda: hj.find_limit_cycles([half(0.0), half(1e-10)], cycle),
+        lambda: hj.orbits.find_limit_cycles([half(0.0), half(1e-10)], cycle),
         lambda: cycle.sensitivity("system.bias"),
         lambda: jax.grad(lambda x: hj.find_limit_cycle(half(x), cycle).period)(0.0),
-        lambda: hj.identifiability(cycle.system, seen, "system.bias", guess=cycle),
+        lambda: hj.fitting.identifiability(
+            cycle.system, seen, "system.bias", guess=cycle
+        ),
     ):
         with pytest.raises(
-            hj.DefinitionError, match="Biased does not have the symmetry"
+            hj.errors.DefinitionError, match="Biased does not have the symmetry"
         ):
             use()
     cycle.sensitivity("system.beta")
-    check_symmetry(hj.Quotient(hj.models.Duffing(rate=1e16), **ODD))
+    check_symmetry(hj.systems.Symmetric(hj.models.Duffing(rate=1e16), **ODD))
     with pytest.raises(
-        hj.DefinitionError, match="'left lands' is not the mirror image"
+        hj.errors.DefinitionError, match="'left lands' is not the mirror image"
     ):
-        check_symmetry(hj.Quotient(Full(early=1e-10), **MIRROR), {"left stands": SIZES})
+        check_symmetry(
+            hj.systems.Symmetric(Full(early=1e-10), **MIRROR), {"left stands": SIZES}
+        )
 
 
 class Inverter(
@@ -178,8 +182,12 @@ class Inverter(
         }
 
     def transitions(self):
-        yield hj.Transition("down", "plus", "minus", hj.Scheduled(2.0, self.early))
-        yield hj.Transition("up", "minus", "plus", hj.Scheduled(2.0, 1 + self.early))
+        yield hj.Transition(
+            "down", "plus", "minus", hj.systems.Scheduled(2.0, self.early)
+        )
+        yield hj.Transition(
+            "up", "minus", "plus", hj.systems.Scheduled(2.0, 1 + self.early)
+        )
 
     def period(self):
         return 2.0
@@ -191,7 +199,7 @@ class Inverter(
 @pytest.mark.slow
 def test_scheduled_switches_close_after_half_a_period():
     symmetry = dict(swap={"plus": "minus"}, flipped="i", half_period=True)
-    half = hj.Quotient(Inverter(), **symmetry)
+    half = hj.systems.Symmetric(Inverter(), **symmetry)
     half = hj.find_limit_cycle(half, section=hj.AtEvent("half period (minus)"))
     whole = hj.find_limit_cycle(Inverter())
     assert_allclose(2 * half.period, whole.period, rtol=1e-12)
@@ -201,12 +209,12 @@ def test_scheduled_switches_close_after_half_a_period():
         0
     ] == "down"
     with pytest.raises(
-        hj.DefinitionError, match="transition 'up' is not the mirror image"
+        hj.errors.DefinitionError, match="transition 'up' is not the mirror image"
     ):
         hj.find_limit_cycle(
-            hj.Quotient(Inverter(), swap={"plus": "minus"}, flipped="i")
+            hj.systems.Symmetric(Inverter(), swap={"plus": "minus"}, flipped="i")
         )
     with pytest.raises(
-        hj.DefinitionError, match="'down' must not be scheduled at t = 0"
+        hj.errors.DefinitionError, match="'down' must not be scheduled at t = 0"
     ):
-        hj.Quotient(Inverter(early=0.0), **symmetry)
+        hj.systems.Symmetric(Inverter(early=0.0), **symmetry)

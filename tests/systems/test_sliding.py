@@ -64,12 +64,14 @@ def field(drift, push):
     ],
 )
 def test_it_slides_or_crosses(push, end, chart):
-    parts = hj.sliding({"up": field(0.5, -1.0), "down": field(2.0, push)}, height)
+    parts = hj.systems.filippov(
+        {"up": field(0.5, -1.0), "down": field(2.0, push)}, height
+    )
     way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
     assert_allclose(way.after[-1], end, atol=1e-9)
     assert way.chart[-1] == chart
 
 
 def test_what_cannot_be_put_together():
-    with pytest.raises(hj.DefinitionError, match="two charts"):
-        hj.sliding({"up": field(0.0, 1.0)}, height)
+    with pytest.raises(hj.errors.DefinitionError, match="two charts"):
+        hj.systems.filippov({"up": field(0.0, 1.0)}, height)

@@ -54,10 +54,10 @@ def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
     )
     assert_array_equal(many.M, [1.0, 2.0, 3.0])
     with pytest.raises(
-        hj.DefinitionError, match="no parameter 'K'; parameters are m, M, k"
+        hj.errors.DefinitionError, match="no parameter 'K'; parameters are m, M, k"
     ):
         hj.models.VerticalHopper(K=1.0)
-    with pytest.raises(hj.DefinitionError, match="`period` must be a method"):
+    with pytest.raises(hj.errors.DefinitionError, match="`period` must be a method"):
         type("Fixed", (hj.HybridSystem,), {"period": 1.0})
 
 
@@ -123,7 +123,7 @@ class Early(hj.models.VerticalHopper):
     ],
 )
 def test_what_is_wrong_is_said(system, message):
-    with pytest.raises(hj.DefinitionError, match=message):
+    with pytest.raises(hj.errors.DefinitionError, match=message):
         check_system(system)
 
 
@@ -139,10 +139,10 @@ def test_outputs_by_name_by_function_and_by_chart():
     assert z.defined(0)
     assert not z.defined(1)
     with pytest.raises(
-        hj.DefinitionError, match="output 'x' is not defined in chart 'b'"
+        hj.errors.DefinitionError, match="output 'x' is not defined in chart 'b'"
     ):
         z.require(1)
     with pytest.raises(
-        hj.DefinitionError, match="there is no output 'y'; outputs are x, v"
+        hj.errors.DefinitionError, match="there is no output 'y'; outputs are x, v"
     ):
         s.resolve_outputs("y")

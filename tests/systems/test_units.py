@@ -15,16 +15,16 @@ def units(names):
 
 
 def small_htf(**names):
-    return hj.HTF([0.1, 0.2], np.ones((1, 2, 1, 1)), 0, 8, **names)
+    return hj.linear.HTF([0.1, 0.2], np.ones((1, 2, 1, 1)), 0, 8, **names)
 
 
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
     assert units(kinematic_ldtp.outputs) == ["m", "m/s"]
     assert units(kinematic_ldtp.inputs) == ["N"]
-    design = hj.multisine(periods=16, band=(0, 4.0))
+    design = hj.multisine(periods=16, frequencies=(0, 4.0))
     data = hj.experiments.simulate_experiments(kinematic_ldtp, design, start="periodic")
     estimate = hj.estimate_htf(data)
-    fit = hj.fit_multipliers(estimate, 2, overhang=16)
+    fit = hj.fit_multipliers(estimate, 2, extra_lags=16)
     for thing in (
         data,
         data.records[0],
@@ -42,7 +42,9 @@ def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
 
 
 def test_what_has_other_units_is_not_compared():
-    with pytest.raises(hj.DefinitionError, match=r"\('y' \(m\),\) and \('y' \(mm\),\)"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"\('y' \(m\),\) and \('y' \(mm\),\)"
+    ):
         small_htf(outputs={"y": "m"}).error(small_htf(outputs={"y": "mm"}))
     assert small_htf(outputs={"y": "m"}).error(small_htf(outputs="y")) == 0
 
@@ -52,5 +54,7 @@ def test_units_that_do_not_fit_are_refused():
         return q
 
     charts = {unit: FieldChart(still, ("y",), (unit,)) for unit in ("m", "mm")}
-    with pytest.raises(hj.DefinitionError, match=r"two units: 'y' \(m\), .*'y' \(mm\)"):
+    with pytest.raises(
+        hj.errors.DefinitionError, match=r"two units: 'y' \(m\), .*'y' \(mm\)"
+    ):
         hj.simulate(toy(charts), "m", (1.0,), 1.0)

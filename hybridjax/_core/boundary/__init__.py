@@ -6,7 +6,7 @@
         order: Order | LDTP,
         *,
         start: Literal["free", "cycle"] = "free",
-        overhang: Index | None = None,
+        extra_lags: Index | None = None,
     ) -> SeriesFit: ...
 
     fit_series(data, 2, start="cold")

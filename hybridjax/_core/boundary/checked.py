@@ -9,11 +9,12 @@ from typing import Annotated, Any, TypeVar, cast
 
 import jax
 
-from ...errors import DefinitionError
 from ..arguments import require_among
 from ..call import public_call
+from ..exceptions import DefinitionError
 from ..executor import as_numpy, is_hidden
 from ..memo import Memory
+from ..public import about_word
 from .kinds import kind_of
 from .values import Kind, Misfit
 
@@ -75,7 +76,19 @@ def checked_methods(cls: Class) -> Class:
             continue
         wrapped = _wrapped(function, f"{cls.__name__}.{name}")
         setattr(cls, name, type(member)(wrapped) if is_bound_otherwise else wrapped)
+    if not hasattr(cls, "__getattr__"):
+        setattr(cls, "__getattr__", _missing_attribute)  # noqa: B010
     return cls
+
+
+def _missing_attribute(self: Any, name: str) -> Any:
+    """`__getattr__` of public classes: an attribute that had another name leads to it."""
+    if inspect.getattr_static(type(self), name, None) is not None:
+        # A property raised an AttributeError, which Python hides: it is raised again.
+        return object.__getattribute__(self, name)
+    cls = type(self).__name__
+    text = about_word(cls, name)
+    raise AttributeError(text or f"{cls!r} object has no attribute {name!r}")
 
 
 def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
@@ -106,6 +119,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     def call(*args, **kwargs):
         try:
             with public_call(), as_numpy():
+                kinds.refuse_earlier(name, kwargs)
                 args, kwargs = kinds.take(args, kwargs)
                 return function(*args, **kwargs)
         except Misfit as misfit:
@@ -152,6 +166,13 @@ class _Kinds:
         rest = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
         named = [(x, self.by_name[x]) for x in positional]
         return named, (rest, self.by_name.get(rest))
+
+    def refuse_earlier(self, function: str, kwargs: dict[str, Any]) -> None:
+        """**Raises:** `TypeError` for an argument that had another name."""
+        for name in kwargs.keys() - self.by_name.keys():
+            text = about_word(function, name)
+            if text is not None:
+                raise TypeError(text)
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.

@@ -90,7 +90,7 @@ def _written(value: Any) -> str:
 
 
 def with_article(name: str) -> str:
-    """ "a Record", "an Output", "an LDTP"."""
+    """ "a SectionSeries", "an Output", "an LDTP"."""
     vowels = "AEFHILMNORSX" if name[:2].isupper() else "AEIOUaeiou"
     return f"{'an' if name[0] in vowels else 'a'} {name}"
 

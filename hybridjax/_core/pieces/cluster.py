@@ -16,9 +16,9 @@ import numpy as np
 from distributed import Client, as_completed
 from distributed.scheduler import KilledWorker
 
-from ...errors import ComputationError, DefinitionError, HybridJaxError
 from .. import jax_compat
 from ..cache import enable_compilation_cache
+from ..exceptions import ComputationError, DefinitionError, HybridJaxError
 from ..meaning import meaning
 from ..progress import counted, say
 from ..reading import is_packaged

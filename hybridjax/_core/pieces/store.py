@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import DefinitionError, FileFormatError
 from .. import limits
 from ..arguments import package
+from ..exceptions import DefinitionError, FileFormatError
 from ..progress import counted
 from .description import difference
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 from typing import Annotated
 
 import equinox as eqx
@@ -24,6 +25,7 @@ from ..._core.boundary.kinds import (
 from ..._core.boundary.values import Integers
 from ...errors import DefinitionError
 from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
+from .tables import write_table
 
 
 InputNames = Count | SignalNames
@@ -53,7 +55,7 @@ class Design(eqx.Module):
     - `line`: j, so that f = j / periods.
     - `channel`: index of the input it is applied to.
     - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
-    - `n_sections`: N. `periods`: P. `experiments`: their number S. `input_names`.
+    - `n_sections`: N. `periods`: P. `experiments`: their number S. `inputs`: names of the inputs.
     """
 
     experiment: Int[np.ndarray, " K"]
@@ -64,9 +66,7 @@ class Design(eqx.Module):
     n_sections: SectionCount = eqx.field(static=True)
     periods: PeriodCount = eqx.field(static=True)
     experiments: kinds.ExperimentCount = eqx.field(static=True)
-    input_names: Annotated[tuple[str, ...], Names()] = eqx.field(
-        static=True, default=("u",)
-    )
+    inputs: Annotated[tuple[str, ...], Names()] = eqx.field(static=True, default=("u",))
 
     def __check_init__(self):
         self.check()
@@ -146,7 +146,7 @@ class Design(eqx.Module):
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
         self._refuse(~good, "has an amplitude that is not a positive number")
         self._refuse(~np.isfinite(self.phase), "has a phase that is not finite")
-        nu = len(self.input_names)
+        nu = len(self.inputs)
         outside = (self.channel < 0) | (self.channel >= nu)
         self._refuse(outside, f"is applied to an input that is not one of the {nu}")
         # Several inputs may share a line, but none may have it twice.
@@ -180,7 +180,7 @@ class Design(eqx.Module):
         """**Raises:** an error if responses to several inputs cannot be separated."""
         if pairs == len(self.line):
             return
-        nu = len(self.input_names)
+        nu = len(self.inputs)
         lines, place = np.unique(self.line, return_inverse=True)
         U = np.zeros((len(lines), self.experiments, nu), complex)
         U[place, self.experiment, self.channel] = self.amplitude * np.exp(
@@ -204,7 +204,7 @@ class Design(eqx.Module):
             )
 
     @property
-    def f(self) -> Float[np.ndarray, " K"]:
+    def frequency(self) -> Float[np.ndarray, " K"]:
         """Frequency of each cosine, cycles per period."""
         return self.line / self.periods
 
@@ -213,7 +213,7 @@ class Design(eqx.Module):
         """All frequencies that the design measures, ascending, each once."""
         return np.unique(self.line) / self.periods
 
-    def inputs(
+    def signals(
         self, cycles: PeriodCount | None = None, experiments: slice | None = None
     ) -> Float[np.ndarray, "S n nu"]:
         """Return the signals of all experiments, n = cycles * N samples long. Default: P cycles.
@@ -237,9 +237,7 @@ class Design(eqx.Module):
         line = self.line[k]
         channel = self.channel[k]
         length = self.n_sections * self.periods
-        spectrum = np.zeros(
-            (last - first, length // 2 + 1, len(self.input_names)), complex
-        )
+        spectrum = np.zeros((last - first, length // 2 + 1, len(self.inputs)), complex)
         value = 0.5 * length * self.amplitude[k] * np.exp(1j * self.phase[k])
         value = np.where(
             is_real(line, self.periods, self.n_sections), 2 * value.real, value
@@ -248,13 +246,38 @@ class Design(eqx.Module):
         one = np.fft.irfft(spectrum, n=length, axis=1)
         return one[:, np.arange(cycles * self.n_sections) % length]
 
+    def write(
+        self,
+        path: kinds.FilePath,
+        *,
+        cycles: PeriodCount | None = None,
+        period: kinds.Positive | None = None,
+        rate: kinds.Positive | None = None,
+    ) -> None:
+        """Write the signals of all experiments to a CSV file, for hardware that plays them.
+
+        - Without `period`, for hardware that triggers on phase: a row for each section, with the
+          columns `experiment`, `cycle`, `section`, `phase` and the inputs, which are held until the
+          next section (zero-order hold).
+        - With `period` and `rate`, for other hardware: a row for each sample, with `experiment`,
+          `time` and the inputs.
+
+        **Arguments:** `cycles`: cycles of each experiment. Default: its periods P. `period`: period
+        of the cycle in seconds. `rate`: samples per second.
+
+        **Raises:** `DefinitionError` for a period without a rate, a rate with less than one sample
+        for each section, and a file that cannot be written.
+        """
+        u = self.signals(cycles)
+        write_table(Path(path), self.inputs, u, self.n_sections, period, rate)
+
     def scaled(self, rms: kinds.Positive) -> "Design":
         """Return the design with amplitudes multiplied so that every signal has this rms value.
 
         Each signal (an input in one experiment) is scaled separately; the ratios of its amplitudes
         do not change.
         """
-        now = np.sqrt(np.mean(self.inputs() ** 2, axis=1))[
+        now = np.sqrt(np.mean(self.signals() ** 2, axis=1))[
             self.experiment, self.channel
         ]
         return eqx.tree_at(lambda d: d.amplitude, self, self.amplitude * rms / now)
@@ -270,10 +293,10 @@ class Design(eqx.Module):
         **Returns:** a design with `count` times the experiments, one realization after the other.
         """
         rng = np.random.default_rng(seed)
-        pair = self.line * len(self.input_names) + self.channel
+        pair = self.line * len(self.inputs) + self.channel
         pairs, place = np.unique(pair, return_inverse=True)
         turns = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
-        real = is_real(pairs // len(self.input_names), self.periods, self.n_sections)
+        real = is_real(pairs // len(self.inputs), self.periods, self.n_sections)
         turns = np.where(real, np.pi * (turns > np.pi), turns)
         phase = (self.phase + turns[:, place]) % (2 * np.pi)
         shift = np.arange(count)[:, None] * self.experiments
@@ -292,9 +315,7 @@ class Design(eqx.Module):
         same = [np.tile(x, count) for x in (self.line, self.channel, self.amplitude)]
         cosines = [experiment.ravel(), *same, phase.ravel()]
         experiments = count * self.experiments
-        return ordered(
-            cosines, self.n_sections, self.periods, experiments, self.input_names
-        )
+        return ordered(cosines, self.n_sections, self.periods, experiments, self.inputs)
 
     def expected_variance(
         self, noise: kinds.NonNegative = 1.0, repeats: Count = 1
@@ -304,7 +325,7 @@ class Design(eqx.Module):
         `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
         """
         lines, place = np.unique(self.line, return_inverse=True)
-        power = np.zeros((len(lines), len(self.input_names)))
+        power = np.zeros((len(lines), len(self.inputs)))
         alone = is_real(self.line, self.periods, self.n_sections)
         real = np.where(alone, 2 * np.cos(self.phase), 1)
         np.add.at(power, (place, self.channel), (self.amplitude * real) ** 2)
@@ -318,7 +339,7 @@ class Design(eqx.Module):
 
     def crest_factors(self) -> Float[np.ndarray, " S"]:
         """Return max |u| / rms(u) of each experiment, the largest over its inputs."""
-        u = self.inputs()
+        u = self.signals()
         rms = np.sqrt(np.mean(u**2, axis=1))
         peak = np.abs(u).max(axis=1)
         return np.max(
@@ -333,7 +354,7 @@ class Design(eqx.Module):
         per = per[np.isfinite(per)]
         rows = [
             f"Design({_count(self.experiments, 'experiment')} of {self.periods} periods, "
-            f"{self.n_sections} sections, inputs {', '.join(self.input_names)})",
+            f"{self.n_sections} sections, inputs {', '.join(self.inputs)})",
             f"  frequencies  {len(f)}, {_span(f)} cycles per period{self._steps()}",
             f"  each         {_count(_span(sizes), 'cosine')} of amplitude {_span(self.amplitude)}"
             f", crest factor {_span(crest)}",
@@ -381,7 +402,7 @@ def require_inputs(
     """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
     of one input is that of another one there."""
     what = f"design and {other}"
-    names = design.input_names
+    names = design.inputs
     require_equal(what, "n_sections", design.n_sections, n_sections)
     require_equal(what, "numbers of inputs", len(names), len(inputs))
     if any(x in inputs and x != y for x, y in zip(names, inputs, strict=True)):

@@ -43,7 +43,7 @@ _STEPS = 100
 def multisine(
     n_sections: SectionCount = 32,
     periods: PeriodCount = 64,
-    band: Band | None = None,
+    frequencies: Band | None = None,
     amplitude: kinds.Positive | Callable[[np.ndarray], np.ndarray] = 0.01,
     seed: Seed = 0,
     *,
@@ -63,8 +63,8 @@ def multisine(
 
     - `n_sections`: N. Default: 32. `periods`: P, the periods in one window; the resolution is 1/P.
       Default: 64.
-    - `band`: the lowest and the highest frequency in cycles per period, both included. Default:
-      0 to 10 as in the paper, or to N/2 if that is less.
+    - `frequencies`: the lowest and the highest frequency in cycles per period, both included.
+      Default: 0 to 10 as in the paper, or to N/2 if that is less.
     - `amplitude`: amplitude of each cosine, or a function that returns it for an array of f.
       `Design.scaled` sets the rms value of the signals. Default: 0.01.
     - `seed`: seed of the phases and of the division. Default: 0.
@@ -93,7 +93,9 @@ def multisine(
     names = input_names(inputs)
     check_window(n_sections, periods)
     _check_choices(lines, division, periods)
-    j = _lines(n_sections, periods, band or (0.0, min(10.0, n_sections / 2)), lines)
+    j = _lines(
+        n_sections, periods, frequencies or (0.0, min(10.0, n_sections / 2)), lines
+    )
     # A frequency that needs two phases is listed twice; `second` marks the repetition.
     j = np.sort(np.concatenate([j, j[needs_two_phases(j, periods, n_sections)]]))
     second = np.concatenate([[False], j[1:] == j[:-1]])
@@ -171,7 +173,7 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
     f_min, f_max = band
     if not f_min <= f_max <= n_sections / 2:
         raise DefinitionError(
-            f"`band` {band} must increase in [0, N/2 = {n_sections / 2}]."
+            f"`frequencies` {band} must increase in [0, N/2 = {n_sections / 2}]."
         )
     low = int(np.ceil(f_min * periods - OFF_LINE))
     high = int(np.floor(f_max * periods + OFF_LINE))
@@ -182,7 +184,8 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
         j = j[j % 2 == 1]
     if len(j) == 0:
         raise DefinitionError(
-            f"lines='{lines}' excites nothing in `band` {band}: take more periods or a wider band."
+            f"lines='{lines}' excites nothing in `frequencies` {band}: take more periods or "
+            "a wider band."
         )
     return j
 
@@ -239,7 +242,7 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
 
     **Raises:** `DefinitionError` if there is no phase to choose.
     """
-    nu = len(design.input_names)
+    nu = len(design.inputs)
     length = design.n_sections * design.periods
     _, pair, count = np.unique(
         design.line * nu + design.channel, return_inverse=True, return_counts=True

@@ -272,7 +272,7 @@ def check_sharing(
         raise DefinitionError(
             f"experiment {number[k]}: {reason}, so their responses fall on the same frequencies: a "
             f"recorded input must repeat after P = {periods} periods, with noise below "
-            "`threshold`; one that a controller makes needs its `reference`."
+            "`threshold`; one that a controller makes needs its `references`."
         )
     raise DefinitionError(
         f"experiment {number[k]}: {reason}, so their responses fall on the same frequencies: move "

@@ -28,15 +28,14 @@ from ..denominator import Covariance, multipliers_of
 from ..descent import Spread
 from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierEstimate, MultiplierFit, RoughFit
-from ..multipliers import exact_htf
+from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..periodic import (
     LocalCoordinates,
     PeriodicModel,
     characteristic_slopes,
     local_coordinates,
 )
-from ..realization import default_horizon, given_dims, realized
+from ..realization import given_dims
 from ..series import prediction, residuals
 from ..series.prediction import Predictor, SeriesPart, SeriesProblem
 from ..series.records import (
@@ -52,7 +51,8 @@ from .frequency import FrequencyProblem, transfer, transfer_slopes
 from .realization import realized_htf
 
 
-Guess = LDTP | Order | Annotated[Numbers, Integers("sections", sign="positive")]
+Dimensions = Order | Annotated[Numbers, Integers("sections", sign="positive")]
+Guess = LDTP | Dimensions
 
 # Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
 # errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
@@ -84,11 +84,11 @@ class LDTPFit(MultiplierFit):
       noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
       ahead.
     - `findings`: "feedback" for inputs of time series that a controller makes, or may make (not
-      with a `reference`); "drift" if drift of the outputs of time series (in the first 1000 cycles)
-      gives multipliers outside of each other's confidence regions; "left over" if residuals depend
-      on the inputs, or "misfit" if they are larger than their variances, or alike at neighboring
-      frequencies: the dimensions are too few, or the iteration found a local minimum; "order" if
-      one dimension less explains the data; "undetermined"; "no convergence".
+      with a `references`); "drift" if drift of the outputs of time series (in the first 1000
+      cycles) gives multipliers outside of each other's confidence regions; "left over" if residuals
+      depend on the inputs, or "misfit" if they are larger than their variances, or alike at
+      neighboring frequencies: the dimensions are too few, or the iteration found a local minimum;
+      "order" if one dimension less explains the data; "undetermined"; "no convergence".
     """
 
     model: LDTP
@@ -124,15 +124,17 @@ class LDTPFit(MultiplierFit):
         return self._coordinates.size
 
     @checked
-    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
-        """Return the HTFs of the fitted model at frequencies f (F,), in cycles per period.
+    def htf(
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> HTF:
+        """Return the HTFs of the fitted model at `frequencies` (F,), in cycles per period.
 
         The variance is that of the fit, to first order. It is infinite for combinations that the
         data do not determine, e.g. at harmonics that were not fitted.
 
         **Arguments:** `harmonics`: Default: those that were fitted.
         """
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         N = self.n_sections
         if harmonics is None:
             harmonics = self.harmonics
@@ -149,9 +151,9 @@ class LDTPFit(MultiplierFit):
 
     @checked
     def noise_spectrum(
-        self, f: Scalar | Vector, harmonics: Harmonics | None = None
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
     ) -> Float[np.ndarray, "M F ny"]:
-        """Return the spectrum of the fitted noise at the harmonics of frequencies f (F,).
+        """Return the spectrum of the fitted noise at the harmonics of `frequencies` (F,).
 
         White noise with the standard deviation sigma has the spectrum sigma^2 for all f and m. The
         variance of an H_m that is measured with a cosine of amplitude a in P periods is
@@ -167,7 +169,7 @@ class LDTPFit(MultiplierFit):
             raise DefinitionError(
                 "no noise is fitted to HTFs (`HTF.variance`): fit time series."
             )
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         return prediction.noise_spectrum(self.noise_model, f, harmonics)
 
     def spread(self, grid: CycleGrid) -> Iterator[Float[np.ndarray, "S T ny r"]]:
@@ -203,7 +205,7 @@ class LDTPFit(MultiplierFit):
         return bool(np.isfinite(self._spread.variance(slopes)).all())
 
     def _about(self) -> str:
-        about = f"chi-square {self.cost:.6g} with {self.dof:.0f} degrees of freedom"
+        about = f"chi-square per degree of freedom {self.chi2_per_dof:.3g} (dof {self.dof:.0f})"
         if self.noise is not None:
             about = f"errors one step ahead {signal_values(self.outputs, self.noise)}"
         return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
@@ -212,12 +214,13 @@ class LDTPFit(MultiplierFit):
 @checked
 def fit_ldtp(
     data: HTF | RecordedData,
-    guess: Guess | None = None,
+    dims: Dimensions | None = None,
+    initial: LDTP | None = None,
     *,
     noise: Literal["output", "innovations"] = "output",
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> LDTPFit:
     r"""Fit the matrices A[n], B[n], C[n], D[n] of a periodic model by maximum likelihood.
 
@@ -227,7 +230,7 @@ def fit_ldtp(
 
     over all frequencies, harmonics, outputs and inputs. `fit_multipliers` gives each of the
     transfer functions a numerator of its own; here they follow from fewer unknowns, and the
-    standard errors of multipliers are smaller (`hj.identify.ldtp_bound` returns them).
+    standard errors of multipliers are smaller (`hj.identify.cramer_rao` returns them).
 
     For *time series*, with Gaussian one-step prediction errors e,
 
@@ -247,13 +250,13 @@ def fit_ldtp(
     - `data`: estimated HTFs, with as many harmonics as possible: few harmonics determine few
       entries of the matrices. Without variances each output is weighted by its residuals. Or time
       series, as for `fit_series`.
-    - `guess`: dimensions of the state at each section (or one for all): the fit starts from
-      a realization of HTFs (states below the noise are left out by default, which may bias a
-      multiplier), and from a subspace method for time series, which need this. Alternatively, an
-      observable initial model with these dimensions; if its D is zero, D stays zero. Too few
-      dimensions bias the multipliers: compare `cost` with `dof` where variances are known;
-      for time series, see `findings`. The iteration finds a local minimum; the same checks reveal a
-      poor one.
+    - `dims`: dimensions of the state at each section, or one for all. The fit starts from a
+      realization of HTFs, and from a subspace method for time series, which need `dims`. Too few
+      dimensions bias the multipliers: compare `cost` with `dof` where variances are known; for time
+      series, see `findings`. The iteration finds a local minimum; the same checks reveal a poor
+      one. Default: states of HTFs above the noise, which may bias a multiplier.
+    - `initial`: an observable model to start from, in place of `dims`. If its D is zero, D stays
+      zero. Default: None.
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
@@ -261,7 +264,7 @@ def fit_ldtp(
       "innovations"), and to test whether one dimension less explains the data as well, whether
       residuals of time series depend on the inputs, and whether drift explains the multipliers;
       `findings`, and warnings (`FindingWarning`), then say so. Default: True.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs. The plant from these to the outputs is fitted with innovations; it may be
       unstable. The fit is consistent if D is zero at sections where the controller responds without
       delay, which the response of the outputs to the reference shows. If the reference was not
@@ -273,25 +276,31 @@ def fit_ldtp(
     a finding reports that a controller could cause the dependence. If the data do not determine
     D, the printed fit reports this.
 
-    **Raises:** `DefinitionError` if data and guess do not fit together, for NaN in the HTFs,
-    variances that are not positive, a guess with an unobservable state, fewer numbers in the data
-    than unknowns, outputs that do not respond to the inputs, or records with `lead`.
+    **Raises:** `DefinitionError` for both `dims` and `initial`, if data and initial model do not
+    fit together, for NaN in the HTFs, variances that are not positive, an unobservable initial
+    model, fewer numbers in the data than unknowns, outputs that do not respond to the inputs, or
+    records with `lead`.
     """
     require_x64()
     free_start = start == "free"
+    if dims is not None and initial is not None:
+        raise DefinitionError(
+            "fit_ldtp: `initial` has its own dimensions: give it or `dims`."
+        )
+    guess = dims if initial is None else initial
     if not isinstance(data, HTF):
         if guess is None:
             raise DefinitionError(
-                "fit_ldtp: give the dimensions of the state as `guess`, which time series need."
+                "fit_ldtp: give the dimensions of the state as `dims`, which time series need."
             )
-        how = _How(noise == "innovations" or reference is not None, free_start, check)
-        fit = _fit_to_records(data, guess, how, reference)
-    elif reference is None and noise == "output" and free_start:
+        how = _How(noise == "innovations" or references is not None, free_start, check)
+        fit = _fit_to_records(data, guess, how, references)
+    elif references is None and noise == "output" and free_start:
         fit = _fit_to_htf(data, guess, check)
     else:
         raise DefinitionError(
-            "`reference`, `noise` and `start` are for time series: give the data, not HTFs, or "
-            "leave these arguments out (and pass `reference` to `estimate_htf`)."
+            "`references`, `noise` and `start` are for time series: give the data, not HTFs, or "
+            "leave these arguments out (and pass `references` to `estimate_htf`)."
         )
     if check:
         warn_of(fit.findings)
@@ -312,8 +321,8 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     scale = weights.check_values(htf)
     direct = _is_direct(guess)
     if not isinstance(guess, LDTP):
-        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "guess"))
-    require_same("guess and data", guess, htf)
+        guess = realized_htf(htf, given_dims(guess, htf.n_sections, "dims"))
+    require_same("initial model and data", guess, htf)
     problem = FrequencyProblem.of(htf, weights.error_weights(htf, scale), scale)
     model = PeriodicModel.of(guess, scale)
     unknowns = local_coordinates(model, direct).size
@@ -321,11 +330,11 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     if dof < 1:
         raise DefinitionError(
             f"the HTFs hold {problem.residuals} numbers, too few for {unknowns} unknowns: give "
-            "more frequencies, or smaller `guess`."
+            "more frequencies, or smaller `dims`."
         )
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
-            "`guess` has an infinite response at a frequency: give a stable one."
+            "`initial` has an infinite response at a frequency: give a stable one."
         )
     point, converged = descend(ModelPoint(problem, model, direct))
     if htf.variance is None:
@@ -348,12 +357,12 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
 
 
 def _fit_to_records(
-    data: RecordedData, guess: Guess, how: _How, reference: SignalNames | None
+    data: RecordedData, guess: Guess, how: _How, references: SignalNames | None
 ) -> LDTPFit:
     """Return a fit to time series, with the findings of its residuals."""
     drive = None
-    if reference is not None:
-        data, drive = in_loop(data, reference)
+    if references is not None:
+        data, drive = in_loop(data, references)
     records = PreparedRecords(data, how.free_start)
     outside = records if drive is None else PreparedRecords(drive, how.free_start)
     chosen = isinstance(guess, LDTP)
@@ -465,7 +474,7 @@ def _fit_to_series(
     dof = _freedom_of(records, problem, model, direct)
     if not np.isfinite(problem.cost(model)):
         raise DefinitionError(
-            "the responses of `guess` are infinite: give a stable model."
+            "the responses of `initial` are infinite: give a stable model."
         )
     start = ModelPoint(problem.reweighted(model), model, direct)
     point, converged = descend(start)
@@ -488,10 +497,10 @@ def _first_model(
     if isinstance(guess, PeriodicModel):
         return guess
     if isinstance(guess, LDTP):
-        require_same("guess and data", guess, records)
+        require_same("initial model and data", guess, records)
         errors = len(records.outputs) if how.innovations else 0
         return PeriodicModel.of(guess, records.scale, errors)
-    dims = given_dims(guess, records.n_sections, "guess") or []
+    dims = given_dims(guess, records.n_sections, "dims") or []
     return subspace_model(records, dims, how.innovations, direct)
 
 
@@ -584,7 +593,7 @@ def _about_point(fit: LDTPFit) -> tuple[Finding, ...]:
     if fit.cost > 2 * fit.dof or alike:
         text = (
             "errors are larger than their variances, or alike at neighboring frequencies: too few "
-            "dimensions, or a local minimum that another guess avoids."
+            "dimensions, or a local minimum that another `initial` model avoids."
         )
         findings.append(Finding("misfit", text))
     if not fit.determines_direct:
@@ -620,7 +629,9 @@ def _finished(
             _, deviation = weights.estimated_noise(weights.largest_misfit(data), unit)
             unit = deviation**2
         correlation = weights.neighbor_correlation(
-            problem.errors(model), problem.weight * problem.target, np.asarray(data.f)
+            problem.errors(model),
+            problem.weight * problem.target,
+            np.asarray(data.frequencies),
         )
     else:
         S = cast(SeriesProblem, point.problem).S
@@ -644,33 +655,3 @@ def _finished(
         _scale=scale,
     )
     return dataclasses.replace(fit, findings=_about_point(fit))
-
-
-@checked
-def ldtp_bound(model: LDTP, htf: HTF) -> MultiplierEstimate:
-    r"""Return the Cramer-Rao bound of the multipliers for known dimensions of the states.
-
-    The errors of the HTFs are independent, circular and Gaussian, as for `multiplier_bound`. The
-    unknowns are the matrices A[n], B[n], C[n] (and D[n], if the model has any) instead of free
-    numerators: this is the bound of `fit_ldtp`. The squared ratio of the standard errors of
-    `multiplier_bound` to these is the factor by which the structure reduces the amount of data.
-
-    **Arguments:**
-
-    - `model`: the true model, of which the minimal part counts. `htf`: HTFs with the frequencies,
-      harmonics and `variance` of the experiment; H is not used.
-
-    **Returns:** as many multipliers as the smallest state of the minimal model has coordinates.
-
-    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
-    """
-    exact = exact_htf(model, htf)
-    lags = 2 * default_horizon(model.n_sections) + 1
-    minimal = realized(np.asarray(model.impulse_response(lags)))
-    scale = weights.check_values(exact)
-    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
-    direct = bool(np.asarray(model.D).any())
-    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
-    c, slopes = characteristic_slopes(coordinates)
-    spread = problem.linearize(coordinates).spread()
-    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)

@@ -52,7 +52,10 @@ class FrequencyProblem(NamedTuple):
         """
         size = scale[:, None]
         return cls(
-            np.asarray(htf.f), htf.harmonics, np.asarray(htf.H) / size, weight * size
+            np.asarray(htf.frequencies),
+            htf.harmonics,
+            np.asarray(htf.H) / size,
+            weight * size,
         )
 
     @property

@@ -44,7 +44,7 @@ def realized_htf(
     support.
     """
     htf.require_sampled("a state-space model")
-    f = np.asarray(htf.f)
+    f = np.asarray(htf.frequencies)
     N = htf.n_sections
     if not np.isfinite(htf.H).all():
         raise DefinitionError(

@@ -73,7 +73,7 @@ from .residuals import about_answers
 from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
-_BIASED = "the fit is biased; name their `reference`"
+_BIASED = "the fit is biased; name their `references`"
 
 
 class SeriesFit(MultiplierFit):
@@ -96,7 +96,7 @@ class SeriesFit(MultiplierFit):
     - `noise` (ny,): standard deviation of the residuals.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `reference`: signals that enter the loop from outside. With a reference, `noise` is the
+    - `references`: signals that enter the loop from outside. With a references, `noise` is the
       standard deviation of $\chi y$.
     - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
       more multiplier or two, give multipliers outside of each other's confidence regions;
@@ -112,7 +112,7 @@ class SeriesFit(MultiplierFit):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     lead: int = eqx.field(static=True, default=0)
-    reference: tuple[str, ...] = eqx.field(static=True, default=())
+    references: tuple[str, ...] = eqx.field(static=True, default=())
 
     @remembered
     def model(self) -> LDTP:
@@ -141,15 +141,17 @@ class SeriesFit(MultiplierFit):
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
-    def htf(self, f: Scalar | Vector, harmonics: Harmonics | None = None) -> HTF:
-        """Return the harmonic transfer functions at frequencies f (F,), in cycles per period.
+    def htf(
+        self, frequencies: Scalar | Vector, harmonics: Harmonics | None = None
+    ) -> HTF:
+        """Return the harmonic transfer functions at `frequencies` (F,), in cycles per period.
 
         The variance is that of white noise for the numerators, and follows from `covariance` for c.
         It is large or infinite at frequencies without power of the inputs.
 
         **Arguments:** `harmonics`: Default: all N.
         """
-        f = np.atleast_1d(np.asarray(f, float))
+        f = np.atleast_1d(np.asarray(frequencies, float))
         harmonics = check_harmonics(harmonics, self.n_sections)
         N = self.n_sections
         c = self.coefficients
@@ -175,7 +177,9 @@ class SeriesFit(MultiplierFit):
         return HTF(f, H, harmonics, N, *names, "series fit", variance=variance)
 
     def _about(self) -> str:
-        loop = f"in a loop, by {', '.join(self.reference)}; " if self.reference else ""
+        loop = (
+            f"in a loop, by {', '.join(self.references)}; " if self.references else ""
+        )
         return (
             f"{loop}noise {signal_values(self.outputs, self.noise)}; "
             f"{self.n_sections} sections, {self.numerators.shape[1]} lags"
@@ -226,10 +230,10 @@ def fit_series(
     data: RecordedData,
     order: Order | LDTP,
     *,
-    overhang: Index | None = None,
+    extra_lags: Index | None = None,
     start: Literal["free", "cycle"] = "free",
     check: bool = True,
-    reference: SignalNames | None = None,
+    references: SignalNames | None = None,
 ) -> SeriesFit:
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
@@ -242,15 +246,16 @@ def fit_series(
 
     **Arguments:**
 
-    - `data`: `Record`s, `ExperimentData` (all cycles of successful experiments), or `SectionData`.
-      If outputs drift or have offsets: `[dataclasses.replace(r, drift=20) for r in data.records]`.
+    - `data`: `SectionSeries`, `ExperimentData` (all cycles of successful experiments), or
+      `SectionData`. If outputs drift or have offsets: `[dataclasses.replace(r, drift=20) for r in
+      data.records]`.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model that has this number.
-    - `overhang`: number of lags of the numerators beyond d N, with N sections. Default: N.
+    - `extra_lags`: number of lags of the numerators beyond d N, with N sections. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `findings` as warnings (`FindingWarning`). Default: True.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
       instrumental variables, which are consistent for any noise and controller. `start` has no
       effect: the first cycles of each record are not used. Default: None.
@@ -260,10 +265,10 @@ def fit_series(
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order
-    if reference is None:
-        fit = _fit_open_loop(data, order, overhang, start == "free", check)
+    if references is None:
+        fit = _fit_open_loop(data, order, extra_lags, start == "free", check)
     else:
-        fit = _fit_in_loop(data, order, overhang, reference, check)
+        fit = _fit_in_loop(data, order, extra_lags, references, check)
     if check:
         warn_of(fit.findings, wrappers=2)
     return fit
@@ -272,13 +277,13 @@ def fit_series(
 def _fit_in_loop(
     data: RecordedData,
     order: int,
-    overhang: int | None,
-    reference: SignalNames,
+    extra_lags: int | None,
+    references: SignalNames,
     check: bool,
 ) -> SeriesFit:
-    plant, drive = in_loop(data, reference)
-    fit = SeriesFit(**LoopEquations(plant, drive, order, overhang).fit(check))
-    fewer = max(overhang - plant[0].n_sections, 0) if overhang else 0
+    plant, drive = in_loop(data, references)
+    fit = SeriesFit(**LoopEquations(plant, drive, order, extra_lags).fit(check))
+    fewer = max(extra_lags - plant[0].n_sections, 0) if extra_lags else 0
     higher = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
     return dataclasses.replace(fit, findings=tuple(fit.order_doubts(higher)))
 
@@ -295,17 +300,17 @@ class _Weighted(NamedTuple):
 def _fit_open_loop(
     data: RecordedData | PreparedRecords,
     order: int,
-    overhang: int | None,
+    extra_lags: int | None,
     free_start: bool,
     check: bool,
 ) -> SeriesFit:
     records = data
     if not isinstance(records, PreparedRecords):
         records = PreparedRecords(records, free_start)
-    overhang = records.n_sections if overhang is None else overhang
+    extra_lags = records.n_sections if extra_lags is None else extra_lags
 
     def weighted(order: int) -> _Weighted:
-        problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
+        problem = OutputErrorProblem.from_data(records, order, extra_lags, free_start)
         delayed = late_outputs(problem, order)
         solution, _ = minimize(problem, total_least_squares(delayed))
         _require_freedom(problem, solution)
@@ -369,7 +374,7 @@ def _about_drift(
         problem = _problem_like(fit, slow(), len(fewer), free_start)
         solution, _ = minimize(problem, fewer, rough=True)
         _require_freedom(problem, solution)
-        spread = 1 / np.sqrt(2 * solution.freedom.sum(axis=0))
+        spread = 1 / np.sqrt(2 * solution.dof.sum(axis=0))
         if (_noise(solution) < 1 + 3 * spread).all():
             return [MAY_DRIFT]
     return []
@@ -392,8 +397,8 @@ def _problem_like(
     """Return a problem in units of a fit's noise, with no more lags than the fit has, if possible:
     without zero multipliers they are enough."""
     N, R = fit.numerators.shape[:2]
-    overhang = max(R - 1 - fit.lead - order * N, 0)
-    problem = OutputErrorProblem.from_data(records, order, overhang, free_start)
+    extra_lags = max(R - 1 - fit.lead - order * N, 0)
+    problem = OutputErrorProblem.from_data(records, order, extra_lags, free_start)
     return problem._replace(scale=fit.noise)
 
 
@@ -439,7 +444,7 @@ def assemble(
         slopes=by_input(slopes),
         roots=roots.reshape(N, ny, problem.lags, nu, widest),
         noise=_noise(solution) * problem.scale,
-        dof=float(solution.freedom.sum() - d),
+        dof=float(solution.dof.sum() - d),
         result=result,
         findings=tuple(not_converged(result)),
         **problem.records.about,
@@ -448,7 +453,7 @@ def assemble(
 
 def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     """Return the standard deviation of each output's noise, in units of the problem's scale."""
-    left = solution.freedom.sum(axis=0) - len(solution.c) / solution.freedom.shape[1]
+    left = solution.dof.sum(axis=0) - len(solution.c) / solution.dof.shape[1]
     return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
@@ -456,9 +461,9 @@ def missing_cycles(
     problem: OutputErrorProblem, solution: Linearization, least: int
 ) -> int:
     """Return how many more cycles would leave this number of degrees of freedom, about."""
-    n, i = np.unravel_index(np.argmin(solution.freedom), solution.freedom.shape)
+    n, i = np.unravel_index(np.argmin(solution.dof), solution.dof.shape)
     # (More lags than samples would use up more of them.)
-    left = int(solution.freedom[n, i]) or problem.freedom_left(int(n), int(i))
+    left = int(solution.dof[n, i]) or problem.freedom_left(int(n), int(i))
     return max(least - left, 0)
 
 
@@ -466,7 +471,7 @@ def _require_freedom(problem: OutputErrorProblem, solution: Linearization) -> No
     order = len(solution.c)
     missing = missing_cycles(problem, solution, order + 1)
     if missing:
-        n, i = np.argwhere(solution.freedom <= order)[0]
+        n, i = np.argwhere(solution.dof <= order)[0]
         raise TooFewCycles(problem, n, i, missing)
 
 
@@ -474,7 +479,7 @@ def _noise_ratios(
     delayed: DelayedOutputs, noise: Float[np.ndarray, " ny"]
 ) -> NoiseRatios:
     """Return the ratios of a fit to outputs with noise of this standard deviation."""
-    rows = max(delayed.freedom, 1)
+    rows = max(delayed.dof, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
     return np.linalg.eigvalsh(gram) / rows, float(np.sqrt(2 / rows))
 
@@ -559,7 +564,7 @@ def gradient_covariance(
     filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
-    white = np.array([[solution.freedom.sum(), first], [first, second]])
+    white = np.array([[solution.dof.sum(), first], [first, second]])
     of_white, of_filtered = amounts(white, squares[:, 0])
     by_filtered = np.einsum("bcd,bce->de", score[:, 1:], score[:, 1:]) / _FILTERED_DRAWS
     expected = of_white * by_white.sum(axis=0) + of_filtered * by_filtered

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from ..._core.results import Result
 from ...errors import DefinitionError
-from ...experiments.record import Record, RecordedData
+from ...experiments.record import RecordedData, SectionSeries
 from .. import denominator
 from ..denominator import Covariance, in_blocks, multipliers_of
 from ..descent import Coefficients
@@ -46,7 +46,7 @@ _DETERMINED = 10.0
 
 
 def predicted(
-    plant: list[Record], drive: list[Record], order: int
+    plant: list[SectionSeries], drive: list[SectionSeries], order: int
 ) -> Float[np.ndarray, "S T N nuy"]:
     """Return inputs and outputs as the references explain them.
 
@@ -80,7 +80,7 @@ class SectionEquations(NamedTuple):
     """root @ root.T is their covariance, for noise of variance one."""
     taken: tuple[Float[np.ndarray, "rows r"], Float[np.ndarray, "rows r"]]
     """The first, times the second transposed, maps errors to the part that numerators take."""
-    freedom: int
+    dof: int
 
 
 class Solution(NamedTuple):
@@ -96,7 +96,7 @@ class Solution(NamedTuple):
 
 
 def best_order(
-    data: RecordedData, reference: Sequence[str], most: int
+    data: RecordedData, references: Sequence[str], most: int
 ) -> tuple[int, str]:
     """Return the largest number of multipliers, up to `most`, that the references determine, and
     the obstacle to a larger number, if there was one."""
@@ -104,7 +104,7 @@ def best_order(
     for order in range(most, 1, -1):
         # Too few cycles for so many: a finding shows the text.
         try:
-            solution = LoopEquations(*in_loop(data, reference), order, None).solution
+            solution = LoopEquations(*in_loop(data, references), order, None).solution
         except DefinitionError as error:
             obstacle = str(error)
             continue
@@ -118,15 +118,19 @@ class LoopEquations:
     """The equations of all sections."""
 
     def __init__(
-        self, plant: list[Record], drive: list[Record], order: int, overhang: int | None
+        self,
+        plant: list[SectionSeries],
+        drive: list[SectionSeries],
+        order: int,
+        extra_lags: int | None,
     ):
         self.records = PreparedRecords(plant)
         self.order = order
-        self.reference = drive[0].inputs
+        self.references = drive[0].inputs
         self.grid = self.records.whole()
         N = self.records.n_sections
         z = predicted(plant, drive, order)
-        span = N if overhang is None else overhang
+        span = N if extra_lags is None else extra_lags
         self.lags = self.records.lead + order * N + span + 1
         self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
 
@@ -167,7 +171,7 @@ class LoopEquations:
             numerators=np.tensordot(to_lags, fitted, 1),
             root=to_lags @ inverse,
             taken=(inputs @ inverse, instruments),
-            freedom=int(used.sum() - kept.sum()),
+            dof=int(used.sum() - kept.sum()),
         )
 
     def fit(self, check: bool) -> dict[str, Any]:
@@ -195,10 +199,10 @@ class LoopEquations:
             roots=roots,
             noise=noise,
             covariance_dof=covariance.dof,
-            dof=float(sum(x.freedom for x in self.sections) * ny - len(c)),
+            dof=float(sum(x.dof for x in self.sections) * ny - len(c)),
             result=int(Result.OK),
             **self.records.about,
-            reference=self.reference,
+            references=self.references,
         )
 
     def coefficients(self) -> RoughFit:
@@ -212,13 +216,13 @@ class LoopEquations:
         d = self.order
         sections = self.sections
         scale = self.records.scale
-        least = min(x.freedom for x in sections)
+        least = min(x.dof for x in sections)
         if least <= d:
             raise DefinitionError(
                 f"a section was sampled {d + 1 - least} times too few for numerators of "
                 f"{self.lags} lags: record more, take fewer sections, or lower `order`."
             )
-        freedom = sum(x.freedom for x in sections)
+        dof = sum(x.dof for x in sections)
         outputs = np.array([x.outputs for x in sections])
         instruments = np.array([x.instruments for x in sections])
         for _ in range(2):  # the second time with the weights that the errors suggest
@@ -227,13 +231,13 @@ class LoopEquations:
             along = W.T @ y
             c = -np.linalg.lstsq(along[:, 1:], along[:, 0])[0]
             square = ((outputs @ [1.0, *c]) ** 2).sum(axis=(0, 1))
-            scale = np.maximum(np.sqrt(square / freedom), RANK * self.records.scale)
+            scale = np.maximum(np.sqrt(square / dof), RANK * self.records.scale)
         along = along[:, 1:]
         # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
         part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
         part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
-        seen = part * freedom * len(scale) > _DETERMINED * (1 - part)
+        seen = part * dof * len(scale) > _DETERMINED * (1 - part)
         return Solution(c, along, scale, int(seen.sum()))
 
     def solve(

@@ -36,7 +36,7 @@ class SectionFit(NamedTuple):
     """Coefficients of the inputs, for C columns of each of m outputs."""
     slopes: Float[np.ndarray, "r d m C"]
     """Their derivatives with respect to c."""
-    freedom: float
+    dof: float
     products: Float[np.ndarray, "m C C"]
     """Products of the residuals of different columns."""
     gradient: Float[np.ndarray, "m d"]
@@ -76,7 +76,7 @@ class SectionFit(NamedTuple):
             root=root,
             coefficients=a,
             slopes=slopes,
-            freedom=sum(r.freedom for r in regressions),
+            dof=sum(r.dof for r in regressions),
             products=_total(np.einsum("rmk,rml->mkl", e, e) for e in errors),
             gradient=_total(map(_along_slopes, by_c, errors)),
             curvature=_total(np.einsum("rimk,rjmk->mij", s, s) for s in by_c) - taken,
@@ -115,7 +115,7 @@ class Linearization(NamedTuple):
     """Sum of the products of residuals and their derivatives, over all sections."""
     curvature: Float[np.ndarray, "ny d d"]
     """Sum of the products of derivatives."""
-    freedom: Int[np.ndarray, "N ny"]
+    dof: Int[np.ndarray, "N ny"]
     """Samples less unknowns."""
     fits: list[list[SectionFit]]
     """The fits of each section."""
@@ -171,7 +171,7 @@ def linearize(
         square=np.zeros((N, ny)),
         gradient=np.zeros((ny, d)),
         curvature=np.zeros((ny, d, d)),
-        freedom=np.zeros((N, ny), int),
+        dof=np.zeros((N, ny), int),
         fits=sum_up(problem, c, outputs, _regressions_at(problem, c)),
     )
     for n, section in enumerate(out.fits):
@@ -179,7 +179,7 @@ def linearize(
             out.square[n, fit.outputs] = np.linalg.trace(fit.products)
             out.gradient[fit.outputs] += fit.gradient
             out.curvature[fit.outputs] += fit.curvature
-            out.freedom[n, fit.outputs] = round(fit.freedom) - fit.root.shape[1]
+            out.dof[n, fit.outputs] = round(fit.dof) - fit.root.shape[1]
     return out
 
 

@@ -81,7 +81,7 @@ class SectionRegression(NamedTuple):
         return cls(inputs, starts, rows, basis, to_starts, remainder)
 
     @property
-    def freedom(self) -> float:
+    def dof(self) -> float:
         """Samples less unknown initial conditions and drift."""
         return float((self.weight > 0).sum() - (self.basis**2).sum())
 
@@ -126,17 +126,17 @@ class OutputErrorProblem(NamedTuple):
 
     @classmethod
     def from_data(
-        cls, records: PreparedRecords, order: int, overhang: int, free_start: bool
+        cls, records: PreparedRecords, order: int, extra_lags: int, free_start: bool
     ) -> "OutputErrorProblem":
-        """**Arguments:** `order`: d. `overhang`: lags of the numerators beyond d N. `free_start`:
+        """**Arguments:** `order`: d. `extra_lags`: lags of the numerators beyond d N. `free_start`:
         whether the state at the start of records is unknown, or zero.
 
         **Raises:** `DefinitionError` for too few cycles, and for inputs that depend on each other.
         """
         N = records.n_sections
         nu = len(records.inputs)
-        lags = records.lead + order * N + overhang + 1
-        free = order + -(-overhang // N) if free_start else 0
+        lags = records.lead + order * N + extra_lags + 1
+        free = order + -(-extra_lags // N) if free_start else 0
         if lags > records.cycles * N:
             raise DefinitionError(
                 f"{lags} lags reach beyond the longest record, of {records.cycles * N} samples: "

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 from ..._core.findings import Finding
 from ...errors import DefinitionError
 from ...experiments.record import (
-    Record,
     RecordedData,
+    SectionSeries,
     require_deviations,
     uninterrupted_records,
 )
@@ -25,7 +25,7 @@ from ..descent import Coefficients
 SLOW = 20.0
 MAY_DRIFT = Finding(
     "drift",
-    f"outputs may drift: `with_drift({SLOW:g})`, or `Record(drift=)`, changes multipliers.",
+    f"outputs may drift: `with_drift({SLOW:g})`, or `SectionSeries(drift=)`, changes multipliers.",
 )
 # Level of the confidence regions of multipliers that a drift must leave (drift moves them further
 # than a missing multiplier does). Lower: right fits are doubted; higher: drifts pass.
@@ -52,7 +52,7 @@ class CycleGrid(NamedTuple):
     """Basis of the drift of each section's outputs; zero outside of a record."""
 
     @classmethod
-    def from_records(cls, records: Sequence[Record]) -> "CycleGrid":
+    def from_records(cls, records: Sequence[SectionSeries]) -> "CycleGrid":
         """Put records of one kind, without unknown inputs, on one grid."""
         S = len(records)
         T = max(map(count_cycles, records))
@@ -91,12 +91,12 @@ class CycleGrid(NamedTuple):
         )
 
 
-def count_cycles(record: Record) -> int:
+def count_cycles(record: SectionSeries) -> int:
     """Return the number of cycles that a record touches, counted from section 0 of its first."""
     return -(-(record.first_section + len(record.u)) // record.n_sections)
 
 
-def drift_waves(record: Record) -> Float[np.ndarray, "T K"]:
+def drift_waves(record: SectionSeries) -> Float[np.ndarray, "T K"]:
     """Return the basis of a drift: cosines in the cycles, down to a wavelength of `record.drift`.
 
     The first is a constant. Records that announce no drift have none.
@@ -112,7 +112,7 @@ class PreparedRecords:
     """Records as grids of similar lengths.
 
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
-    `Record`; `about`: by name. `grids`: the grids. `cycles`: number of cycles of the longest
+    `SectionSeries`; `about`: by name. `grids`: the grids. `cycles`: number of cycles of the longest
     record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
 
     **Arguments:** `free_start`: whether the states at the starts are unknown. Records that drift
@@ -166,7 +166,7 @@ def _require_signals(
         )
 
 
-def with_drift(records: Sequence[Record]) -> list[Record]:
+def with_drift(records: Sequence[SectionSeries]) -> list[SectionSeries]:
     """Return the first 1000 cycles of records, with unknown drifts slower than `SLOW` cycles.
 
     Records that may drift as fast already are left out.
@@ -176,7 +176,7 @@ def with_drift(records: Sequence[Record]) -> list[Record]:
     return [dataclasses.replace(record.part(0, n), drift=SLOW) for record in slower]
 
 
-def _pieces(record: Record) -> list[Record]:
+def _pieces(record: SectionSeries) -> list[SectionSeries]:
     """Cut a record into pieces of 50 times its drift, or less."""
     longest = 50 * (record.drift or np.inf) * record.n_sections
     samples = len(record.u)
@@ -185,7 +185,7 @@ def _pieces(record: Record) -> list[Record]:
     return [record.part(k, k + n) for k in range(0, samples, n)]
 
 
-def _grids(records: Sequence[Record]) -> list[CycleGrid]:
+def _grids(records: Sequence[SectionSeries]) -> list[CycleGrid]:
     """Put records on grids, each at least half as long as the longest of its grid."""
     left = sorted(records, key=count_cycles, reverse=True)
     grids = []

@@ -30,17 +30,21 @@ _POWER = 0.8
 ANSWER = 1e-3
 # Advice where inputs answer residuals.
 FOR_WHITE_NOISE = (
-    "the fit is biased; name their `reference`, or pass noise='innovations'"
+    "the fit is biased; name their `references`, or pass noise='innovations'"
 )
 FOR_GIVEN_D = (
-    "D is biased by a controller that answers at once; name their `reference`, or give a guess "
-    "with D = 0"
+    "D is biased by a controller that answers at once; name their `references`, or give an "
+    "`initial` model with D = 0"
 )
-FOR_ZERO_D = "D = 0 was taken; if outputs answer inputs at the same section, name their `reference`"
+FOR_ZERO_D = (
+    "D = 0 was taken; if outputs answer inputs at the same section, name their "
+    "`references`"
+)
 UNSEEN = Finding(
     "feedback",
     "outputs are correlated with inputs at the same section, so D was fitted: if a controller "
-    "causes the correlation, D is biased (then name its `reference`, or give a guess with D = 0).",
+    "causes the correlation, D is biased (then name its `references`, or give an `initial` model "
+    "with D = 0).",
 )
 
 
@@ -198,7 +202,7 @@ def about_misfit(
     noise = "" if innovations else ", noise='innovations'"
     text = (
         "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
-        f"errors: give more dimensions{noise}, or another guess."
+        f"errors: give more dimensions{noise}, or another `initial` model."
     )
     return [Finding("left over", text)]
 

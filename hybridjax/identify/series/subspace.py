@@ -52,7 +52,7 @@ def subspace_model(
     if past < needed:
         raise DefinitionError(
             f"{samples} cycles are too few to begin with {most} dimensions: record about "
-            f"{_ROWS * columns * needed}, or give a model as `guess`: `fit_series(...).model`."
+            f"{_ROWS * columns * needed}, or give a model as `initial`: `fit_series(...).model`."
         )
     # The effect of the past of each section on its outputs.
     rules = []
@@ -73,7 +73,7 @@ def subspace_model(
         d = dims[n]
         if d > len(size):
             raise DefinitionError(
-                f"the data show {len(size)} dimensions of section {n}, not {d}: lower `guess`."
+                f"the data show {len(size)} dimensions of section {n}, not {d}: lower `dims`."
             )
         scale = np.maximum(size[:d], _SHRINKAGE * size[0]) / np.sqrt(len(section.y))
         to_state.append(ahead @ (directions[:d].T / scale))
@@ -125,7 +125,7 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         raise DefinitionError(
             "outputs answer inputs at the same section, where the inputs have a part that neither "
             "the reference nor the past explains: no model of the noise tells the two directions "
-            "apart. Pass a model with D = 0 as `guess` if outputs do not respond at once."
+            "apart. Pass a model with D = 0 as `initial` if outputs do not respond at once."
         )
     return False
 
@@ -236,7 +236,7 @@ class DelayedOutputs(NamedTuple):
 
     gram: Float[np.ndarray, "ny d1 d1"]
     """Their Gram matrix, for each output."""
-    freedom: int
+    dof: int
     """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
     matrices that large."""
 
@@ -263,13 +263,13 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         ]
 
     gram = np.zeros((ny, order + 1, order + 1))
-    freedom = 0
+    dof = 0
     for section in sum_up(problem, np.zeros(0), past, regress):
         for fit in section:
             gram[fit.outputs] += fit.products
-            rows = round(fit.freedom) - fit.root.shape[1]
-            freedom += max(rows, 0) * len(fit.outputs)
-    return DelayedOutputs(gram, freedom)
+            rows = round(fit.dof) - fit.root.shape[1]
+            dof += max(rows, 0) * len(fit.outputs)
+    return DelayedOutputs(gram, dof)
 
 
 def total_least_squares(delayed: DelayedOutputs) -> Coefficients:

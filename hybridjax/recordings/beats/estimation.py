@@ -287,8 +287,8 @@ def _noise(
     """
     curvature = across.T @ across
     noise = residual - across @ np.linalg.lstsq(curvature, across.T @ residual)[0]
-    freedom = int(fit.used.sum()) - len(fit.rates) - across.shape[1]
-    variance = float(noise @ noise) / max(freedom, 1)
+    dof = int(fit.used.sum()) - len(fit.rates) - across.shape[1]
+    variance = float(noise @ noise) / max(dof, 1)
     if not variance > 0:
         return 0.0, 1.0
     block = _blocks(intervals)

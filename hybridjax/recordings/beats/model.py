@@ -74,7 +74,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
     for trial, x, parts in phase.samples(recording, name):
         if not all(part.linear for part in parts):
             raise DefinitionError(
-                "`phase` must be of events or a Crossing, not a KinematicPhase."
+                "`sections` must be of events or a Crossing, not a KinematicPhase."
             )
         known = np.isfinite(x)
         if known.sum() < 2:

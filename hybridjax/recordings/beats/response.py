@@ -36,7 +36,7 @@ class PhaseResponse(PhaseCurve):
     **Fields:**
 
     - `coefficients` (K + 1,): coefficients of $\cos(\pi k \varphi)$. `covariance`, and the degrees
-      of `freedom` with which it was estimated. `detail`: number of coefficients that the data
+      of `dof` with which it was estimated. `detail`: number of coefficients that the data
       determine, while the smoothness of the curve determines the others.
     - `phase` (P,), `values` (P,), `errors` (P,): the curve and its standard errors.
     - `rates` (trials,): w, in cycles per second.
@@ -55,7 +55,7 @@ class PhaseResponse(PhaseCurve):
 
     coefficients: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
-    freedom: float = eqx.field(static=True)
+    dof: float = eqx.field(static=True)
     detail: float = eqx.field(static=True)
     errors: Float[np.ndarray, " P"]
     rates: Float[np.ndarray, " trials"]
@@ -87,7 +87,7 @@ class PhaseResponse(PhaseCurve):
         the phases: they are too narrow where it changes faster than elsewhere."""
         waves = self._waves(phase)
         error = _errors(waves, self.covariance)
-        reach = float(stats.t.ppf((1 + level) / 2, self.freedom)) * error
+        reach = float(stats.t.ppf((1 + level) / 2, self.dof)) * error
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
@@ -113,7 +113,7 @@ class PhaseResponse(PhaseCurve):
 @working("phase_response")
 def phase_response(
     recording: Recording,
-    phase: Phase | AtEvent | Crossing,
+    sections: Phase | AtEvent | Crossing,
     *,
     input: str,
 ) -> PhaseResponse:
@@ -131,7 +131,7 @@ def phase_response(
 
     **Arguments:**
 
-    - `phase`: the event at which each cycle begins, or a `Phase` estimated from events or
+    - `sections`: the event at which each cycle begins, or a `Phase` estimated from events or
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback). The curve and the rates are those at its mean in each trial.
@@ -139,6 +139,7 @@ def phase_response(
     **Raises:** `DefinitionError` for an input that is missing or constant, a phase that is an
     angle, and too few intervals.
     """
+    phase = sections
     if not isinstance(phase, Phase):
         phase = estimate_phase(recording, phase)
     intervals = intervals_of(recording, phase, input)
@@ -158,7 +159,7 @@ def phase_response(
     return PhaseResponse(
         coefficients=fit.coefficients,
         covariance=covariance.matrix,
-        freedom=max(covariance.dof, 1.0),
+        dof=max(covariance.dof, 1.0),
         detail=detail,
         phase=x,
         values=waves @ fit.coefficients,

@@ -32,7 +32,7 @@ _TEXTS = {
 
 
 @checked
-def inspect(
+def check_recording(
     recording: Recording,
     *,
     inputs: SignalNames,

@@ -42,7 +42,7 @@ class Population:
     - `values`, `errors`: by name of a quantity, an estimate and its standard error in each row; NaN
       where it is missing.
     - `units`: by name of a quantity. Default: none.
-    - `freedom`: degrees of freedom of the errors, in each row. Where they are few, errors are
+    - `dof`: degrees of freedom of the errors, in each row. Where they are few, errors are
       moderated by those of the other subjects (Smyth 2004), with the trend of the column `strides`
       if there is one. Default: infinite.
 
@@ -56,7 +56,7 @@ class Population:
         values: Numeric,
         errors: Numeric,
         units: Mapping[str, str] | None = None,
-        freedom: Freedom | None = None,
+        dof: Freedom | None = None,
     ):
         if not values or set(values) != set(errors):
             raise DefinitionError(
@@ -79,9 +79,9 @@ class Population:
                     f"{error[row]:.3g}: it must be a positive number."
                 )
         self.units = dict.fromkeys(values, "") | dict(units or {})
-        self.freedom = np.full(rows, np.inf)
-        if freedom is not None:
-            self.freedom = np.asarray(freedom, float)
+        self.dof = np.full(rows, np.inf)
+        if dof is not None:
+            self.dof = np.asarray(dof, float)
 
     @classmethod
     def from_fits(
@@ -111,8 +111,8 @@ class Population:
             for kind, number, square in zip(kinds, numbers, squares, strict=False):
                 values[kind][row] = number
                 errors[kind][row] = np.sqrt(square)
-        freedom = [fit.covariance_dof for fit in fits]
-        return cls(frame, values, errors, {"angle": "rad"}, freedom)
+        dof = [fit.covariance_dof for fit in fits]
+        return cls(frame, values, errors, {"angle": "rad"}, dof)
 
     def __repr__(self) -> str:
         cells = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)
@@ -370,7 +370,7 @@ class Population:
             trend = np.column_stack([trend, np.log(np.maximum(strides, 1.0))])
         known = np.isfinite(y)
         v[~known] = np.nan
-        v[known] = moderated(v[known], self.freedom[known], trend[known])
+        v[known] = moderated(v[known], self.dof[known], trend[known])
         frame = self.table[["subject", *factors_of(self.table)]]
         return frame.assign(cell=cells_of(frame), y=y, v=v)
 
@@ -423,8 +423,8 @@ class Population:
         spread: tuple[float, ...],
     ) -> Any:
         """Return a row for each contrast of a fit; the first has the spread and its interval."""
-        value, error, freedom = np.array([fit.contrast(w) for w in weights]).T
-        reach = stats.t.ppf(0.975, freedom) * error
+        value, error, dof = np.array([fit.contrast(w) for w in weights]).T
+        reach = stats.t.ppf(0.975, dof) * error
         frame = package("pandas").DataFrame(
             {
                 "quantity": quantity,
@@ -433,10 +433,10 @@ class Population:
                 "subjects": subjects,
                 "estimate": value,
                 "standard_error": error,
-                "freedom": freedom,
+                "dof": dof,
                 "low": value - reach,
                 "high": value + reach,
-                "p": 2 * stats.t.sf(abs(value) / error, freedom),
+                "p": 2 * stats.t.sf(abs(value) / error, dof),
             }
         )
         frame.loc[0, ["spread", "spread_low", "spread_high"]] = spread
@@ -500,7 +500,7 @@ def _test(
         y = np.sqrt(spread**2 + v) * rng.normal(size=len(subjects))
         y += difference * (group == 0)
         fit = meta(y, v, x) if paired else mixed(y, v, x, subjects, group)
-        value, error, freedom = fit.contrast(contrast)
-        return int(abs(value) > stats.t.isf(0.025, freedom) * error)
+        value, error, dof = fit.contrast(contrast)
+        return int(abs(value) > stats.t.isf(0.025, dof) * error)
 
     return draw

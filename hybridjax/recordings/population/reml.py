@@ -50,8 +50,8 @@ class Mixed(NamedTuple):
         slope = np.einsum("i,kij,j->k", w, self.slopes, w)
         square = w @ self.plain @ w
         scatter = max(slope @ self.uncertainty @ slope, 1e-300)
-        freedom = 2 * square**2 / scatter
-        return value, error, float(np.clip(freedom, 1, self.most))
+        dof = 2 * square**2 / scatter
+        return value, error, float(np.clip(dof, 1, self.most))
 
 
 def mixed(
@@ -127,7 +127,7 @@ def mixed(
     )
     each = np.unique(same, axis=0)
     sums = np.array([x[rows].sum(axis=0) for rows in each])
-    freedom = len(sums) - np.linalg.matrix_rank(sums)
+    dof = len(sums) - np.linalg.matrix_rank(sums)
     return Mixed(
         coefficients=weights.T @ y * scale,
         covariance=(plain + 2 * correction) * square,
@@ -135,7 +135,7 @@ def mixed(
         plain=plain * square,
         slopes=weights.T @ effect,
         uncertainty=uncertainty * square**2,
-        most=max(freedom, 1),
+        most=max(dof, 1),
     )
 
 
@@ -177,7 +177,7 @@ def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
     return bound(0.025), bound(0.975)
 
 
-def moderated(v: Reals, freedom: Reals, trend: Design) -> Reals:
+def moderated(v: Reals, dof: Reals, trend: Design) -> Reals:
     """Return variances with less scatter: means of each, weighted by its degrees of freedom, and of
     the common trend of their logarithms, weighted by the freedom that fits their scatter (empirical
     Bayes: Smyth 2004).
@@ -185,7 +185,7 @@ def moderated(v: Reals, freedom: Reals, trend: Design) -> Reals:
     Variances that are estimated from few blocks would otherwise give the largest weights to
     subjects whose errors happen to be underestimated.
     """
-    half = np.minimum(freedom, _EXACT) / 2
+    half = np.minimum(dof, _EXACT) / 2
     surplus = len(v) - trend.shape[1]
     if surplus < 3 or half.min() > 1e6:
         return v

@@ -17,8 +17,8 @@ from .structure import as_vector
 from .transition import Direction, Transition
 
 
-class Sliding(NamedTuple):
-    """What `sliding` builds."""
+class FilippovParts(NamedTuple):
+    """Charts and transitions that `filippov` makes."""
 
     charts: dict[str, Chart]
     """The two charts that were given, and that of sliding."""
@@ -27,11 +27,11 @@ class Sliding(NamedTuple):
 
 
 @checked
-def sliding(
+def filippov(
     charts: Mapping[str, Chart],
     surface: Callable[[Any, Any], Any],
     name: str = "slides",
-) -> Sliding:
+) -> FilippovParts:
     """Charts and transitions of a system whose field jumps at a surface.
 
     ```python
@@ -43,7 +43,7 @@ def sliding(
 
     def parts(self):
         sides = {"ahead": Slips(self, 1.0), "behind": Slips(self, -1.0)}
-        return hj.sliding(sides, lambda t, q: q[1] - self.belt, "sticks")
+        return hj.systems.filippov(sides, lambda t, q: q[1] - self.belt, "sticks")
     ```
 
     Let a and b be the rates of h in the fields f_a (where h > 0) and f_b (where h < 0). A state
@@ -63,7 +63,7 @@ def sliding(
     """
     if len(charts) != 2:
         raise DefinitionError(
-            f"sliding takes two charts, above and below, not {len(charts)}."
+            f"filippov takes two charts, above and below, not {len(charts)}."
         )
     (above, f), (below, g) = charts.items()
     if f.states != g.states or f.inputs != g.inputs:
@@ -103,7 +103,7 @@ def sliding(
         event(name, above, up, "rising"),
         event(name, below, down),
     ]
-    return Sliding({**charts, name: middle}, transitions)
+    return FilippovParts({**charts, name: middle}, transitions)
 
 
 class SlidingChart(DerivedChart):

@@ -33,7 +33,7 @@ from ..orbits.limit_cycles import (
 from ..orbits.return_map import ReturnMap
 from ..orbits.verdict import require_sound
 from ..systems.system import HybridSystem
-from .family import Axes, Family, Points, Space
+from .family import Axes, Family, Space, SweepPoints
 from .wanted import Measure, Want, Wanted
 
 
@@ -55,8 +55,11 @@ _DIGITS = 7
 @working("sweep")
 def sweep(
     model: HybridSystem | Callable[..., HybridSystem],
-    over: Axes | Points,
-    want: Want | Measure | Sequence[Want | Measure] = ("period", "spectral_radius"),
+    values: Axes | SweepPoints,
+    quantities: Want | Measure | Sequence[Want | Measure] = (
+        "period",
+        "spectral_radius",
+    ),
     *,
     guess: LimitCycle | None = None,
     chunk: Count | None = None,
@@ -66,8 +69,8 @@ def sweep(
     """Find limit cycles over a space of parameters, as a labelled array.
 
     ```python
-    over = {"k": np.linspace(8, 13, 100), "b": np.linspace(3, 7, 100)}
-    map = hj.sweep(hj.models.VerticalHopper(), over)
+    values = {"k": np.linspace(8, 13, 100), "b": np.linspace(3, 7, 100)}
+    map = hj.sweep(hj.models.VerticalHopper(), values)
     map.spectral_radius.plot()
     ```
 
@@ -82,10 +85,10 @@ def sweep(
 
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
-    - `over`: values of each parameter by name, of which all combinations are taken; or
-        `hj.Points`.
-    - `want`: quantities to keep of each cycle: "period", "state" (at its phase origin, with the
-        chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
+    - `values`: values of each parameter by name, of which all combinations are taken; or
+        `hj.scale.SweepPoints`.
+    - `quantities`: quantities to keep of each cycle: "period", "state" (at its phase origin, with
+        the chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
         functions of a `LimitCycle`, kept under their names, that return a number or an array of
         always the same shape. NaN where they raise `ComputationError`. The code of the cycle's
         `Result` is always kept. Default: period and spectral radius.
@@ -107,17 +110,17 @@ def sweep(
     cycle in the middle, or the cluster is lost.
     """
     require_x64()
-    given = over.values if isinstance(over, Points) else over
+    given = values.values if isinstance(values, SweepPoints) else values
     axes = {name: np.asarray(x, float) for name, x in given.items()}
     if not axes or not all(map(len, axes.values())):
         raise DefinitionError(
-            "`over` must name at least one parameter, each with a value or more."
+            "`values` must name at least one parameter, each with a value or more."
         )
-    space = Space(axes, not isinstance(over, Points))
+    space = Space(axes, not isinstance(values, SweepPoints))
     family = Family(model, list(space.axes))
     middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
     system = family.check(middle)
-    wanted = Wanted(want, system)
+    wanted = Wanted(quantities, system)
     total = math.prod(space.shape)
     most = chunk or (_MEASURED if wanted.measures else max(total // _PIECES, _SMALLEST))
     blocks = Blocks(space.shape, near_cube(space.shape, most))
@@ -125,9 +128,9 @@ def sweep(
         "kind": "sweep",
         "versions": versions(),
         "model": family.describe(system),
-        "over": {name: digest_of(x) for name, x in space.axes.items()},
+        "values": {name: digest_of(x) for name, x in space.axes.items()},
         "form": list(space.dims),
-        "want": list(wanted.names),
+        "quantities": list(wanted.names),
         "measures": {name: digest_of(f) for name, f in wanted.measures.items()},
         "guess": None if guess is None else rough(guess),
         "piece": list(blocks.block),

@@ -167,7 +167,7 @@ class Branch(eqx.Module):
 def continuation(
     cycle: LimitCycle,
     parameter: str,
-    values: Annotated[Numbers, Reals("n")],
+    range: Annotated[Numbers, Reals("n")],
     *,
     step: Share = 0.05,
     max_points: Count = 1000,
@@ -175,7 +175,7 @@ def continuation(
     """Continue a limit cycle in a parameter, and mark changes of its stability.
 
     Pseudo-arclength continuation computes the branch in both directions from the cycle, to the
-    first and the last of the values, around folds in between. Points at which a multiplier crosses
+    ends of the range, around folds in between. Points at which a multiplier crosses
     the unit circle are located to rounding errors. The cycle may be unstable.
 
     ```python
@@ -186,13 +186,13 @@ def continuation(
     **Arguments:**
 
     - `cycle`: the first cycle. The value of the parameter in its system lies between the first and
-      the last of `values`.
+      the last number of `range`.
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
-    - `values`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last. It contains a cycle wherever it passes one of the values, and further cycles in
+    - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
+        last. It contains a cycle wherever it passes one of the numbers, and further cycles in
         between.
-    - `step`: the longest step, as a fraction of the range of values and of the magnitudes of the
+    - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
     - `max_points`: largest number of cycles each way. Default: 1000.
 
@@ -203,7 +203,7 @@ def continuation(
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of the values.
     """
-    values = _check(cycle, values)
+    values = _check(cycle, range)
     cycle = _at_event(cycle)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
     for value in values:

@@ -14,7 +14,7 @@ from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
-from ..experiments.record import Record, RecordedData, uninterrupted_records
+from ..experiments.record import RecordedData, SectionSeries, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .descent import positive
 from .instrument import in_loop
@@ -38,7 +38,7 @@ _SAMPLES_PER_UNKNOWN = 3
 
 
 def can_be_compared(
-    model: LDTP | SeriesFit | Predictor, record: Record, free_start: bool
+    model: LDTP | SeriesFit | Predictor, record: SectionSeries, free_start: bool
 ) -> bool:
     """Test whether a record has samples beyond those that fit its initial condition and drift."""
     N = record.n_sections
@@ -75,7 +75,7 @@ class Validation(eqx.Module):
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
       input, or of the reference of a loop: the model is wrong where it is small.
-    - `level`: significance level of both tests, for all outputs together.
+    - `alpha`: significance level of both tests, for all outputs together.
     - `visible` (ny,): the smallest misfit that the test of independence would detect in four of
       five such data: rms of the response to lagged inputs that the model lacks, relative to
       the rms of the simulated output. Smaller errors of a model pass.
@@ -98,7 +98,7 @@ class Validation(eqx.Module):
     cross_correlation: Float[np.ndarray, "N lags ny nu"]
     measured: Float[np.ndarray, "n ny"]
     simulated: Float[np.ndarray, "n ny"]
-    level: float = eqx.field(static=True)
+    alpha: float = eqx.field(static=True)
     first_section: int = eqx.field(static=True)
     left_out: int = eqx.field(static=True)
     n_sections: int = eqx.field(static=True)
@@ -108,18 +108,18 @@ class Validation(eqx.Module):
     @property
     def white(self) -> bool:
         """True if the residuals of all outputs may be white."""
-        return bool(np.min(self.whiteness) >= self.level / len(self.outputs))
+        return bool(np.min(self.whiteness) >= self.alpha / len(self.outputs))
 
     @property
     def independent(self) -> bool:
         """True if the residuals of all outputs may be independent of the inputs."""
-        return bool(np.min(self.independence) >= self.level / len(self.outputs))
+        return bool(np.min(self.independence) >= self.alpha / len(self.outputs))
 
     @property
     def unexplained(self) -> tuple[str, ...]:
         """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
         pairs = zip(self.outputs, self.no_better, strict=True)
-        return tuple(name for name, p in pairs if p > self.level / len(self.outputs))
+        return tuple(name for name, p in pairs if p > self.alpha / len(self.outputs))
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]
@@ -142,7 +142,7 @@ class Validation(eqx.Module):
         verdict = {True: "not rejected", False: "rejected"}
         rows.append(
             f"residuals: whiteness {verdict[self.white]}, independence of the input "
-            f"{verdict[self.independent]} (level {self.level:g})"
+            f"{verdict[self.independent]} (level {self.alpha:g})"
         )
         if self.left_out:
             rows.append(f"records too short to compare, left out: {self.left_out}")
@@ -170,8 +170,8 @@ def validate(
     data: RecordedData,
     *,
     start: Literal["free", "cycle"] = "free",
-    level: Probability = 0.01,
-    reference: SignalNames | None = None,
+    alpha: Probability = 0.01,
+    references: SignalNames | None = None,
 ) -> Validation:
     r"""Simulate a model on data and test the residuals.
 
@@ -200,8 +200,8 @@ def validate(
       model always agrees too well.
     - `start`: "free", the default, estimates the initial state of each record from the record;
       "cycle" takes it as zero. Declared drift of the records is estimated in either case.
-    - `level`: significance level of the tests. Default: 0.01.
-    - `reference`: names of the inputs that enter a control loop from outside. The controller makes
+    - `alpha`: significance level of the tests. Default: 0.01.
+    - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs, which respond to noise; `model` is that of the plant from these to the
       outputs. Residuals are tested for independence of the reference. Default: None.
 
@@ -213,8 +213,8 @@ def validate(
     tested: LDTP | SeriesFit | Predictor = _tested(model)
     records = uninterrupted_records(data)
     outside = records
-    if reference is not None:
-        records, outside = in_loop(data, reference)
+    if references is not None:
+        records, outside = in_loop(data, references)
     require_same("model and data", model, records[0])
     kept = [can_be_compared(tested, record, free_start) for record in records]
     compared = list(itertools.compress(records, kept))
@@ -244,7 +244,7 @@ def validate(
     predicts = isinstance(model, LDTPFit) and model.predictor is not None
     if not predicts and (np.abs(model.multipliers) >= 1).any():
         finite = np.isfinite(simulated[grid.inside]).all()
-        if reference is not None or not finite:
+        if references is not None or not finite:
             raise DefinitionError(
                 "the simulation of an unstable plant grows without bound: validate "
                 "`fit_ldtp(series)`."
@@ -255,7 +255,7 @@ def validate(
     late = np.where((grid.age >= lags)[..., None], error, np.nan)
     inputs = CycleGrid.from_records(list(itertools.compress(outside, kept))).u
     cross_correlation, independence, visible = independence_test(
-        inputs, late, lags, level / ny, roots
+        inputs, late, lags, alpha / ny, roots
     )
     rounding = is_exact(grid, error)  # (shows nothing)
     k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
@@ -274,7 +274,7 @@ def validate(
         cross_correlation=cross_correlation,
         measured=y[k].reshape(-1, ny)[shown],
         simulated=simulated[k].reshape(-1, ny)[shown],
-        level=level,
+        alpha=alpha,
         first_section=first,
         left_out=len(records) - len(compared),
         n_sections=N,

@@ -1,0 +1,91 @@
+"""The smallest standard errors that an experiment allows, before it is made."""
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from .._core.arguments import require_same
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index
+from .._core.execution import one_blas_thread
+from ..errors import DefinitionError
+from ..linear.htf import HTF
+from ..linear.ldtp import LDTP
+from . import variable_projection as varpro, weights
+from .denominator import multipliers_of
+from .joint.frequency import FrequencyProblem
+from .multiplier_estimate import MultiplierEstimate
+from .periodic import PeriodicModel, characteristic_slopes, local_coordinates
+from .realization import default_horizon, realized
+
+
+@checked
+@one_blas_thread()
+def cramer_rao(
+    model: LDTP,
+    htf: HTF,
+    *,
+    estimator: Literal["fit_multipliers", "fit_ldtp"] = "fit_multipliers",
+    extra_lags: Index | None = None,
+) -> MultiplierEstimate:
+    r"""Return the Cramer-Rao bound of the multipliers of a known model.
+
+    The errors of the HTFs are independent, circular and Gaussian. The bound limits the accuracy
+    that an experiment can reach, before the experiment.
+
+    **Arguments:**
+
+    - `model`: the true system. `htf`: frequencies, harmonics and `variance` of the experiment; its
+      H is not used.
+    - `estimator`: the function whose unknowns count. For "fit_multipliers" they are the multipliers
+      and all numerators: the bound is the inverse of $J^T J$, where J is the derivative of the HTFs
+      in units of their standard deviations, projected orthogonally to all changes of the
+      numerators. For "fit_ldtp" they are the matrices A[n], B[n], C[n] (and D[n], if the model has
+      any), of the minimal part of the model. The squared ratio of both standard errors is the
+      factor by which the structure reduces the amount of data. Default: "fit_multipliers".
+    - `extra_lags`: degree of the numerators beyond d N, of "fit_multipliers". Default: N.
+
+    **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;
+    `standard_errors` are bounds of rms errors. For "fit_ldtp" there are as many as the smallest
+    state of the minimal model has coordinates.
+
+    **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
+    few frequencies to find the multipliers at all.
+    """
+    exact = _exact_htf(model, htf)
+    if estimator == "fit_ldtp":
+        return _with_matrices(model, exact)
+    multipliers = model.multipliers
+    c = np.poly(multipliers).real[1:]
+    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), extra_lags), c)
+    return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
+
+
+def _with_matrices(model: LDTP, exact: HTF) -> MultiplierEstimate:
+    """Return the bound if the matrices of the minimal model are the unknowns."""
+    lags = 2 * default_horizon(model.n_sections) + 1
+    minimal = realized(np.asarray(model.impulse_response(lags)))
+    scale = weights.check_values(exact)
+    problem = FrequencyProblem.of(exact, weights.error_weights(exact, scale), scale)
+    direct = bool(np.asarray(model.D).any())
+    coordinates = local_coordinates(PeriodicModel.of(minimal, scale), direct)
+    c, slopes = characteristic_slopes(coordinates)
+    spread = problem.linearize(coordinates).spread()
+    return MultiplierEstimate(multipliers_of(c), c, spread.covariance(slopes), np.inf)
+
+
+def _exact_htf(model: LDTP, htf: HTF) -> HTF:
+    """Return the HTFs of a model with the frequencies, harmonics and variances of others.
+
+    **Raises:** `DefinitionError` if the two do not fit together, or `htf` has no variances.
+    """
+    require_same("model and HTFs", model, htf)
+    if htf.variance is None:
+        raise DefinitionError(
+            "a bound needs HTFs with variances: estimate them from several realizations or "
+            "windows (`repeats`)."
+        )
+    return dataclasses.replace(
+        model.htf(htf.frequencies, htf.harmonics), variance=htf.variance
+    )

@@ -1,0 +1,25 @@
+from ..engine.settings import Settings as Settings
+from ..engine.trajectory import Event as Event, Trajectory as Trajectory
+from .branches import (
+    Branch as Branch,
+    BranchEnd as BranchEnd,
+    BranchPoint as BranchPoint,
+)
+from .coincidence import (
+    SimultaneousEvents as SimultaneousEvents,
+    simultaneous_events as simultaneous_events,
+)
+from .cycle import LimitCycle as LimitCycle
+from .fluctuations import Fluctuations as Fluctuations
+from .limit_cycles import (
+    LimitCycles as LimitCycles,
+    find_limit_cycles as find_limit_cycles,
+)
+from .responses import (
+    Coupling as Coupling,
+    Impulse as Impulse,
+    Locked as Locked,
+    PhaseCurve as PhaseCurve,
+    Responses as Responses,
+)
+from .sensitivity import Sensitivity as Sensitivity

@@ -1,0 +1,66 @@
+"""The number of multipliers that HTFs, or data, support."""
+
+from typing import overload
+
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import Index, Order
+from .._core.findings import warn_of
+from ..errors import DefinitionError
+from ..experiments.record import HasRecords
+from ..identify.multipliers import OrderSelection, compare_orders
+from ..linear.htf import HTF
+from .findings import untried_orders
+from .held_out import HeldOutOrders, split
+
+
+@overload
+def select_order(
+    data: HTF, max_order: Order | None = None, *, extra_lags: Index | None = None
+) -> OrderSelection: ...
+@overload
+def select_order(data: HasRecords, max_order: Order | None = None) -> HeldOutOrders: ...
+@checked
+def select_order(
+    data: HTF | HasRecords,
+    max_order: Order | None = None,
+    *,
+    extra_lags: Index | None = None,
+) -> OrderSelection | HeldOutOrders:
+    r"""Compare numbers of multipliers.
+
+    *HTFs, by rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is
+    removed. The rest has one independent component for each multiplier (D at most), and noise.
+    Components are counted by generalized singular values: each above the largest value of noise
+    alone counts. *HTFs, by MDL*: Rissanen's criterion for a fit of each order, with numerators of
+    the degree that belongs to this order. Without variances the misfit of the largest order is
+    taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors
+    that are not random (a transient, distortion by an input that was not drawn at random) then
+    look like multipliers.
+
+    *Data*: for each number, the model is estimated by total least squares (which is consistent)
+    without the last quarter of every record (see `hj.recordings.hold_out`), and then simulates this
+    part. At most the first 1000 cycles are used. If the data are too few to try a larger number, a
+    warning gives the reason.
+
+    ```python
+    hj.select_order(hj.estimate_htf(data)).order
+    ```
+
+    **Arguments:**
+
+    - `data`: HTFs, or data as for `fit_series`, of experiments or recordings.
+    - `max_order`: the largest number. Default: 5 of HTFs, 4 of data.
+    - `extra_lags`: as in `fit_multipliers`, for HTFs.
+
+    **Returns:** the comparison, whose `order` is the number that is selected.
+
+    **Raises:** `DefinitionError` for HTFs as `fit_multipliers`; for data with too few cycles for
+    one multiplier.
+    """
+    if isinstance(data, HTF):
+        return compare_orders(data, max_order or 5, extra_lags)
+    if extra_lags is not None:
+        raise DefinitionError("`extra_lags` is for HTFs: leave it out for data.")
+    compared, obstacle = split(data).compare_orders(max_order or 4)
+    warn_of(untried_orders(compared.order, obstacle))
+    return compared
