@@ -24,6 +24,7 @@ from .._core.pieces.run import DaskClient
 from .._core.precision import enable_x64
 from .._core.progress import counted, working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded
 from .._core.writing import Format, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
@@ -53,7 +54,7 @@ _FOREST = (
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Study:
+class Study(Showable):
     """Results of `identify_subjects`.
 
     **Fields:** `population` of the subjects that were identified; its table also has `report`,

@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
+from .._core.showable import Showable
 from .._core.text import columns
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
@@ -47,7 +48,7 @@ _WORTH_IT = 1.5
 
 
 @checked_methods
-class OptimalDesign(eqx.Module):
+class OptimalDesign(Showable, eqx.Module):
     """A design that needs the fewest strides, and the design that it improves.
 
     Standard errors are Cramer-Rao bounds: a fit that uses all of the data reaches them where noise

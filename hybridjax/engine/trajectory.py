@@ -18,6 +18,7 @@ from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system, evaluating
@@ -61,7 +62,7 @@ class Event(NamedTuple):
 
 
 @checked_methods
-class Trajectory(eqx.Module):
+class Trajectory(Showable, eqx.Module):
     """A hybrid trajectory: steps, events, and interpolation between steps.
 
     **Fields:** `t`, the ends of the steps; `chart`, the chart after each; `before` and `after`,

@@ -12,6 +12,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import fields, folded, listed
 from ..errors import DefinitionError
 from .record import Record
@@ -46,7 +47,7 @@ class Simulated(eqx.Module):
 
 
 @checked
-class ExperimentData(eqx.Module):
+class ExperimentData(Showable, eqx.Module):
     """Inputs and outputs of S experiments, sampled at the sections of a limit cycle.
 
     **Fields**, all on the host:

@@ -24,6 +24,7 @@ from .._core.pieces.store import (
 )
 from .._core.progress import working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -39,7 +40,7 @@ _KIND = "experiments"
 
 
 @checked
-class StoredExperiments:
+class StoredExperiments(Showable):
     """Experiments in a store that `stream_experiments(..., store=...)` fills.
 
     Iterating over them reads chunk after chunk as `ExperimentData`, so that

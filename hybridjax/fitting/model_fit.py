@@ -16,6 +16,7 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding
 from .._core.html import table, text
 from .._core.results import Result
+from .._core.showable import Showable
 from ..errors import DefinitionError
 from ..identify.fit import Fit, not_converged
 from ..orbits.cycle import LimitCycle
@@ -33,7 +34,7 @@ _RANK = 1e-9
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
 
 
-class Identifiability(eqx.Module):
+class Identifiability(Showable, eqx.Module):
     r"""The combinations of parameters that the data identify, near given values.
 
     With the sensitivities $S_{ij} = p_j\,\partial r_i/\partial p_j$ of the weighted residuals to
@@ -278,7 +279,7 @@ class ModelFit(Fit):
             self._cost(),
             "standard errors include noise, but no distortion:",
         ]
-        for name, value, error, unit in self._rows():
+        for name, value, error, unit in self.rows():
             shown = f"{error} {unit}" if "±" in error else error
             lines.append(f"{name:{width}}  {value:<14} {shown}".rstrip())
         return "\n  ".join(lines)
@@ -306,7 +307,7 @@ class ModelFit(Fit):
         head = f"cost {self.cost:.6g}, {expected}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"
 
-    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
+    def rows(self) -> Iterator[tuple[str, str, str, str]]:
         """Yield each name with its value, standard error and unit."""
         for name, value, error in zip(
             self.names, self.values, self.standard_errors, strict=True
@@ -321,7 +322,7 @@ class ModelFit(Fit):
 
     def _page(self) -> tuple[str, ...]:
         parameters = table(
-            ("parameter", "value", "standard error", "unit"), self._rows()
+            ("parameter", "value", "standard error", "unit"), self.rows()
         )
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
         return of, parameters, text(self._cost())

@@ -12,9 +12,10 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding, print_findings
 from .._core.html import card, text
 from .._core.results import Result
+from .._core.showable import Showable
 
 
-class Fit(eqx.Module):
+class Fit(Showable, eqx.Module):
     """A fit to data.
 
     **Fields** of all fits:
@@ -48,8 +49,6 @@ class Fit(eqx.Module):
         def dof(self) -> float: ...
         @property
         def result(self) -> int: ...
-        @property
-        def findings(self) -> tuple[Finding, ...]: ...
 
     @property
     def modulus(self) -> Float[np.ndarray, " d"]:

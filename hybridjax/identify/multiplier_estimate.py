@@ -15,6 +15,7 @@ from .._core.boundary.values import Complexes
 from .._core.findings import Finding
 from .._core.html import multiplier_table, text, unit_circle
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded
 from ..errors import DefinitionError
 from .denominator import Covariance, multipliers_of
@@ -32,7 +33,7 @@ RoughFit = tuple[Coefficients, Callable[[], Covariance]]
 _BORDER_POINTS = 100
 
 
-class MultiplierComparison(eqx.Module):
+class MultiplierComparison(Showable, eqx.Module):
     """Estimated Floquet multipliers, each paired with a true one.
 
     The pairing has the smallest sum of distances; if the numbers of multipliers differ, the

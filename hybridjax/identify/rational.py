@@ -14,6 +14,7 @@ from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
@@ -37,7 +38,7 @@ _STARTS = (0, 1, 4, 29)
 _ACCURACY = 1e-8
 
 
-class RationalFit(eqx.Module):
+class RationalFit(Showable, eqx.Module):
     r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to $H_0$, one per output.
 
     $$H_0(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}

@@ -12,6 +12,7 @@ from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability, SignalNames
 from .._core.html import COLORS, Curve, card, picture, text
+from .._core.showable import Showable
 from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
 from ..experiments.record import Record, RecordedData, uninterrupted_records
@@ -58,7 +59,7 @@ _DRAWN = 4
 _SAMPLES_PER_LAG = 4
 
 
-class Validation(eqx.Module):
+class Validation(Showable, eqx.Module):
     r"""The part of data that a model explains, and tests of the residuals.
 
     Printing it gives a report; `hj.plot.validation` draws it.

@@ -17,6 +17,7 @@ from .._core.boundary.values import Complexes, Reals, Whole
 from .._core.executor import from_host, is_traced, namespace, put, to_host
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
+from .._core.showable import Showable
 from .._core.signal import ratio, with_unit
 from .._core.text import folded, listed
 from ..errors import DefinitionError
@@ -97,7 +98,7 @@ _SILENT_LINE = 1e-10
 
 
 @checked
-class HTF(eqx.Module):
+class HTF(Showable, eqx.Module):
     r"""Harmonic transfer functions of a periodic system on a grid of input frequencies.
 
     An input $u[n] = e^{i w n}$ has the response

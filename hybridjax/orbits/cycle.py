@@ -27,6 +27,7 @@ from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
@@ -66,7 +67,7 @@ _LEAST_OF_IMPLICIT = 1e-10
 
 
 @checked_methods
-class LimitCycle(eqx.Module):
+class LimitCycle(Showable, eqx.Module):
     """A periodic orbit of a hybrid system.
 
     **Fields:**

@@ -12,6 +12,7 @@ from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNam
 from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
+from .._core.showable import Showable
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit, fit_series
@@ -41,7 +42,7 @@ MEANING = (
 )
 
 
-class Identification(eqx.Module):
+class Identification(Showable, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `inspect` leaves out; `findings` of the
@@ -51,7 +52,7 @@ class Identification(eqx.Module):
     """
 
     recording: Recording
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
     phase: Phase
     data: SectionData
     fit: SeriesFit

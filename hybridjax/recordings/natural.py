@@ -24,6 +24,7 @@ from .._core.boundary.kinds import Probability, Seed
 from .._core.boundary.values import Whole
 from .._core.findings import Finding, print_findings
 from .._core.progress import working
+from .._core.showable import Showable
 from ..errors import DefinitionError
 from .data import SectionData
 from .fit_warnings import about_natural_multipliers
@@ -44,7 +45,7 @@ MultiplierCount = Annotated[int, Whole(1, 12)]
 
 
 @checked_methods
-class NaturalMultipliers(eqx.Module):
+class NaturalMultipliers(Showable, eqx.Module):
     """Multipliers of a rhythm that nobody perturbed.
 
     **Fields:**

@@ -14,6 +14,7 @@ from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings
+from .._core.showable import Showable
 from .._core.signal import with_unit
 from .._core.text import folded
 from ..errors import DefinitionError
@@ -46,7 +47,7 @@ class Trial(eqx.Module):
 
 
 @checked
-class Recording(eqx.Module):
+class Recording(Showable, eqx.Module):
     """Sampled signals of one or several trials. Nothing is resampled.
 
     **Fields:**
@@ -59,7 +60,7 @@ class Recording(eqx.Module):
     trials: tuple[Trial, ...]
     signals: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
 
     def __init__(
         self,

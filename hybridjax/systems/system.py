@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
+from .._core.boundary.leads import missing_attribute
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
 from .._core.executor import Definition, is_tracer
@@ -309,6 +310,16 @@ class HybridSystem(Definition):
         one state as a vector field is. `q` holds the states of the chart and the values of those
         that it lacks (`Chart.absent`) by name. `None`, the default: states are drawn over time."""
         return None
+
+    def replace(self, **parameters: Any) -> "HybridSystem":
+        """Return the system with other parameters: `system.replace(k=9.0)`.
+
+        **Raises:** `DefinitionError` for a name that is no parameter, and for a value that a
+        parameter may not have.
+        """
+        return dataclasses.replace(self, **parameters)
+
+    __getattr__ = missing_attribute
 
     def __repr__(self):
         rows = []
