@@ -7,7 +7,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names, require_axes
+from .._core.arguments import (
+    Numbers,
+    input_and_output_names,
+    require_among,
+    require_axes,
+)
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
@@ -147,6 +152,21 @@ class ExperimentData(Showable, eqx.Module):
                 f"experiment {s}: {name} is not finite at sample {i}: repair the record, or mark "
                 "the experiment as failed in `result`."
             )
+
+    def __len__(self) -> int:
+        """The number of experiments."""
+        return len(self.u)
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, "S n"]:
+        """An input or output of all experiments: `data["yM"]`.
+
+        **Raises:** `DefinitionError` for a signal that does not exist.
+        """
+        signals = (*self.inputs, *self.outputs)
+        require_among("signal", [name], signals)
+        k = signals.index(name)
+        nu = len(self.inputs)
+        return self.u[:, :, k] if k < nu else self.y[:, :, k - nu]
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:

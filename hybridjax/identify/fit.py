@@ -13,6 +13,8 @@ from .._core.findings import Finding, print_findings
 from .._core.html import card, text
 from .._core.results import Result
 from .._core.showable import Showable
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
 
 
 class Fit(Showable, eqx.Module):
@@ -31,6 +33,9 @@ class Fit(Showable, eqx.Module):
     - `dof`: degrees of freedom of the residuals: numbers in the data less unknowns.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.
+
+    All fits have `modulus`, `standard_errors`, `interval`, `compare`, `contains`, `plot` and
+    `to_pandas`, and `hj.save` writes them.
     """
 
     if TYPE_CHECKING:
@@ -61,8 +66,28 @@ class Fit(Showable, eqx.Module):
         """Standard error of each estimated number."""
 
     @abstractmethod
+    def compare(self, other: Any) -> Any:
+        """Compare with a truth, or with another fit; the result has a `p_value`."""
+
+    @abstractmethod
+    def contains(self, true: Any, level: float = 0.95) -> Any:
+        """Test whether a truth lies in the confidence region of this level."""
+
+    @abstractmethod
     def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return the real numbers of which `interval` gives bounds, and their standard errors."""
+
+    def linear_model(self, data: Any) -> Any:
+        """Return the `LDTP` that is simulated on data to validate the fit.
+
+        **Raises:** `DefinitionError` for a fit that has no model, or none with the data's sections.
+        """
+        if isinstance(self.model, LDTP):
+            return self.model
+        raise DefinitionError(
+            f"{type(self).__name__} has no model that can be simulated: validate that of "
+            "`hj.fit_series` or `hj.fit_ldtp`."
+        )
 
     @abstractmethod
     def _summary(self) -> str:

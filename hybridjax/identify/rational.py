@@ -18,7 +18,7 @@ from .._core.showable import Showable
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
-from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
+from .multiplier_estimate import MultiplierComparison, Truth, compare_multipliers
 from .variable_projection import (
     HTFGroup,
     Response,
@@ -81,11 +81,17 @@ class RationalFit(Showable, eqx.Module):
         H = (top / bottom * delay).T[None, :, :, None]
         return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
+    @property
+    def modulus(self) -> Float[np.ndarray, "ny n"]:
+        """The moduli of the multipliers."""
+        return np.abs(self.multipliers)
+
     @checked
     def compare(
-        self, true: Multipliers, output: str | int | None = None
+        self, true: Truth, output: str | int | None = None
     ) -> MultiplierComparison:
         """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
+        There is no test: the errors of this fit are not known.
 
         **Raises:** `DefinitionError` for an output that is not there.
         """

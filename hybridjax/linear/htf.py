@@ -303,6 +303,11 @@ class HTF(Showable, eqx.Module):
         require_chain("feedback", other.outputs, self.inputs, self, other)
         return _combined(algebra.feedback, [self, other], self.inputs, self.outputs)
 
+    @property
+    def standard_errors(self) -> Float[Array, "M F ny nu"] | None:
+        """Root of the variance; None if it is unknown."""
+        return None if self.variance is None else jnp.sqrt(self.variance)
+
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.
 

@@ -260,6 +260,13 @@ class LimitCycle(Showable, eqx.Module):
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
 
+    is_stable = stable
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " r"]:
+        """The moduli of the multipliers: the parts of deviations that are left after a period."""
+        return np.abs(self.multipliers)
+
     @property
     def state(self) -> dict[str, float]:
         """The state at `anchor`, by name."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from .._core.boundary.values import with_article
 from .._core.showable import Showable
 from .._core.signal import with_unit
 from ..designs.optimize import OptimalDesign
@@ -13,7 +14,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..experiments.record import Record
-from ..fitting.model_fit import Identifiability, ModelFit
+from ..fitting.model_fit import Identifiability, ParameterFit
 from ..identify.loops import Loop
 from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
 from ..identify.multipliers import OrderSelection
@@ -48,7 +49,8 @@ def draw(result: Showable, *args: Any, **options: Any) -> Plot:
     **Raises:** `DefinitionError` for a type that has no figure.
     """
     raise DefinitionError(
-        f"a {type(result).__name__} has no figure: print it, or draw its fields."
+        f"there is no figure of {with_article(type(result).__name__)}: print it, or draw its "
+        "fields."
     )
 
 
@@ -197,7 +199,7 @@ def _(result: OrderSelection, *, ax: AxesLike | None = None) -> Plot:
 
 
 @draw.register
-def _(result: ModelFit, *, ax: AxesLike | None = None) -> Plot:
+def _(result: ParameterFit, *, ax: AxesLike | None = None) -> Plot:
     """95 % intervals of the fitted parameters, relative to their values."""
     size = np.where(result.values == 0, 1.0, np.abs(result.values))
     reach = 100 * (result.interval()[:, 1] - result.values) / size

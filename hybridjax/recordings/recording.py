@@ -259,6 +259,34 @@ class Recording(Showable, eqx.Module):
         require_among("signal", [name], self.signals)
         return self.signals.index(name)
 
+    def __len__(self) -> int:
+        """The number of trials."""
+        return len(self.trials)
+
+    def __getitem__(self, name: str) -> Series:
+        """The samples of a signal, one trial after the other: `recording["yM"]`.
+
+        **Raises:** `DefinitionError` for a signal that does not exist.
+        """
+        return np.concatenate([x for _, x in self.samples(name)])
+
+    @property
+    def time(self) -> Series:
+        """The times of all samples in s, one trial after the other."""
+        return np.concatenate([trial.time for trial in self.trials])
+
+    @property
+    def rate(self) -> float:
+        """Samples per second: one over the median time between samples."""
+        return float(
+            1 / np.median(np.concatenate([np.diff(t.time) for t in self.trials]))
+        )
+
+    @property
+    def duration(self) -> float:
+        """The length of all trials together, in s."""
+        return float(sum(np.ptp(trial.time) for trial in self.trials))
+
     def samples(self, name: str) -> list[tuple[Trial, Series]]:
         """Return each trial with the samples of a signal."""
         return [(trial, trial.values[:, self.column(name)]) for trial in self.trials]

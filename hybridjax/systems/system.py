@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core.boundary.checked import check_fields, checked
-from .._core.boundary.leads import missing_attribute
 from .._core.boundary.containers import Names
 from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
+from .._core.boundary.leads import missing_attribute
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
 from .._core.pieces.description import digest_of, marked

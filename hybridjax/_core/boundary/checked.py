@@ -249,7 +249,9 @@ class _Names(NamedTuple):
     def of(cls, signature: inspect.Signature) -> "_Names":
         parameters = list(signature.parameters.values())
         kinds = [p.kind for p in parameters]
-        named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+        named = [
+            p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+        ]
         positional = [p.name for p in named if p.kind <= p.POSITIONAL_OR_KEYWORD]
         return cls(
             tuple(p.name for p in named),

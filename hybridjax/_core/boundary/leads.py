@@ -16,7 +16,7 @@ from .values import Kind, with_article
 
 
 MAKERS = {
-    "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of them makes "
+    "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "
     "sections",
     "Branch": "`hj.continuation(cycle, parameter, (low, high))` makes one",
     "Crossing": "`hj.Crossing('y', 'falling')` makes one",
@@ -25,10 +25,14 @@ MAKERS = {
     "Guess": "`hj.Guess(chart, state)` makes one",
     "HTF": "`hj.estimate_htf(data)` or `model.htf(frequencies)` makes one",
     "HybridSystem": "`hj.models` has ready ones, and subclasses of `hj.HybridSystem` are others",
+    "HasMultipliers": "limit cycles, models and fits have them",
+    "HasRecords": "`hj.run_experiments(cycle, sections, design, outputs)` makes data, and "
+    "`hj.identify_recording` those of a recording",
     "Identification": "`hj.identify_recording(recording, ...)` makes one",
     "LDTP": "`hj.linearize(cycle, sections)` or `hj.fit_ldtp(data, ...)` makes one",
     "LimitCycle": "`hj.find_limit_cycle(system)` makes one",
     "LimitCycles": "`hj.orbits.find_limit_cycles(systems)` makes one",
+    "Fit": "`hj.fit_multipliers(htf, order)` or `hj.fit_series(data, order)` makes one",
     "MultiplierFit": "`hj.fit_multipliers(htf, order)` makes one",
     "OptimalDesign": "`hj.optimal_design(model)` makes one",
     "Phase": "`hj.recordings.estimate_phase(recording, sections)` makes one",
@@ -51,20 +55,56 @@ STEPS = {
     ("HTF", "SectionData"): "`hj.fit_series(data, order)` fits data at sections",
     ("HTF", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
     ("HTF", "LDTP"): "`model.htf(frequencies)` makes one of a model",
-    ("HTF", "LimitCycle"): "`hj.linearize(cycle, sections).htf(frequencies)` makes one of a cycle",
+    (
+        "HTF",
+        "LimitCycle",
+    ): "`hj.linearize(cycle, sections).htf(frequencies)` makes one of a cycle",
     ("HTF", "Fit"): "`fit.htf(frequencies)` makes one of a fit",
     ("LDTP", "LimitCycle"): "`hj.linearize(cycle, sections)` makes one of a cycle",
-    ("LDTP", "HybridSystem"): "`hj.linearize(hj.find_limit_cycle(system), sections)` makes one of a "
-    "system",
+    (
+        "LDTP",
+        "HybridSystem",
+    ): "`hj.linearize(hj.find_limit_cycle(system), sections)` makes one of a system",
     ("LDTP", "HTF"): "`hj.fit_ldtp(htf, ...)` makes one of an HTF",
-    ("ExperimentData", "HTF"): "it takes the data: `hj.fit_multipliers(htf, order)` takes an HTF",
-    ("ExperimentData", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
-    ("ExperimentData", "LDTP"): "`hj.run_experiments(model, ...)` makes data of a model",
+    (
+        "ExperimentData",
+        "HTF",
+    ): "it takes the data: `hj.fit_multipliers(htf, order)` takes an HTF",
+    (
+        "ExperimentData",
+        "Recording",
+    ): "`hj.identify_recording(recording, ...)` takes recordings",
+    (
+        "ExperimentData",
+        "LDTP",
+    ): "`hj.run_experiments(model, ...)` makes data of a model",
+    (
+        "HasRecords",
+        "HTF",
+    ): "it takes the data; `hj.fit_multipliers(htf, order)` takes an HTF",
+    (
+        "HasRecords",
+        "Recording",
+    ): "`hj.identify_recording(recording, ...)` takes recordings",
+    (
+        "HasRecords",
+        "LimitCycle",
+    ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
+    ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
+    ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
     ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
-    ("LimitCycle", "LDTP"): "it needs the cycle that was linearized: `hj.find_limit_cycle(system)`",
-    ("AbstractObservation", "HTF"): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
-    ("AbstractObservation", "ExperimentData"): "`hj.fitting.ObservedSeries(data, sections)` makes "
-    "one of data",
+    (
+        "LimitCycle",
+        "LDTP",
+    ): "it needs the cycle that was linearized: `hj.find_limit_cycle(system)`",
+    (
+        "AbstractObservation",
+        "HTF",
+    ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
+    (
+        "AbstractObservation",
+        "ExperimentData",
+    ): "`hj.fitting.ObservedSeries(data, sections)` makes one of data",
 }
 """For a type that is needed, and one that was given, the step between them. A given type also
 stands for those derived from it."""
@@ -161,7 +201,7 @@ atol: abs_tol
 batch_size: batch
 channels: ch_names columns picks channel pick ch chs
 chi2: chisq redchi fun loss objective cost misfit chi_square
-ci: conf_int confint confidence_interval confidence_intervals intervals bounds error_bar conf_interval
+ci: conf_int confint confidence_interval confidence_intervals intervals bounds conf_interval
 coef: coef_ coefs coefficients beta theta popt weights
 confidence: conf conf_level cl coverage confidence_level
 cov: vcov pcov cov_params cov_x covariance_matrix
@@ -233,11 +273,11 @@ KEYWORDS = {
     "run_experiments.noise": "`hj.experiments.add_noise(data, std=...)` adds noise to data, and "
     "`process_noise` acts on the system",
     "find_limit_cycle.settings": "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=1000)`",
-    "simulate.settings": "the step follows from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
+    "simulate.settings": "steps follow from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
     "`trajectory.dense()` has values between steps",
-    "simulate.guess": "pass the name of a chart and a state there: `hj.simulate(system, chart, "
-    "state, duration)`",
-    "multisine.amplitude": "pass `amplitude`, of each cosine; `design.scaled(rms)` sets the rms value",
+    "simulate.guess": "pass the name of a chart and a state there, or a guess: "
+    "`hj.simulate(system, guess, duration)`",
+    "multisine.amplitude": "pass `amplitude`, of each cosine; `design.scaled(rms)` sets the rms",
     "multisine.realizations": "`design.realizations(4)` repeats a design with new phases",
     "multisine.experiments": "`design.realizations(4)` repeats a design with new phases; "
     "`experiments` is their number for one set of frequencies",
@@ -255,7 +295,7 @@ ATTRIBUTES = {
     "AbstractSections.on": "`hj.place_sections(cycle, sections)` places them",
     "Design.u": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
     "Design.to_numpy": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
-    "ExperimentData.duration": "`len(data)` is the number of experiments, `data.u.shape` is (S, n, nu)",
+    "ExperimentData.duration": "`len(data)` is the number of experiments, each of `data.u.shape[1]` samples",
     "ExperimentData.fs": "samples lie on sections: there are `data.n_sections` in a period",
     "ExperimentData.t": "samples lie on sections: sample i on section `i % data.n_sections`",
     "ExperimentData.shape": "`data.u` is (S, n, nu) and `data.y` is (S, n, ny)",
@@ -265,8 +305,8 @@ ATTRIBUTES = {
     "Fit.pvalue": "`fit.compare(other)` returns one",
     "Fit.pvalues": "`fit.compare(other)` returns them",
     "Fit.score": "`hj.validate(fit, data)` compares a fit with data",
-    "Fit.predict": "`hj.validate(fit, data)` compares a fit with data, and `fit.htf(frequencies)` is "
-    "its response",
+    "Fit.predict": "`hj.validate(fit, data)` compares it with data, and `fit.htf(frequencies)` is its "
+    "response",
     "Fit.fit": "`hj.fit_multipliers`, `hj.fit_series`, `hj.fit_ldtp` and `hj.fit_model` fit",
     "Fit.summary": "`print(fit)` shows a summary",
     "HTF.coherence": "`htf.variance` and `htf.standard_error` have the errors",
@@ -296,23 +336,27 @@ ATTRIBUTES = {
     "LimitCycle.jacobian": "`cycle.multipliers` has the eigenvalues of the return map's Jacobian",
     "LimitCycle.find": "`hj.find_limit_cycle(system)` finds one",
     "Plot.savefig": "`plot.save(path)` writes the figure, and `plot.figure` is that of matplotlib",
+    "RationalFit.contains": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
+    "RationalFit.interval": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
+    "RationalFit.standard_errors": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
     "Recording.crop": "`hj.Recording(time[part], {name: x[part]})` makes a part",
-    "Recording.data": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all",
-    "Recording.duration": "`recording.trials` have their `time`: `np.ptp(trial.time)`",
+    "Recording.data": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all "
+    "signals",
     "Recording.filter": "`bandwidth`, an argument of `hj.identify_recording`, smooths signals",
     "Recording.get_data": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` "
-    "all",
+    "all signals",
     "Recording.info": "`print(recording)` shows signals, units and rates",
     "Recording.head": "`recording.to_pandas().head()` shows the first samples",
     "Recording.pick": "`recording['yM']` has the samples of a signal",
     "Recording.resample": "`hj.identify_recording` takes any rate, also uneven times",
-    "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all",
+    "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all "
+    "signals",
     "Recording.shape": "`recording.trials` has them, with `time` and `values`",
     "Trajectory.sol": "`trajectory.dense()` has values between steps",
     "Trajectory.x": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.y": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.ys": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.states": "`trajectory.after` has the states (n, d), `trajectory.to_pandas()` a table",
+    "Trajectory.states": "`trajectory.after` has the states (n, d), and `trajectory.to_pandas()` all",
     "Trajectory.t_events": "`trajectory.events` has events with their `time`",
     "Trajectory.y_events": "`trajectory.events` has events with the states before and after",
 }
@@ -405,7 +449,7 @@ def about_attribute(cls: type, name: str) -> str:
         lead = ATTRIBUTES.get(f"{base.__name__}.{name}")
         if lead is not None:
             return f"{head}: {lead}."
-    word = closest(name, attributes)
+    word = closest(name, attributes) or _documented(cls, name)
     if word is not None:
         return f"{head}: use `{word}`."
     function = place_of(name)
@@ -414,13 +458,23 @@ def about_attribute(cls: type, name: str) -> str:
     return f"{head}; it has {_some(attributes)}."
 
 
+def _documented(cls: type, name: str) -> str | None:
+    """Return the parameter of a system whose description has this word."""
+    if dataclasses.is_dataclass(cls):
+        for field in dataclasses.fields(cls):
+            if name in field.metadata.get("doc", "").split():
+                return field.name
+    return None
+
+
 def attributes_of(cls: type) -> list[str]:
     """Return the public attributes of a class, its fields first."""
     fields: list[str] = []
     if dataclasses.is_dataclass(cls):
-        fields = [field.name for field in dataclasses.fields(cls)]
+        fields = [field.name for field in dataclasses.fields(cls) if field.repr]
     names = dict.fromkeys([*fields, *dir(cls)])
-    return [name for name in names if not name.startswith("_")]
+    hidden = {"code_digest"}
+    return [name for name in names if name[0] != "_" and name not in hidden]
 
 
 def about_keyword(function: str, name: str, parameters: Sequence[str]) -> str:
@@ -475,13 +529,16 @@ def classes_in(kind: Kind | None) -> Iterable[type]:
     cls = getattr(kind, "cls", None)
     if cls is not None:
         yield cls
-    for part in getattr(kind, "kinds", ()):
+    item = getattr(kind, "item", None)
+    for part in (*getattr(kind, "kinds", ()), *([item] if item else [])):
         yield from classes_in(part)
 
 
 def _part(value: Any, cls: type) -> str | None:
     """Return the name of the field of an object that holds one of the class."""
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return None
+    if getattr(cls, "_is_protocol", False):
         return None
     for field in dataclasses.fields(value):
         part = getattr(value, field.name, None)
