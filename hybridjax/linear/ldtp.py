@@ -227,8 +227,8 @@ class LDTP(Showable, eqx.Module):
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), or (n,) of a single input, from `first_section` on; `x0`, the state there, either
-        padded (d,) or with its true dimension. Default: zero.
+        **Arguments:** `u` (n, nu), or (n,) of a single input, from `first_section` on; `x0`, the
+        state there, either padded (d,) or with its true dimension. Default: zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
@@ -433,7 +433,7 @@ class LDTP(Showable, eqx.Module):
         nu = len(self.inputs)
         if u.ndim == 1 and nu == 1:
             u = u[:, None]
-        if u.ndim != 2 or u.shape[1] != nu:
+        if u.ndim < 2 or u.shape[-1] != nu:
             raise DefinitionError(
                 f"`u` must be of shape (n, {nu}), with a column for each input "
                 f"({', '.join(self.inputs)}), not of shape {u.shape}."

@@ -273,7 +273,8 @@ KEYWORDS = {
     "run_experiments.noise": "`hj.experiments.add_noise(data, std=...)` adds noise to data, and "
     "`process_noise` acts on the system",
     "find_limit_cycle.settings": "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=1000)`",
-    "simulate.settings": "steps follow from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
+    "simulate.settings": "steps "
+    "follow from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
     "`trajectory.dense()` has values between steps",
     "simulate.guess": "pass the name of a chart and a state there, or a guess: "
     "`hj.simulate(system, guess, duration)`",
@@ -295,7 +296,7 @@ ATTRIBUTES = {
     "AbstractSections.on": "`hj.place_sections(cycle, sections)` places them",
     "Design.u": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
     "Design.to_numpy": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
-    "ExperimentData.duration": "`len(data)` is the number of experiments, each of `data.u.shape[1]` samples",
+    "ExperimentData.duration": "each of the `len(data)` experiments has `data.u.shape[1]` samples",
     "ExperimentData.fs": "samples lie on sections: there are `data.n_sections` in a period",
     "ExperimentData.t": "samples lie on sections: sample i on section `i % data.n_sections`",
     "ExperimentData.shape": "`data.u` is (S, n, nu) and `data.y` is (S, n, ny)",
@@ -305,7 +306,8 @@ ATTRIBUTES = {
     "Fit.pvalue": "`fit.compare(other)` returns one",
     "Fit.pvalues": "`fit.compare(other)` returns them",
     "Fit.score": "`hj.validate(fit, data)` compares a fit with data",
-    "Fit.predict": "`hj.validate(fit, data)` compares it with data, and `fit.htf(frequencies)` is its "
+    "Fit.predict": "`hj.validate(fit, data)` "
+    "compares it with data, and `fit.htf(frequencies)` is its "
     "response",
     "Fit.fit": "`hj.fit_multipliers`, `hj.fit_series`, `hj.fit_ldtp` and `hj.fit_model` fit",
     "Fit.summary": "`print(fit)` shows a summary",
@@ -349,14 +351,14 @@ ATTRIBUTES = {
     "Recording.head": "`recording.to_pandas().head()` shows the first samples",
     "Recording.pick": "`recording['yM']` has the samples of a signal",
     "Recording.resample": "`hj.identify_recording` takes any rate, also uneven times",
-    "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all "
-    "signals",
+    "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` "
+    "all signals",
     "Recording.shape": "`recording.trials` has them, with `time` and `values`",
     "Trajectory.sol": "`trajectory.dense()` has values between steps",
     "Trajectory.x": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.y": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.ys": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.states": "`trajectory.after` has the states (n, d), and `trajectory.to_pandas()` all",
+    "Trajectory.states": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.t_events": "`trajectory.events` has events with their `time`",
     "Trajectory.y_events": "`trajectory.events` has events with the states before and after",
 }
