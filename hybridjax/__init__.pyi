@@ -43,6 +43,7 @@ from .fitting.observations import (
     ObservedSeries as ObservedSeries,
 )
 from .fitting.stability import spectral_radius as spectral_radius
+from .identify.from_system import identify_model as identify_model
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
 from .identify.multipliers import (
