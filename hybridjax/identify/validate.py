@@ -250,7 +250,7 @@ def validate(
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):
-        simulated = tested.predict(grid, free_start)
+        simulated = tested.predicted(grid, free_start)
         error = y - simulated
         no_better = _no_better(y, error)
     predicts = isinstance(model, LDTPFit) and model.predictor is not None

@@ -259,7 +259,7 @@ def test_residuals_tell_of_the_loop(plant):
             CycleGrid.from_records([record]),
         )
         assert (
-            feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3
+            feedback_test(grid, grid.y - fit.predicted(grid, True))[0] < 1e-3
         ) == answers
     unstable = hj.LDTP(1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1)))
     unstable = dataclasses.replace(unstable, inputs=("u",), outputs=early.outputs)

@@ -215,10 +215,12 @@ class _Kinds:
             named = ", ".join(f"`{name}`" for name in by_name)
             return f"{first}; give others by name: {named}."
         given = {*kwargs, *names.positional[: len(args)]}
+        # (An argument that does not fit tells more than one that is missing.)
+        self.take(args, dict(kwargs))
         name = next(x for x in names.in_order if x in names.required - given)
         kind = self.by_name[name]
         about = "" if kind is None else f" ({kind.allowed})"
-        return f"{function} needs `{name}`{about}{leads.about_object(kind, None)}."
+        return f"{function} needs `{name}`{about}{leads.about_object(function, kind, None)}."
 
     def _lead(self, name: str, kind: Kind | None, value: Any, args: tuple) -> str:
         """Return the rest of the sentence about a value that does not fit."""
@@ -228,7 +230,7 @@ class _Kinds:
                 continue
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
-        return leads.about_object(kind, value)
+        return leads.about_object(self.function.__name__, kind, value)
 
     @functools.cached_property
     def _names(self) -> "_Names":

@@ -109,6 +109,20 @@ STEPS = {
 """For a type that is needed, and one that was given, the step between them. A given type also
 stands for those derived from it."""
 
+OBJECTS = {
+    "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
+    "fit_series.LDTP": "are the model and the data in the wrong order?",
+    "save.LimitCycle": "a cycle contains the code of its system: `cycle.to_pandas()` has its numbers",
+    "save.HybridSystem": "a system is code: keep the script that makes it",
+    "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
+    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it, and `data.records` can be saved",
+    "save.Identification": "save its `fit`, or write `hj.recordings.write_report(folder, result)`",
+    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
+    "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
+}
+"""For a function, and the type of the object that it was given, what to do. A given type also
+stands for those derived from it."""
+
 WORDS = {
     "A": ("amplitude",),
     "N": ("n_sections",),
@@ -314,6 +328,7 @@ ATTRIBUTES = {
     "HTF.coherence": "`htf.variance` and `htf.standard_error` have the errors",
     "HTF.magnitude": "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
     "HTF.phase": "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
+    "HTF.harmonic": "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values",
     "HTF.gain": "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
     "HTF.bode": "`hj.plot.bode(htf)` draws it",
     "HTF.shape": "`htf.H` has the shape (harmonics, frequencies, outputs, inputs)",
@@ -364,9 +379,31 @@ ATTRIBUTES = {
 }
 """More than a word for an attribute that a class, or one derived from it, has not."""
 
+IN_NAMESPACES = {
+    "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
+    "other fields are arrays",
+    "models": "`dir(hj.models)` lists them",
+    "plot": "`result.plot()` draws any result, and `dir(hj.plot)` lists all figures",
+}
+"""Where a name is none of a namespace's, and close to no other one."""
+
+CALLED = {
+    "identify": "`hj.fit_multipliers(htf, order)`, `hj.fit_series(data, order)` and "
+    "`hj.identify_recording(recording, ...)` identify",
+    "plot": "`result.plot()` draws a result, and `hj.plot.bode(htf)` an HTF",
+    "fitting": "`hj.fit_model(system, observations, parameters)` fits",
+    "experiments": "`hj.run_experiments(cycle, sections, design, outputs)` runs some",
+    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
+    "linear": "`hj.linearize(cycle, sections)` linearizes",
+    "convert": "`result.to_pandas()` and `hj.convert.to_xarray(result)` convert",
+    "models": "`hj.models.VerticalHopper()` is one",
+}
+"""What does what a call of a namespace means."""
+
 NAMES = {
     "bode_plot": "hj.plot.bode(htf)",
     "compare": "fit.compare(other)",
+    "convert.to_numpy": "result.to_pandas().to_numpy()",
     "cycle": "hj.find_limit_cycle(system)",
     "diffeqsolve": "hj.simulate(system, chart, state, duration)",
     "dlsim": "model.simulate(u)",
@@ -405,6 +442,9 @@ NAMES = {
     "shooting": "hj.find_limit_cycle(system)",
     "solve_ivp": "hj.simulate(system, chart, state, duration)",
     "ss": "hj.linear.LDTP(A, B, C, D)",
+    "plot.nyquist": "hj.plot.bode(htf)",
+    "plot.time_series": "recording.plot()",
+    "plot.trajectory": "trajectory.plot()",
     "stability": "hj.find_limit_cycle(system).is_stable",
     "step_response": "model.simulate(np.ones((n, nu)))",
     "subjects": "hj.identify_subjects(table, folder)",
@@ -412,11 +452,33 @@ NAMES = {
     "transfer_function": "model.htf(frequencies)",
     "trajectory": "hj.simulate(system, chart, state, duration)",
 }
-"""Names of modules that are none, and the call that does it."""
+"""Names that a module has not, and the call that does what they mean. Those of the package stand
+alone, and those of a namespace after its name."""
 
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
 # is longer than a line.
 _LISTED = 24
+
+
+def about_name(package: str, name: str) -> str | None:
+    """Return the rest of the sentence about a name that a namespace has not, where a call does what
+    it means; None if none is known."""
+    namespace = package.rpartition(".")[2]
+    key = name if namespace == "hybridjax" else f"{namespace}.{name}"
+    call = NAMES.get(key)
+    return None if call is None else f"use `{call}`"
+
+
+def about_namespace(package: str) -> str:
+    """Return the rest of the sentence about a name that is close to no other one."""
+    return IN_NAMESPACES.get(package.rpartition(".")[2], "")
+
+
+def about_called(package: str) -> str:
+    """Return the sentence about a module that was called like a function."""
+    name = package.rpartition(".")[2]
+    lead = CALLED.get(name, f"`dir(hj.{name})` lists its names")
+    return f"`hj.{name}` is a module: {lead}."
 
 
 class UnknownAttribute(HybridJaxError, AttributeError):
@@ -508,9 +570,13 @@ def closest(name: str, among: Collection[str]) -> str | None:
     return None
 
 
-def about_object(kind: Kind | None, value: Any) -> str:
-    """Return the call that makes what is needed instead of a value, or the part of it that is
-    needed, as the rest of a sentence; "" if none is known."""
+def about_object(function: str, kind: Kind | None, value: Any) -> str:
+    """Return the call that makes what a function needs instead of a value, or the part of it that
+    is needed, as the rest of a sentence; "" if none is known."""
+    for base in type(value).__mro__:
+        lead = OBJECTS.get(f"{function}.{base.__name__}")
+        if lead is not None:
+            return f": {lead}"
     wanted = list(classes_in(kind))
     for cls in wanted:
         part = _part(value, cls)
