@@ -8,10 +8,12 @@ no pickle, and only the kinds listed here are built, by their own checked constr
 
 import typing
 from pathlib import Path
+from typing import Annotated
 
 from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
 from ._core.boundary.kinds import FilePath
+from ._core.boundary.values import Plain
 from ._core.precision import require_x64
 from .errors import DefinitionError
 from .experiments.data import ExperimentData
@@ -45,11 +47,19 @@ Saved = (
     | StructuredFit
 )
 
+Written = Annotated[
+    Saved | ModelFit,
+    Plain(
+        "a design, data, a transfer function, a model or a fit",
+        lambda thing: isinstance(thing, (*KINDS.values(), ModelFit)),
+    ),
+]
+
 KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 
 
 @checked
-def save(path: FilePath, thing: Saved | ModelFit) -> None:
+def save(path: FilePath, thing: Written) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
     Of a `ModelFit` the numbers are written, as its `estimate`: its system is code of the user,

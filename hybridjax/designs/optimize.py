@@ -282,11 +282,11 @@ def optimal_design(
       from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
       `hj.designs.Limits`, which also limits peaks, rates, strides and distortion.
       Default: `"input"`.
-    - `noise`: standard deviation of the white noise of each measured output, by name; or a function
-      of the frequency of the output (0 to N/2 cycles per period). Its value is the standard
-      deviation of white noise with the spectral density at this frequency. Default: all outputs are
-      measured, with white noise of a tenth of their rms deviation in `design`, scaled to the
-      limits.
+    - `noise`: standard deviation of the white noise of each measured output, by name, or one number
+      for all outputs; or, by name, a function of the frequency of the output (0 to N/2 cycles per
+      period). Its value is the standard deviation of white noise with the spectral density at this
+      frequency. Default: all outputs are measured, with white noise of a tenth of their rms
+      deviation in `design`, scaled to the limits.
     - `seed`: seed of the phases, and of the division of cosines among experiments. Default: 0.
     - `robust`: with several models, minimize the `"mean"` of their criteria, or the `"worst"` one
       (approximately: a power mean with exponent 16). Default: `"mean"`.

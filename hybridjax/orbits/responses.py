@@ -34,7 +34,7 @@ from .._core.meaning import require_as_made
 from .._core.results import Result
 from .._core.showable import Showable
 from .._core.signal import unit_of
-from .._core.text import number
+from .._core.text import fields, number
 from ..engine import kernels
 from ..engine.lanes import lane_at
 from ..engine.move import move
@@ -66,6 +66,8 @@ class PhaseCurve(Showable, eqx.Module):
     values: Float[np.ndarray, " P"]
     input: str = eqx.field(static=True)
     time_unit: str = eqx.field(static=True, default="s", kw_only=True)
+
+    __repr__ = fields
 
     @property
     def unit(self) -> str:
@@ -108,6 +110,8 @@ class Coupling(Showable, eqx.Module):
         xp, n = namespace(self.coefficients), np.arange(len(self.coefficients))
         waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
         return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
+
+    __repr__ = fields
 
     @property
     def locking(self) -> tuple[float, float]:

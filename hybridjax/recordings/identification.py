@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, Order, SectionCount, SignalNames
@@ -60,6 +62,16 @@ class Identification(Showable, eqx.Module):
     responses: ImpulseResponses
     curve: PhaseResponse | None
     advice: Advice
+
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        """Those of the fit."""
+        return self.fit.multipliers
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " d"]:
+        """Moduli of the multipliers."""
+        return self.fit.modulus
 
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]

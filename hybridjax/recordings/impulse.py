@@ -11,6 +11,7 @@ from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Number
 from .._core.showable import Showable
+from .._core.text import fields
 from ..errors import DefinitionError
 from ..experiments.record import average_cycle
 from ..identify.series.fit import SeriesFit
@@ -53,6 +54,8 @@ class ImpulseResponses(Showable, eqx.Module):
     durations: Float[np.ndarray, " N"]
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    __repr__ = fields
 
     n_sections = property(lambda self: len(self.phase))
 

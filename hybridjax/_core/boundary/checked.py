@@ -204,10 +204,13 @@ class _Kinds:
         if not names.any_name:
             for name in kwargs:
                 if name not in names.all:
-                    return leads.about_keyword(function, name, visible)
+                    first = args[0] if args else None
+                    return leads.about_keyword(function, name, visible, first)
         positional = [name for name in names.positional if name in visible]
         by_name = [name for name in visible if name not in positional]
         if not names.any_number and len(args) > len(names.positional):
+            # (An argument that does not fit tells more than their number.)
+            self.take(args[: len(names.positional)], {})
             taken = ", ".join(f"`{name}`" for name in positional)
             first = f"{function} takes {taken or 'nothing'} by position"
             if not by_name:
@@ -218,9 +221,7 @@ class _Kinds:
         # (An argument that does not fit tells more than one that is missing.)
         self.take(args, dict(kwargs))
         name = next(x for x in names.in_order if x in names.required - given)
-        kind = self.by_name[name]
-        about = "" if kind is None else f" ({kind.allowed})"
-        return f"{function} needs `{name}`{about}{leads.about_object(function, kind, None)}."
+        return leads.about_missing(function, name, self.by_name[name])
 
     def _lead(self, name: str, kind: Kind | None, value: Any, args: tuple) -> str:
         """Return the rest of the sentence about a value that does not fit."""

@@ -112,10 +112,12 @@ stands for those derived from it."""
 OBJECTS = {
     "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
     "fit_series.LDTP": "are the model and the data in the wrong order?",
-    "save.LimitCycle": "a cycle contains the code of its system: `cycle.to_pandas()` has its numbers",
+    "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
+    "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
+    "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "save.HybridSystem": "a system is code: keep the script that makes it",
     "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
-    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it, and `data.records` can be saved",
+    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
     "save.Identification": "save its `fit`, or write `hj.recordings.write_report(folder, result)`",
     "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
@@ -178,6 +180,12 @@ WORDS = {
     "residuals": ("residuals", "residual", "noise"),
     "sections": ("sections", "section", "phase"),
     "seed": ("seed",),
+    "save": ("save", "to_pandas"),
+    "start": ("guess", "anchor", "initial", "state"),
+    "n_points": ("n_sections", "max_points", "count"),
+    "to_pandas": ("to_pandas",),
+    "plot": ("plot",),
+    "points": ("points",),
     "signal": ("signals", "signal", "function"),
     "size": ("n_sections", "experiments"),
     "solver": ("settings", "solver"),
@@ -205,7 +213,7 @@ and attributes of objects."""
 
 _ALIKE = """
 A: amplitudes ampl
-N: M n_points num npoints nsections
+N: M num nsections
 T: T0 tau period_time
 X: dataset
 alpha: significance sig
@@ -248,6 +256,11 @@ n_jobs: workers n_workers num_workers parallel threads nproc processes
 names: labels keys variables signal_names variable_names state_names output_names
 noise: noise_std noise_level snr sigma_noise
 nperiods: n_periods num_periods
+n_points: npoints num_points n_pts
+plot: draw figure visualize plot_2d imshow
+points: bifurcations special_points bifurcation_points
+save: savefig write to_file export dump to_csv
+to_pandas: to_data_frame to_dataframe to_df df dataframe as_dataframe frame table
 order: model_degree dims guess
 output: outputs y_names output_name observable observe measured
 overlay: fit model_fit
@@ -286,7 +299,14 @@ for _row in _ALIKE.strip().splitlines():
 KEYWORDS = {
     "run_experiments.noise": "`hj.experiments.add_noise(data, std=...)` adds noise to data, and "
     "`process_noise` acts on the system",
+    "find_limit_cycle.period": "the period follows from the clock or the search; `max_period` "
+    "bounds it",
     "find_limit_cycle.settings": "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=1000)`",
+    "simulate.events": "events are transitions of the system, as in "
+    "`hj.HybridSystem.from_functions(states, field, events)`",
+    "simulate.t_eval": "`trajectory.at(times)` has the states at any times",
+    "simulate.saveat": "`trajectory.at(times)` has the states at any times",
+    "simulate.args": "parameters belong to the system: `system.replace(k=9.0)` changes them",
     "simulate.settings": "steps "
     "follow from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
     "`trajectory.dense()` has values between steps",
@@ -299,7 +319,9 @@ KEYWORDS = {
     "Recording.rate": "pass `time`, the times of all samples: `np.arange(n) / rate`",
     "read_recording.time": "the file has a column with times, which `time` names",
     "identify_recording.time": "the recording has its times: `hj.Recording(time, signals)`",
-    "sweep.range": "pass the values by name: `hj.sweep(system, {'k': [8, 9]})`",
+    "continuation.parameter": "pass its name and range: `hj.continuation(cycle, 'k', (low, high))`",
+    "sweep.parameter": "pass the values by name: `hj.sweep(system, {'k': values})`",
+    "sweep.range": "pass the values by name: `hj.sweep(system, {'k': values})`",
     "linearize.settings": "pass `settings` to `find_limit_cycle`, whose cycle is linearized",
     "run_experiments.execution": "pass `execution=hj.scale.Execution(workers=2)`",
 }
@@ -369,6 +391,14 @@ ATTRIBUTES = {
     "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` "
     "all signals",
     "Recording.shape": "`recording.trials` has them, with `time` and `values`",
+    "Showable.copy": "results do not change, so that there is no need of a copy",
+    "Showable.export": "`hj.save(path, result)` writes it",
+    "Showable.save": "`hj.save(path, result)` writes it",
+    "Showable.show": "`result.plot().show()` shows the figure",
+    "Showable.to_csv": "`result.to_pandas().to_csv(path)` writes it",
+    "Showable.to_mat": "`hj.save('name.mat', result)` writes it",
+    "Showable.to_xarray": "`hj.convert.to_xarray(result)` returns a dataset",
+    "Showable.write": "`hj.save(path, result)` writes it",
     "Trajectory.sol": "`trajectory.dense()` has values between steps",
     "Trajectory.x": "`trajectory.after` has the states (n, d) after each step",
     "Trajectory.y": "`trajectory.after` has the states (n, d) after each step",
@@ -408,6 +438,7 @@ NAMES = {
     "diffeqsolve": "hj.simulate(system, chart, state, duration)",
     "dlsim": "model.simulate(u)",
     "eigenvalues": "cycle.multipliers",
+    "enable_double": "hj.enable_x64()",
     "fit": "hj.fit_multipliers(htf, order) or hj.fit_series(data, order)",
     "floquet": "hj.find_limit_cycle(system).multipliers",
     "floquet_multipliers": "hj.find_limit_cycle(system).multipliers",
@@ -444,7 +475,7 @@ NAMES = {
     "ss": "hj.linear.LDTP(A, B, C, D)",
     "plot.nyquist": "hj.plot.bode(htf)",
     "plot.time_series": "recording.plot()",
-    "plot.trajectory": "trajectory.plot()",
+    "plot.trajectory": "cycle.plot()` or `trajectory.plot()",
     "stability": "hj.find_limit_cycle(system).is_stable",
     "step_response": "model.simulate(np.ones((n, nu)))",
     "subjects": "hj.identify_subjects(table, folder)",
@@ -516,6 +547,9 @@ def about_attribute(cls: type, name: str) -> str:
     word = closest(name, attributes) or _documented(cls, name)
     if word is not None:
         return f"{head}: use `{word}`."
+    part = _attribute_of_part(cls, name)
+    if part is not None:
+        return f"{head}: use `{part}`."
     function = place_of(name)
     if function is not None:
         return f"{head}: `{function}` is a function that may take it."
@@ -531,6 +565,16 @@ def _documented(cls: type, name: str) -> str | None:
     return None
 
 
+def _attribute_of_part(cls: type, name: str) -> str | None:
+    """Return the attribute of this name of a field, such as `fit.interval`."""
+    if not dataclasses.is_dataclass(cls):
+        return None
+    for field in dataclasses.fields(cls):
+        if isinstance(field.type, type) and name in attributes_of(field.type):
+            return f"{field.name}.{name}"
+    return None
+
+
 def attributes_of(cls: type) -> list[str]:
     """Return the public attributes of a class, its fields first."""
     fields: list[str] = []
@@ -541,8 +585,30 @@ def attributes_of(cls: type) -> list[str]:
     return [name for name in names if name[0] != "_" and name not in hidden]
 
 
-def about_keyword(function: str, name: str, parameters: Sequence[str]) -> str:
-    """Return the sentence about an argument that a function has not."""
+NEEDS = {
+    "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
+    "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
+    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
+}
+"""What a missing argument is."""
+
+
+def about_missing(function: str, name: str, kind: Kind | None) -> str:
+    """Return the sentence about an argument that a function needs."""
+    lead = NEEDS.get(name)
+    if lead is not None:
+        return f"{function} needs `{name}`: {lead}."
+    about = "" if kind is None else f" ({kind.allowed})"
+    return f"{function} needs `{name}`{about}{about_object(function, kind, None)}."
+
+
+def about_keyword(
+    function: str, name: str, parameters: Sequence[str], first: Any = None
+) -> str:
+    """Return the sentence about an argument that a function has not.
+
+    **Arguments:** `first`: the first argument; a system may have a parameter of this name.
+    """
     short = function.rpartition(".")[2]
     head = f"{function} has no argument `{name}`"
     words = [name, *WORDS.get(name, ())]
@@ -550,6 +616,9 @@ def about_keyword(function: str, name: str, parameters: Sequence[str]) -> str:
         lead = KEYWORDS.get(f"{short}.{word}")
         if lead is not None:
             return f"{head}: {lead}."
+    if hasattr(type(first), "charts") and name in attributes_of(type(first)):
+        change = f"`system.replace({name}=...)` returns a system with another `{name}`"
+        return f"{head}: {KEYWORDS.get(f'{short}.parameter', change)}."
     word = closest(name, parameters)
     if word is not None:
         return f"{head}: use `{word}`."
@@ -561,6 +630,9 @@ def closest(name: str, among: Collection[str]) -> str | None:
     for word in WORDS.get(name, ()):
         if word in among:
             return word
+    by_case = {word.lower(): word for word in among}
+    if name.lower() in by_case:
+        return by_case[name.lower()]
     ending = f"_{name}"
     named = [x for x in among if x.endswith(ending) or x.startswith(f"{name}_")]
     alike = difflib.get_close_matches(name, among, n=1, cutoff=0.7)
