@@ -437,7 +437,7 @@ class ModelFit(ParameterFit):
             findings=self.findings,
         )
 
-    def linear_model(self, data: Any) -> LDTP:
+    def _linear_model(self, data: Any) -> LDTP:
         """Return the linearization at the sections of an observation with the data's sections.
 
         **Raises:** `DefinitionError` if there is none.

@@ -34,8 +34,9 @@ class Fit(Showable, eqx.Module):
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.
 
-    All fits have `modulus`, `standard_errors`, `interval`, `compare`, `contains`, `plot` and
-    `to_pandas`, and `hj.save` writes them.
+    All fits have `modulus`, `standard_errors` and `interval`; `compare(other)`, which compares with
+    a truth or with another fit and has a `p_value`; `contains(truth)`, whether a truth lies in the
+    confidence region of a level; `plot` and `to_pandas`. `hj.save` writes them.
     """
 
     if TYPE_CHECKING:
@@ -55,6 +56,10 @@ class Fit(Showable, eqx.Module):
         @property
         def result(self) -> int: ...
 
+        # (What they take depends on what is fitted.)
+        def compare(self, *args: Any, **options: Any) -> Any: ...
+        def contains(self, *args: Any, **options: Any) -> Any: ...
+
     @property
     def modulus(self) -> Float[np.ndarray, " d"]:
         """The moduli of the multipliers."""
@@ -66,18 +71,10 @@ class Fit(Showable, eqx.Module):
         """Standard error of each estimated number."""
 
     @abstractmethod
-    def compare(self, other: Any) -> Any:
-        """Compare with a truth, or with another fit; the result has a `p_value`."""
-
-    @abstractmethod
-    def contains(self, true: Any, level: float = 0.95) -> Any:
-        """Test whether a truth lies in the confidence region of this level."""
-
-    @abstractmethod
     def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return the real numbers of which `interval` gives bounds, and their standard errors."""
 
-    def linear_model(self, data: Any) -> Any:
+    def _linear_model(self, data: Any) -> Any:
         """Return the `LDTP` that is simulated on data to validate the fit.
 
         **Raises:** `DefinitionError` for a fit that has no model, or none with the data's sections.

@@ -319,7 +319,7 @@ def _simulated(model: LDTP | Fit, record: Record) -> LDTP | SeriesFit | LDTPFit:
         return _as_series_fit(model)
     if isinstance(model, LDTP | SeriesFit | LDTPFit):
         return model
-    return model.linear_model(record)
+    return model._linear_model(record)
 
 
 def _as_series_fit(fit: StructuredFit) -> SeriesFit:
