@@ -78,6 +78,14 @@ class Study(Showable):
             remarks += [f"{name} is doubtful: {doubt.text}" for doubt in fit.findings]
         return remarks
 
+    def plot(self, quantity: str = "modulus", **options: Any) -> Any:
+        """Draw a quantity of all subjects, as `hj.plot.forest` does."""
+        return self.population.plot(quantity, **options)
+
+    def to_pandas(self) -> Any:
+        """Return the table of the population: a row for each report."""
+        return self.population.to_pandas()
+
     def __repr__(self) -> str:
         lines = [
             f"Study({len(self.fits)} reports in {self.folder}, {len(self.failures)} failed)"

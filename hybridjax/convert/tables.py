@@ -27,6 +27,7 @@ from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import PhaseCurve
+from ..orbits.sensitivity import Sensitivity
 from ..plants.cycle import SettledCycle
 from ..recordings.data import SectionData
 from ..recordings.identification import Identification
@@ -314,6 +315,15 @@ def _(thing: ImpulseResponses) -> Any:
 def _(thing: Identifiability) -> Any:
     lost = np.any(thing.unseen != 0, axis=0)
     return {"parameter": list(thing.names), "identified": ~lost}
+
+
+@_columns.register
+def _(thing: Sensitivity) -> Any:
+    return {
+        "event": list(thing.events),
+        "time": np.asarray(thing.times),
+        "duration": np.asarray(thing.durations),
+    }
 
 
 @_columns.register

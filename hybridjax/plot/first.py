@@ -9,6 +9,7 @@ from .._core.boundary.values import with_article
 from .._core.showable import Showable
 from .._core.signal import with_unit
 from ..designs.optimize import OptimalDesign
+from ..designs.study import Study
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -26,7 +27,7 @@ from ..linear.ldtp import LDTP
 from ..orbits.continuation import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
-from ..orbits.responses import PhaseCurve, Responses
+from ..orbits.responses import Coupling, PhaseCurve, Responses
 from ..plants.cycle import SettledCycle
 from ..recordings.data import SectionData
 from ..recordings.identification import Identification
@@ -40,6 +41,10 @@ from ..sections.placed import PlacedSections
 from . import data as of_data, designs, frequency, orbit, plane, subjects
 from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, axis_of, panels
 from .over_parameters import branch
+
+
+# Leads at which a coupling is drawn. Fewer: corners show; more: figures grow.
+_LEADS = 201
 
 
 @functools.singledispatch
@@ -98,6 +103,13 @@ def _(result: Identification, **options: Any) -> Plot:
 
 
 @draw.register
+def _(result: Study, **options: Any) -> Plot:
+    if result.fit is None:
+        raise DefinitionError("the study has no data yet: `study.design.plot()`.")
+    return draw(result.fit, **options)
+
+
+@draw.register
 def _(result: Loop, **options: Any) -> Plot:
     plant = result.closed if result.plant is None else result.plant
     return frequency.bode(plant, **options)
@@ -106,6 +118,25 @@ def _(result: Loop, **options: Any) -> Plot:
 @draw.register
 def _(result: Responses, input: str | None = None, **options: Any) -> Plot:
     return of_data.phase_response(result.curve(input), **options)
+
+
+@draw.register
+def _(result: Coupling, *, ax: AxesLike | None = None) -> Plot:
+    """The effect on the rate of the phase by the lead of the push; dots are locked leads."""
+    lead = np.linspace(0, 1, _LEADS)
+    with panels(ax, height=2.2) as axes:
+        panel = axes[0, 0]
+        panel.plot(lead, result(lead))
+        for locked in result.locked():
+            is_stable = locked.rate < 0
+            fill = CYCLE[0] if is_stable else "none"
+            panel.plot(
+                locked.lead, result([locked.lead]), "o", color=CYCLE[0], mfc=fill
+            )
+        panel.axhline(0, color="black", lw=0.4)
+        panel.set(xlabel="lead of the push (cycles)", ylabel="effect per strength")
+        panel.set_xlim(0, 1)
+    return Plot(axes)
 
 
 @draw.register
