@@ -151,8 +151,8 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     N = model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
-    if isinstance(noise, float):
-        noise = dict.fromkeys(outputs, noise)
+    if isinstance(noise, int | float):
+        noise = dict.fromkeys(outputs, float(noise))
     require_among("output", noise, outputs, "`noise`: ")
     if not noise:
         raise DefinitionError(

@@ -256,12 +256,12 @@ def simulate(
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     check_schedules(s)
-    start, duration = _start_of(chart, state, duration, time)
+    start, length = _start_of(chart, state, duration, time)
     begin = lane_at(s, start.chart, start.state, start.time, "`state`")
     lanes = begin
     settings = settings.filled(SIMULATION)
     u = constant[:, None]
-    end = lanes.t + float(duration)
+    end = lanes.t + float(length)
     tapes = []
     steps = 0
     h = None

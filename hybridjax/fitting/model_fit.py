@@ -22,6 +22,7 @@ from ..errors import DefinitionError
 from ..identify.fit import Fit, not_converged
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
+from ..sections.families import AbstractSections
 from ..sections.linearize import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
@@ -444,7 +445,9 @@ class ModelFit(ParameterFit):
         """
         for observation in self.problem.observations:
             family = getattr(observation, "sections", None)
-            if getattr(family, "n_sections", None) == data.n_sections:
+            if not isinstance(family, AbstractSections):
+                continue
+            if family.n_sections == data.n_sections:
                 delay = getattr(observation, "delay", None)
                 names = data.outputs, data.inputs
                 return linearize(self.cycle, family, *names, delay)

@@ -1,7 +1,7 @@
 """All steps from a system to estimated multipliers, in one call."""
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import equinox as eqx
 import numpy as np
@@ -14,6 +14,7 @@ from .._core.boundary.values import Reals
 from .._core.findings import Finding
 from .._core.progress import say, working
 from .._core.showable import Showable
+from ..engine.trajectory import observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
@@ -27,7 +28,7 @@ from ..orbits.find import find_limit_cycle
 from ..sections.linearize import linearize
 from ..sections.place import as_placed
 from ..sections.placed import SectionsLike
-from ..systems.system import HybridSystem, Output, OutputNames
+from ..systems.system import HybridSystem, OutputNames
 from .htf_estimate import estimate_htf
 from .multiplier_estimate import MultiplierComparison
 from .multipliers import StructuredFit, fit_multipliers
@@ -36,6 +37,9 @@ from .multipliers import StructuredFit, fit_multipliers
 # Predicted deviations of the outputs, relative to half of their range on the cycle. Larger:
 # distortion biases estimates. Smaller: the accuracy of integration limits them.
 _DEVIATION = 1e-3
+# Points in each step of the orbit, of which the range of the outputs is taken. Fewer: the range is
+# too small. More: time.
+_PER_STEP = 8
 # Periods of the design, and its versions with other random phases. More: time. Fewer: few lines,
 # and variances that are uncertain.
 _PERIODS, _REALIZATIONS = 16, 4
@@ -133,7 +137,7 @@ def identify_model(
     say("linearization")
     model = linearize(cycle, placed, names)
     if design is None:
-        design = _small_design(cycle, model, names, seed)
+        design = _small_design(cycle, model, cast(Sequence, names), seed)
     say("experiments")
     data = run_experiments(cycle, placed, design, names, start="periodic")
     if noise is not None:
@@ -145,7 +149,7 @@ def identify_model(
 
 
 def _small_design(
-    cycle: LimitCycle, model: LDTP, outputs: Sequence[str | Output], seed: int
+    cycle: LimitCycle, model: LDTP, outputs: Sequence[Any], seed: int
 ) -> Design:
     """Return a design that makes the outputs deviate by a small part of their range."""
     N = model.n_sections
@@ -154,7 +158,8 @@ def _small_design(
     H = np.asarray(model.htf(lines).H)
     # (The response to inputs of rms 1: of all harmonics together, on average over the lines.)
     gain = np.sqrt((np.abs(H) ** 2).sum(axis=(0, 3)).mean(axis=0))
-    values = cycle.trajectory()(*outputs)[1:]
+    orbit = cycle.trajectory()
+    values = observed(orbit.structure, outputs, *orbit.dense(_PER_STEP))
     reach = np.array([np.nanmax(x) - np.nanmin(x) for x in values]) / 2
     moves = (reach > 0) & (gain > 0)
     if not moves.any():

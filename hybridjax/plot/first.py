@@ -274,7 +274,7 @@ def _states(trajectory: Trajectory) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for chart in charts for name in chart.states))
 
 
-def _rows(t: np.ndarray, signals: dict[str, np.ndarray], ax: AxesLike | None) -> Plot:
+def _rows(t: np.ndarray, signals: dict[Any, Any], ax: AxesLike | None) -> Plot:
     """Draw signals against time, one row for each."""
     size = {"width": COLUMN, "height": 0.5 + 0.85 * len(signals)}
     with panels(ax, len(signals), 1, **size, sharex=True) as axes:

@@ -118,9 +118,10 @@ class Plot:
 
         **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
         """
-        suffix = Path(path).suffix[1:]
         if formats is None:
-            formats = [suffix] if suffix in get_args(Format) else ["png"]
+            suffix = Path(path).suffix[1:]
+            known = suffix in get_args(Format)
+            formats = [cast(Format, suffix if known else "png")]
         return save(path, self, formats)
 
     def show(self) -> None:

@@ -5,6 +5,7 @@ import contextvars
 import copy
 import dataclasses
 import functools as ft
+import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -387,7 +388,10 @@ class HybridSystem(Definition):
             named = inputs
             namespace["inputs"] = tuple(map(str, named))
             namespace["input_units"] = tuple(map(unit_of, named))
-        return type(HybridSystem)(name, (HybridSystem,), namespace)()
+        made_class = types.new_class(
+            name, (HybridSystem,), {}, lambda body: body.update(namespace)
+        )
+        return made_class()
 
     def replace(self, **parameters: Any) -> "HybridSystem":
         """Return the system with other parameters: `system.replace(k=9.0)`.
