@@ -173,6 +173,7 @@ PENDING = {
     "hj.recordings.sample_sections",
     "hj.recordings.write_report",
     "hj.scale.Execution",
+    "hj.sections.place_sections",
     "hj.sections.section_map",
 }
 

@@ -178,6 +178,7 @@ UNCHECKED = {
         "Lanes",
         "LimitCycle",
         "LimitCycles",
+        "ModelIdentification",
         "Motion",
         "NaturalMultipliers",
         "Phase",

@@ -330,7 +330,7 @@ KEYWORDS = {
 given one, or one of this package that it stands for."""
 
 ATTRIBUTES = {
-    "AbstractSections.on": "`hj.place_sections(cycle, sections)` places them",
+    "AbstractSections.on": "`hj.sections.place_sections(cycle, sections)` places them",
     "Design.u": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
     "Design.to_numpy": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
     "ExperimentData.duration": "each of the `len(data)` experiments has `data.u.shape[1]` samples",
