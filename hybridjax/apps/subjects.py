@@ -30,7 +30,8 @@ from .._core.writing import Format, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
-from ..plot.look import save_and_close
+from ..plot.look import AxesLike, Plot, save_and_close
+from ..plot.subjects import forest
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
@@ -78,9 +79,10 @@ class Study(Showable):
             remarks += [f"{name} is doubtful: {doubt.text}" for doubt in fit.findings]
         return remarks
 
-    def plot(self, quantity: str = "modulus", **options: Any) -> Any:
+    @checked
+    def plot(self, quantity: str = "modulus", *, ax: AxesLike | None = None) -> Plot:
         """Draw a quantity of all subjects, as `hj.plot.forest` does."""
-        return self.population.plot(quantity, **options)
+        return forest(self.population, quantity, ax=ax)
 
     def to_pandas(self) -> Any:
         """Return the table of the population: a row for each report."""
