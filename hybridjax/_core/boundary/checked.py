@@ -189,13 +189,12 @@ class _Kinds:
         """Test whether arguments are unknown, too many or too few. (One that is given twice is left
         to Python.)"""
         names = self._names
-        if not names.any_name and not names.all.issuperset(kwargs):
+        count = min(len(args), len(names.positional))
+        if count < len(args) and not names.any_number:
             return True
-        count = len(args)
-        if not names.any_number and count > len(names.positional):
+        if not names.needed_after[count] <= kwargs.keys():
             return True
-        missing = names.required.difference(kwargs, names.positional[:count])
-        return bool(missing)
+        return not names.any_name and not kwargs.keys() <= names.all
 
     def about_wrong(self, function: str, args: tuple, kwargs: dict[str, Any]) -> str:
         """Return the sentence about arguments that are unknown, too many or too few."""
@@ -245,6 +244,8 @@ class _Names(NamedTuple):
     all: frozenset[str]
     positional: tuple[str, ...]
     required: frozenset[str]
+    needed_after: tuple[frozenset[str], ...]
+    """Those that have to be given by name, after so many by position."""
     any_number: bool
     any_name: bool
 
@@ -256,11 +257,14 @@ class _Names(NamedTuple):
             p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
         ]
         positional = [p.name for p in named if p.kind <= p.POSITIONAL_OR_KEYWORD]
+        required = frozenset(p.name for p in named if p.default is p.empty)
+        counts = range(len(positional) + 1)
         return cls(
             tuple(p.name for p in named),
             frozenset(p.name for p in named),
             tuple(positional),
-            frozenset(p.name for p in named if p.default is p.empty),
+            required,
+            tuple(required.difference(positional[:count]) for count in counts),
             inspect.Parameter.VAR_POSITIONAL in kinds,
             inspect.Parameter.VAR_KEYWORD in kinds,
         )
