@@ -23,6 +23,7 @@ from .engine.trajectory import simulate as simulate
 from .experiments.design.multisine import multisine as multisine
 from .experiments.stored import run_experiments as run_experiments
 from .fitting.fit import fit_model as fit_model
+from .identify.from_system import identify_model as identify_model
 from .identify.htf_estimate import estimate_htf as estimate_htf
 from .identify.joint.fit import fit_ldtp as fit_ldtp
 from .identify.multipliers import fit_multipliers as fit_multipliers

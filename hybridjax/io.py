@@ -8,20 +8,27 @@ no pickle, and only the kinds listed here are built, by their own checked constr
 
 import typing
 from pathlib import Path
+from typing import Annotated
 
 from ._core.archive import read_module, write_module
 from ._core.boundary.checked import checked
 from ._core.boundary.kinds import FilePath
+from ._core.boundary.values import Plain
 from ._core.precision import require_x64
 from .errors import DefinitionError
 from .experiments.data import ExperimentData
 from .experiments.design.design import Design
 from .experiments.record import SectionSeries
+from .fitting.model_fit import ModelFit, ParameterEstimate
+from .identify.joint.fit import LDTPFit
+from .identify.multiplier_estimate import MultiplierEstimate
 from .identify.multipliers import StructuredFit
 from .identify.rational import RationalFit
 from .identify.series.fit import SeriesFit
 from .linear.htf import HTF
 from .linear.ldtp import LDTP
+from .plants.cycle import Returns
+from .recordings.natural import NaturalMultipliers
 
 
 Saved = (
@@ -29,18 +36,34 @@ Saved = (
     | ExperimentData
     | HTF
     | LDTP
+    | LDTPFit
+    | MultiplierEstimate
+    | NaturalMultipliers
+    | ParameterEstimate
     | RationalFit
     | SectionSeries
+    | Returns
     | SeriesFit
     | StructuredFit
 )
+
+Written = Annotated[
+    Saved | ModelFit,
+    Plain(
+        "a design, data, a transfer function, a model or a fit",
+        lambda thing: isinstance(thing, (*KINDS.values(), ModelFit)),
+    ),
+]
 
 KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)}
 
 
 @checked
-def save(path: FilePath, thing: Saved) -> None:
+def save(path: FilePath, thing: Written) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
+
+    Of a `ModelFit` the numbers are written, as its `estimate`: its system is code of the user,
+    which no file contains.
 
     The file appears complete or not at all: an old file of that name stays until then. With the
     suffix `.mat` it is a MATLAB file of the same arrays, with `_` for `.` in their names, and of
@@ -49,13 +72,14 @@ def save(path: FilePath, thing: Saved) -> None:
     **Arguments:**
 
     - `path`: ends in `.npz` or `.mat`; its folder must exist.
-    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `RationalFit`, `SectionSeries`,
-      `SeriesFit` or `StructuredFit`.
+    - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `SectionSeries`, or any fit.
 
     **Raises:** `DefinitionError` for other objects, traced or batched ones, another suffix, and
     where the file cannot be written; `PrecisionError` in single precision.
     """
     path = Path(path)
+    if isinstance(thing, ModelFit):
+        thing = thing.estimate
     kind = type(thing).__name__
     if type(thing) is not KINDS.get(kind):
         raise DefinitionError(

@@ -19,7 +19,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from errno import EINVAL
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -66,7 +66,12 @@ def write_module(path: Path, thing: eqx.Module) -> None:
     text = json.dumps(header, indent=1, default=lambda x: x.item())
     with replacing(path) as temporary, open(temporary, "xb") as file:
         if path.suffix == ".mat":
-            named = {name.replace(".", "_"): array for name, array in arrays.items()}
+            # (MATLAB has no names that begin with `_`: they are private, and of no use there.)
+            named = {
+                name.replace(".", "_"): array
+                for name, array in arrays.items()
+                if not name.startswith("_")
+            }
             scipy.io.savemat(file, {_HEADER: text, **named})
         else:
             np.savez(file, allow_pickle=False, **{_HEADER: np.array(text)}, **arrays)
@@ -97,18 +102,49 @@ def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
 
 
-def taken_apart(thing: eqx.Module) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Static fields and arrays; a module among the fields becomes a dictionary of its own static
-    fields, and arrays with its name before theirs. Modules in a tuple have static fields only."""
+class _Field(NamedTuple):
+    """A field of a module or of a named tuple."""
+
+    name: str
+    type: Any
+    static: bool
+    required: bool
+
+
+def _fields_of(kind: type) -> list[_Field]:
+    if issubclass(kind, tuple):
+        hints = typing.get_type_hints(kind)
+        return [_Field(name, x, x is bool, True) for name, x in hints.items()]
+    fields = []
+    for x in dataclasses.fields(kind):
+        is_static = x.metadata.get("static", False)
+        is_required = x.default is dataclasses.MISSING
+        fields.append(_Field(x.name, x.type, is_static, is_required))
+    return fields
+
+
+def _is_made_of_fields(value: Any) -> bool:
+    return isinstance(value, eqx.Module) or hasattr(value, "_fields")
+
+
+def taken_apart(
+    thing: eqx.Module | tuple,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Static fields and arrays; a module or a named tuple among the fields becomes a dictionary of
+    its own static fields, and arrays with its name before theirs. A list of arrays becomes their
+    number, and arrays with the name and an index. Modules in a tuple have static fields only."""
     static: dict[str, Any] = {}
     arrays: dict[str, np.ndarray] = {}
-    for field in dataclasses.fields(thing):
+    for field in _fields_of(type(thing)):
         value = getattr(thing, field.name)
-        if field.metadata.get("static", False):
+        if field.static:
             static[field.name] = value
-        elif isinstance(value, eqx.Module):
+        elif _is_made_of_fields(value):
             static[field.name], inner = taken_apart(value)
             arrays |= {f"{field.name}.{name}": array for name, array in inner.items()}
+        elif isinstance(value, list):
+            static[field.name] = len(value)
+            arrays |= {f"{field.name}.{k}": np.asarray(x) for k, x in enumerate(value)}
         elif isinstance(value, tuple):
             static[field.name] = [taken_apart(x)[0] for x in value]
         elif value is not None:
@@ -128,17 +164,26 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     static = dict(static)
     arrays = dict(arrays)
     values = {}
-    for field in dataclasses.fields(kind):
+    for field in _fields_of(kind):
         name = field.name
         inner = _module_in(field.type)
         item = _item_of(field.type)
-        if field.metadata.get("static", False):
+        if field.static:
             if name in static:
                 values[name] = static.pop(name)
                 if not _matches(values[name], field.type):
                     raise ValueError(f"{name} is {reprlib.repr(values[name])}")
-            elif field.default is dataclasses.MISSING:
+            elif field.required:
                 raise other
+        elif typing.get_origin(field.type) is list:
+            count = static.pop(name, None)
+            if not _matches(count, int):
+                raise other
+            values[name] = []
+            for k in range(count):
+                if f"{name}.{k}" not in arrays:
+                    raise other
+                values[name].append(arrays.pop(f"{name}.{k}"))
         elif item is not None:
             values[name] = tuple(
                 put_together(item, x, {}) for x in static.pop(name, ())
@@ -164,9 +209,10 @@ def options_of(hint: Any) -> tuple[Any, ...]:
 
 
 def _module_in(hint: Any) -> type | None:
-    """The kind of module that a field of this type may hold."""
+    """The kind of module, or of named tuple, that a field of this type may hold."""
     classes = (x for x in options_of(hint) if isinstance(x, type))
-    return next((x for x in classes if issubclass(x, eqx.Module)), None)
+    made = (x for x in classes if issubclass(x, eqx.Module) or hasattr(x, "_fields"))
+    return next(made, None)
 
 
 def _item_of(hint: Any) -> type | None:
@@ -230,16 +276,16 @@ def restored(value: Any, units: Mapping[str, str]) -> Any:
     return value
 
 
-def _wrong_field(thing: eqx.Module) -> str | None:
+def _wrong_field(thing: eqx.Module | tuple) -> str | None:
     """The first field that is not what its annotation says; array axes of one name must agree."""
     with jaxtyped("context"):
-        for field in dataclasses.fields(thing):
+        for field in _fields_of(type(thing)):
             value = getattr(thing, field.name)
             if not _matches(value, field.type):
                 if hasattr(value, "dtype"):
                     return f"{field.name} is {value.dtype}{value.shape}"
                 return f"{field.name} is {value!r}"
-            if isinstance(value, eqx.Module):
+            if _is_made_of_fields(value):
                 wrong = _wrong_field(value)
                 if wrong is not None:
                     return f"{field.name}.{wrong}"
@@ -259,6 +305,8 @@ def _matches(value: Any, hint: Any) -> bool:
         return isinstance(value, tuple) and all(
             _matches(x, arguments[0]) for x in value
         )
+    if origin is list:  # of arrays whose shapes differ
+        return isinstance(value, list) and all(isinstance(x, np.ndarray) for x in value)
     if hint is int:  # none that is larger than a header may declare
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         return whole and bool(abs(value) <= limits.PERIODS)

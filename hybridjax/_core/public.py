@@ -9,6 +9,8 @@ import difflib
 import functools
 import importlib
 import pathlib
+import sys
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -100,11 +102,27 @@ _WORDS = {
 }
 
 
+_ROOT = pathlib.Path(__file__).parents[1]
+
+
+class Namespace(types.ModuleType):
+    """A module that says what to call, if it is called itself."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        raise TypeError(_leads().about_called(self.__name__))
+
+
+def _leads() -> Any:
+    """Return the tables of errors. (Where names are right, they are not imported.)"""
+    return importlib.import_module(".boundary.leads", __package__)
+
+
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
     `__init__.pyi`."""
     homes = _homes(pathlib.Path(file).with_suffix(".pyi"))
     names = sorted(homes)
+    sys.modules[package].__class__ = Namespace
 
     def __getattr__(name: str) -> Any:
         home = homes.get(name)
@@ -129,11 +147,16 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     if place is not None:
         return f"{asked} is {place}"
     text = f"module {package!r} has no attribute {name!r}"
+    leads = _leads()
+    lead = leads.about_name(package, name)
+    if lead is not None:
+        return f"{text}: {lead}"
     for known in (names, list(places())):
         close = difflib.get_close_matches(name, known, n=1)
         if close:
             return f"{text}; did you mean {place_of(close[0])}?"
-    return text
+    lead = leads.about_namespace(package)
+    return f"{text}: {lead}" if lead else text
 
 
 def place_of(name: str) -> str | None:

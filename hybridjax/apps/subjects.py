@@ -24,12 +24,14 @@ from .._core.pieces.run import DaskClient
 from .._core.precision import enable_x64
 from .._core.progress import counted, working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded
 from .._core.writing import Format, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
-from ..plot.look import save_and_close
+from ..plot.look import AxesLike, Plot, save_and_close
+from ..plot.subjects import forest
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
@@ -53,7 +55,7 @@ _FOREST = (
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class SubjectStudy:
+class SubjectStudy(Showable):
     """Results of `identify_subjects`.
 
     **Fields:** `population` of the subjects that were identified; its table also has `report`,
@@ -76,6 +78,15 @@ class SubjectStudy:
         for name, fit in fits:
             remarks += [f"{name} is doubtful: {doubt.text}" for doubt in fit.findings]
         return remarks
+
+    @checked
+    def plot(self, quantity: str = "modulus", *, ax: AxesLike | None = None) -> Plot:
+        """Draw a quantity of all subjects, as `hj.plot.forest` does."""
+        return forest(self.population, quantity, ax=ax)
+
+    def to_pandas(self) -> Any:
+        """Return the table of the population: a row for each report."""
+        return self.population.to_pandas()
 
     def __repr__(self) -> str:
         lines = [

@@ -1,63 +1,98 @@
 """Results as `pandas.DataFrame`."""
 
-from typing import Any
+import functools
+from typing import Annotated, Any
 
 import numpy as np
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
-from ..identify.multiplier_estimate import MultiplierFit
+from .._core.boundary.values import Plain, with_article
+from .._core.showable import Showable
+from ..designs.optimize import OptimalDesign
+from ..engine.trajectory import Trajectory
+from ..errors import DefinitionError
+from ..experiments.data import ExperimentData
+from ..experiments.design.design import Design
+from ..experiments.record import Record
+from ..fitting.model_fit import Identifiability, ParameterComparison, ParameterFit
+from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
+from ..identify.multipliers import OrderSelection
 from ..identify.rational import RationalFit
+from ..identify.transient import TransientFit
+from ..identify.validate import Validation
 from ..linear.htf import HTF
+from ..linear.ldtp import LDTP
 from ..orbits.branches import Branch
+from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
+from ..orbits.responses import PhaseCurve
+from ..orbits.sensitivity import Sensitivity
+from ..plants.cycle import SettledCycle
 from ..recordings.data import SectionData
+from ..recordings.identification import Identification
+from ..recordings.impulse import ImpulseResponses
+from ..recordings.natural import NaturalMultipliers
+from ..recordings.population.population import Population
 from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray
 
 
-Tabular = (
-    Recording | SectionData | HTF | LimitCycles | Branch | MultiplierFit | RationalFit
-)
+def _is_result(thing: Any) -> bool:
+    return isinstance(thing, Showable)
 
 
 @checked
-def to_pandas(thing: Tabular) -> Any:
-    """Return a `pandas.DataFrame`.
+def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
+    """Return a `pandas.DataFrame` of a result; `result.to_pandas()` does the same.
 
-    - `Recording`, `SectionData`: a row for each sample, with time and trial;
-      `Recording.from_frame` reads one trial of it.
-    - `LimitCycles`, `Branch`: a row for each cycle, with its parameters; `multipliers.0.real`, ...
+    - Fits: a row for each multiplier, with the 95 % interval of its modulus. Fits of parameters: a
+      row for each parameter. A `RationalFit` gives a row for each output and pole.
+    - `LimitCycle`, `LimitCycles`, `Branch`: a row for each cycle, with its parameters;
+      `multipliers.0.real`, ...
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
-    - Fits: a row for each multiplier. A `RationalFit` gives a row for each output and pole.
+    - `LDTP`: a row for each multiplier.
+    - `Recording`, `SectionData`: a row for each sample, with time and trial;
+      `Recording.from_frame` reads one trial of it. `ExperimentData`, `Record`: likewise, with the
+      number of the experiment, the cycle and the section.
+    - `Design`: a row for each cosine. `Trajectory`: a row for each end of a step.
+    - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
+    - Other results that have findings: a row for each.
 
     Complex numbers get columns for their real and imaginary part, which R and CSV files can hold; H
     and multipliers their modulus, too. `standard_error` is the root of the expected squared
     distance from the true value; `real_error` and `imaginary_error` are those of the parts.
 
-    **Raises:** `DefinitionError` where pandas, or xarray, is not installed.
+    **Raises:** `DefinitionError` where pandas, or xarray, is not installed, and for a result that
+    is no table.
     """
-    frame = package("pandas").DataFrame
-    if isinstance(thing, MultiplierFit):
-        real, imaginary = np.sqrt(
-            np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
-        ).T
-        errors = {"real_error": real, "imaginary_error": imaginary}
-        errors["standard_error"] = thing.standard_errors
-        return frame({**_parts("", thing.multipliers), **errors})
-    if isinstance(thing, RationalFit):
-        outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
-        poles = _parts("pole_", thing.poles.ravel())
-        return frame(
-            {"output": outputs, **poles, **_parts("", thing.multipliers.ravel())}
+    return package("pandas").DataFrame(_columns(thing))
+
+
+@functools.singledispatch
+def _columns(thing: Any) -> Any:
+    """Return the columns of the table of a result, or a table.
+
+    **Raises:** `DefinitionError` for a result that is no table.
+    """
+    findings = thing.findings
+    if not findings:
+        raise DefinitionError(
+            f"{with_article(type(thing).__name__)} is no table: its fields have the numbers."
         )
+    return {
+        "cause": [x.cause for x in findings],
+        "finding": [x.text for x in findings],
+        "action": [x.action for x in findings],
+    }
+
+
+@_columns.register(Recording)
+@_columns.register(SectionData)
+@_columns.register(LimitCycles)
+@_columns.register(Branch)
+def _(thing: Recording | SectionData | LimitCycles | Branch) -> Any:
     dataset = to_xarray(thing)
-    if isinstance(thing, HTF):
-        rows = dataset[[x for x in ("H", "variance") if x in dataset]].to_dataframe()
-        parts = _parts("", rows["H"].values)
-        if "variance" in rows:
-            parts["standard_error"] = np.sqrt(rows["variance"].values)
-        return rows[[]].assign(**parts)
     row = next(iter(dataset.data_vars.values())).dims[0]
     table: dict[str, Any] = {}
     for name, x in {**dataset.coords, **dataset.data_vars}.items():
@@ -70,7 +105,236 @@ def to_pandas(thing: Tabular) -> Any:
             table |= (
                 _parts(f"{key}.", values) if np.iscomplexobj(values) else {key: values}
             )
-    return frame(table)
+    return table
+
+
+@_columns.register
+def _(thing: HTF) -> Any:
+    dataset = to_xarray(thing)
+    rows = dataset[[x for x in ("H", "variance") if x in dataset]].to_dataframe()
+    parts = _parts("", rows["H"].values)
+    if "variance" in rows:
+        parts["standard_error"] = np.sqrt(rows["variance"].values)
+    return rows[[]].assign(**parts)
+
+
+@_columns.register
+def _(thing: MultiplierFit) -> Any:
+    real, imaginary = np.sqrt(
+        np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
+    ).T
+    low, high = thing.interval().T
+    return {
+        **_parts("", thing.multipliers),
+        "real_error": real,
+        "imaginary_error": imaginary,
+        "standard_error": thing.standard_errors,
+        "modulus_low": low,
+        "modulus_high": high,
+    }
+
+
+@_columns.register
+def _(thing: NaturalMultipliers) -> Any:
+    low, high = thing.interval().T
+    errors = {"standard_error": thing.standard_errors}
+    bounds = {"modulus_low": low, "modulus_high": high}
+    return {**_parts("", thing.multipliers), **errors, **bounds}
+
+
+@_columns.register
+def _(thing: ParameterFit) -> Any:
+    low, high = thing.interval().T
+    return {
+        "parameter": list(thing.names),
+        "value": np.asarray(thing.values),
+        "standard_error": thing.standard_errors,
+        "low": low,
+        "high": high,
+        "unit": list(thing.units),
+    }
+
+
+@_columns.register
+def _(thing: RationalFit) -> Any:
+    outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
+    poles = _parts("pole_", thing.poles.ravel())
+    return {"output": outputs, **poles, **_parts("", thing.multipliers.ravel())}
+
+
+@_columns.register
+def _(thing: Identification) -> Any:
+    return _columns(thing.fit)
+
+
+@_columns.register(LDTP)
+@_columns.register(TransientFit)
+def _(thing: LDTP | TransientFit) -> Any:
+    return _parts("", thing.multipliers)
+
+
+@_columns.register
+def _(thing: LimitCycle) -> Any:
+    table: dict[str, Any] = {}
+    for name, number in thing.numbers.items():
+        if np.ndim(number) == 0:
+            table[name] = [float(number)]
+    table["period"] = [float(thing.period)]
+    for k, multiplier in enumerate(thing.multipliers):
+        table |= _parts(f"multipliers.{k}.", np.array([multiplier]))
+    table["stable"] = [thing.stable]
+    return table
+
+
+@_columns.register
+def _(thing: ExperimentData) -> Any:
+    S, n, _ = thing.u.shape
+    first: dict[str, Any] = {"experiment": np.repeat(np.arange(S), n)}
+    sample = np.tile(np.arange(n), S)
+    signals = np.concatenate([thing.u, thing.y], axis=2).reshape(S * n, -1)
+    return first | _samples(thing, sample, signals)
+
+
+@_columns.register
+def _(thing: Record) -> Any:
+    sample = thing.first_section + np.arange(len(thing.u))
+    return _samples(thing, sample, np.concatenate([thing.u, thing.y], axis=1))
+
+
+def _samples(thing: Any, sample: np.ndarray, signals: np.ndarray) -> dict[str, Any]:
+    """Return columns of samples at sections, counted from section 0 of a cycle."""
+    cycle, section = np.divmod(sample, thing.n_sections)
+    names = map(str, (*thing.inputs, *thing.outputs))
+    columns = dict(zip(names, signals.T, strict=True))
+    return {"cycle": cycle, "section": section, **columns}
+
+
+@_columns.register
+def _(thing: Trajectory) -> Any:
+    charts = thing.structure.charts
+    names = list(dict.fromkeys(x for chart in charts for x in chart.states))
+    t, chart, states = thing.dense(1)
+    table: dict[str, Any] = {
+        "time": t,
+        "chart": [thing.structure.names[a] for a in chart],
+    }
+    for name in names:
+        table[name] = np.full(len(t), np.nan)
+    for a, row, values in zip(chart, range(len(t)), states, strict=True):
+        for k, name in enumerate(charts[a].states):
+            table[name][row] = values[k]
+    return table
+
+
+@_columns.register
+def _(thing: Design) -> Any:
+    return {
+        "experiment": thing.experiment,
+        "frequency": thing.line / thing.periods,
+        "channel": thing.channel,
+        "amplitude": thing.amplitude,
+        "phase": thing.phase,
+    }
+
+
+@_columns.register
+def _(thing: OrderSelection) -> Any:
+    return {
+        "order": thing.orders,
+        "strength": thing.strength,
+        "deviation": thing.deviation,
+        "threshold": thing.threshold,
+        "chi2_per_dof": thing.cost / thing.dof,
+        "mdl": thing.mdl,
+    }
+
+
+@_columns.register
+def _(thing: Validation) -> Any:
+    return {
+        "output": list(map(str, thing.outputs)),
+        "fit": thing.fit,
+        "noise": thing.noise,
+        "no_better": thing.no_better,
+        "whiteness": thing.whiteness,
+        "independence": thing.independence,
+        "visible": thing.visible,
+    }
+
+
+@_columns.register
+def _(thing: OptimalDesign) -> Any:
+    return {
+        "quantity": list(thing.names),
+        "standard_error": thing.standard_errors,
+        "usual_standard_error": thing.usual_standard_errors,
+    }
+
+
+@_columns.register
+def _(thing: MultiplierComparison) -> Any:
+    outputs = {"output": list(map(str, thing.outputs))} if thing.outputs else {}
+    true = _parts("true_", thing.true)
+    estimated = _parts("estimated_", thing.estimated)
+    return {**outputs, **true, **estimated, "error": thing.error}
+
+
+@_columns.register
+def _(thing: ParameterComparison) -> Any:
+    return {
+        "parameter": list(thing.names),
+        "true": thing.true,
+        "estimated": thing.estimated,
+        "error": thing.error,
+        "standard_error": thing.standard_errors,
+    }
+
+
+@_columns.register
+def _(thing: PhaseCurve) -> Any:
+    errors = getattr(thing, "errors", None)
+    table = {"phase": thing.phase, "value": thing.values}
+    return table if errors is None else {**table, "standard_error": errors}
+
+
+@_columns.register
+def _(thing: ImpulseResponses) -> Any:
+    shape = thing.values.shape
+    phase, lag, output, input = (x.ravel() for x in np.indices(shape))
+    return {
+        "phase": thing.phase[phase],
+        "lag": thing.lag[lag],
+        "output": [str(thing.outputs[k]) for k in output],
+        "input": [str(thing.inputs[k]) for k in input],
+        "value": np.ravel(thing.values),
+        "standard_error": np.ravel(thing.errors),
+    }
+
+
+@_columns.register
+def _(thing: Identifiability) -> Any:
+    lost = np.any(thing.unseen != 0, axis=0)
+    return {"parameter": list(thing.names), "identified": ~lost}
+
+
+@_columns.register
+def _(thing: Sensitivity) -> Any:
+    return {
+        "event": list(thing.events),
+        "time": np.asarray(thing.times),
+        "duration": np.asarray(thing.durations),
+    }
+
+
+@_columns.register
+def _(thing: SettledCycle) -> Any:
+    columns = dict(zip(thing.outputs, thing.cycle_outputs.T, strict=True))
+    return {"section": np.arange(len(thing.cycle_outputs)), **columns}
+
+
+@_columns.register
+def _(thing: Population) -> Any:
+    return thing.table
 
 
 def _parts(prefix: str, z: np.ndarray) -> dict[str, np.ndarray]:

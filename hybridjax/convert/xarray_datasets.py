@@ -16,6 +16,7 @@ from .._core.boundary.checked import checked
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
 from ..errors import DefinitionError, HybridJaxError
+from ..fitting.model_fit import ModelFit
 from ..io import KINDS, Saved
 from ..linear.ldtp import LDTP
 from ..orbits.branches import Branch
@@ -52,13 +53,16 @@ _COORDINATES = {"input": "inputs", "output": "outputs", "harmonic": "harmonics"}
 
 
 @checked
-def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> Any:
+def to_xarray(
+    thing: Saved | ModelFit | Recording | SectionData | LimitCycles | Branch,
+) -> Any:
     """Return an `xarray.Dataset` with named dimensions, coordinates, and units.
 
     - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, frequency,
       output, input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment,
       sample, input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
       `output_unit` beside them.
+      Of a `ModelFit` these are the numbers, without its system.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
     - `SectionData`: the same at sections, and the `average_cycle`.
@@ -69,6 +73,8 @@ def to_xarray(thing: Saved | Recording | SectionData | LimitCycles | Branch) -> 
     for signals that are called like a coordinate; `PrecisionError` in single precision.
     """
     require_x64()
+    if isinstance(thing, ModelFit):
+        thing = thing.estimate
     if isinstance(thing, Recording):
         return _from_recording(thing)
     if isinstance(thing, SectionData):
@@ -114,8 +120,9 @@ def from_xarray(dataset: Any) -> Saved:
         arrays = {}
         if "frequency" in dataset.coords:
             arrays["frequencies"] = np.asarray(dataset["frequency"].values)
-        for name in map(str, dataset.data_vars):
-            array = dataset[name].transpose(*_axes(kind, name))
+        for name in map(str, names):
+            array = dataset[name]
+            array = array.transpose(*_axes(kind, name, array.ndim))
             arrays[name] = np.asarray(array.values)
         return put_together(kind, static, arrays)
     except (
@@ -142,7 +149,7 @@ def _from_module(module: eqx.Module) -> Any:
             if isinstance(values[0], str):
                 coordinates[f"{dimension}_unit"] = dimension, list(map(unit_of, values))
     kind = type(module)
-    variables = {name: (_axes(kind, name), x) for name, x in arrays.items()}
+    variables = {name: (_axes(kind, name, x.ndim), x) for name, x in arrays.items()}
     if "frequencies" in variables:
         coordinates["frequency"] = variables.pop("frequencies")
     units = {str(name): name.unit for name in signals_in(static)}
@@ -154,15 +161,21 @@ def _from_module(module: eqx.Module) -> Any:
     return dataset.assign_coords(order).assign_attrs({_HEADER: text})
 
 
-def _axes(kind: type, name: str) -> tuple[str, ...]:
-    """Return the dimensions of a field; `outer.inner` is one of a module in a field."""
+def _axes(kind: type, name: str, ndim: int) -> tuple[str, ...]:
+    """Return the dimensions of a field; `outer.inner` is one of a module in a field. Private arrays
+    and those of a model in a fit have dimensions of their own."""
     if kind is LDTP and name in _STATES:
         return _STATES[name]
+    own = tuple(f"{name}, axis {k}" for k in range(ndim))
+    if name.startswith("_"):
+        return own
     hint: Any = kind
     for part in name.split("."):
         module = next(
             x for x in options_of(hint) if isinstance(x, type) and hasattr(x, "__mro__")
         )
+        if module is LDTP and kind is not LDTP:
+            return own
         hint = module.__dataclass_fields__[part].type  # type: ignore[attr-defined]
     shaped = next(x for x in options_of(hint) if hasattr(x, "dim_str"))
     axes: list[str] = []

@@ -26,7 +26,7 @@ Kept = Int[np.ndarray, " k"]
 """Indices of the cosines that remain, in ascending order."""
 Squares = dict[str, Powers]
 """Mean square of each signal, by name, per unit of each cosine's power."""
-NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]]
+NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]] | Positive
 
 # Default noise, relative to the rms of the output in the usual design: 20 dB. It scales all
 # standard errors; the optimal powers depend only on the ratios of the outputs.
@@ -151,6 +151,8 @@ def make_noise(model: Model, noise: NoiseLike | None, rms: dict[str, float]) -> 
     N = model.n_sections
     if noise is None:
         noise = {name: _NOISE * rms[name] for name in outputs if rms[name] > 0}
+    if isinstance(noise, int | float):
+        noise = dict.fromkeys(outputs, float(noise))
     require_among("output", noise, outputs, "`noise`: ")
     if not noise:
         raise DefinitionError(

@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Positive, Seed
 from .._core.execution import one_blas_thread
 from .._core.progress import working
+from .._core.showable import Showable
 from .._core.text import columns
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
@@ -47,7 +48,7 @@ _WORTH_IT = 1.5
 
 
 @checked_methods
-class OptimalDesign(eqx.Module):
+class OptimalDesign(Showable, eqx.Module):
     """A design that needs the fewest cycles, and the design that it improves.
 
     Standard errors are Cramer-Rao bounds: a fit that uses all of the data reaches them where noise
@@ -279,11 +280,11 @@ def optimal_design(
       from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
       `hj.designs.Limits`, which also limits peaks, rates, cycles and distortion.
       Default: `"input"`.
-    - `noise`: standard deviation of the white noise of each measured output, by name; or a function
-      of the frequency of the output (0 to N/2 cycles per period). Its value is the standard
-      deviation of white noise with the spectral density at this frequency. Default: all outputs are
-      measured, with white noise of a tenth of their rms deviation in `design`, scaled to the
-      limits.
+    - `noise`: standard deviation of the white noise of each measured output, by name, or one number
+      for all outputs; or, by name, a function of the frequency of the output (0 to N/2 cycles per
+      period). Its value is the standard deviation of white noise with the spectral density at this
+      frequency. Default: all outputs are measured, with white noise of a tenth of their rms
+      deviation in `design`, scaled to the limits.
     - `seed`: seed of the phases, and of the division of cosines among experiments. Default: 0.
     - `robust`: with several models, minimize the `"mean"` of their criteria, or the `"worst"` one
       (approximately: a power mean with exponent 16). Default: `"mean"`.

@@ -14,6 +14,7 @@ from .._core.execution import one_blas_thread
 from .._core.executor import is_traced
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
+from .._core.showable import Showable
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
@@ -46,7 +47,7 @@ class History(NamedTuple):
 
 
 @checked
-class SequentialDesign(eqx.Module):
+class SequentialDesign(Showable, eqx.Module):
     r"""A sequence of experiments that starts without a model, and ends at a requested precision.
 
     ```python

@@ -18,6 +18,7 @@ from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system, evaluating
@@ -61,7 +62,7 @@ class Event(NamedTuple):
 
 
 @checked_methods
-class Trajectory(eqx.Module):
+class Trajectory(Showable, eqx.Module):
     """A hybrid trajectory: steps, events, and interpolation between steps.
 
     **Fields:** `t`, the ends of the steps; `chart`, the chart after each; `before` and `after`,
@@ -218,9 +219,9 @@ def observed(
 @checked
 def simulate(
     system: HybridSystem,
-    chart: str,
-    state: Annotated[Numbers, Reals("n")],
-    duration: Duration,
+    chart: str | Guess,
+    state: Annotated[Numbers, Reals()] | None = None,
+    duration: Duration | None = None,
     *,
     time: Scalar = 0.0,
     input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
@@ -234,7 +235,7 @@ def simulate(
 
     - `chart`, `state`, `time`: the start. A guard that is zero or negative there is not an
         event: a ball that starts below the floor falls on. `findings` of the trajectory name such
-        guards.
+        guards. A `Guess` stands for all three: `hj.simulate(system, guess, duration)`.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -255,12 +256,12 @@ def simulate(
     constant = _constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     check_schedules(s)
-    start = Guess(chart, state, time)
-    begin = lane_at(s, chart, start.state, start.time, "`state`")
+    start, length = _start_of(chart, state, duration, time)
+    begin = lane_at(s, start.chart, start.state, start.time, "`state`")
     lanes = begin
     settings = settings.filled(SIMULATION)
     u = constant[:, None]
-    end = lanes.t + float(duration)
+    end = lanes.t + float(length)
     tapes = []
     steps = 0
     h = None
@@ -287,6 +288,35 @@ def simulate(
             f"{path.result.message}. `throw=False` returns it up to there."
         )
     return path
+
+
+def _start_of(
+    chart: str | Guess, state: Any, duration: Any, time: Any
+) -> tuple[Guess, Any]:
+    """Return the start and the duration, from a chart with a state, or from a guess.
+
+    **Raises:** `DefinitionError` where one of them is missing.
+    """
+    if isinstance(chart, Guess):
+        # (The duration takes the place of the state.)
+        length = state if duration is None else duration
+        if length is None or np.ndim(length) or not length > 0:
+            raise DefinitionError(
+                "simulate: after a guess, give the duration, a positive number: "
+                "`hj.simulate(system, guess, duration)`."
+            )
+        return chart, length
+    if state is None or duration is None:
+        missing = "state" if state is None else "duration"
+        raise DefinitionError(
+            f"simulate needs `{missing}`: `hj.simulate(system, chart, state, duration)`, or "
+            "`hj.simulate(system, guess, duration)`."
+        )
+    if np.ndim(state) != 1:
+        raise DefinitionError(
+            f"simulate: `state` must be of shape (n,), not of shape {np.shape(state)}."
+        )
+    return Guess(chart, state, time), duration
 
 
 def recorded(

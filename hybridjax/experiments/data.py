@@ -7,11 +7,17 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.arguments import Numbers, input_and_output_names, require_axes
+from .._core.arguments import (
+    Numbers,
+    input_and_output_names,
+    require_among,
+    require_axes,
+)
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import fields, folded, listed
 from ..errors import DefinitionError
 from .record import SectionSeries
@@ -46,7 +52,7 @@ class Simulated(eqx.Module):
 
 
 @checked
-class ExperimentData(eqx.Module):
+class ExperimentData(Showable, eqx.Module):
     """Inputs and outputs of S experiments, sampled at the sections of a limit cycle.
 
     **Fields**, all on the host:
@@ -146,6 +152,21 @@ class ExperimentData(eqx.Module):
                 f"experiment {s}: {name} is not finite at sample {i}: repair the record, or mark "
                 "the experiment as failed in `result`."
             )
+
+    def __len__(self) -> int:
+        """The number of experiments."""
+        return len(self.u)
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, "S n"]:
+        """An input or output of all experiments: `data["yM"]`.
+
+        **Raises:** `DefinitionError` for a signal that does not exist.
+        """
+        signals = (*self.inputs, *self.outputs)
+        require_among("signal", [name], signals)
+        k = signals.index(name)
+        nu = len(self.inputs)
+        return self.u[:, :, k] if k < nu else self.y[:, :, k - nu]
 
     @property
     def ok(self) -> Bool[np.ndarray, " S"]:

@@ -13,6 +13,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.containers import Stream
 from .._core.boundary.kinds import Index, NewNames, NewOptionalNames, SectionCount
 from .._core.boundary.values import Number, Reals
+from .._core.showable import Showable
 from .._core.text import folded, listed
 from ..errors import DefinitionError
 
@@ -21,7 +22,7 @@ Drift = Annotated[float, Number("two cycles or more", low=2, infinite=True)]
 
 
 @checked
-class SectionSeries(eqx.Module):
+class SectionSeries(Showable, eqx.Module):
     """One stretch of recorded inputs and outputs, of any length, with any input.
 
     **Fields**, on the host:

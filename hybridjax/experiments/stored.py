@@ -24,6 +24,7 @@ from .._core.pieces.store import (
 )
 from .._core.progress import working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import Signal, unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
@@ -44,7 +45,7 @@ _KIND = "experiments"
 
 
 @checked
-class StoredExperiments:
+class StoredExperiments(Showable):
     """Experiments in a store that `run_experiments(..., store=...)` fills.
 
     Iterating over them reads chunk after chunk as `ExperimentData`, so that

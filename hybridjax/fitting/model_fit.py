@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator, Mapping
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Union
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,9 +16,14 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding
 from .._core.html import table, text
 from .._core.results import Result
+from .._core.showable import Showable
+from .._core.text import p_value
 from ..errors import DefinitionError
 from ..identify.fit import Fit, not_converged
+from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
+from ..sections.families import AbstractSections
+from ..sections.linearize import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
 
@@ -33,7 +38,7 @@ _RANK = 1e-9
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
 
 
-class Identifiability(eqx.Module):
+class Identifiability(Showable, eqx.Module):
     r"""The combinations of parameters that the data identify, near given values.
 
     With the sensitivities $S_{ij} = p_j\,\partial r_i/\partial p_j$ of the weighted residuals to
@@ -142,7 +147,218 @@ class ParameterGuess(NamedTuple):
     """Code of `Result`."""
 
 
-class ModelFit(Fit):
+class ParameterComparison(Showable, eqx.Module):
+    """Fitted parameters beside true ones, or those of another fit. Printing it shows a table.
+
+    **Fields:** `names`; `true` and `estimated` (p,); `error` (p,), their difference, and
+    `standard_errors` (p,), those of the difference; `p_value`: probability of differences as large
+    as these if all are equal.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    true: Float[np.ndarray, " p"]
+    estimated: Float[np.ndarray, " p"]
+    standard_errors: Float[np.ndarray, " p"]
+    p_value: float = eqx.field(static=True)
+
+    @property
+    def error(self) -> Float[np.ndarray, " p"]:
+        return self.estimated - self.true
+
+    def __repr__(self) -> str:
+        width = max(9, *map(len, self.names))
+        heads = f"{'true':>12}  {'estimated':>12}  {'error':>9}  {'standard error':>14}"
+        rows = [f"{'parameter':>{width}}  {heads}"]
+        columns = self.true, self.estimated, self.error, self.standard_errors
+        for name, true, estimated, error, size in zip(
+            self.names, *columns, strict=True
+        ):
+            rows.append(
+                f"{name:>{width}}  {true:12.6g}  {estimated:12.6g}  {error:9.2g}  {size:14.2g}"
+            )
+        rows.append(f"all are equal: {p_value(self.p_value)}")
+        return "\n".join(rows)
+
+
+Truth = Union[HybridSystem, LimitCycle, "ParameterFit", Mapping[str, float]]
+"""Values of parameters by name, or what has them."""
+
+
+class ParameterFit(Fit):
+    """What all fits of parameters share, with their system or without.
+
+    **Fields:**
+
+    - `names`, `values` (p,), `units`: the free parameters.
+    - `covariance` (p, p): of the values. `unseen` (p - rank, p): combinations that the data do not
+      identify, see `Identifiability`.
+    - `weighted`: whether all data have standard deviations. `dof`, `result`: as for all fits.
+    """
+
+    if TYPE_CHECKING:
+        # (Fields of one, and properties of the other.)
+        @property
+        def names(self) -> tuple[str, ...]: ...
+        @property
+        def values(self) -> Float[np.ndarray, " p"]: ...
+        @property
+        def units(self) -> tuple[str, ...]: ...
+        @property
+        def unseen(self) -> Float[np.ndarray, "k p"]: ...
+        @property
+        def weighted(self) -> bool: ...
+
+    @property
+    def noise(self) -> None:
+        return None
+
+    @property
+    def covariance_dof(self) -> float:
+        return np.inf if self.weighted else self.dof
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " p"]:
+        """Standard error of each value; infinite for a parameter that is not identified alone, NaN
+        without standard deviations of the data if `dof` is 0."""
+        lost = np.any(self.unseen != 0, axis=0)
+        return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def _rank(self) -> int:
+        return len(self.names) - len(self.unseen)
+
+    def _values_of(self, true: Any) -> Float[np.ndarray, " p"]:
+        """Return the values of the fitted parameters in a mapping, a system, a cycle or a fit.
+
+        **Raises:** `DefinitionError` if a value is missing or was not fitted.
+        """
+        if isinstance(true, ParameterFit):
+            given: Mapping[str, Any] = dict(zip(true.names, true.values, strict=True))
+        elif isinstance(true, HybridSystem | LimitCycle):
+            given = self._changed(
+                true if isinstance(true, HybridSystem) else true.system
+            )
+        else:
+            given = true
+        if more := [name for name in given if name not in self.names]:
+            raise DefinitionError(
+                f"`true` has another '{more[0]}', which was not fitted: free it."
+            )
+        if missing := [name for name in self.names if name not in given]:
+            raise DefinitionError(
+                f"`true` must have a value of '{missing[0]}', which was fitted."
+            )
+        return np.array([float(given[name]) for name in self.names])
+
+    def _changed(self, system: HybridSystem) -> dict[str, Any]:
+        """Return the numbers of a system that were fitted, or that differ from those of the fit."""
+        return {x: y for x, y in arrays_of(system).items() if x in self.names}
+
+    def _distance(
+        self, missed: Float[np.ndarray, " p"], covariance: Float[np.ndarray, "p p"]
+    ) -> float:
+        """Return the squared size of a difference, in units of a covariance."""
+        size = np.sqrt(np.diag(covariance))
+        size = np.where(size > 0, size, 1.0)
+        correlation = covariance / np.outer(size, size)
+        weights = np.linalg.pinv(correlation, rcond=_RANK, hermitian=True)
+        return float(missed / size @ weights @ (missed / size))
+
+    def chi_square(self, true: Truth) -> float:
+        """Return the squared distance of the values from other ones, in units of the covariance."""
+        return self._distance(self._values_of(true) - self.values, self.covariance)
+
+    @checked
+    def contains(self, true: Truth, level: Probability = 0.95) -> bool:
+        """Test whether other values lie in the joint confidence region."""
+        return self._tail(self.chi_square(true), self.covariance_dof) >= 1 - level
+
+    @checked
+    def compare(self, other: Truth) -> ParameterComparison:
+        """Compare the values with true ones, or with those of another fit of the same parameters,
+        to other data; printing the result shows a table.
+
+        **Arguments:** `other`: values by name, a system or cycle with them, or a fit.
+
+        **Raises:** `DefinitionError` if a value is missing or was not fitted, or if the fit has no
+        standard errors.
+        """
+        true = self._values_of(other)
+        errors = self.standard_errors
+        if isinstance(other, ParameterFit):
+            order = [other.names.index(name) for name in self.names]
+            covariance = self.covariance + other.covariance[np.ix_(order, order)]
+            errors = np.hypot(errors, other.standard_errors[order])
+            distance = self._distance(self.values - true, covariance)
+            dof = min(self.covariance_dof, other.covariance_dof)
+        else:
+            distance = self.chi_square(other)
+            dof = self.covariance_dof
+        tail = self._tail(distance, dof)
+        return ParameterComparison(self.names, true, self.values, errors, tail)
+
+    def _tail(self, distance: float, dof: float) -> float:
+        """Return the probability of a larger squared distance from the true values."""
+        rank = max(self._rank, 1)
+        if np.isinf(dof):
+            return float(stats.chi2.sf(distance, rank))
+        return float(stats.f.sf(distance / rank, rank, dof))
+
+    def _estimates(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        return self.values, self.standard_errors
+
+    def rows(self) -> Iterator[tuple[str, str, str, str]]:
+        """Yield each name with its value, standard error and unit."""
+        for name, value, error, unit in zip(
+            self.names, self.values, self.standard_errors, self.units, strict=True
+        ):
+            shown = "not identified alone" if np.isinf(error) else f"± {error:.2g}"
+            yield name, f"{value:.9g}", shown, unit
+
+    def _table(self) -> Iterator[str]:
+        """Yield the lines of a summary with the values."""
+        width = max(map(len, self.names))
+        for name, value, error, unit in self.rows():
+            shown = f"{error} {unit}" if "±" in error else error
+            yield f"{name:{width}}  {value:<14} {shown}".rstrip()
+
+
+class ParameterEstimate(ParameterFit):
+    """Fitted parameters without their system: what `hj.save` writes of a `ModelFit`.
+
+    **Fields** beside those of all fits of parameters: `system`, the name of its class;
+    `multipliers` of its limit cycle; `cost`; `findings`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    system: str = eqx.field(static=True)
+    values: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    unseen: Float[np.ndarray, "k p"]
+    multipliers: Complex[np.ndarray, " d"]
+    cost: float = eqx.field(static=True)
+    dof: float = eqx.field(static=True)
+    weighted: bool = eqx.field(static=True)
+    result: int = eqx.field(static=True)
+    findings: tuple[Finding, ...] = eqx.field(default=())
+
+    @property
+    def model(self) -> None:
+        return None
+
+    def _summary(self) -> str:
+        head = f"ParameterEstimate({self.system}: {Result(self.result).message})"
+        return "\n  ".join([head, *self._table()])
+
+    def _page(self) -> tuple[str, ...]:
+        parameters = table(
+            ("parameter", "value", "standard error", "unit"), self.rows()
+        )
+        return f"of {self.system}: {Result(self.result).message}", parameters
+
+
+class ModelFit(ParameterFit):
     r"""A system whose parameters were fitted to data.
 
     **Fields** beside those of every `Fit` (`noise` is None):
@@ -187,31 +403,74 @@ class ModelFit(Fit):
         return self.system
 
     @property
-    def noise(self) -> None:
-        return None
-
-    @property
-    def covariance_dof(self) -> float:
-        return np.inf if self.weighted else self.dof
-
-    @property
     def findings(self) -> tuple[Finding, ...]:
         return tuple(self._doubts())
+
+    @property
+    def unseen(self) -> Float[np.ndarray, "k p"]:
+        """Combinations that the data do not identify."""
+        return self.identifiability.unseen
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        units = []
+        for name in self.names:
+            is_delay = name in DELAYS
+            unit = unit_of_parameter(self.system, name) if not is_delay else ""
+            units.append(self.system.time_unit if is_delay else unit)
+        return tuple(units)
+
+    @property
+    def estimate(self) -> ParameterEstimate:
+        """The numbers of the fit without its system, as `hj.save` writes them."""
+        return ParameterEstimate(
+            names=self.names,
+            units=self.units,
+            system=type(self.system).__name__,
+            values=np.asarray(self.values),
+            covariance=np.asarray(self.covariance),
+            unseen=np.asarray(self.unseen),
+            multipliers=self.multipliers,
+            cost=float(self.cost),
+            dof=float(self.dof),
+            weighted=self.weighted,
+            result=int(self.result),
+            findings=self.findings,
+        )
+
+    def _linear_model(self, data: Any) -> LDTP:
+        """Return the linearization at the sections of an observation with the data's sections.
+
+        **Raises:** `DefinitionError` if there is none.
+        """
+        for observation in self.problem.observations:
+            family = getattr(observation, "sections", None)
+            if not isinstance(family, AbstractSections):
+                continue
+            if family.n_sections == data.n_sections:
+                delay = getattr(observation, "delay", None)
+                names = data.outputs, data.inputs
+                return linearize(self.cycle, family, *names, delay)
+        raise DefinitionError(
+            f"no observation of this fit has {data.n_sections} sections: validate "
+            "`hj.linearize(fit.cycle, sections)` at those of the data."
+        )
+
+    def _changed(self, system: HybridSystem) -> dict[str, Any]:
+        kept = {x: y for x, y in arrays_of(self.system).items() if x not in self.names}
+        return {
+            x: y
+            for x, y in arrays_of(system).items()
+            if not np.array_equal(y, kept.get(x, np.nan))
+        }
 
     @property
     def weighted(self) -> bool:
         """True if all data have standard deviations."""
         return self.problem.weighted
 
-    @property
-    def standard_errors(self) -> Float[np.ndarray, " p"]:
-        """Standard error of each value; infinite for a parameter that is not identified alone, NaN
-        without standard deviations of the data if `dof` is 0."""
-        lost = np.any(self.identifiability.unseen != 0, axis=0)
-        return np.where(lost, np.inf, np.sqrt(np.diag(self.covariance)))
-
     @checked
-    def chi_square(self, true: HybridSystem | Mapping[str, float]) -> float:
+    def chi_square(self, true: Truth) -> float:
         r"""Return the cost of other values less that of the fit.
 
         For the true values it has a chi square distribution with `identifiability.rank` degrees of
@@ -225,27 +484,7 @@ class ModelFit(Fit):
         **Raises:** `DefinitionError` if a value is missing or was not fitted, or if the fit has no
         standard errors.
         """
-        given: Mapping[str, Any]
-        if isinstance(true, HybridSystem):
-            kept = {
-                x: y for x, y in arrays_of(self.system).items() if x not in self.names
-            }
-            given = {
-                x: y
-                for x, y in arrays_of(true).items()
-                if not np.array_equal(y, kept.get(x, np.nan))
-            }
-        else:
-            given = true
-        if more := [name for name in given if name not in self.names]:
-            raise DefinitionError(
-                f"`true` has another '{more[0]}', which was not fitted: free it."
-            )
-        if missing := [name for name in self.names if name not in given]:
-            raise DefinitionError(
-                f"`true` must have a value of '{missing[0]}', which was fitted."
-            )
-        values = jnp.array([float(given[name]) for name in self.names])
+        values = jnp.array(self._values_of(true))
         self.cycle.require_current()
         r, *_ = evaluate(
             self.problem, self.problem.parameters.encode(values), self.cycle
@@ -257,30 +496,13 @@ class ModelFit(Fit):
             )
         return (float(r @ r) - self.cost) / unit
 
-    @checked
-    def contains(
-        self, true: HybridSystem | Mapping[str, float], level: Probability = 0.95
-    ) -> bool:
-        """Test whether other values lie in the joint confidence region."""
-        rank = max(self.identifiability.rank, 1)
-        region = (
-            stats.chi2(rank) if self.weighted else stats.f(rank, self.dof, scale=rank)
-        )
-        return bool(self.chi_square(true) <= region.ppf(level))
-
-    def _estimates(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-        return self.values, self.standard_errors
-
     def _summary(self) -> str:
-        width = max(map(len, self.names))
         lines = [
             f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
             self._cost(),
             "standard errors include noise, but no distortion:",
+            *self._table(),
         ]
-        for name, value, error, unit in self._rows():
-            shown = f"{error} {unit}" if "±" in error else error
-            lines.append(f"{name:{width}}  {value:<14} {shown}".rstrip())
         return "\n  ".join(lines)
 
     def _doubts(self) -> Iterator[Finding]:
@@ -307,22 +529,9 @@ class ModelFit(Fit):
         head = f"{size}; {good} of {len(self.guesses)} guesses converged"
         return f"{head}, {sum(guess.steps for guess in self.guesses)} evaluations"
 
-    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
-        """Yield each name with its value, standard error and unit."""
-        for name, value, error in zip(
-            self.names, self.values, self.standard_errors, strict=True
-        ):
-            shown = "not identified alone" if np.isinf(error) else f"± {error:.2g}"
-            unit = (
-                self.system.time_unit
-                if name in DELAYS
-                else unit_of_parameter(self.system, name)
-            )
-            yield name, f"{value:.9g}", shown, unit
-
     def _page(self) -> tuple[str, ...]:
         parameters = table(
-            ("parameter", "value", "standard error", "unit"), self._rows()
+            ("parameter", "value", "standard error", "unit"), self.rows()
         )
         of = f"of {type(self.system).__name__}: {Result(self.result).message}"
         return of, parameters, text(self._cost())

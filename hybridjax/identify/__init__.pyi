@@ -1,5 +1,6 @@
 from .bounds import cramer_rao as cramer_rao
 from .fit import Fit as Fit
+from .from_system import ModelIdentification as ModelIdentification
 from .joint.fit import LDTPFit as LDTPFit
 from .loops import Loop as Loop, estimate_loop as estimate_loop
 from .multiplier_estimate import (

@@ -12,9 +12,12 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding, print_findings
 from .._core.html import card, text
 from .._core.results import Result
+from .._core.showable import Showable
+from ..errors import DefinitionError
+from ..linear.ldtp import LDTP
 
 
-class Fit(eqx.Module):
+class Fit(Showable, eqx.Module):
     """A fit to data.
 
     **Fields** of all fits:
@@ -30,6 +33,10 @@ class Fit(eqx.Module):
     - `dof`: degrees of freedom of the residuals: numbers in the data less unknowns.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.
+
+    All fits have `modulus`, `standard_errors` and `interval`; `compare(other)`, which compares with
+    a truth or with another fit and has a `p_value`; `contains(truth)`, whether a truth lies in the
+    confidence region of a level; `plot` and `to_pandas`. `hj.save` writes them.
     """
 
     if TYPE_CHECKING:
@@ -50,8 +57,10 @@ class Fit(eqx.Module):
         def dof(self) -> float: ...
         @property
         def result(self) -> int: ...
-        @property
-        def findings(self) -> tuple[Finding, ...]: ...
+
+        # (What they take depends on what is fitted.)
+        def compare(self, *args: Any, **options: Any) -> Any: ...
+        def contains(self, *args: Any, **options: Any) -> Any: ...
 
     @property
     def modulus(self) -> Float[np.ndarray, " d"]:
@@ -72,6 +81,18 @@ class Fit(eqx.Module):
     @abstractmethod
     def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return the real numbers of which `interval` gives bounds, and their standard errors."""
+
+    def _linear_model(self, data: Any) -> Any:
+        """Return the `LDTP` that is simulated on data to validate the fit.
+
+        **Raises:** `DefinitionError` for a fit that has no model, or none with the data's sections.
+        """
+        if isinstance(self.model, LDTP):
+            return self.model
+        raise DefinitionError(
+            f"{type(self).__name__} has no model that can be simulated: validate that of "
+            "`hj.fit_series` or `hj.fit_ldtp`."
+        )
 
     @abstractmethod
     def _summary(self) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, SignalNames
 from .._core.precision import require_x64
+from .._core.showable import Showable
 from .._core.text import folded
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -18,7 +19,7 @@ from .instrument import Roles, Sums, require_loop, solve, spectral_products
 Names = Sequence[str]
 
 
-class Loop(eqx.Module):
+class Loop(Showable, eqx.Module):
     r"""Estimated HTFs of the control loop $u = r - F y$, $y = P u + d$ with references r and d.
 
     **Fields**, each with variances:

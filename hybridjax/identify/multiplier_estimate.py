@@ -1,8 +1,9 @@
 """Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Annotated
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
@@ -15,7 +16,8 @@ from .._core.boundary.values import Complexes
 from .._core.findings import Finding
 from .._core.html import multiplier_table, text, unit_circle
 from .._core.results import Result
-from .._core.text import folded
+from .._core.showable import Showable
+from .._core.text import folded, p_value
 from ..errors import DefinitionError
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
@@ -25,14 +27,37 @@ from .fit import Fit
 Multipliers = Annotated[Numbers, Complexes()]
 """Supposed or true multipliers, one or several."""
 
+
+@runtime_checkable
+class HasMultipliers(Protocol):
+    """A limit cycle, a model, or a fit."""
+
+    @property
+    def multipliers(self) -> Any: ...
+
+
+Truth = Multipliers | HasMultipliers
+"""Multipliers, or what has them."""
+
+
+def multipliers_from(truth: Any) -> Complex[np.ndarray, " k"]:
+    """Return the multipliers of a limit cycle, a model or a fit, or the given ones."""
+    values = getattr(truth, "multipliers", truth)
+    return np.atleast_1d(np.asarray(values, complex)).ravel()
+
+
 RoughFit = tuple[Coefficients, Callable[[], Covariance]]
 """Coefficients, and a function for their covariance."""
 
+# Eigenvalues of a correlation matrix below this part of the largest one are zero: equations of
+# multipliers that coincide are one. Larger: correlated equations count as one. Smaller: rounding is
+# divided by.
+_RANK = 1e-12
 # Points of the border of a confidence region. Fewer: corners show; more: figures grow.
 _BORDER_POINTS = 100
 
 
-class MultiplierComparison(eqx.Module):
+class MultiplierComparison(Showable, eqx.Module):
     """Estimated Floquet multipliers, each paired with a true one.
 
     The pairing has the smallest sum of distances; if the numbers of multipliers differ, the
@@ -42,11 +67,14 @@ class MultiplierComparison(eqx.Module):
 
     - `true` and `estimated` (k,); `error` (k,), their distance, and `max_error`, the largest.
     - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
+    - `p_value`: probability of distances as large as these if all are equal; None where the
+      covariance is unknown.
     """
 
     true: Complex[np.ndarray, " k"]
     estimated: Complex[np.ndarray, " k"]
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
+    p_value: float | None = eqx.field(static=True, default=None)
 
     @property
     def error(self) -> Float[np.ndarray, " k"]:
@@ -64,6 +92,8 @@ class MultiplierComparison(eqx.Module):
         for label, true, estimated, error in pairs:
             numbers = f"{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}"
             rows.append(f"{label:>{width}}{numbers}")
+        if self.p_value is not None:
+            rows.append(f"all are equal: {p_value(self.p_value)}")
         return "\n".join(rows)
 
 
@@ -72,15 +102,15 @@ def _show(value: complex) -> str:
     return f"{value.real:+.9f}{imaginary}"
 
 
-def compare_multipliers(estimated: Numbers, true: Multipliers) -> MultiplierComparison:
+def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     """Pair estimated with true multipliers so that the sum of distances is smallest.
 
     **Raises:** `DefinitionError` if either is empty.
     """
     from scipy.optimize import linear_sum_assignment  # (a third of a second)
 
-    values = np.asarray(estimated, complex).ravel()
-    truth = np.asarray(true, complex).ravel()
+    values = multipliers_from(estimated)
+    truth = multipliers_from(true)
     if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
     rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
@@ -149,7 +179,7 @@ class MultiplierFit(Fit):
         return modulus, np.sqrt(variance[:, 0, 0])
 
     @checked
-    def distance(self, true: Multipliers) -> Float[np.ndarray, " k"]:
+    def distance(self, true: Truth) -> Float[np.ndarray, " k"]:
         r"""Squared distance of the estimate from supposed multipliers, in units of its covariance.
 
         $\lambda$ is a multiplier if $p(\lambda) = 0$, which is linear in c: one real equation for
@@ -158,35 +188,42 @@ class MultiplierFit(Fit):
         a true multiplier (Hotelling's $T^2$ where the covariance is estimated), also where
         multipliers are close to each other (Fieller 1954). Zero where the covariance is infinite.
         """
-        truth = np.atleast_1d(np.asarray(true, complex)).ravel()
+        truth = multipliers_from(true)
         if not np.isfinite(self.covariance).all():
             return np.zeros(len(truth))
-        return np.array([self._distance_of(z) for z in truth])
+        return np.array(
+            [self._distance_of(truth[k : k + 1])[0] for k in range(len(truth))]
+        )
 
-    def _distance_of(self, multiplier: complex) -> float:
-        powers = multiplier ** np.arange(len(self.coefficients), -1, -1)
-        value = powers @ [1.0, *self.coefficients]
-        equations = 1 if multiplier.imag == 0 else 2
-        slopes = np.array([powers[1:].real, powers[1:].imag])[:equations]
-        missed = np.array([value.real, value.imag])[:equations]
+    def _distance_of(self, multipliers: Complex[np.ndarray, " k"]) -> tuple[float, int]:
+        """Return the squared distance from the hypothesis that all of these are multipliers, and
+        the number of independent equations."""
+        powers = multipliers[:, None] ** np.arange(len(self.coefficients), -1, -1)
+        is_complex = np.imag(multipliers) != 0
+        equations = np.concatenate([powers.real, powers[is_complex].imag])
+        missed = equations @ [1.0, *self.coefficients]
+        slopes = equations[:, 1:]
         covariance = slopes @ self.covariance @ slopes.T
         # Scaled, since a tiny multiplier makes one of the two equations tiny.
         scale = np.sqrt(np.diag(covariance))
         if not (scale > 0).all():
-            return np.inf if missed.any() else 0.0
+            return (np.inf if missed.any() else 0.0), len(missed)
         missed = missed / scale
         correlation = covariance / np.outer(scale, scale)
-        return float(missed @ np.linalg.lstsq(correlation, missed)[0])
+        solution, _, rank, _ = np.linalg.lstsq(correlation, missed, rcond=_RANK)
+        return float(missed @ solution), int(rank)
 
     @checked
     def contains(
-        self, true: Multipliers, level: Probability = 0.95
+        self, true: Truth, level: Probability = 0.95
     ) -> Bool[np.ndarray, " k"]:
         """Test whether supposed multipliers lie in the confidence region of this level.
 
         A conjugate pair is one hypothesis, not two.
+
+        **Arguments:** `true`: multipliers, or a cycle, a model or a fit that has them.
         """
-        truth = np.atleast_1d(np.asarray(true, complex)).ravel()
+        truth = multipliers_from(true)
         equations = np.where(np.imag(truth) == 0, 1, 2)
         return self.distance(truth) <= self._radius(level, equations)
 
@@ -211,9 +248,59 @@ class MultiplierFit(Fit):
         return self.multipliers[index] + x + 1j * y
 
     @checked
-    def compare(self, true: Multipliers) -> MultiplierComparison:
-        """Pair the multipliers with the true ones; printing the result shows a table."""
-        return compare_multipliers(self.multipliers, true)
+    def compare(self, true: Truth) -> MultiplierComparison:
+        """Pair the multipliers with true ones, or with those of another fit, and test whether all
+        are equal; printing the result shows a table.
+
+        The test of true multipliers is that of `distance`, for all of them together. For another
+        fit, to other data, it compares the coefficients of both polynomials; if the orders differ,
+        each pair of multipliers to first order (Bonferroni). Estimated covariances are allowed for
+        with the fewer degrees of freedom of both.
+
+        **Arguments:** `true`: multipliers, or a cycle, a model or a fit that has them.
+        """
+        paired = compare_multipliers(self.multipliers, true)
+        if isinstance(true, MultiplierFit):
+            p = self._p_value_of_fit(true, paired)
+        elif isinstance(true, Fit):
+            p = None  # (The covariance of its multipliers is unknown.)
+        else:
+            p = self._p_value_of_truth(paired.true)
+        return dataclasses.replace(paired, p_value=p)
+
+    def _p_value_of_truth(self, true: Complex[np.ndarray, " k"]) -> float | None:
+        """Return the p value of the hypothesis that all of these are multipliers."""
+        if not np.isfinite(self.covariance).all():
+            return None
+        # (Of a conjugate pair one is enough.)
+        distinct = true[(np.imag(true) >= 0) | ~np.isin(np.conj(true), true)]
+        distance, equations = self._distance_of(distinct)
+        return _tail(distance, equations, self.covariance_dof)
+
+    def _p_value_of_fit(
+        self, other: "MultiplierFit", paired: MultiplierComparison
+    ) -> float | None:
+        """Return the p value of the hypothesis that both fits have the same multipliers."""
+        total = [self.covariance, other.covariance]
+        if not all(np.isfinite(covariance).all() for covariance in total):
+            return None
+        dof = min(self.covariance_dof, other.covariance_dof)
+        d = len(self.coefficients)
+        if len(other.coefficients) == d:
+            missed = self.coefficients - other.coefficients
+            distance = missed @ np.linalg.lstsq(sum(total), missed, rcond=_RANK)[0]
+            return _tail(float(distance), d, dof)
+        tails = []
+        for z, true in zip(paired.estimated, paired.true, strict=True):
+            own = self.multiplier_covariances[np.argmin(abs(self.multipliers - z))]
+            theirs = other.multiplier_covariances[
+                np.argmin(abs(other.multipliers - true))
+            ]
+            missed = np.array([(z - true).real, (z - true).imag])
+            weights = np.linalg.pinv(own + theirs, rcond=_RANK)
+            equations = 2 if missed[1] else 1
+            tails.append(_tail(float(missed @ weights @ missed), equations, dof))
+        return min(1.0, len(tails) * min(tails))
 
     def contradicted_by(
         self, others: Iterable[Callable[[], RoughFit]], level: float = 0.95
@@ -297,6 +384,17 @@ class MultiplierFit(Fit):
             return 2 * special.gammaincinv(equations / 2, level)
         left = np.maximum(dof - equations + 1, 1.0)
         return equations * dof / left * special.fdtri(equations, left, level)
+
+
+def _tail(distance: float, equations: int, dof: float) -> float:
+    """Return the probability of a larger squared distance from a true hypothesis."""
+    from scipy import special  # (a fifth of a second)
+
+    if np.isinf(dof):
+        return float(special.gammaincc(equations / 2, distance / 2))
+    left = max(dof - equations + 1, 1.0)
+    ratio = distance * left / (equations * dof)
+    return float(special.fdtrc(equations, left, ratio))
 
 
 def _short(value: complex) -> str:

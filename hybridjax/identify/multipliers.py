@@ -14,6 +14,7 @@ from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.execution import one_blas_thread
 from .._core.findings import Finding, refuse, warn_of
 from .._core.results import Result
+from .._core.showable import Showable
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
@@ -234,7 +235,7 @@ _ROUNDING_VARIES = 1e6
 _FALSE_ALARMS, _DRAWS = 0.01, 20000
 
 
-class OrderSelection(eqx.Module):
+class OrderSelection(Showable, eqx.Module):
     """Criteria for each number of multipliers. Printing it shows a table.
 
     **Fields**, one entry for each order 0, 1, ..., the largest tried:

@@ -14,10 +14,11 @@ from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
-from .multiplier_estimate import MultiplierComparison, Multipliers, compare_multipliers
+from .multiplier_estimate import MultiplierComparison, Truth, compare_multipliers
 from .variable_projection import (
     FittedResponse,
     HTFGroup,
@@ -37,7 +38,7 @@ _STARTS = (0, 1, 4, 29)
 _ACCURACY = 1e-8
 
 
-class RationalFit(eqx.Module):
+class RationalFit(Showable, eqx.Module):
     r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to $H_0$, one per output.
 
     $$H_0(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}
@@ -80,11 +81,17 @@ class RationalFit(eqx.Module):
         H = (top / bottom * delay).T[None, :, :, None]
         return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
+    @property
+    def modulus(self) -> Float[np.ndarray, "ny n"]:
+        """The moduli of the multipliers."""
+        return np.abs(self.multipliers)
+
     @checked
     def compare(
-        self, true: Multipliers, output: str | int | None = None
+        self, true: Truth, output: str | int | None = None
     ) -> MultiplierComparison:
         """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
+        There is no test: the errors of this fit are not known.
 
         **Raises:** `DefinitionError` for an output that is not there.
         """

@@ -17,6 +17,7 @@ from scipy import linalg, optimize
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
+from .._core.showable import Showable
 from .._core.text import folded
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
@@ -32,7 +33,7 @@ from .spectral_sums import SILENT_LINE
 _LARGEST_ORDER = 4
 
 
-class TransientFit(eqx.Module):
+class TransientFit(Showable, eqx.Module):
     """Records without their transients.
 
     **Fields:**

@@ -11,14 +11,18 @@ from scipy import stats
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability, SignalNames
+from .._core.findings import Finding, print_findings
 from .._core.html import COLORS, Curve, card, picture, text
+from .._core.showable import Showable
 from .._core.text import folded, listed, p_value
 from ..errors import DefinitionError
 from ..experiments.record import RecordedData, SectionSeries, uninterrupted_records
 from ..linear.ldtp import LDTP
 from .descent import positive
+from .fit import Fit
 from .instrument import in_loop
 from .joint.fit import LDTPFit
+from .multipliers import StructuredFit
 from .periodic import PeriodicModel
 from .series.fit import SeriesFit
 from .series.prediction import Predictor
@@ -58,7 +62,7 @@ _DRAWN = 4
 _SAMPLES_PER_LAG = 4
 
 
-class Validation(eqx.Module):
+class Validation(Showable, eqx.Module):
     r"""The part of data that a model explains, and tests of the residuals.
 
     Printing it gives a report; `hj.plot.validation` draws it.
@@ -85,6 +89,7 @@ class Validation(eqx.Module):
     - `measured`, `simulated` (n, ny): the longest record, whose first sample lies on
       `first_section`.
     - `left_out`: number of records that are too short to test more than their initial condition.
+    - `findings`: "harmonics" if the model lacks harmonics, whose responses count as residuals.
     - `n_sections`, `inputs`, `outputs`.
     """
 
@@ -104,6 +109,7 @@ class Validation(eqx.Module):
     n_sections: int = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+    findings: tuple[Finding, ...] = eqx.field(static=True, default=())
 
     @property
     def white(self) -> bool:
@@ -151,6 +157,8 @@ class Validation(eqx.Module):
         rows.append(
             folded(f"smallest model error detectable with 80 % power: {visible}")
         )
+        if self.findings:
+            rows.append(print_findings(self.findings))
         return "\n".join(rows)
 
     def _repr_html_(self) -> str:
@@ -166,7 +174,7 @@ class Validation(eqx.Module):
 
 @checked
 def validate(
-    model: LDTP | SeriesFit | LDTPFit,
+    model: LDTP | Fit,
     data: RecordedData,
     *,
     start: Literal["free", "cycle"] = "free",
@@ -195,7 +203,9 @@ def validate(
 
     **Arguments:**
 
-    - `model`: identified or exact; a `SeriesFit` is simulated as it is.
+    - `model`: identified or exact. A fit of `fit_series` or `fit_multipliers` is simulated as it
+      is; the latter should have all harmonics. Of a fit of `fit_model` the linearization at the
+      sections of its observations is simulated.
     - `data`: data as for `fit_series`, preferably other data than those of the fit, with which a
       model always agrees too well.
     - `start`: "free", the default, estimates the initial state of each record from the record;
@@ -210,8 +220,10 @@ def validate(
     unstable outside of its loop or grows without bound, unless it is a fit of `fit_ldtp`.
     """
     free_start = start == "free"
-    tested: LDTP | SeriesFit | Predictor = _tested(model)
     records = uninterrupted_records(data)
+    findings = _about_harmonics(model)
+    model = _simulated(model, records[0])
+    tested: LDTP | SeriesFit | Predictor = _tested(model)
     outside = records
     if references is not None:
         records, outside = in_loop(data, references)
@@ -238,7 +250,7 @@ def validate(
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):
-        simulated = tested.predict(grid, free_start)
+        simulated = tested.predicted(grid, free_start)
         error = y - simulated
         no_better = _no_better(y, error)
     predicts = isinstance(model, LDTPFit) and model.predictor is not None
@@ -280,6 +292,54 @@ def validate(
         n_sections=N,
         inputs=longest.inputs,
         outputs=longest.outputs,
+        findings=findings,
+    )
+
+
+def _about_harmonics(model: LDTP | Fit) -> tuple[Finding, ...]:
+    """Return a finding if a fit lacks harmonics."""
+    if not isinstance(model, StructuredFit):
+        return ()
+    missing = model.n_sections - len(model.harmonics)
+    if not missing:
+        return ()
+    text = (
+        f"the fit has {len(model.harmonics)} of {model.n_sections} harmonics; responses at the "
+        "others count as residuals: estimate all harmonics."
+    )
+    return (Finding("harmonics", text),)
+
+
+def _simulated(model: LDTP | Fit, record: Record) -> LDTP | SeriesFit | LDTPFit:
+    """Return the model that is simulated to validate a fit.
+
+    **Raises:** `DefinitionError` for a fit without a model.
+    """
+    if isinstance(model, StructuredFit):
+        return _as_series_fit(model)
+    if isinstance(model, LDTP | SeriesFit | LDTPFit):
+        return model
+    return model._linear_model(record)
+
+
+def _as_series_fit(fit: StructuredFit) -> SeriesFit:
+    """Return the same model with numerators at sections, whose errors are not known."""
+    N = fit.n_sections
+    waves = np.exp(2j * np.pi * np.outer(np.arange(N), fit.harmonics) / N)
+    numerators = np.einsum("nm,mrij->nrij", waves, fit.numerators).real
+    _, R, ny, nu = numerators.shape
+    return SeriesFit(
+        fit.multipliers,
+        fit.coefficients,
+        fit.covariance,
+        fit.covariance_dof,
+        numerators,
+        slopes=np.zeros((len(fit.coefficients), *numerators.shape)),
+        roots=np.zeros((N, ny, R, nu, 0)),
+        noise=np.zeros(ny),
+        n_sections=N,
+        inputs=fit.inputs,
+        outputs=fit.outputs,
     )
 
 

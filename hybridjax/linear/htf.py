@@ -17,6 +17,7 @@ from .._core.boundary.values import Complexes, Reals, Whole
 from .._core.executor import from_host, is_traced, namespace, put, to_host
 from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
+from .._core.showable import Showable
 from .._core.signal import ratio, with_unit
 from .._core.text import folded, listed
 from ..errors import DefinitionError
@@ -98,7 +99,7 @@ _SILENT_LINE = 1e-10
 
 
 @checked
-class HTF(eqx.Module):
+class HTF(Showable, eqx.Module):
     r"""Harmonic transfer functions of a periodic system on a grid of input frequencies.
 
     An input $u[n] = e^{i w n}$ has the response
@@ -306,6 +307,11 @@ class HTF(eqx.Module):
         require_chain("feedback", self.outputs, other.inputs, self, other)
         require_chain("feedback", other.outputs, self.inputs, self, other)
         return _combined(algebra.feedback, [self, other], self.inputs, self.outputs)
+
+    @property
+    def standard_errors(self) -> Float[Array, "M F ny nu"] | None:
+        """Root of the variance; None if it is unknown."""
+        return None if self.variance is None else jnp.sqrt(self.variance)
 
     def confidence_radius(self, level: Probability = 0.95) -> Float[Array, "M F ny nu"]:
         r"""Radius of the disc around each estimate that holds the true value with this probability.

@@ -16,6 +16,7 @@ from .._core.executor import from_host, is_traced, namespace, to_host
 from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
+from .._core.showable import Showable
 from .._core.text import folded, listed
 from ..errors import DefinitionError
 from . import algebra, time_response
@@ -30,7 +31,7 @@ from .multipliers import product_eigenvalues, product_rank
 
 
 Matrix = Annotated[Numbers, Reals("rows columns")]
-Signals = Annotated[Numbers, Reals("samples inputs")]
+Signals = Annotated[Numbers, Reals()]
 Gain = Annotated[Numbers, Reals()]
 
 # Singular values of a factor below this part of its largest one are zero. Smaller: rounding is
@@ -42,7 +43,7 @@ _RESONANCE = 1e-8
 
 
 @checked
-class LDTP(eqx.Module):
+class LDTP(Showable, eqx.Module):
     r"""A linear discrete-time periodic system of period $N$ sections.
 
     $$x[n+1] = A[n]\,x[n] + B[n]\,u[n], \qquad y[n] = C[n]\,x[n] + D[n]\,u[n]$$
@@ -179,6 +180,16 @@ class LDTP(eqx.Module):
         """The number of sections in one period, `N`."""
         return self.A.shape[0]
 
+    @property
+    def modulus(self) -> Float[np.ndarray, " r"]:
+        """The moduli of the multipliers: the parts of deviations that are left after a period."""
+        return np.abs(self.multipliers)
+
+    @property
+    def is_stable(self) -> bool:
+        """True if all multipliers lie inside the unit circle."""
+        return bool((self.modulus < 1).all())
+
     def __repr__(self) -> str:
         ports = f"{listed(self.inputs)} -> {listed(self.outputs)}"
         return folded(
@@ -216,8 +227,8 @@ class LDTP(eqx.Module):
     ) -> Float[Array, "time d"]:
         """The states that an input leads to.
 
-        **Arguments:** `u` (n, nu), the input from `first_section` on; `x0`, the state there, either
-        padded (d,) or with its true dimension. Default: zero.
+        **Arguments:** `u` (n, nu), or (n,) of a single input, from `first_section` on; `x0`, the
+        state there, either padded (d,) or with its true dimension. Default: zero.
 
         **Returns:** (n + 1, d), padded with zeros, `x0` first.
         """
@@ -419,9 +430,13 @@ class LDTP(eqx.Module):
 
     def _input(self, u):
         require_x64()
-        if u.shape[-1] != len(self.inputs):
+        nu = len(self.inputs)
+        if u.ndim == 1 and nu == 1:
+            u = u[:, None]
+        if u.ndim < 2 or u.shape[-1] != nu:
             raise DefinitionError(
-                f"`u` has {u.shape[-1]} columns, but the inputs are ({', '.join(self.inputs)})."
+                f"`u` must be of shape (n, {nu}), with a column for each input "
+                f"({', '.join(self.inputs)}), not of shape {u.shape}."
             )
         return u
 

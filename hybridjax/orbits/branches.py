@@ -20,6 +20,7 @@ from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import number
 from ..errors import DefinitionError
 from ..systems.system import Guess, copies_of, require_positive
@@ -81,7 +82,7 @@ class BranchEnd(NamedTuple):
 
 
 @checked_methods
-class Branch(eqx.Module):
+class Branch(Showable, eqx.Module):
     """Limit cycles along one parameter, in their order on the branch.
 
     **Fields:**

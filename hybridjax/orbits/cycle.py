@@ -27,6 +27,7 @@ from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
@@ -66,7 +67,7 @@ _LEAST_OF_IMPLICIT = 1e-10
 
 
 @checked_methods
-class LimitCycle(eqx.Module):
+class LimitCycle(Showable, eqx.Module):
     """A periodic orbit of a hybrid system.
 
     **Fields:**
@@ -266,6 +267,13 @@ class LimitCycle(eqx.Module):
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
+
+    is_stable = stable
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " r"]:
+        """The moduli of the multipliers: the parts of deviations that are left after a period."""
+        return np.abs(self.multipliers)
 
     @property
     def state(self) -> dict[str, float]:

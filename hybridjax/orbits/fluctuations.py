@@ -18,6 +18,7 @@ from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Index, NonNegative
 from .._core.compilation import one_program
 from .._core.executor import Array, is_traced, namespace, on_host, put, scan, solve
+from .._core.showable import Showable
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
@@ -39,7 +40,7 @@ GivenResets = Resets | None
 
 
 @checked_methods
-class Fluctuations(eqx.Module):
+class Fluctuations(Showable, eqx.Module):
     """Stationary deviations from a cycle under noise (see `LimitCycle.fluctuations`).
 
     **Fields:**

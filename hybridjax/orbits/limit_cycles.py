@@ -19,6 +19,7 @@ from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
@@ -55,7 +56,7 @@ _TESTED = 8
 
 
 @checked_methods
-class LimitCycles(eqx.Module):
+class LimitCycles(Showable, eqx.Module):
     """Limit cycles of S systems; `cycles[i]` is one of them.
 
     **Fields**, with the systems on the first axis:

@@ -32,8 +32,9 @@ from .._core.executor import (
 )
 from .._core.meaning import require_as_made
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import unit_of
-from .._core.text import number
+from .._core.text import fields, number
 from ..engine import kernels
 from ..engine.lanes import lane_at
 from ..engine.move import move
@@ -54,7 +55,7 @@ Unit = Literal["time", "cycles", "radians"]
 Phases = Annotated[Numbers, Reals("p")]
 
 
-class PhaseCurve(eqx.Module):
+class PhaseCurve(Showable, eqx.Module):
     """The phase response to one input over one cycle, of a model or measured.
 
     **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
@@ -65,6 +66,8 @@ class PhaseCurve(eqx.Module):
     values: Float[np.ndarray, " P"]
     input: str = eqx.field(static=True)
     time_unit: str = eqx.field(static=True, default="s", kw_only=True)
+
+    __repr__ = fields
 
     @property
     def unit(self) -> str:
@@ -92,7 +95,7 @@ class Locked(NamedTuple):
 
 
 @checked_methods
-class Coupling(eqx.Module):
+class Coupling(Showable, eqx.Module):
     r"""Mean effect of a weak push, by its lead $\psi$ in cycles (see `Responses.coupling`).
 
     The rate of the phase is $f_0 + \varepsilon \Gamma(\psi)$ in cycles per time under a push of the
@@ -107,6 +110,8 @@ class Coupling(eqx.Module):
         xp, n = namespace(self.coefficients), np.arange(len(self.coefficients))
         waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
         return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
+
+    __repr__ = fields
 
     @property
     def locking(self) -> tuple[float, float]:
@@ -149,7 +154,7 @@ _MADE = "these responses were computed"
 
 
 @checked_methods
-class Responses(eqx.Module):
+class Responses(Showable, eqx.Module):
     """Responses of a limit cycle to brief pushes, at every phase (see `LimitCycle.responses`).
 
     Phase 0 is the anchor of the cycle. At an event, responses are those right after it. In a chart

@@ -15,6 +15,7 @@ from .._core.boundary.checked import checked_methods
 from .._core.compilation import at_ease, one_program
 from .._core.executor import Array, is_traced, namespace, on_host, svdvals
 from .._core.meaning import require_as_made
+from .._core.showable import Showable
 from .._core.text import number
 from ..engine import kernels
 from ..errors import ComputationError
@@ -28,7 +29,7 @@ from .return_map import SINGULAR, ReturnMap, with_derivatives
 
 
 @checked_methods
-class Sensitivity(eqx.Module):
+class Sensitivity(Showable, eqx.Module):
     """Derivatives of a cycle by a parameter (see `LimitCycle.sensitivity`).
 
     **Fields:**

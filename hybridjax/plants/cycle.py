@@ -18,6 +18,7 @@ from .._core.execution import core_count
 from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.signal import Signal, signals
 from .._core.text import folded, listed
 from ..engine.trajectory import Trajectory
@@ -218,7 +219,7 @@ def _resolved(
 
 @checked_methods
 @dataclasses.dataclass(frozen=True, eq=False)
-class PlantCycle:
+class PlantCycle(Showable):
     """The limit cycle of a plant, as `hj.plants.find_cycle` measures it.
 
     **Fields:**

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
-from .._core.boundary.checked import checked
+from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import FilePath
 from .._core.signal import unit_of, with_unit
 from .._core.writing import Format, replacing
@@ -87,9 +87,10 @@ AxesLike = Axes | np.ndarray | Sequence
 """Axes to draw on: one, or a grid of them."""
 
 
+@checked_methods
 @dataclasses.dataclass(frozen=True, repr=False)
 class Plot:
-    """What every function of `hybridjax.plot` returns: where it has drawn.
+    """The figure that every function of `hybridjax.plot` returns.
 
     **Fields:** `axes`, the grid of panels, (rows, columns); `figure`, in which they are.
     """
@@ -104,6 +105,28 @@ class Plot:
     def ax(self) -> Axes:
         """The first panel, and the only one of many plots."""
         return self.axes[0, 0]
+
+    def save(
+        self, path: FilePath, formats: Sequence[Format] | None = None
+    ) -> tuple[Path, ...]:
+        """Write the figure, in one file for each format.
+
+        **Arguments:** `path`: with a suffix, or without; `formats`, of "png" (150 dots per inch),
+        "pdf" and "svg". Default: that of the suffix; without suffix, "png".
+
+        **Returns:** the paths.
+
+        **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
+        """
+        if formats is None:
+            suffix = Path(path).suffix[1:]
+            known = suffix in get_args(Format)
+            formats = [cast(Format, suffix if known else "png")]
+        return save(path, self, formats)
+
+    def show(self) -> None:
+        """Open a window with the figure, or show it in a notebook."""
+        self.figure.show()
 
     def __repr__(self) -> str:
         rows, columns = self.axes.shape

@@ -11,6 +11,7 @@ from scipy import signal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
+from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
 from .._core.text import folded
 from ..experiments.data import ExperimentData
@@ -25,7 +26,7 @@ LEAST_POWER = 0.01
 WHOLE_BAND = 0.9
 
 
-class SectionData(eqx.Module):
+class SectionData(Showable, eqx.Module):
     """Inputs and outputs of a recording at N sections of each cycle, as deviations from it.
 
     **Fields:**

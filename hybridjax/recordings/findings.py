@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._core.findings import Finding, listed, print_findings
+from .._core.showable import Showable
 from .recording import Recording, Trial
 
 
@@ -23,13 +24,13 @@ NAME_REFERENCE = (
 )
 
 
-class Inspection(eqx.Module):
+class Inspection(Showable, eqx.Module):
     """The result of `inspect`. Printing it shows the findings.
 
     **Fields:** `findings`; `recording`, in which samples that are left out are missing (NaN).
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
     recording: Recording
 
     def __repr__(self) -> str:

@@ -15,6 +15,7 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import listed, p_value
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
@@ -49,7 +50,7 @@ _LEVEL = 0.01
 Multipliers = Complex[np.ndarray, " d"]
 
 
-class Diagnosis(eqx.Module):
+class Diagnosis(Showable, eqx.Module):
     """Reasons to doubt a fit. Printing it shows the findings.
 
     **Fields:**
@@ -61,7 +62,7 @@ class Diagnosis(eqx.Module):
       so many cycles like these would give.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
     plain: Multipliers
     bandwidths: tuple[float, ...] = eqx.field(static=True)
     cycles: tuple[int, ...] = eqx.field(static=True)

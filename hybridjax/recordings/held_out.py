@@ -174,6 +174,6 @@ def split(data: HasRecords) -> Split:
 
 def _misfit(fit: SeriesFit, grid: CycleGrid) -> float:
     """Return the mean logarithm of the rms errors of the outputs."""
-    error = (fit.predict(grid, free_start=True) - grid.y) * grid.sampled
+    error = (fit.predicted(grid, free_start=True) - grid.y) * grid.sampled
     square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
     return float(np.log(square).mean()) / 2

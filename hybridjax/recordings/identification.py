@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import (
@@ -20,6 +22,7 @@ from .._core.boundary.kinds import (
 from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
+from .._core.showable import Showable
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit, fit_series
@@ -49,7 +52,7 @@ MEANING = (
 )
 
 
-class Identification(eqx.Module):
+class Identification(Showable, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `inspect` leaves out; `findings` of the
@@ -59,7 +62,7 @@ class Identification(eqx.Module):
     """
 
     recording: Recording
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
     phase: Phase
     data: SectionData
     fit: SeriesFit
@@ -90,6 +93,16 @@ class Identification(eqx.Module):
         # (Reports are made of figures, which are drawn above this layer.)
         report = importlib.import_module("hybridjax.apps.identify")
         return report.write_report(folder, self, formats)
+
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        """Those of the fit."""
+        return self.fit.multipliers
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " d"]:
+        """Moduli of the multipliers."""
+        return self.fit.modulus
 
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]

@@ -10,6 +10,8 @@ from scipy import ndimage, signal
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
 from .._core.boundary.values import Number
+from .._core.showable import Showable
+from .._core.text import fields
 from ..errors import DefinitionError
 from ..experiments.record import average_cycle
 from ..identify.series.fit import SeriesFit
@@ -28,7 +30,7 @@ _PUSH_REACH = 3
 Responses = Float[np.ndarray, "N lags ny nu"]
 
 
-class ImpulseResponses(eqx.Module):
+class ImpulseResponses(Showable, eqx.Module):
     r"""Outputs after a brief push of area 1, for each phase at which it acts.
 
     The impulse response of a periodic system depends on two times; neuromechanics calls it the
@@ -52,6 +54,8 @@ class ImpulseResponses(eqx.Module):
     durations: Float[np.ndarray, " N"]
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+
+    __repr__ = fields
 
     n_sections = property(lambda self: len(self.phase))
 

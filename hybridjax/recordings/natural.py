@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy import stats
 
 from .._core.boundary.checked import checked, checked_methods
@@ -24,7 +24,13 @@ from .._core.boundary.kinds import Probability, Seed
 from .._core.boundary.values import Whole
 from .._core.findings import Finding, print_findings
 from .._core.progress import working
+from .._core.showable import Showable
 from ..errors import DefinitionError
+from ..identify.multiplier_estimate import (
+    MultiplierComparison,
+    Truth,
+    compare_multipliers,
+)
 from .data import SectionData
 from .fit_warnings import about_natural_multipliers
 
@@ -44,7 +50,7 @@ MultiplierCount = Annotated[int, Whole(1, 12)]
 
 
 @checked_methods
-class NaturalMultipliers(eqx.Module):
+class NaturalMultipliers(Showable, eqx.Module):
     """Multipliers of a rhythm that nobody perturbed.
 
     **Fields:**
@@ -69,6 +75,31 @@ class NaturalMultipliers(eqx.Module):
     records: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def modulus(self) -> Float[np.ndarray, " d"]:
+        """The moduli of the multipliers."""
+        return np.abs(self.multipliers)
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " d"]:
+        """Standard deviation of each modulus over the resamplings."""
+        return np.abs(self.draws).std(axis=0)
+
+    def contains(
+        self, true: Truth, level: Probability = 0.95
+    ) -> Bool[np.ndarray, " d"]:
+        """Test whether the modulus of each true multiplier, paired with these, lies in its
+        interval."""
+        paired = self.compare(true)
+        order = [int(np.argmin(abs(self.multipliers - z))) for z in paired.estimated]
+        low, high = self.interval(level)[order].T
+        return (low <= np.abs(paired.true)) & (np.abs(paired.true) <= high)
+
+    def compare(self, true: Truth) -> MultiplierComparison:
+        """Pair the multipliers with true ones, or with those of another fit. There is no test: see
+        `interval`."""
+        return compare_multipliers(self.multipliers, true)
 
     def interval(
         self,

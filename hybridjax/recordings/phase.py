@@ -8,6 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from .._core.arguments import require_equal
 from .._core.memo import remembered
+from .._core.showable import Showable
 from .._core.text import folded
 from ..errors import DefinitionError
 from .recording import Recording, Trial
@@ -52,7 +53,7 @@ class Winding(eqx.Module):
         return np.interp(time, self.time, self.phase, left=np.nan, right=np.nan)
 
 
-class Phase(eqx.Module):
+class Phase(Showable, eqx.Module):
     """The phase of all trials of a recording, as `estimate_phase` returns it.
 
     **Fields:**

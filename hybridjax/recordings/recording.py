@@ -14,6 +14,7 @@ from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings
+from .._core.showable import Showable
 from .._core.signal import with_unit
 from .._core.text import folded
 from ..errors import DefinitionError
@@ -46,7 +47,7 @@ class Trial(eqx.Module):
 
 
 @checked
-class Recording(eqx.Module):
+class Recording(Showable, eqx.Module):
     """Sampled signals of one or several trials. Nothing is resampled.
 
     **Fields:**
@@ -59,7 +60,7 @@ class Recording(eqx.Module):
     trials: tuple[Trial, ...]
     signals: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = eqx.field()
 
     def __init__(
         self,
@@ -257,6 +258,34 @@ class Recording(eqx.Module):
         """
         require_among("signal", [name], self.signals)
         return self.signals.index(name)
+
+    def __len__(self) -> int:
+        """The number of trials."""
+        return len(self.trials)
+
+    def __getitem__(self, name: str) -> Series:
+        """The samples of a signal, one trial after the other: `recording["yM"]`.
+
+        **Raises:** `DefinitionError` for a signal that does not exist.
+        """
+        return np.concatenate([x for _, x in self.samples(name)])
+
+    @property
+    def time(self) -> Series:
+        """The times of all samples in s, one trial after the other."""
+        return np.concatenate([trial.time for trial in self.trials])
+
+    @property
+    def rate(self) -> float:
+        """Samples per second: one over the median time between samples."""
+        return float(
+            1 / np.median(np.concatenate([np.diff(t.time) for t in self.trials]))
+        )
+
+    @property
+    def duration(self) -> float:
+        """The length of all trials together, in s."""
+        return float(sum(np.ptp(trial.time) for trial in self.trials))
 
     def samples(self, name: str) -> list[tuple[Trial, Series]]:
         """Return each trial with the samples of a signal."""

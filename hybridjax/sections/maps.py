@@ -16,6 +16,7 @@ from .._core.compilation import host_first
 from .._core.executor import is_traced, namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
+from .._core.showable import Showable
 from .._core.text import folded
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
@@ -42,7 +43,7 @@ class Arrival(NamedTuple):
 
 
 @checked_methods
-class SectionMap(eqx.Module):
+class SectionMap(Showable, eqx.Module):
     """P_{i->j}: from a state on section i, under a constant input, to section j.
 
     See `section_map`. Made under a JAX transformation, where charts are not known, it takes and

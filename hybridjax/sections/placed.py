@@ -14,6 +14,7 @@ from .._core.html import card, facts
 from .._core.meaning import require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
+from .._core.showable import Showable
 from .._core.text import folded, number
 from ..engine import kernels
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
@@ -27,7 +28,7 @@ from .families import AbstractSections, BoundSections, FamilyLike
 
 
 @checked_methods
-class PlacedSections(eqx.Module):
+class PlacedSections(Showable, eqx.Module):
     """N sections of a family on a limit cycle.
 
     **Fields:**

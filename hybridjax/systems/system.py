@@ -5,24 +5,34 @@ import contextvars
 import copy
 import dataclasses
 import functools as ft
+import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import check_fields, checked
 from .._core.boundary.containers import Names
-from .._core.boundary.kinds import PositiveScalar, Scalar, Vector
+from .._core.boundary.kinds import (
+    NewNames,
+    NewOptionalNames,
+    PositiveScalar,
+    Scalar,
+    Vector,
+)
+from .._core.boundary.leads import missing_attribute
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
 from .._core.pieces.description import digest_of, marked
 from .._core.precision import real
+from .._core.signal import unit_of
 from .._core.text import columns, fields, value
 from ..errors import DefinitionError
-from .chart import Chart, attribute_of
+from .chart import Chart, FieldChart, attribute_of
 from .drawing import Drawing
 from .solver import ByChart, Method, Solver, solvers
 from .transition import Scheduled, Transition
@@ -310,6 +320,89 @@ class HybridSystem(Definition):
         that it lacks (`Chart.absent`) by name. `None`, the default: states are drawn over time."""
         return None
 
+    @staticmethod
+    @checked
+    def from_functions(
+        states: NewNames,
+        field: Callable[..., Any],
+        events: Sequence[tuple[str, Callable[..., Any], Callable[..., Any]]] = (),
+        parameters: Mapping[str, float] | None = None,
+        *,
+        period: str | float | Callable[[Any], Any] | None = None,
+        inputs: NewOptionalNames | None = None,
+        time_unit: str = "",
+        name: str = "System",
+    ) -> "HybridSystem":
+        """Make a system of one chart, `"main"`, from functions.
+
+        **Arguments:**
+
+        - `states`: names, or units by name, as in `{"y": "m", "v": "m/s"}`.
+        - `field`: the vector field, `(t, q, u, p)` -> n numbers. t is the time, q (n,) the state,
+          u the inputs. `p.g` is the parameter g.
+        - `events`: for each its name, its guard `(t, q, u, p)` -> number, which falls through zero
+          at the event, and its reset `(t, q, u, p)` -> state after it.
+        - `parameters`: values by name. They can be fitted, swept and differentiated by.
+        - `period`: that of the clock which drives the system: a number, the name of a parameter,
+          or a function of p. Default: None, no clock.
+        - `inputs`: names, or units by name. Default: one, `u`.
+        - `time_unit`: unit of time. `name`: the name of the system's class.
+
+        **Returns:** a `HybridSystem`; `system.replace(g=1.6)` has other parameters.
+
+        **Raises:** `DefinitionError` for a parameter that is called like an attribute of systems,
+        and for a period that is the name of none.
+
+        **Example:**
+
+        ```python
+        ball = hj.HybridSystem.from_functions(
+            ("y", "v"),
+            lambda t, q, u, p: (q[1], u[0] - p.g),
+            [("impact", lambda t, q, u, p: q[0], lambda t, q, u, p: (q[0], -p.e * q[1]))],
+            {"g": 9.81, "e": 0.7},
+        )
+        hj.simulate(ball, hj.Guess("main", (1.0, 0.0)), 2.0)
+        ```
+        """
+        values = dict(parameters or {})
+        for parameter_name in values:
+            if hasattr(HybridSystem, parameter_name):
+                raise DefinitionError(
+                    f"`parameters`: systems have another attribute '{parameter_name}': rename the "
+                    "parameter."
+                )
+        if isinstance(period, str):
+            require_among("parameter", [period], values, "`period`: ")
+        made = _Functions(tuple(states), field, tuple(events), period)
+        namespace: dict[str, Any] = {
+            "__annotations__": dict.fromkeys(values, Parameter),
+            "__doc__": "A system of one chart, made from functions.",
+            **{key: parameter(value) for key, value in values.items()},
+            "charts": lambda self: made.charts(self),
+            "transitions": lambda self: made.transitions(self),
+            "period": lambda self: made.period_of(self),
+            "time_unit": time_unit,
+        }
+        if inputs is not None:
+            named = inputs
+            namespace["inputs"] = tuple(map(str, named))
+            namespace["input_units"] = tuple(map(unit_of, named))
+        made_class = types.new_class(
+            name, (HybridSystem,), {}, lambda body: body.update(namespace)
+        )
+        return made_class()
+
+    def replace(self, **parameters: Any) -> "HybridSystem":
+        """Return the system with other parameters: `system.replace(k=9.0)`.
+
+        **Raises:** `DefinitionError` for a name that is no parameter, and for a value that a
+        parameter may not have.
+        """
+        return dataclasses.replace(self, **parameters)
+
+    __getattr__ = missing_attribute
+
     def __repr__(self):
         rows = []
         for field in own_fields(self):
@@ -320,6 +413,46 @@ class HybridSystem(Definition):
         if self.solver is not None:
             rows.append(("solver", repr(self.solver), "how charts are integrated"))
         return type(self).__name__ + columns(rows)
+
+
+class _Functions(NamedTuple):
+    """The functions of which `HybridSystem.from_functions` makes a system."""
+
+    states: tuple[str, ...]
+    field: Callable[..., Any]
+    events: tuple[tuple[str, Callable[..., Any], Callable[..., Any]], ...]
+    period: Any
+
+    def charts(self, system: HybridSystem) -> dict[str, Chart]:
+        field = _with_parameters(self.field, system)
+        units = tuple(map(unit_of, self.states))
+        names = tuple(map(str, self.states))
+        return {"main": FieldChart(field, names, units if any(units) else ())}
+
+    def transitions(self, system: HybridSystem) -> list[Transition]:
+        transitions = []
+        for name, guard, reset in self.events:
+            transition = Transition(
+                name,
+                "main",
+                "main",
+                guard=_with_parameters(guard, system),
+                reset=_with_parameters(reset, system),
+            )
+            transitions.append(transition)
+        return transitions
+
+    def period_of(self, system: HybridSystem) -> Any:
+        if callable(self.period):
+            return self.period(system)
+        if isinstance(self.period, str):
+            return getattr(system, self.period)
+        return self.period
+
+
+def _with_parameters(function: Callable[..., Any], system: HybridSystem) -> Callable:
+    """Return a function (t, q, u) from one of (t, q, u, p)."""
+    return lambda t, q, u: function(t, q, u, system)
 
 
 def integrated(system: HybridSystem, solver: Any) -> HybridSystem:

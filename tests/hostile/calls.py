@@ -161,6 +161,9 @@ def designs(t):
 def experiments(t):
     to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
     yield hj.run_experiments, to_run
+    small = hj.multisine(4, periods=16, amplitude=1e-4)
+    whole = dict(system=t.cycle, sections=PHASE, outputs="x", order=1, design=small)
+    yield hj.identify_model, whole
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield (
         hj.experiments.response_function,
@@ -191,6 +194,7 @@ def estimates(t):
     yield t.structured.compare, dict(true=true)
     yield t.structured.contains, dict(true=true)
     yield t.structured.interval, dict(level=0.9)
+    yield t.data.__getitem__, dict(name=t.data.outputs[0])
     yield hj.select_order, dict(data=t.estimate, extra_lags=6)
     yield hj.identify.cramer_rao, dict(model=t.model, htf=t.uncertain)
     yield hj.fit_ldtp, dict(data=t.uncertain, initial=t.model)
@@ -264,7 +268,7 @@ def recordings(t):
     rises = hj.Crossing("x", "rising")
     angle = hj.KinematicPhase(4, position="x", velocity="v")
     yield t.recording.mark, dict(event="e", crossing=rises)
-    for name in ("column", "samples", "unit"):
+    for name in ("column", "samples", "unit", "__getitem__"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, sections=angle)
     take = dict(

@@ -279,7 +279,7 @@ def test_residuals_tell_of_the_loop(plant):
             CycleGrid.from_records([record]),
         )
         assert (
-            feedback_test(grid, grid.y - fit.predict(grid, True))[0] < 1e-3
+            feedback_test(grid, grid.y - fit.predicted(grid, True))[0] < 1e-3
         ) == answers
     unstable = hj.linear.LDTP(
         1.3 * np.ones((N, 1, 1)), np.ones((N, 1, 1)), np.ones((N, 1, 1))

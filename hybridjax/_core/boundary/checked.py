@@ -5,7 +5,7 @@ import inspect
 import sys
 import typing
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 import jax
 
@@ -14,7 +14,7 @@ from ..call import public_call
 from ..exceptions import DefinitionError
 from ..executor import as_numpy, is_hidden
 from ..memo import Memory
-from ..public import about_word
+from . import leads
 from .kinds import kind_of
 from .values import Kind, Misfit
 
@@ -37,6 +37,10 @@ class NeedsValues(DefinitionError):
     """A function that needs values was called where JAX knows none."""
 
 
+class WrongArguments(DefinitionError, TypeError):
+    """Arguments that a function has not, too many, or too few."""
+
+
 def checked(thing: Thing) -> Thing:
     """A public function whose arguments are checked against its annotations when it is called; a
     class whose constructor and public methods are.
@@ -44,7 +48,8 @@ def checked(thing: Thing) -> Thing:
     What does not fit is refused with one sentence, which names the function, the argument, what
     is allowed and what was given. What fits is handed on in one form: see `Kind.take`. Defaults
     are not checked, nor are arguments without annotation, or with `Any`. Arguments that are
-    missing, too many or unknown are left to Python.
+    missing, too many or unknown raise an error, which leads on as that of a wrong object does
+    (`leads.py`).
 
     How a call is put right if JAX transforms it: numbers, words and switches refuse to be traced;
     arrays (`Reals`) may be, and their values are then not looked at. Where a function needs values
@@ -77,18 +82,8 @@ def checked_methods(cls: Class) -> Class:
         wrapped = _wrapped(function, f"{cls.__name__}.{name}")
         setattr(cls, name, type(member)(wrapped) if is_bound_otherwise else wrapped)
     if not hasattr(cls, "__getattr__"):
-        setattr(cls, "__getattr__", _missing_attribute)  # noqa: B010
+        setattr(cls, "__getattr__", leads.missing_attribute)  # noqa: B010
     return cls
-
-
-def _missing_attribute(self: Any, name: str) -> Any:
-    """`__getattr__` of public classes: an attribute that had another name leads to it."""
-    if inspect.getattr_static(type(self), name, None) is not None:
-        # A property raised an AttributeError, which Python hides: it is raised again.
-        return object.__getattribute__(self, name)
-    cls = type(self).__name__
-    text = about_word(cls, name)
-    raise AttributeError(text or f"{cls!r} object has no attribute {name!r}")
 
 
 def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
@@ -119,12 +114,13 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     def call(*args, **kwargs):
         try:
             with public_call(), as_numpy():
-                kinds.refuse_earlier(name, kwargs)
+                if kinds.is_wrong(args, kwargs):
+                    raise WrongArguments(kinds.about_wrong(name, args, kwargs))
                 args, kwargs = kinds.take(args, kwargs)
                 return function(*args, **kwargs)
         except Misfit as misfit:
             raise DefinitionError(
-                f"{name}: `{misfit.path}` {misfit.problem}."
+                f"{name}: `{misfit.path}` {misfit.problem}{misfit.lead}."
             ) from None
         except (*_JAX_ERRORS, NeedsValues):
             if not is_hidden(args, kwargs):
@@ -167,13 +163,6 @@ class _Kinds:
         named = [(x, self.by_name[x]) for x in positional]
         return named, (rest, self.by_name.get(rest))
 
-    def refuse_earlier(self, function: str, kwargs: dict[str, Any]) -> None:
-        """**Raises:** `TypeError` for an argument that had another name."""
-        for name in kwargs.keys() - self.by_name.keys():
-            text = about_word(function, name)
-            if text is not None:
-                raise TypeError(text)
-
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.
 
@@ -182,6 +171,8 @@ class _Kinds:
         positional, further = self.in_order
         taken = []
         name = ""
+        kind: Kind | None = None
+        value: Any = None
         try:
             for k, value in enumerate(args):
                 name, kind = positional[k] if k < len(positional) else further
@@ -190,8 +181,101 @@ class _Kinds:
                 kind = self.by_name.get(name)
                 kwargs[name] = value if kind is None else kind.take(value)
         except Misfit as misfit:
-            raise misfit.of(name) from None
+            lead = functools.partial(self._lead, name, kind, value, args)
+            raise misfit.of(name).leading(lead) from None
         return taken, kwargs
+
+    def is_wrong(self, args: tuple, kwargs: dict[str, Any]) -> bool:
+        """Test whether arguments are unknown, too many or too few. (One that is given twice is left
+        to Python.)"""
+        names = self._names
+        count = min(len(args), len(names.positional))
+        if count < len(args) and not names.any_number:
+            return True
+        if not names.needed_after[count] <= kwargs.keys():
+            return True
+        return not names.any_name and not kwargs.keys() <= names.all
+
+    def about_wrong(self, function: str, args: tuple, kwargs: dict[str, Any]) -> str:
+        """Return the sentence about arguments that are unknown, too many or too few."""
+        names = self._names
+        visible = [name for name in names.in_order if name not in ("self", "cls")]
+        if not names.any_name:
+            for name in kwargs:
+                if name not in names.all:
+                    first = args[0] if args else None
+                    return leads.about_keyword(function, name, visible, first)
+        positional = [name for name in names.positional if name in visible]
+        by_name = [name for name in visible if name not in positional]
+        if not names.any_number and len(args) > len(names.positional):
+            # (An argument that does not fit tells more than their number.)
+            self.take(args[: len(names.positional)], {})
+            taken = ", ".join(f"`{name}`" for name in positional)
+            first = f"{function} takes {taken or 'nothing'} by position"
+            if not by_name:
+                return f"{first}, and no more."
+            named = ", ".join(f"`{name}`" for name in by_name)
+            return f"{first}; give others by name: {named}."
+        given = {*kwargs, *names.positional[: len(args)]}
+        # (An argument that does not fit tells more than one that is missing.)
+        self.take(args, dict(kwargs))
+        name = next(x for x in names.in_order if x in names.required - given)
+        return leads.about_missing(function, name, self.by_name[name])
+
+    def _lead(self, name: str, kind: Kind | None, value: Any, args: tuple) -> str:
+        """Return the rest of the sentence about a value that does not fit."""
+        positional, _ = self.in_order
+        for (other, other_kind), given in zip(positional, args, strict=False):
+            if other == name or kind is None or other_kind is None:
+                continue
+            if _fits(kind, given) and _fits(other_kind, value):
+                return f": `{name}` and `{other}` may be in the wrong order"
+        return leads.about_object(self.function.__name__, kind, value)
+
+    @functools.cached_property
+    def _names(self) -> "_Names":
+        return _Names.of(inspect.signature(self.function))
+
+
+class _Names(NamedTuple):
+    """The parameters of a function."""
+
+    in_order: tuple[str, ...]
+    all: frozenset[str]
+    positional: tuple[str, ...]
+    required: frozenset[str]
+    needed_after: tuple[frozenset[str], ...]
+    """Those that have to be given by name, after so many by position."""
+    any_number: bool
+    any_name: bool
+
+    @classmethod
+    def of(cls, signature: inspect.Signature) -> "_Names":
+        parameters = list(signature.parameters.values())
+        kinds = [p.kind for p in parameters]
+        named = [
+            p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+        ]
+        positional = [p.name for p in named if p.kind <= p.POSITIONAL_OR_KEYWORD]
+        required = frozenset(p.name for p in named if p.default is p.empty)
+        counts = range(len(positional) + 1)
+        return cls(
+            tuple(p.name for p in named),
+            frozenset(p.name for p in named),
+            tuple(positional),
+            required,
+            tuple(required.difference(positional[:count]) for count in counts),
+            inspect.Parameter.VAR_POSITIONAL in kinds,
+            inspect.Parameter.VAR_KEYWORD in kinds,
+        )
+
+
+def _fits(kind: Kind, value: Any) -> bool:
+    try:
+        kind.take(value)
+    except Misfit:
+        return False
+    return True
 
 
 class _Fields(_Kinds):

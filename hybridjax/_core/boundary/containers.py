@@ -49,6 +49,7 @@ class Having(Kind):
     would do.)"""
 
     def __init__(self, protocol: type):
+        self.cls = protocol
         names = {**vars(protocol), **protocol.__annotations__}
         self.names = sorted(x for x in names if x[0] != "_")
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"

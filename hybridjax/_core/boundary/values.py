@@ -34,23 +34,35 @@ class Misfit(Exception):
         *,
         near: bool = False,
         path: str = "",
+        lead: Callable[[], str] | None = None,
     ):
         self._problem = problem
         self.near = near
         self.path = path
+        self._lead = lead
 
     @property
     def problem(self) -> str:
         """The words, composed at the first use: of several kinds most do not fit, unseen."""
         return self._problem if isinstance(self._problem, str) else self._problem()
 
+    @property
+    def lead(self) -> str:
+        """The rest of the sentence: the call that makes what is allowed, or nothing."""
+        return "" if self._lead is None else self._lead()
+
+    def leading(self, lead: Callable[[], str]) -> "Misfit":
+        """The same, with the rest of the sentence."""
+        return Misfit(self._problem, near=self.near, path=self.path, lead=lead)
+
     def inside(self, key: Any) -> "Misfit":
         """The same, of a value that stands under this key of the argument."""
-        return Misfit(self._problem, near=True, path=f"[{key!r}]{self.path}")
+        path = f"[{key!r}]{self.path}"
+        return Misfit(self._problem, near=True, path=path, lead=self._lead)
 
     def of(self, name: str) -> "Misfit":
         """The same, of the argument with this name."""
-        return Misfit(self._problem, path=name + self.path)
+        return Misfit(self._problem, path=name + self.path, lead=self._lead)
 
 
 def show(value: Any) -> str:

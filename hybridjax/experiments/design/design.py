@@ -23,6 +23,7 @@ from ..._core.boundary.kinds import (
     Vector,
 )
 from ..._core.boundary.values import Integers
+from ..._core.showable import Showable
 from ...errors import DefinitionError
 from .partition import SINGULAR, check_sharing, is_real, needs_two_phases, regular
 from .tables import write_table
@@ -40,7 +41,7 @@ OFF_LINE = 1e-6
 
 
 @checked
-class Design(eqx.Module):
+class Design(Showable, eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
 
     Experiment s applies, at section n counted from its start, `u[n] = sum_k a_k cos(2 pi j_k n / (N

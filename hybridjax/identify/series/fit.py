@@ -199,7 +199,7 @@ class SeriesFit(MultiplierFit):
         for n, root in enumerate(self.roots.reshape(N, ny, R * nu, r)):
             yield np.tensordot(lagged_inputs(v, n, R, self.lead), root, (2, 1))
 
-    def predict(
+    def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "S T N ny"]:
         """Return the outputs from the inputs, and from the starts and drift that fit best."""
@@ -324,7 +324,7 @@ def _fit_open_loop(
     covariance = coefficient_covariance(best.problem, best.solution)
     fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
-    error = np.where(grid.sampled, grid.y - fit.predict(grid, free_start), 0.0)
+    error = np.where(grid.sampled, grid.y - fit.predicted(grid, free_start), 0.0)
     answers = about_answers(grid, error, records.inputs, _BIASED)
     drift = _about_drift(fit, records, free_start)
 

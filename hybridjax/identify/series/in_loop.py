@@ -65,7 +65,7 @@ def predicted(
     records.scale = np.maximum(size, RANK * records.scale)
     model = subspace_model(records, [order] * records.n_sections, False)
     S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
-    return Predictor(model, S).predict(grid, False) * records.scale
+    return Predictor(model, S).predicted(grid, False) * records.scale
 
 
 class SectionEquations(NamedTuple):

@@ -398,7 +398,7 @@ class Predictor(NamedTuple):
     def dims(self) -> list[int]:
         return self.model.dims
 
-    def predict(
+    def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
@@ -418,4 +418,4 @@ class Predictor(NamedTuple):
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the errors of `predict`; NaN where an output was not sampled."""
-        return np.where(grid.sampled, grid.y - self.predict(grid, free_start), np.nan)
+        return np.where(grid.sampled, grid.y - self.predicted(grid, free_start), np.nan)

@@ -18,6 +18,7 @@ from ..._core.arguments import Numbers, require_axes
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Seed, Vector
 from ..._core.boundary.values import Complexes
+from ..._core.showable import Showable
 from ..._core.text import p_value
 from .tables import Columns, require, rows_with, signed, table_of
 
@@ -32,7 +33,7 @@ Signs = Float[np.ndarray, "P n"]
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class MapResult:
+class MapResult(Showable):
     """A mean, or a tested difference, of the maps of subjects.
 
     **Fields:** `values` (*grid): the mean or difference. `each` (n, *grid): maps of the subjects,

@@ -10,6 +10,7 @@ from ..._core.arguments import Numbers, package, require_equal
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
+from ..._core.showable import Showable
 from ..._core.text import folded
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierFit
@@ -24,7 +25,7 @@ Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
 
 @checked
-class Population:
+class Population(Showable):
     r"""Estimates of several subjects, each with its own error.
 
     The model is $\theta_s = \mu + b_s + e_s$: $e_s$ has the standard error of the estimate, and

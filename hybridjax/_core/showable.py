@@ -1,0 +1,44 @@
+"""`Showable`: what every result of a public function can do besides its own."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from .boundary.leads import missing_attribute
+from .findings import Finding
+
+
+class Showable:
+    """A result that can be drawn and put in a table, and that lists the reasons to doubt it.
+
+    **Fields:** `findings`, reasons to doubt the result; empty where there are none, or where the
+    step that made it does not look for any.
+    """
+
+    if TYPE_CHECKING:
+        # (A field of some results, and a property of others: neither can be declared for all.)
+        @property
+        def findings(self) -> tuple[Finding, ...]: ...
+    else:
+        findings = ()
+        __getattr__ = missing_attribute
+
+    def plot(self, *args: Any, **options: Any) -> Any:
+        """Draw what one would ask for first.
+
+        **Arguments:** those of the function of `hj.plot` that draws it, such as `ax`.
+
+        **Returns:** a `Plot`, with `save(path)`, `show()` and `axes`.
+
+        **Raises:** `DefinitionError` for a result that has no figure.
+        """
+        # (By name: results know nothing of figures, which import all of them.)
+        first = importlib.import_module("hybridjax.plot.first")
+        return first.draw(self, *args, **options)
+
+    def to_pandas(self) -> Any:
+        """Return a `pandas.DataFrame`, as `hj.convert.to_pandas` does.
+
+        **Raises:** `DefinitionError` where pandas is not installed, and for a result that is no
+        table.
+        """
+        return importlib.import_module("hybridjax.convert").to_pandas(self)

@@ -1,0 +1,363 @@
+"""Calls that someone who knows the field tries first: they run, or the error leads on in one line.
+Results do what every result does."""
+
+import importlib
+import inspect
+import pathlib
+import re
+import types
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
+
+import hybridjax as hj
+from hybridjax._core.boundary import leads
+from hybridjax._core.showable import Showable
+
+from .conftest import APEX, OUTPUTS
+
+
+@pytest.fixture(scope="module")
+def names():
+    """What guesses are about: one hopper with its cycle, data and fits."""
+    hopper = hj.models.VerticalHopper()
+    cycle = hj.find_limit_cycle(hopper)
+    sections = hj.ClockPhase(8, anchor=APEX)
+    model = hj.linearize(cycle, sections, OUTPUTS)
+    design = hj.multisine(8, periods=16, lines="odd", amplitude=1e-3).realizations(4)
+    clean = hj.run_experiments(cycle, sections, design, OUTPUTS, start="periodic")
+    data = hj.experiments.add_noise(clean, std=1e-5)
+    est = hj.estimate_htf(data, harmonics=(-1, 0, 1))
+    whole = hj.estimate_htf(data)
+    force = np.random.default_rng(0).normal(size=(1, 500, 1))
+    made = hj.testing.simulate_recording(cycle, 0.01 * force, OUTPUTS, rate=50)
+    known = dict(
+        hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
+    )
+    known |= dict(sections=sections, model=model, design=design, whole=whole, rec=made)
+    known |= dict(
+        fit=hj.fit_multipliers(est, order=2),
+        ser=hj.fit_series(data, order=2),
+        ldtp=hj.fit_ldtp(whole, model.dims),
+        phys=hj.fit_model(hopper, hj.ObservedHTF(whole, sections), free=("k", "b")),
+        rat=hj.identify.fit_rational(est),
+        traj=hj.simulate(hopper, "flight", (2.0, 0.0, 1.0, 0.0), 1.0),
+    )
+    return known
+
+
+RUN = """
+hj.simulate(hopper, hopper.guess(), 0.5)
+hopper.replace(k=9.0)
+cycle.is_stable
+cycle.modulus
+cycle.findings
+cycle.plot()
+cycle.to_pandas()
+model.is_stable
+model.simulate(np.zeros(16))
+model.plot()
+model.to_pandas()
+hj.run_experiments(cycle, sections, np.zeros((1, 8, 1)), discard=0)["ym"]
+design.plot()
+data.plot()
+data.to_pandas()
+data["yM"]
+len(data)
+est.plot(outputs="yM")
+est.plot().save("bode.pdf")
+est.standard_errors
+traj.plot()
+traj.to_pandas()
+rec["yM"]
+rec.plot()
+rec.rate
+rec.duration
+rec.time
+len(rec)
+fit.contains(cycle)
+fit.compare(ser).p_value
+hj.validate(fit, data)
+hj.validate(phys, data).plot()
+hj.select_order(est).plot()
+hj.optimal_design(model, noise=1e-4).plot()
+phys.compare({"k": 10.0, "b": 5.0})
+phys.compare(cycle)
+phys.contains(hopper)
+phys.identifiability.plot()
+rat.modulus
+"""
+
+LEAD = """
+hj.solve_ivp(hopper, (0, 1), (2.0, 0.0))                -> hj.simulate
+hj.floquet_multipliers(cycle)                           -> .multipliers
+hj.bode(est)                                            -> hj.plot.bode
+hj.plot(est)                                            -> result.plot()
+hj.identify(data)                                       -> hj.fit_series
+hj.find_limit_cycle(cycle)                              -> its `system`
+hj.find_limit_cycle(hopper, y0=(1.0,))                  -> `guess`
+hj.find_limit_cycle(hopper, rtol=1e-9)                  -> Settings
+hj.find_limit_cycle(hopper, k=9.0)                      -> system.replace(k=
+hj.simulate(hopper, t_span=(0, 2))                      -> `duration`
+hj.simulate(hopper, hopper.guess(), 1.0, t_eval=[0.1])  -> trajectory.at
+hj.linearize(hopper, sections)                          -> hj.find_limit_cycle(system)
+hj.linearize(cycle, 32)                                 -> hj.ClockPhase
+hj.ClockPhase(n=8)                                      -> `n_sections`
+hj.multisine(8, input="u")                              -> `inputs`
+hj.run_experiments(cycle, design, sections)             -> wrong order
+hj.run_experiments(cycle, sections, design, noise=1e-5) -> add_noise
+hj.estimate_htf(cycle)                                  -> hj.run_experiments
+hj.estimate_htf(model)                                  -> model.htf(
+hj.fit_multipliers(data, order=2)                       -> hj.estimate_htf(data)
+hj.fit_multipliers(est)                                 -> hj.select_order
+hj.fit_multipliers(est, poles=2)                        -> `order`
+hj.fit_series(rec, order=2)                             -> hj.identify_recording
+hj.fit_model(hopper, est, "k")                          -> ObservedHTF
+hj.identify_recording("trial.csv", apex, inputs="u", outputs="yM") -> hj.read_recording
+hj.validate(data, model)                                -> wrong order
+hj.save(fit, "fit.npz")                                 -> wrong order
+hj.save("cycle.npz", cycle)                             -> cycle.to_pandas()
+hj.sweep(hopper, k=[8, 9])                              -> {'k': values}
+cycle.T                                                 -> `period`
+cycle.eigenvalues                                       -> `multipliers`
+cycle.trajectories                                      -> `trajectory`
+model.poles                                             -> `multipliers`
+est.phase                                               -> np.angle
+fit.standard_error                                      -> `standard_errors`
+fit.conf_int()                                          -> `interval`
+fit.coef_                                               -> `coefficients`
+fit.save("fit.npz")                                     -> hj.save(path, result)
+rat.interval()                                          -> hj.fit_multipliers
+rec.ch_names                                            -> `signals`
+rec.sfreq                                               -> `rate`
+rec.pick("yM")                                          -> recording['yM']
+est.plot().savefig("bode.png")                          -> plot.save(path)
+hopper.stiffness                                        -> `k`
+"""
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: None)
+
+
+@pytest.mark.parametrize("call", RUN.strip().splitlines())
+def test_a_guess_runs(names, call):
+    eval(call, names)
+
+
+@pytest.mark.parametrize("line", LEAD.strip().splitlines())
+def test_the_error_of_a_guess_leads_on(names, line):
+    call, _, lead = line.rpartition("-> ")
+    with pytest.raises((TypeError, ValueError, AttributeError)) as caught:
+        eval(call.strip(), names)
+    text = str(caught.value)
+    assert lead in text
+    assert "\n" not in text
+
+
+# Calls of errors that have these names only with the other names of version 0.2.
+PENDING = {
+    "hj.experiments.random_input",
+    "hj.fitting.ObservedHTF",
+    "hj.fitting.ObservedSeries",
+    "hj.linear.LDTP",
+    "hj.orbits.Settings",
+    "hj.orbits.find_limit_cycles",
+    "hj.recordings.sample_sections",
+    "hj.recordings.write_report",
+    "hj.scale.Execution",
+    "hj.sections.place_sections",
+    "hj.sections.section_map",
+}
+
+
+def test_errors_name_calls_that_exist():
+    for path in re.findall(r"hj(?:\.\w+)+", inspect.getsource(leads)):
+        thing = types.SimpleNamespace(hj=hj)
+        if path not in PENDING:
+            for name in path.split("."):
+                thing = getattr(thing, name)
+
+
+def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
+    class Broken(hj.HybridSystem):
+        k: hj.Parameter = hj.parameter(1.0)
+
+        def charts(self):
+            return {}
+
+        @property
+        def stiffness(self):
+            return self.k.mistyped
+
+    with pytest.raises(AttributeError, match="mistyped"):
+        Broken().stiffness  # noqa: B018
+    with pytest.raises(AttributeError, match="use `k`"):
+        Broken().K  # noqa: B018
+    assert not hasattr(Broken(), "__jax_array__")
+
+
+FITS = "fit", "ser", "ldtp", "phys"
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_every_fit_does_what_fits_do(names, name):
+    fit = names[name]
+    assert isinstance(fit, hj.identify.Fit)
+    assert isinstance(fit, Showable)
+    assert_allclose(fit.modulus, np.abs(fit.multipliers))
+    values, errors = fit._estimates()
+    low, high = fit.interval(0.9).T
+    assert_allclose((low + high) / 2, values)
+    assert (high - low > 3 * errors).all()
+    assert np.all(fit.contains(names["cycle"], level=1 - 1e-9))
+    assert fit.compare(names["cycle"]).p_value > 1e-9
+    assert "p " in repr(fit.compare(names["cycle"]))
+    assert fit.compare(fit).p_value > 0.99
+    assert len(fit.to_pandas()) == len(values)
+    assert fit.plot().axes.size
+    assert hj.validate(fit, names["data"]).fit.min() > 90
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_every_fit_comes_back_from_a_file(names, name):
+    fit = names[name]
+    hj.save("fit.npz", fit)
+    hj.save("fit.mat", fit)
+    back = hj.load("fit.npz")
+    dataset = hj.convert.to_xarray(fit)
+    for other in (back, hj.convert.from_xarray(dataset)):
+        assert_array_equal(other.multipliers, fit.multipliers)
+        assert_array_equal(other.interval(), fit.interval())
+        assert other.findings == fit.findings
+        assert other.to_pandas().equals(fit.to_pandas())
+    if name == "ldtp":
+        f = np.array([0.1, 0.7])
+        assert_array_equal(back.htf(f).H, fit.htf(f).H)
+        assert_array_equal(back.htf(f).variance, fit.htf(f).variance)
+    if name == "phys":
+        assert type(back).__name__ == "ParameterEstimate"
+        assert back.names == ("k", "b")
+        assert back.units == ("N/m", "N s/m")
+        assert back.compare(fit).p_value == 1.0
+        assert "±" in repr(back)
+
+
+def test_p_values_are_those_of_the_coefficients(names):
+    """All multipliers together are the coefficients of their polynomial."""
+    fit = names["fit"]
+    other = names["ser"]
+    true = names["cycle"].multipliers
+    missed = fit.coefficients - np.poly(true).real[1:]
+    distance = missed @ np.linalg.solve(fit.covariance, missed)
+    dof = fit.covariance_dof
+    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    assert_allclose(fit.compare(true).p_value, expected, rtol=1e-6)
+    missed = fit.coefficients - other.coefficients
+    distance = missed @ np.linalg.solve(fit.covariance + other.covariance, missed)
+    dof = min(dof, other.covariance_dof)
+    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    assert_allclose(fit.compare(other).p_value, expected, rtol=1e-6)
+
+
+def test_p_values_of_parameters_are_those_of_their_covariance(names):
+    fit = names["phys"]
+    estimate = fit.estimate
+    true = {"k": 10.0, "b": 5.0}
+    missed = fit.values - [10.0, 5.0]
+    distance = missed @ np.linalg.solve(fit.covariance, missed)
+    expected = stats.chi2.sf(distance, 2)
+    assert_allclose(estimate.compare(true).p_value, expected, rtol=1e-6)
+    # By the likelihood, which is nearly a parabola here.
+    assert_allclose(fit.compare(true).p_value, expected, rtol=0.1)
+    assert_allclose(fit.compare(true).error, missed)
+
+
+def test_a_fit_of_some_harmonics_says_so_where_it_is_validated(names):
+    data = names["data"]
+    some = hj.validate(names["fit"], data)
+    assert [x.cause for x in some.findings] == ["harmonics"]
+    whole = hj.validate(hj.fit_multipliers(names["whole"], order=2), data)
+    assert not whole.findings
+    assert whole.independent
+    # As the fit to the series explains the same data.
+    assert_allclose(whole.fit, hj.validate(names["ser"], data).fit, atol=0.3)
+
+
+def test_tables_hold_the_numbers(names):
+    data = names["data"]
+    table = data.to_pandas()
+    row = table[(table.experiment == 3) & (table.cycle == 5) & (table.section == 2)]
+    assert row.vM.item() == data.y[3, 42, 1]
+    assert_array_equal(data["u"], data.u[:, :, 0])
+    states = names["traj"].to_pandas()
+    assert set(states.chart) == {"flight", "stance"}
+    assert states[states.chart == "stance"].ym.isna().all()
+    assert_allclose(states.yM.iloc[-1], names["traj"].after[-1, 0])
+    one = names["cycle"].to_pandas()
+    assert one.k.item() == 10.0
+    assert_allclose(one["multipliers.0.modulus"], names["cycle"].modulus[0])
+
+
+def test_a_system_from_functions_is_that_of_a_class():
+    rate = 2 * jnp.pi
+    juggler = hj.HybridSystem.from_functions(
+        {"y": "m", "v": "m/s"},
+        lambda t, q, u, p: (q[1], u[0] - p.g),
+        [
+            (
+                "impact",
+                lambda t, q, u, p: q[0] - p.A * jnp.sin(rate * t),
+                lambda t, q, u, p: (
+                    q[0],
+                    (1 + p.e) * p.A * rate * jnp.cos(rate * t) - p.e * q[1],
+                ),
+            )
+        ],
+        {"g": 9.81, "A": 0.15, "e": 0.7},
+        period=1.0,
+    )
+    cycle = hj.find_limit_cycle(juggler, hj.Guess("main", (0.2, 4.5), time=0.1))
+    *_, exact = hj.models.PaddleJuggler().exact()
+    assert_allclose(cycle.multipliers, exact, atol=1e-12)
+
+    def trace(e):
+        changed = hj.find_limit_cycle(juggler.replace(e=e), cycle)
+        model = hj.linearize(changed, hj.ClockPhase(2))
+        return model.characteristic_polynomial()[1]
+
+    def exact_trace(e):
+        *_, multipliers = hj.models.PaddleJuggler(restitution=e).exact()
+        return -jnp.sum(multipliers).real
+
+    assert_allclose(jax.grad(trace)(0.7), jax.grad(exact_trace)(0.7), rtol=1e-8)
+    with pytest.raises(hj.DefinitionError, match="another attribute 'inputs'"):
+        hj.HybridSystem.from_functions("x", lambda t, q, u, p: -q, (), {"inputs": 1.0})
+
+
+def test_identify_model_finds_the_exact_multipliers(names):
+    result = hj.identify_model(names["cycle"], names["sections"], OUTPUTS, noise=1e-6)
+    assert result.fit.contains(names["cycle"], level=0.9999).all()
+    assert result.comparison.max_error < 1e-3
+    assert_allclose(result.model.multipliers, names["cycle"].multipliers, atol=1e-10)
+    assert "ModelIdentification(VerticalHopper; 32/32 ok)" in repr(result)
+
+
+def test_every_result_prints_itself():
+    folder = pathlib.Path(hj.__file__).parent
+    for file in folder.rglob("*.py"):
+        path = file.relative_to(folder.parent).with_suffix("").parts
+        if not path[-1].startswith("__"):
+            importlib.import_module(".".join(path))
+    kinds = [Showable]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+        if kind is not Showable:
+            assert kind.__repr__ not in (eqx.Module.__repr__, object.__repr__), kind
