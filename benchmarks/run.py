@@ -23,8 +23,9 @@ import traceback
 
 import one_thread
 from cases import NAMES, Options
-from report import Report, hardware, software, today
 from tables import fill
+
+from report import Report, hardware, software, today
 
 
 HERE = pathlib.Path(__file__).parent

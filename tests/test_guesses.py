@@ -44,7 +44,9 @@ def names():
         fit=hj.fit_multipliers(est, order=2),
         ser=hj.fit_series(data, order=2),
         ldtp=hj.fit_ldtp(whole, model.dims),
-        phys=hj.fit_model(hopper, hj.ObservedHTF(whole, sections), free=("k", "b")),
+        phys=hj.fit_model(
+            hopper, hj.fitting.ObservedHTF(whole, sections), free=("k", "b")
+        ),
         rat=hj.identify.fit_rational(est),
         traj=hj.simulate(hopper, "flight", (2.0, 0.0, 1.0, 0.0), 1.0),
     )
@@ -162,28 +164,11 @@ def test_the_error_of_a_guess_leads_on(names, line):
     assert "\n" not in text
 
 
-# Calls of errors that have these names only with the other names of version 0.2.
-PENDING = {
-    "hj.experiments.random_input",
-    "hj.fitting.ObservedHTF",
-    "hj.fitting.ObservedSeries",
-    "hj.linear.LDTP",
-    "hj.orbits.Settings",
-    "hj.orbits.find_limit_cycles",
-    "hj.recordings.sample_sections",
-    "hj.recordings.write_report",
-    "hj.scale.Execution",
-    "hj.sections.place_sections",
-    "hj.sections.section_map",
-}
-
-
 def test_errors_name_calls_that_exist():
     for path in re.findall(r"hj(?:\.\w+)+", inspect.getsource(leads)):
         thing = types.SimpleNamespace(hj=hj)
-        if path not in PENDING:
-            for name in path.split("."):
-                thing = getattr(thing, name)
+        for name in path.split("."):
+            thing = getattr(thing, name)
 
 
 def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
@@ -338,7 +323,7 @@ def test_a_system_from_functions_is_that_of_a_class():
         return -jnp.sum(multipliers).real
 
     assert_allclose(jax.grad(trace)(0.7), jax.grad(exact_trace)(0.7), rtol=1e-8)
-    with pytest.raises(hj.DefinitionError, match="another attribute 'inputs'"):
+    with pytest.raises(hj.errors.DefinitionError, match="another attribute 'inputs'"):
         hj.HybridSystem.from_functions("x", lambda t, q, u, p: -q, (), {"inputs": 1.0})
 
 

@@ -102,9 +102,6 @@ _WORDS = {
 }
 
 
-_ROOT = pathlib.Path(__file__).parents[1]
-
-
 class Namespace(types.ModuleType):
     """A module that says what to call, if it is called itself."""
 
@@ -143,14 +140,16 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     """Return one line that leads from a name that a namespace does not have to the one that is
     meant."""
     asked = package.replace("hybridjax", "hj", 1) + f".{name}"
-    place = _NAMES.get(name, place_of(name))
-    if place is not None:
-        return f"{asked} is {place}"
-    text = f"module {package!r} has no attribute {name!r}"
+    if name in _NAMES:
+        return f"{asked} is {_NAMES[name]}"
     leads = _leads()
     lead = leads.about_name(package, name)
     if lead is not None:
-        return f"{text}: {lead}"
+        return f"there is no {asked}: {lead}"
+    place = place_of(name)
+    if place is not None:
+        return f"{asked} is {place}"
+    text = f"module {package!r} has no attribute {name!r}"
     for known in (names, list(places())):
         close = difflib.get_close_matches(name, known, n=1)
         if close:

@@ -14,13 +14,13 @@ from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
-from ..experiments.record import Record
+from ..experiments.record import SectionSeries
 from ..fitting.model_fit import Identifiability, ParameterComparison, ParameterFit
 from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
 from ..identify.multipliers import OrderSelection
 from ..identify.rational import RationalFit
 from ..identify.transient import TransientFit
-from ..identify.validate import Validation
+from ..identify.validation import Validation
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.branches import Branch
@@ -28,7 +28,7 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import PhaseCurve
 from ..orbits.sensitivity import Sensitivity
-from ..plants.cycle import SettledCycle
+from ..plants.cycle import PlantCycle
 from ..recordings.data import SectionData
 from ..recordings.identification import Identification
 from ..recordings.impulse import ImpulseResponses
@@ -53,7 +53,7 @@ def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
     - `LDTP`: a row for each multiplier.
     - `Recording`, `SectionData`: a row for each sample, with time and trial;
-      `Recording.from_frame` reads one trial of it. `ExperimentData`, `Record`: likewise, with the
+      `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise, with the
       number of the experiment, the cycle and the section.
     - `Design`: a row for each cosine. `Trajectory`: a row for each end of a step.
     - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
@@ -196,7 +196,7 @@ def _(thing: ExperimentData) -> Any:
 
 
 @_columns.register
-def _(thing: Record) -> Any:
+def _(thing: SectionSeries) -> Any:
     sample = thing.first_section + np.arange(len(thing.u))
     return _samples(thing, sample, np.concatenate([thing.u, thing.y], axis=1))
 
@@ -327,7 +327,7 @@ def _(thing: Sensitivity) -> Any:
 
 
 @_columns.register
-def _(thing: SettledCycle) -> Any:
+def _(thing: PlantCycle) -> Any:
     columns = dict(zip(thing.outputs, thing.cycle_outputs.T, strict=True))
     return {"section": np.arange(len(thing.cycle_outputs)), **columns}
 

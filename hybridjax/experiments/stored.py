@@ -134,7 +134,7 @@ def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: OutputNames,
+    outputs: OutputNames | None = None,
     *,
     start: StartName = "cycle",
     discard: Index | None = None,
@@ -151,7 +151,7 @@ def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: OutputNames,
+    outputs: OutputNames | None = None,
     *,
     start: StartName = "cycle",
     discard: Index | None = None,
@@ -168,7 +168,7 @@ def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: OutputNames,
+    outputs: OutputNames | None = None,
     *,
     start: StartName = "cycle",
     discard: Index | None = None,
@@ -186,7 +186,7 @@ def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
-    outputs: OutputNames,
+    outputs: OutputNames | None = None,
     *,
     start: StartName = "cycle",
     discard: Index | None = None,
@@ -219,7 +219,8 @@ def run_experiments(
     - `sections`: a family, or `PlacedSections`.
     - `design`: a `Design`, or inputs (S, n, nu) that are constant from section to section. n must
         be a whole number of periods. All periods after the discarded ones are used for estimation.
-    - `outputs`: names or `Output`s, recorded at each section before the new input acts.
+    - `outputs`: names or `Output`s, recorded at each section before the new input acts. Default:
+        all states that every chart defines, as of `linearize`.
     - `start`: initial condition. "cycle" is a state on the limit cycle. "periodic" is a state on
         the periodic response that the linearization predicts, which leaves a transient of second
         order in the inputs. "steady" is a state on the periodic response itself, found by Newton's
@@ -252,6 +253,8 @@ def run_experiments(
     unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
     found, or if the cluster is lost.
     """
+    if outputs is None:
+        outputs = cycle.structure.states_everywhere()
     options = RunOptions(start, discard, process_noise, accuracy, execution, feedback)
     if store is not None:
         _check_storable(options)

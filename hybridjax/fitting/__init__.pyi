@@ -2,6 +2,8 @@ from .fit import identifiability as identifiability
 from .model_fit import (
     Identifiability as Identifiability,
     ModelFit as ModelFit,
+    ParameterComparison as ParameterComparison,
+    ParameterEstimate as ParameterEstimate,
     ParameterGuess as ParameterGuess,
 )
 from .observations import (

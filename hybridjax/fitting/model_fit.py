@@ -23,7 +23,7 @@ from ..identify.fit import Fit, not_converged
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
 from .problem import DELAYS, FitProblem, evaluate
 

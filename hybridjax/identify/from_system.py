@@ -20,12 +20,12 @@ from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..experiments.design.multisine import multisine
 from ..experiments.noise import add_noise
-from ..experiments.run import run_experiments
+from ..experiments.stored import run_experiments
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..sections.linearize import linearize
+from ..sections.linearization import linearize
 from ..sections.place import as_placed
 from ..sections.placed import SectionsLike
 from ..systems.system import HybridSystem, OutputNames

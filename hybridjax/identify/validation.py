@@ -310,7 +310,7 @@ def _about_harmonics(model: LDTP | Fit) -> tuple[Finding, ...]:
     return (Finding("harmonics", text),)
 
 
-def _simulated(model: LDTP | Fit, record: Record) -> LDTP | SeriesFit | LDTPFit:
+def _simulated(model: LDTP | Fit, record: SectionSeries) -> LDTP | SeriesFit | LDTPFit:
     """Return the model that is simulated to validate a fit.
 
     **Raises:** `DefinitionError` for a fit without a model.

@@ -361,7 +361,7 @@ def _found_later(
         except ComputationError as error:
             fault = f" From the guess the flow leads to no cycle either: {error}"
             return None, fault
-        if int(cycle.result) in (*_FOUND, Result.COINCIDENCE):
+        if int(cycle.result) in (*_FOUND, Result.SIMULTANEOUS):
             return (cycle, turn), ""
     return None, ""
 

@@ -9,26 +9,26 @@ from .._core.boundary.values import with_article
 from .._core.showable import Showable
 from .._core.signal import with_unit
 from ..designs.optimize import OptimalDesign
-from ..designs.study import Study
+from ..designs.study import SequentialDesign
 from ..engine.trajectory import Trajectory
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
-from ..experiments.record import Record
+from ..experiments.record import SectionSeries
 from ..fitting.model_fit import Identifiability, ParameterFit
 from ..identify.loops import Loop
 from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
 from ..identify.multipliers import OrderSelection
 from ..identify.rational import RationalFit
 from ..identify.transient import TransientFit
-from ..identify.validate import Validation
+from ..identify.validation import Validation
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
-from ..orbits.continuation import Branch
+from ..orbits.branches import Branch
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import Coupling, PhaseCurve, Responses
-from ..plants.cycle import SettledCycle
+from ..plants.cycle import PlantCycle
 from ..recordings.data import SectionData
 from ..recordings.identification import Identification
 from ..recordings.impulse import ImpulseResponses
@@ -70,7 +70,7 @@ draw.register(Phase, of_data.phase)
 draw.register(ImpulseResponses, of_data.impulse_responses)
 draw.register(PhaseCurve, of_data.phase_response)
 draw.register(Validation, of_data.validation)
-draw.register(OptimalDesign, designs.strides)
+draw.register(OptimalDesign, designs.standard_errors)
 draw.register(MapResult, subjects.subject_maps)
 draw.register(Population, subjects.forest)
 
@@ -103,7 +103,7 @@ def _(result: Identification, **options: Any) -> Plot:
 
 
 @draw.register
-def _(result: Study, **options: Any) -> Plot:
+def _(result: SequentialDesign, **options: Any) -> Plot:
     if result.fit is None:
         raise DefinitionError("the study has no data yet: `study.design.plot()`.")
     return draw(result.fit, **options)
@@ -175,7 +175,7 @@ def _(
 
 
 @draw.register
-def _(result: Record, *, ax: AxesLike | None = None) -> Plot:
+def _(result: SectionSeries, *, ax: AxesLike | None = None) -> Plot:
     """Inputs and outputs against time in cycles."""
     time = (result.first_section + np.arange(len(result.u))) / result.n_sections
     signals = dict(zip(result.inputs, result.u.T, strict=True))
@@ -186,7 +186,7 @@ def _(result: Record, *, ax: AxesLike | None = None) -> Plot:
 
 
 @draw.register
-def _(result: SettledCycle, *, ax: AxesLike | None = None) -> Plot:
+def _(result: PlantCycle, *, ax: AxesLike | None = None) -> Plot:
     """Mean outputs at the sections."""
     N = len(result.cycle_outputs)
     signals = dict(zip(result.outputs, result.cycle_outputs.T, strict=True))

@@ -110,22 +110,22 @@ def test_full_duty_is_refused_by_name_from_any_guess(
         monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
     guess = hj.Guess(chart, (0.3, ramp), time=0.9)
     for duty in BESIDE_FULL:
-        with pytest.raises(hj.ComputationError, match="'trip'.* coincide"):
+        with pytest.raises(hj.errors.ComputationError, match="'trip'.* coincide"):
             hj.find_limit_cycle(Converter(duty), guess)
 
 
 def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
     cycle = hj.find_limit_cycle(Converter(1.05), hj.Guess("on", (0.3, 0.2), time=0.9))
     failed = hj.find_limit_cycle(Converter(1.0), cycle, throw=False)
-    (group,) = hj.coincidences(failed)
+    (group,) = hj.orbits.simultaneous_events(failed)
     assert set(group.orders) == {("tick on",), ("trip", "tick")}
     duties = np.array([0.95, *BESIDE_FULL, 1.1])
-    batch = hj.find_limit_cycles([Converter(float(x)) for x in duties], cycle)
+    batch = hj.orbits.find_limit_cycles([Converter(float(x)) for x in duties], cycle)
     assert_array_equal(batch.ok, [True, *[False] * len(BESIDE_FULL), True])
     result = jax.jit(
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
-    is_found = result(jnp.asarray(duties)) == hj.Result.OK
+    is_found = result(jnp.asarray(duties)) == hj.errors.Result.OK
     assert_array_equal(is_found, [*[False] * len(BESIDE_FULL), False, True])
 
 
@@ -141,7 +141,7 @@ def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_befor
 
     state, result = found(0.93)
     exact = 1 + (at_tick(0.93) - 1) * np.exp(-0.9)
-    assert result != hj.Result.OK or state == pytest.approx(exact, abs=1e-10)
+    assert result != hj.errors.Result.OK or state == pytest.approx(exact, abs=1e-10)
 
 
 def test_schedules_whose_order_is_not_defined():

@@ -218,9 +218,13 @@ def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard(
 
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
     good = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
-    cycles = hj.find_limit_cycles([SchmittTrigger(width=w) for w in (0.3, 0.9)], good)
+    cycles = hj.orbits.find_limit_cycles(
+        [SchmittTrigger(width=w) for w in (0.3, 0.9)], good
+    )
     assert cycles.result[1] == Result.GUARD_BEYOND
     for name in ("findings", "not_reached"):
         assert not getattr(cycles[0], name)
-        with pytest.raises(hj.DefinitionError, match="the search for this cycle fail"):
+        with pytest.raises(
+            hj.errors.DefinitionError, match="the search for this cycle fail"
+        ):
             getattr(cycles[1], name)

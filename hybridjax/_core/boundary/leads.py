@@ -39,7 +39,7 @@ MAKERS = {
     "Plant": "`hj.plants` has ready ones",
     "Plot": "functions of `hj.plot` make one",
     "RationalFit": "`hj.identify.fit_rational(htf)` makes one",
-    "Record": "`data.records` has them",
+    "SectionSeries": "`data.records` has them",
     "Recording": "`hj.read_recording(path)`, or `hj.Recording(time, signals)` of arrays, makes one",
     "SectionData": "`hj.identify_recording(recording, ...).data` or "
     "`hj.recordings.sample_sections(...)` is one",
@@ -118,7 +118,7 @@ OBJECTS = {
     "save.HybridSystem": "a system is code: keep the script that makes it",
     "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
     "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
-    "save.Identification": "save its `fit`, or write `hj.recordings.write_report(folder, result)`",
+    "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
     "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }
@@ -538,13 +538,13 @@ def missing_attribute(self: Any, name: str) -> Any:
 
 def about_attribute(cls: type, name: str) -> str:
     """Return the sentence about an attribute that a class has not."""
+    earlier = about_word(cls.__name__, name)
+    if earlier is not None:
+        return earlier
     head = f"{with_article(cls.__name__)} has no `{name}`"
     head = head[0].upper() + head[1:]
     attributes = attributes_of(cls)
     for base in cls.__mro__:
-        earlier = about_word(base.__name__, name)
-        if earlier is not None:
-            return f"{earlier}."
         lead = ATTRIBUTES.get(f"{base.__name__}.{name}")
         if lead is not None:
             return f"{head}: {lead}."
@@ -613,11 +613,11 @@ def about_keyword(
 
     **Arguments:** `first`: the first argument; a system may have a parameter of this name.
     """
-    short = function.rpartition(".")[2]
-    head = f"{function} has no argument `{name}`"
     earlier = about_word(function, name)
     if earlier is not None:
-        return f"{earlier}."
+        return earlier
+    short = function.rpartition(".")[2]
+    head = f"{function} has no argument `{name}`"
     words = [name, *WORDS.get(name, ())]
     for word in words:
         lead = KEYWORDS.get(f"{short}.{word}")
