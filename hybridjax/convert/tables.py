@@ -53,8 +53,8 @@ def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
     - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
     - `LDTP`: a row for each multiplier.
     - `Recording`, `SectionData`: a row for each sample, with time and trial;
-      `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise, with the
-      number of the experiment, the cycle and the section.
+      `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise,
+      with the number of the experiment, the cycle and the section.
     - `Design`: a row for each cosine. `Trajectory`: a row for each end of a step.
     - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
     - Other results that have findings: a row for each.
