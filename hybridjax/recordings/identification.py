@@ -132,8 +132,22 @@ def identify_recording(
     - `references`: signals that enter a control loop from outside, at least as many as inputs. The
       controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
+    **Returns:** `hj.recordings.Identification` with the results of all steps: `phase`, `data`,
+    `fit` (a `SeriesFit` with `multipliers` (d,)), `held_out`, `responses` and `diagnosis`. Its
+    method `write_report` writes a page.
+
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `sample_sections` and `fit_series`; `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "order": 2, "n_sections": 8}
+    result = hj.identify_recording(recording, apex, **options)
+    print(result.fit.multipliers)
+    ```
+
+    Before: `hj.read_recording`. After: `result.write_report`, `hj.identify_subjects`.
     """
     require_x64()
     say("inspection")

@@ -138,7 +138,22 @@ def natural_multipliers(
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short.
 
+    **Returns:** `hj.recordings.NaturalMultipliers`: `multipliers` (d,), complex, without unit;
+    `draws` (B, d) of the bootstrap, from which `interval` follows; `plain` (d,), those of a plain
+    regression; `findings`.
+
     **Raises:** `DefinitionError` for too few cycles or signals.
+
+    **Example:**
+
+    ```python
+    names = {"inputs": (), "outputs": ("yM", "vM")}
+    strides = hj.recordings.sample_sections(recording, apex, n_sections=8, **names)
+    natural = hj.recordings.natural_multipliers(strides, order=2)
+    print(natural.multipliers, natural.interval())
+    ```
+
+    Before: `hj.recordings.sample_sections(..., inputs=())`. After: `hj.identify_subjects`.
     """
     result = _estimate(data, order, seed)
     findings = list(about_natural_multipliers(result))
