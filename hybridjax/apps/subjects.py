@@ -177,9 +177,9 @@ def identify_subjects(
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
       and `group`, if there are any; other columns (age, speed) are kept in
       `SubjectStudy.population.table`.
+    - `folder`: folder of the results, which is made if it does not exist.
     - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
       `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`.
-    - `folder`: folder of the results, which is made if it does not exist.
     - `time`: name of the column with the times. Default: "time".
     - `signals`: names of the signals to be read. Default: all.
     - `formats`: formats of the figures. Default: PNG.
@@ -199,13 +199,14 @@ def identify_subjects(
     import functools
     hj.convert.to_pandas(recording).to_csv("S1.csv")
     with open("subjects.csv", "w") as table:
-        table.write("file,subject\nS1.csv,S1\n")
+        print("file,subject", file=table)
+        print("S1.csv,S1", file=table)
     options = {"sections": apex, "inputs": "u", "outputs": outputs, "n_sections": 8}
     identify = functools.partial(hj.identify_recording, order=2, **options)
     study = hj.identify_subjects("subjects.csv", "study", identify, signals=("u", *outputs))
     ```
 
-    Before: `hj.identify_recording` of one subject. After: `study.population.difference`,
+    **Before:** `hj.identify_recording` of one subject. **After:** `study.population.difference`,
     `hj.plot.forest`.
     """
     rows = _rows(Path(table))

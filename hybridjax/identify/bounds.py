@@ -62,7 +62,8 @@ def cramer_rao(
     print(bound.standard_errors)
     ```
 
-    Before: `hj.linearize`, `hj.estimate_htf`. After: `hj.optimal_design`, `hj.fit_multipliers`.
+    **Before:** `hj.linearize`, `hj.estimate_htf`. **After:** `hj.optimal_design`,
+    `hj.fit_multipliers`.
     """
     exact = _exact_htf(model, htf)
     if estimator == "fit_ldtp":

@@ -84,7 +84,8 @@ def estimate_htf(
     print(htf.frequencies, htf[0].shape)
     ```
 
-    Before: `hj.run_experiments`. After: `hj.select_order`, `hj.fit_multipliers` or `hj.fit_ldtp`.
+    **Before:** `hj.run_experiments`. **After:** `hj.select_order`, `hj.fit_multipliers` or
+    `hj.fit_ldtp`.
     """
     if variance == "noise" and repeats < 2:
         raise DefinitionError(

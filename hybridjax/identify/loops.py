@@ -90,7 +90,7 @@ def estimate_loop(
     loop = hj.identify.estimate_loop(loop_data, at_input="r")
     ```
 
-    Before: `hj.run_experiments`. After: `hj.fit_multipliers`, `hj.fit_ldtp`.
+    **Before:** `hj.run_experiments`. **After:** `hj.fit_multipliers`, `hj.fit_ldtp`.
     """
     require_x64()
     r = at_input or ()

@@ -144,7 +144,7 @@ def fit_multipliers(
     print(fit.multipliers, fit.standard_errors)
     ```
 
-    Before: `hj.estimate_htf`, `hj.select_order`. After: `hj.plot.multipliers`.
+    **Before:** `hj.estimate_htf`, `hj.select_order`. **After:** `hj.plot.multipliers`.
     """
     order = order.rank() if isinstance(order, LDTP) else order
     rms = weights.check_values(htf)

@@ -161,7 +161,7 @@ def fit_rational(
     print(rational.multipliers)
     ```
 
-    Before: `hj.estimate_htf`. After: `hj.plot.poles_zeros`, `hj.plot.multipliers`.
+    **Before:** `hj.estimate_htf`. **After:** `hj.plot.poles_zeros`, `hj.plot.multipliers`.
     """
     require_x64(htf.H)
     htf.require_sampled("`fit_rational`")

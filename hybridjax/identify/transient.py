@@ -86,7 +86,7 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     htf = hj.estimate_htf(free.data)
     ```
 
-    Before: `hj.run_experiments`. After: `hj.estimate_htf`.
+    **Before:** `hj.run_experiments`. **After:** `hj.estimate_htf`.
     """
     N = data.n_sections
     P = data.periods

@@ -221,7 +221,7 @@ def validate(
     print(validation)
     ```
 
-    Before: `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. After: `hj.plot.validation`.
+    **Before:** `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. **After:** `hj.plot.validation`.
     """
     free_start = start == "free"
     tested: LDTP | SeriesFit | Predictor = _tested(model)

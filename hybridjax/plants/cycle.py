@@ -462,7 +462,7 @@ def find_cycle(
     print(plant_cycle.cycle_outputs)
     ```
 
-    Before: `hj.plants.Plant`, `FMUPlant`, `MuJoCoPlant` or `GymnasiumPlant`. After:
+    **Before:** `hj.plants.Plant`, `FMUPlant`, `MuJoCoPlant` or `GymnasiumPlant`. **After:**
     `cycle.run_experiments`, then `hj.estimate_htf`.
     """
     family = families.as_family(sections)

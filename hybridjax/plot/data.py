@@ -54,7 +54,7 @@ def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
     hj.plot.phase(result.phase)
     ```
 
-    Before: `hj.recordings.estimate_phase`. After: `hj.plot.save`.
+    **Before:** `hj.recordings.estimate_phase`. **After:** `hj.plot.save`.
     """
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
         left, right = axes[0]
@@ -100,7 +100,7 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     hj.plot.section_data(result.data)
     ```
 
-    Before: `hj.recordings.sample_sections`. After: `hj.fit_series`.
+    **Before:** `hj.recordings.sample_sections`. **After:** `hj.fit_series`.
     """
     N = data.n_sections
     nu = len(data.inputs)
@@ -178,7 +178,7 @@ def impulse_responses(
     hj.plot.impulse_responses(result.responses)
     ```
 
-    Before: `hj.recordings.impulse_responses`. After: `hj.plot.save`.
+    **Before:** `hj.recordings.impulse_responses`. **After:** `hj.plot.save`.
     """
     ny = len(responses.outputs)
     N = len(responses.phase)
@@ -245,10 +245,11 @@ def phase_response(
     **Example:**
 
     ```python
-    hj.plot.phase_response(cycle.responses().curve())
+    oscillator = hj.find_limit_cycle(hj.models.VanDerPol())
+    hj.plot.phase_response(oscillator.responses().curve())
     ```
 
-    Before: `hj.recordings.phase_response` or `cycle.responses`. After: `hj.plot.save`.
+    **Before:** `hj.recordings.phase_response` or `cycle.responses`. **After:** `hj.plot.save`.
     """
     curves = [curve] if model is None else [curve, model]
     units = [unit_of(x.input) for x in curves]
@@ -303,7 +304,7 @@ def experiment(
     hj.plot.experiment(data, 0)
     ```
 
-    Before: `hj.run_experiments`. After: `hj.estimate_htf`.
+    **Before:** `hj.run_experiments`. **After:** `hj.estimate_htf`.
     """
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
@@ -363,7 +364,7 @@ def validation(
     hj.plot.validation(hj.validate(model, data), cycles=4)
     ```
 
-    Before: `hj.validate`. After: `hj.plot.save`.
+    **Before:** `hj.validate`. **After:** `hj.plot.save`.
     """
     N = validation.n_sections
     ny = len(validation.outputs)

@@ -42,7 +42,7 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
     hj.plot.spectrum(plan, model)
     ```
 
-    Before: `hj.optimal_design`. After: `hj.run_experiments`.
+    **Before:** `hj.optimal_design`. **After:** `hj.run_experiments`.
     """
     signals = {*model.inputs, *model.outputs}
     if model.n_sections != plan.design.n_sections or not signals <= set(plan.rms):
@@ -108,7 +108,7 @@ def standard_errors(
     hj.plot.standard_errors(plan)
     ```
 
-    Before: `hj.optimal_design`. After: `hj.designs.SequentialDesign`.
+    **Before:** `hj.optimal_design`. **After:** `hj.designs.SequentialDesign`.
     """
     with panels(ax, height=2.4) as axes:
         panel = axes[0, 0]

@@ -284,7 +284,8 @@ def explore(
     print(explorer.cycle.multipliers)
     ```
 
-    Before: `hj.HybridSystem`, or `hj.find_limit_cycle`. After: `hj.continuation`, `hj.sweep`.
+    **Before:** `hj.HybridSystem`, or `hj.find_limit_cycle`. **After:** `hj.continuation`,
+    `hj.sweep`.
     """
     with searching("as `system`", (ComputationError, DefinitionError)):
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)

@@ -76,7 +76,7 @@ def htf(
     hj.plot.htf(htf, model, output="yM", harmonics=(0, 1))
     ```
 
-    Before: `hj.estimate_htf`. After: `hj.fit_multipliers`.
+    **Before:** `hj.estimate_htf`. **After:** `hj.fit_multipliers`.
     """
     families = _families(htfs)
     if families is None:
@@ -171,7 +171,7 @@ def bode(
     hj.plot.bode(htf, model, fits=fit, outputs=("yM",))
     ```
 
-    Before: `hj.estimate_htf`. After: `hj.fit_multipliers`.
+    **Before:** `hj.estimate_htf`. **After:** `hj.fit_multipliers`.
     """
     families = _families(htfs)
     if families is not None:

@@ -85,7 +85,7 @@ def style() -> contextlib.AbstractContextManager:
         panel.plot(*cycle.trajectory()("yM", "vM")[1:])
     ```
 
-    Before: any result. After: `hj.plot.save`.
+    **Before:** any result. **After:** `hj.plot.save`.
     """
     _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
@@ -228,7 +228,7 @@ def save(
     hj.plot.save("orbit", hj.plot.cycle(cycle, "yM", "vM"), formats=("png", "svg"))
     ```
 
-    Before: any function of `hj.plot`. After: none; the files are complete.
+    **Before:** any function of `hj.plot`. **After:** none; the files are complete.
     """
     if isinstance(plot, Axes):
         figure = cast(Figure, plot.get_figure(root=True))

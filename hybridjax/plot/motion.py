@@ -209,7 +209,7 @@ def animate(
     motion = hj.plot.animate(cycle, "yM", "vM", speed=0.5)
     ```
 
-    Before: `hj.find_limit_cycle` or `hj.simulate`. After: `motion.save`.
+    **Before:** `hj.find_limit_cycle` or `hj.simulate`. **After:** `motion.save`.
     """
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / (_RATE * (speed or 1.0)))

@@ -75,7 +75,7 @@ def cycle(
     hj.plot.cycle(cycle, "yM", "vM", sections=placed)
     ```
 
-    Before: `hj.find_limit_cycle`. After: `hj.sections.place_sections`.
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.sections.place_sections`.
     """
     cycle.require_found()
     s = cycle.structure

@@ -48,11 +48,11 @@ def branch(
     **Example:**
 
     ```python
-    branch = hj.continuation(cycle, "b", (4.5, 5.5), step=0.2)
+    branch = hj.continuation(cycle, "k", (10.0, 11.0), step=0.5)
     hj.plot.branch(branch, output="yM")
     ```
 
-    Before: `hj.continuation`. After: `hj.plot.save`.
+    **Before:** `hj.continuation`. **After:** `hj.plot.save`.
     """
     names = {b.parameter for b in branches}
     if len(names) != 1:
@@ -132,11 +132,11 @@ def sweep(
     **Example:**
 
     ```python
-    maps = hj.sweep(hopper, {"b": np.linspace(4.5, 5.5, 5)})
+    maps = hj.sweep(hopper, {"k": np.linspace(9, 11, 5)})
     hj.plot.sweep(maps, "spectral_radius")
     ```
 
-    Before: `hj.sweep`. After: `hj.plot.save`.
+    **Before:** `hj.sweep`. **After:** `hj.plot.save`.
     """
     if not isinstance(getattr(maps, "data_vars", None), Mapping):
         raise DefinitionError(

@@ -56,7 +56,7 @@ def multipliers(
     hj.plot.multipliers(cycle, {"structured fit": fit})
     ```
 
-    Before: `hj.fit_multipliers`. After: `hj.plot.save`.
+    **Before:** `hj.fit_multipliers`. **After:** `hj.plot.save`.
     """
     reference = "estimate" if isinstance(true, MultiplierFit) else "exact"
     borders = _borders({reference: true, **(estimates or {})})
@@ -142,7 +142,7 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
     hj.plot.poles_zeros({"clock": hj.identify.fit_rational(htf)})
     ```
 
-    Before: `hj.identify.fit_rational`. After: `hj.plot.save`.
+    **Before:** `hj.identify.fit_rational`. **After:** `hj.plot.save`.
     """
     if not fits or len({(fit.outputs, fit.n_sections) for fit in fits.values()}) != 1:
         raise DefinitionError(

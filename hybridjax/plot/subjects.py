@@ -39,7 +39,7 @@ def forest(
     hj.plot.forest(people, "gain")
     ```
 
-    Before: `hj.identify_subjects`. After: `hj.plot.paired`.
+    **Before:** `hj.identify_subjects`. **After:** `hj.plot.paired`.
     """
     means = population.mean(quantity)
     subjects = population.predictions(quantity)
@@ -109,7 +109,7 @@ def paired(
     hj.plot.paired(people, "gain", "fast", "slow")
     ```
 
-    Before: `hj.identify_subjects`. After: `hj.plot.save`.
+    **Before:** `hj.identify_subjects`. **After:** `hj.plot.save`.
     """
     (test,) = population.difference(quantity, a, b).itertuples()
     subjects = population.predictions(quantity)
@@ -171,7 +171,7 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
     hj.plot.subject_maps(maps.mean())
     ```
 
-    Before: `hj.recordings.PopulationMaps`. After: `hj.plot.save`.
+    **Before:** `hj.recordings.PopulationMaps`. **After:** `hj.plot.save`.
     """
     is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray

@@ -38,13 +38,14 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
     **Example:**
 
     ```python
-    command = hj.multisine(8, 16, lines="odd", amplitude=0.001, inputs="command")
+    command = hj.multisine(8, 16, frequencies=(0, 0.5), inputs="command")
     command.write("design.csv", cycles=48)
     phase = hj.recordings.estimate_phase(recording, apex)
     both = hj.recordings.attach_design(recording, phase, "design.csv")
     ```
 
-    Before: `design.write`, `hj.recordings.estimate_phase`. After: `hj.recordings.sample_sections`.
+    **Before:** `design.write`, `hj.recordings.estimate_phase`. **After:**
+    `hj.recordings.sample_sections`.
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(BY_PHASE) <= set(columns):

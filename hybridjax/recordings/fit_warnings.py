@@ -110,7 +110,7 @@ def diagnose(
     print(hj.recordings.diagnose(result.data, result.fit))
     ```
 
-    Before: `hj.fit_series`, `hj.recordings.hold_out`. After: a longer recording, or
+    **Before:** `hj.fit_series`, `hj.recordings.hold_out`. **After:** a longer recording, or
     `hj.plot.multipliers`.
     """
     prepared = PreparedRecords(data, free_start=True)

@@ -160,7 +160,8 @@ def hold_out(data: SectionData, order: Order) -> HeldOut:
     print(validation)
     ```
 
-    Before: `hj.recordings.sample_sections`, `hj.select_order`. After: `hj.recordings.diagnose`.
+    **Before:** `hj.recordings.sample_sections`, `hj.select_order`. **After:**
+    `hj.recordings.diagnose`.
     """
     return split(data).fit(order)
 

@@ -122,8 +122,11 @@ def identify_recording(
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
 
-    **Arguments:** those of `sample_sections`, and
+    **Arguments:**
 
+    - `recording`: the recording, perturbed by the inputs.
+    - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
+      `sample_sections`, with the same defaults.
     - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
       that the reference determines, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
@@ -147,7 +150,7 @@ def identify_recording(
     print(result.fit.multipliers)
     ```
 
-    Before: `hj.read_recording`. After: `result.write_report`, `hj.identify_subjects`.
+    **Before:** `hj.read_recording`. **After:** `result.write_report`, `hj.identify_subjects`.
     """
     require_x64()
     say("inspection")

@@ -112,7 +112,8 @@ def impulse_responses(
     print(responses.values.shape)
     ```
 
-    Before: `hj.fit_series`. After: `hj.plot.impulse_responses`, `hj.recordings.PopulationMaps`.
+    **Before:** `hj.fit_series`. **After:** `hj.plot.impulse_responses`,
+    `hj.recordings.PopulationMaps`.
     """
     require_same("fit and data", fit, data)
     N, R = fit.numerators.shape[:2]

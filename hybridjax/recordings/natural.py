@@ -153,7 +153,7 @@ def natural_multipliers(
     print(natural.multipliers, natural.interval())
     ```
 
-    Before: `hj.recordings.sample_sections(..., inputs=())`. After: `hj.identify_subjects`.
+    **Before:** `hj.recordings.sample_sections(..., inputs=())`. **After:** `natural.interval`.
     """
     result = _estimate(data, order, seed)
     findings = list(about_natural_multipliers(result))

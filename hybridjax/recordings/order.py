@@ -61,8 +61,8 @@ def select_order(
     fit = hj.fit_multipliers(htf, hj.select_order(htf).order)
     ```
 
-    Before: `hj.estimate_htf` or `hj.recordings.sample_sections`. After: `hj.fit_multipliers`,
-    `hj.fit_series`.
+    **Before:** `hj.estimate_htf` or `hj.recordings.sample_sections`. **After:**
+    `hj.fit_multipliers`, `hj.fit_series`.
     """
     if isinstance(data, HTF):
         return compare_orders(data, max_order or 5, extra_lags)

@@ -84,7 +84,7 @@ def estimate_phase(
     print(phase.period)
     ```
 
-    Before: `hj.recordings.check_recording`. After: `hj.recordings.sample_sections`.
+    **Before:** `hj.recordings.check_recording`. **After:** `hj.recordings.sample_sections`.
     """
     if isinstance(sections, KinematicPhase):
         angles = _angles(recording, sections, bandwidth)

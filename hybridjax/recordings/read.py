@@ -72,13 +72,14 @@ def read_recording(
     **Example:**
 
     ```python
-    with open("walk.csv", "w") as file:
-        file.write("time (ms),force (N),hip (m)\n0,0,1.00\n10,1,1.01\n20,0,1.02\n")
+    walk = np.array([[0, 0.0, 1.00], [10, 1.0, 1.01], [20, 0.0, 1.02]])
+    header = "time (ms),force (N),hip (m)"
+    np.savetxt("walk.csv", walk, delimiter=",", header=header, comments="")
     recording = hj.read_recording("walk.csv", signals=("force", "hip"))
     print(recording)
     ```
 
-    Before: a measurement. After: `hj.recordings.check_recording`, `hj.identify_recording`.
+    **Before:** a measurement. **After:** `hj.recordings.check_recording`, `hj.identify_recording`.
     """
     files: list[str | os.PathLike[str]] = []
     for path in paths:

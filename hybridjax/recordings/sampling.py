@@ -106,7 +106,7 @@ def sample_sections(
     fit = hj.fit_series(sampled, order=2)
     ```
 
-    Before: `hj.recordings.estimate_phase`. After: `hj.select_order`, `hj.fit_series`.
+    **Before:** `hj.recordings.estimate_phase`. **After:** `hj.select_order`, `hj.fit_series`.
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)

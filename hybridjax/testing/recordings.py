@@ -66,11 +66,12 @@ def simulate_recording(
     **Example:**
 
     ```python
-    force = hj.experiments.random_input(20, 50, bandwidth=8, rms=0.02)
+    force = hj.experiments.random_input(60, 50, bandwidth=8, rms=0.02, seed=1)
     recording = hj.testing.simulate_recording(cycle, force[None], ("yM", "vM"), rate=50, steps=1)
     ```
 
-    Before: `hj.find_limit_cycle`, `hj.experiments.random_input`. After: `hj.identify_recording`.
+    **Before:** `hj.find_limit_cycle`, `hj.experiments.random_input`. **After:**
+    `hj.identify_recording`.
     """
     recorded = check_outputs(cycle, outputs)
     force = np.asarray(force, float)
@@ -148,7 +149,7 @@ def add_artifacts(
     poor = hj.testing.add_artifacts(recording, ("yM", "vM"), noise=1e-4, missing=0.01, seed=1)
     ```
 
-    Before: `hj.testing.simulate_recording`. After: `hj.recordings.check_recording`.
+    **Before:** `hj.testing.simulate_recording`. **After:** `hj.recordings.check_recording`.
     """
     if gap is not None and gap[0] >= gap[1]:
         raise DefinitionError(f"`gap` must end after it starts, but is {gap}.")
@@ -209,7 +210,7 @@ def simulate_beats(
     beats = hj.testing.simulate_beats(z, force, rate=100, jitter=0.02)
     ```
 
-    Before: none; the curve is known. After: `hj.recordings.phase_response`.
+    **Before:** none; the curve is known. **After:** `hj.recordings.phase_response`.
     """
     force = np.asarray(force, float)
     table = np.asarray(curve, float)

@@ -60,7 +60,7 @@ def synthetic_ldtp() -> LDTP:
     print(system.multipliers)
     ```
 
-    Before: none. After: `hj.experiments.simulate_experiments`.
+    **Before:** none. **After:** `hj.experiments.simulate_experiments`.
     """
     A, B, C, D = ([np.array(x, float) for x in blocks] for blocks in _BLOCKS.values())
     return LDTP.from_blocks(A, B, C, D)

@@ -292,7 +292,7 @@ def fit_ldtp(
     print(fit.multipliers, fit.model)
     ```
 
-    Before: `hj.estimate_htf`, or data as for `hj.fit_series`. After: `hj.validate`.
+    **Before:** `hj.estimate_htf`, or data as for `hj.fit_series`. **After:** `hj.validate`.
     """
     require_x64()
     free_start = start == "free"

@@ -274,7 +274,7 @@ def fit_series(
     print(fit.multipliers, fit.standard_errors)
     ```
 
-    Before: `hj.run_experiments` or `hj.recordings.sample_sections`. After: `hj.validate`.
+    **Before:** `hj.run_experiments` or `hj.recordings.sample_sections`. **After:** `hj.validate`.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order

@@ -147,14 +147,14 @@ def phase_response(
     **Example:**
 
     ```python
-    force = np.random.default_rng(0).normal(size=(1, 20_000))
+    force = np.random.default_rng(0).normal(size=(1, 10_000))
     force = np.repeat(force[:, ::50], 50, axis=1)
     z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
     beats = hj.testing.simulate_beats(z, force, rate=100, jitter=0.01)
     curve = hj.recordings.phase_response(beats, hj.AtEvent("beat"), input="u")
     ```
 
-    Before: `hj.read_recording`. After: `hj.plot.phase_response`.
+    **Before:** `hj.read_recording`. **After:** `hj.plot.phase_response`.
     """
     phase = sections
     if not isinstance(phase, Phase):

@@ -67,7 +67,7 @@ def check_recording(
     print(checked)
     ```
 
-    Before: `hj.read_recording`. After: `hj.recordings.estimate_phase`.
+    **Before:** `hj.read_recording`. **After:** `hj.recordings.estimate_phase`.
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)
