@@ -101,8 +101,8 @@ def diagnose(
     regression; `bandwidths`, one per input, in cycles per period; `expected` (k, d), the standard
     errors that `cycles` (k,) would give.
 
-    **Raises:** `DefinitionError` if data and fit do not belong together, such as other names or
-    sections.
+    **Raises:** `DefinitionError` for data without inputs, and with too few cycles for the order of
+    the fit.
 
     **Example:**
 
