@@ -146,9 +146,9 @@ def fit_rational(
     - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
     - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
 
-    **Returns:** `hj.identify.RationalFit`: `poles` (ny, p), `zeros` (ny, q) and `multipliers` (ny,
-    p), without unit; `residual` (ny,), relative. Outputs are on the first axis also where there is
-    only one.
+    **Returns:** `hj.identify.RationalFit`, without units: `poles` (ny, p), `zeros` (ny, q),
+    `multipliers` (ny, p), and `residual` (ny,), relative to H. Outputs are on the first axis also
+    where there is only one.
 
     **Raises:** `DefinitionError` for an output or input that is not there, for fewer
     lines than coefficients, and for an H with NaN or of zeros; `ComputationError` if no start leads

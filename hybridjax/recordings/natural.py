@@ -136,7 +136,7 @@ def natural_multipliers(
     - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
       one multiplier more contradicts the largest modulus, `findings` say so. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
-      (Künsch 1989), within each record; whole records where these are short.
+      (Künsch 1989), within each record; whole records where these are short. Default: 0.
 
     **Returns:** `hj.recordings.NaturalMultipliers`: `multipliers` (d,), complex, without unit;
     `draws` (B, d) of the bootstrap, from which `interval` follows; `plain` (d,), those of a plain
