@@ -188,17 +188,37 @@ def identify_subjects(
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
       and `group`, if there are any; other columns (age, speed) are kept in
       `SubjectStudy.population.table`.
+    - `folder`: folder of the results, which is made if it does not exist.
     - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
       `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`.
-    - `time`: name of the column with the times. Default: "time". `signals`: names of the signals
-      to be read. Default: all.
+    - `time`: name of the column with the times. Default: "time".
+    - `signals`: names of the signals to be read. Default: all.
     - `formats`: formats of the figures. Default: PNG.
     - `client`: a client of Dask, or an executor of `concurrent.futures`, whose processes do the
       work and can read the same files. Default: this process.
 
+    **Returns:** `hj.recordings.SubjectStudy`: the `population`, one `SeriesFit` per subject in
+    `fits`, data frames of means and differences in `results`, and sentences in `failures`.
+
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
     all subjects fail.
+
+    **Example:**
+
+    ```python
+    import functools
+    hj.convert.to_pandas(recording).to_csv("S1.csv")
+    with open("subjects.csv", "w") as table:
+        print("file,subject", file=table)
+        print("S1.csv,S1", file=table)
+    options = {"sections": apex, "inputs": "u", "outputs": outputs, "n_sections": 8}
+    identify = functools.partial(hj.identify_recording, order=2, **options)
+    study = hj.identify_subjects("subjects.csv", "study", identify, signals=("u", *outputs))
+    ```
+
+    **Before:** `hj.identify_recording` of one subject. **After:** `study.population.difference`,
+    `hj.plot.forest`.
     """
     rows = _rows(Path(table))
     root = Path(folder)

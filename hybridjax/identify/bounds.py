@@ -46,12 +46,24 @@ def cramer_rao(
       factor by which the structure reduces the amount of data. Default: "fit_multipliers".
     - `extra_lags`: degree of the numerators beyond d N, of "fit_multipliers". Default: N.
 
-    **Returns:** the true multipliers with the smallest covariance of an unbiased estimate;
-    `standard_errors` are bounds of rms errors. For "fit_ldtp" there are as many as the smallest
-    state of the minimal model has coordinates.
+    **Returns:** `hj.identify.MultiplierEstimate`: the true `multipliers` (d,) with the smallest
+    `covariance` (d, d) of an unbiased estimate. `standard_errors` (d,) are bounds of rms errors.
+    For "fit_ldtp", d is the smallest dimension of the state of the minimal model.
 
     **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
     few frequencies to find the multipliers at all.
+
+    **Example:**
+
+    ```python
+    exact = hj.experiments.simulate_experiments(model, design.realizations(4), start="periodic")
+    noisy = hj.experiments.add_noise(exact, std=1e-5)
+    bound = hj.identify.cramer_rao(model, hj.estimate_htf(noisy))
+    print(bound.standard_errors)
+    ```
+
+    **Before:** `hj.linearize`, `hj.estimate_htf`. **After:** `hj.optimal_design`,
+    `hj.fit_multipliers`.
     """
     exact = _exact_htf(model, htf)
     if estimator == "fit_ldtp":

@@ -67,14 +67,25 @@ def estimate_htf(
       the controller feeds back does not bias them (`identify/instrument.py`). References have to
       excite all lines of a class f + integers, up to N/2. Default: None; there is no controller.
 
-    **Returns:** `HTF` with ascending frequencies, source "estimate". At a frequency that was
-    measured in one realization only, `variance` is computed from the mean residual of the other
-    frequencies. If most frequencies were measured once, `variance` is that of noise or None, and
-    fits use `power` as weights.
+    **Returns:** `hj.linear.HTF`: `H` (M, F, ny, nu), complex, in units of the output per unit of
+    the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.
+    At a frequency that was measured in one realization only, `variance` is computed from the mean
+    residual of the other frequencies. If most frequencies were measured once, `variance` is that of
+    noise or None, and fits use `power` as weights.
 
     **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
     one experiment disturb each other (the message lists the pair); for too few periods or
     realizations for the requested variance; or for parts that do not belong together.
+
+    **Example:**
+
+    ```python
+    htf = hj.estimate_htf(data, harmonics=(-1, 0, 1))
+    print(htf.frequencies, htf[0].shape)
+    ```
+
+    **Before:** `hj.run_experiments`. **After:** `hj.select_order`, `hj.fit_multipliers` or
+    `hj.fit_ldtp`.
     """
     if variance == "noise" and repeats < 2:
         raise DefinitionError(

@@ -67,11 +67,31 @@ def estimate_loop(
     - `data`: experiments whose inputs are u and the references. References are periodic and excite
       all lines f + integers.
     - `at_input`: names of the references that are added to u, at least as many as inputs u.
+      Default: None.
     - `at_output`: names of the references that are added to y, at least as many as outputs y.
+      Default: None.
     - `repeats`: as for `estimate_htf`. Default: 1.
+
+    **Returns:** `hj.identify.Loop`: the HTFs `plant`, `controller`, `closed` and `sensitivity`,
+    each with variances, in units of their outputs per unit of their inputs. An HTF without its
+    reference is None, and `missing` names the reference.
 
     **Raises:** `DefinitionError` without a reference, for references that are not among the inputs,
     too few of them, equal to an input, or those that excite too little.
+
+    **Example:**
+
+    ```python
+    design = hj.multisine(4, 8, frequencies=(0, 2), amplitude=1.0)
+    r = design.realizations(4).signals(8)
+    u = r / 1.5                                       # plant y = u, controller u = r - 0.5 y
+    both = np.concatenate([u, r], axis=2)
+    names = {"inputs": ("u", "r"), "outputs": "y"}
+    loop_data = hj.experiments.ExperimentData(both, u, n_sections=4, periods=8, **names)
+    loop = hj.identify.estimate_loop(loop_data, at_input="r")
+    ```
+
+    **Before:** `hj.run_experiments`. **After:** `hj.fit_multipliers`, `hj.fit_ldtp`.
     """
     require_x64()
     r = at_input or ()

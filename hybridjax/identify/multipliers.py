@@ -130,9 +130,22 @@ def fit_multipliers(
     - `check`: whether to raise an error if the data do not support so many multipliers (a rank test
       at the level of 1 %): the surplus multipliers would only fit noise. Default: True.
 
+    **Returns:** `hj.identify.StructuredFit`: `multipliers` (d,), complex, without unit, by
+    decreasing modulus; `standard_errors` (d,); `covariance` (d, d), that of the coefficients;
+    `findings`.
+
     **Raises:** `DefinitionError` for an order below 1, NaN in the HTFs, variances that are not
     positive, a harmonic that `htf` does not hold, too few frequencies for so many coefficients (the
     message gives the number needed), or an order that the data do not support.
+
+    **Example:**
+
+    ```python
+    fit = hj.fit_multipliers(htf, order=2)
+    print(fit.multipliers, fit.standard_errors)
+    ```
+
+    **Before:** `hj.estimate_htf`, `hj.select_order`. **After:** `hj.plot.multipliers`.
     """
     order = order.rank() if isinstance(order, LDTP) else order
     rms = weights.check_values(htf)

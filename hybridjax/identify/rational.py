@@ -153,11 +153,22 @@ def fit_rational(
     - `output`: name or index. Default: every output. `input`: name or index. Default: 0.
     - `poles`, `zeros`: their numbers. Default: 2 and 1, the paper's.
 
-    **Returns:** `RationalFit`, outputs on the first axis also where there is only one.
+    **Returns:** `hj.identify.RationalFit`, without units: `poles` (ny, p), `zeros` (ny, q),
+    `multipliers` (ny, p), and `residual` (ny,), relative to H. Outputs are on the first axis also
+    where there is only one.
 
     **Raises:** `DefinitionError` for an output or input that is not there, for fewer
     lines than coefficients, and for an H with NaN or of zeros; `ComputationError` if no start leads
     to a finite fit.
+
+    **Example:**
+
+    ```python
+    rational = hj.identify.fit_rational(htf, output="yM", poles=2, zeros=1)
+    print(rational.multipliers)
+    ```
+
+    **Before:** `hj.estimate_htf`. **After:** `hj.plot.poles_zeros`, `hj.plot.multipliers`.
     """
     require_x64(htf.H)
     htf.require_sampled("`fit_rational`")

@@ -70,13 +70,24 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
 
     **Arguments:**
 
+    - `data`: experiments, S records of at least P + 1 cycles.
     - `order`: d, the number of non-zero multipliers. Default: the one of 1 to 4 with the
       shortest description (Rissanen 1978).
 
-    **Returns:** `TransientFit`, whose `data` are the argument of `estimate_htf`.
+    **Returns:** `hj.identify.TransientFit`: `data`, the argument of `estimate_htf`; `multipliers`
+    (d,) of the decay; `removed` (S, ny), rms in units of the outputs.
 
     **Raises:** `DefinitionError` for an input that does not repeat, for records that are too short,
     and if no experiment ran well.
+
+    **Example:**
+
+    ```python
+    free = hj.identify.remove_transient(data, order=2)
+    htf = hj.estimate_htf(free.data)
+    ```
+
+    **Before:** `hj.run_experiments`. **After:** `hj.estimate_htf`.
     """
     N = data.n_sections
     P = data.periods

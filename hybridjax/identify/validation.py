@@ -208,16 +208,30 @@ def validate(
       sections of its observations is simulated.
     - `data`: data as for `fit_series`, preferably other data than those of the fit, with which a
       model always agrees too well.
-    - `start`: "free", the default, estimates the initial state of each record from the record;
-      "cycle" takes it as zero. Declared drift of the records is estimated in either case.
+    - `start`: "free" estimates the initial state of each record from the record; "cycle" takes it
+      as zero. Declared drift of the records is estimated in either case. Default: "free".
     - `alpha`: significance level of the tests. Default: 0.01.
     - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs, which respond to noise; `model` is that of the plant from these to the
       outputs. Residuals are tested for independence of the reference. Default: None.
 
+    **Returns:** `hj.identify.Validation`: for each output (ny,) the `fit` in percent, the `noise`
+    in units of the output, and p-values, `whiteness` and `independence`. Printing it gives a
+    report.
+
     **Raises:** `DefinitionError` if model and data have different N or names, there are too few
     cycles, all records are too short to be compared or for so many lags, or a plant that is
     unstable outside of its loop or grows without bound, unless it is a fit of `fit_ldtp`.
+
+    **Example:**
+
+    ```python
+    fit = hj.fit_series(data, order=2)
+    validation = hj.validate(fit, data, alpha=0.01)
+    print(validation)
+    ```
+
+    **Before:** `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. **After:** `hj.plot.validation`.
     """
     free_start = start == "free"
     records = uninterrupted_records(data)

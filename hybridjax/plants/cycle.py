@@ -423,21 +423,48 @@ def find_cycle(
 
     **Arguments:**
 
+    - `plant`: a simulator with `reset` and `step`, see `hj.plants.Plant`.
     - `sections`: `ClockPhase` for a plant with a `period`; `KinematicPhase` of two signals, with
       numbers as `anchor`; or one or several `Crossing` of signals by name, which lie more than a
       step apart and are crossed once in each cycle.
     - `outputs`: names of signals.
     - `cycles`: number of cycles before the sections are located. A quarter as many are then
       recorded. Default: 100.
-    - `guess`: a state near the cycle at time 0, from which Newton's method on the return map finds
-      the cycle, also an unstable one. Default: none, the plant settles.
+    - `guess`: a state (n,) near the cycle at time 0, from which Newton's method on the return map
+      finds the cycle, also an unstable one. Default: none, the plant settles.
     - `seed`: seed of `reset`. Default: 0.
 
-    **Returns:** a `PlantCycle`.
+    **Returns:** `hj.plants.PlantCycle`: `period`, in the plant's unit of time; `cycle_outputs`
+    (N, ny), in units of the outputs; `state` on section 0, if the plant can return it.
 
     **Raises:** `DefinitionError` for unknown signals, for sections that need equations, and for a
     plant that does not continue from the state that it returned; `ComputationError` if the plant
     has not settled, or returns NaN. Errors of the plant pass through.
+
+    **Example:**
+
+    ```python
+    class Leak:
+        inputs = ("u",)
+        dt = 0.05
+        period = 1.0
+
+        def reset(self, seed):
+            self.t = 0.0
+            self.x = 0.0
+            return {"x": self.x}
+
+        def step(self, u, duration):
+            self.x += duration * (np.sin(2 * np.pi * self.t) - self.x + u[0])
+            self.t += duration
+            return {"x": self.x}
+
+    plant_cycle = hj.plants.find_cycle(Leak(), hj.ClockPhase(8), "x", cycles=30)
+    print(plant_cycle.cycle_outputs)
+    ```
+
+    **Before:** `hj.plants.Plant`, `FMUPlant`, `MuJoCoPlant` or `GymnasiumPlant`. **After:**
+    `cycle.run_experiments`, then `hj.estimate_htf`.
     """
     family = families.as_family(sections)
     drive = Drive(plant)

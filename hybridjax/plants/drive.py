@@ -48,6 +48,10 @@ class Plant(Protocol):
     - `fixed_step`: True if a step always lasts `dt`. Otherwise steps end on clock sections, and on
       others if the state can be set.
     - `units`: units of signals by name.
+
+    An example of a plant is that of `hj.plants.find_cycle`.
+
+    **Before:** a simulator. **After:** `hj.plants.find_cycle`.
     """
 
     inputs: Sequence[str] | Mapping[str, str]

@@ -36,7 +36,26 @@ from .look import (
 
 @checked
 def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
-    """Periods of the cycles, one after the other, and how they are distributed."""
+    """Draw the periods of the cycles in order, and their distribution.
+
+    **Arguments:**
+
+    - `phase`: result of `hj.recordings.estimate_phase`.
+    - `ax`: two Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 2): the periods in seconds against the number of the
+    cycle, and their histogram.
+
+    **Raises:** `DefinitionError` if `ax` does not hold two Axes.
+
+    **Example:**
+
+    ```python
+    hj.plot.phase(result.phase)
+    ```
+
+    **Before:** `hj.recordings.estimate_phase`. **After:** `hj.plot.save`.
+    """
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
         left, right = axes[0]
         first = 0
@@ -64,6 +83,24 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
     deviation. Right: for an input, its power against frequency; for an output, its deviations in
     successive cycles, at the section where they are largest.
+
+    **Arguments:**
+
+    - `data`: result of `hj.recordings.sample_sections`.
+    - `ax`: three Axes per signal, inputs first. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 3). Phases are in cycles, frequencies in
+    cycles per period, and signals in their units.
+
+    **Raises:** `DefinitionError` if `ax` does not hold three Axes per signal.
+
+    **Example:**
+
+    ```python
+    hj.plot.section_data(result.data)
+    ```
+
+    **Before:** `hj.recordings.sample_sections`. **After:** `hj.fit_series`.
     """
     N = data.n_sections
     nu = len(data.inputs)
@@ -117,8 +154,32 @@ def impulse_responses(
     input: str | int = 0,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Left: responses to a push against its phase and the time since. Right: those at the phases
-    marked left, with bands of 95 %; dashed, those of a model with the same sections."""
+    """Draw the responses of a rhythm to a push against the phase of the push and the time since.
+
+    Left: all phases, in colors. Right: curves at the phases marked left, with bands of 95 %.
+    Dashed: the responses of a model with the same sections.
+
+    **Arguments:**
+
+    - `responses`: result of `hj.recordings.impulse_responses`.
+    - `model`: an `LDTP` with the same sections, inputs and outputs. Default: None.
+    - `input`: name or index of the input that pushes. Default: 0.
+    - `ax`: two Axes per output. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (ny, 2). Time and phase are in cycles, responses in
+    units of the output per unit of the input times second.
+
+    **Raises:** `DefinitionError` for an input that does not exist, a model with other sections or
+    names, or if `ax` does not hold two Axes per output.
+
+    **Example:**
+
+    ```python
+    hj.plot.impulse_responses(result.responses)
+    ```
+
+    **Before:** `hj.recordings.impulse_responses`. **After:** `hj.plot.save`.
+    """
     ny = len(responses.outputs)
     N = len(responses.phase)
     pushing = channel_index("input", input, responses.inputs)
@@ -164,12 +225,31 @@ def impulse_responses(
 def phase_response(
     curve: PhaseCurve, *, model: PhaseCurve | None = None, ax: AxesLike | None = None
 ) -> Plot:
-    """The curve; an estimate with its 95 % band. Dotted lines are events of a model.
+    """Draw a phase response curve, with the 95 % band of an estimate.
 
-    **Arguments:** `model`: the curve of a model (`Responses.curve`), drawn over that of a
-    recording, in its unit of time. Phase 0 of both must be the same event.
+    Dotted lines are events of a model.
 
-    **Raises:** `DefinitionError` for inputs in different units.
+    **Arguments:**
+
+    - `curve`: result of `hj.recordings.phase_response`, or the curve of a model,
+        `cycle.responses().curve()`.
+    - `model`: curve of a model, drawn over that of a recording, in its unit of time. Phase 0 of
+        both must be the same event. Default: None.
+    - `ax`: one Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1). Phase is in cycles, the response in
+    `curve.unit`.
+
+    **Raises:** `DefinitionError` for inputs in different units, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    oscillator = hj.find_limit_cycle(hj.models.VanDerPol())
+    hj.plot.phase_response(oscillator.responses().curve())
+    ```
+
+    **Before:** `hj.recordings.phase_response` or `cycle.responses`. **After:** `hj.plot.save`.
     """
     curves = [curve] if model is None else [curve, model]
     units = [unit_of(x.input) for x in curves]
@@ -201,12 +281,30 @@ def phase_response(
 def experiment(
     data: ExperimentData, index: int = 0, *, ax: AxesLike | None = None
 ) -> Plot:
-    """Inputs and deviations of the outputs of one experiment, against time in cycles.
+    """Draw inputs and deviations of the outputs of one experiment against time.
 
-    One row per signal; cycles before the window that estimates use are shaded, and a failed
-    experiment ends at a mark with its reason.
+    One row per signal. Cycles before the window that estimates use are shaded. A failed experiment
+    ends at a mark, and the title gives the reason.
 
-    **Raises:** `DefinitionError` for an experiment that does not exist.
+    **Arguments:**
+
+    - `data`: result of `hj.run_experiments`.
+    - `index`: number of the experiment; negative numbers count from the last. Default: 0.
+    - `ax`: one Axes per signal, inputs first. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 1). Time is in cycles, signals are in their
+    units.
+
+    **Raises:** `DefinitionError` for an experiment that does not exist, or if `ax` does not hold
+    one Axes per signal.
+
+    **Example:**
+
+    ```python
+    hj.plot.experiment(data, 0)
+    ```
+
+    **Before:** `hj.run_experiments`. **After:** `hj.estimate_htf`.
     """
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
@@ -242,14 +340,31 @@ def experiment(
 def validation(
     validation: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | None = None
 ) -> Plot:
-    """Measured and simulated outputs, and correlations of the residuals; one row per output.
+    """Draw measured and simulated outputs, and correlations of the residuals; one row per output.
 
-    Left: the last cycles of the first record. Middle: correlations of the residuals with earlier
+    Left: the last cycles of the longest record. Middle: correlations of the residuals with earlier
     ones, right: with earlier inputs. Bars are means of the correlations over all sections, in units
     of their standard deviation. If there is no correlation, 1 % of the bars lie outside of the
     shaded band.
 
-    **Arguments:** `cycles`: number of cycles to show. Default: 4.
+    **Arguments:**
+
+    - `validation`: result of `hj.validate`.
+    - `cycles`: number of cycles to show. Default: 4.
+    - `ax`: three Axes per output. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (ny, 3). Time is in cycles, lags are in sections, and
+    outputs in their units.
+
+    **Raises:** `DefinitionError` if `ax` does not hold three Axes per output.
+
+    **Example:**
+
+    ```python
+    hj.plot.validation(hj.validate(model, data), cycles=4)
+    ```
+
+    **Before:** `hj.validate`. **After:** `hj.plot.save`.
     """
     N = validation.n_sections
     ny = len(validation.outputs)

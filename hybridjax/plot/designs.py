@@ -17,13 +17,32 @@ from .look import COLORS, COLUMN, CYCLE, AxesLike, Plot, panels
 
 @checked
 def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -> Plot:
-    """The spectrum of an optimal design, and of that which it improves, below |H_0| of all outputs.
+    """Draw the spectrum of an optimal design and of the design that it improves.
 
-    The upper panel shows |H_0|, each relative to its largest value. The lower panel shows the
-    amplitude of each excited frequency, over three decades: the rms over all experiments and
-    inputs, although most experiments leave this frequency out. Other frequencies are not drawn.
+    The upper panel shows |H_0| of all outputs, each relative to its largest value. The lower panel
+    shows the amplitude of each excited frequency: the rms over all experiments and inputs, although
+    most experiments leave this frequency out. Other frequencies are not drawn.
 
-    **Raises:** `DefinitionError` for a model of other signals.
+    **Arguments:**
+
+    - `plan`: result of `hj.optimal_design`.
+    - `model`: the model that the plan was made for.
+    - `ax`: two Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (2, 1). Frequencies are in cycles per period, amplitudes
+    in the unit of the first input, over three decades.
+
+    **Raises:** `DefinitionError` for a model of other signals or sections, or if `ax` does not hold
+    two Axes.
+
+    **Example:**
+
+    ```python
+    plan = hj.optimal_design(model, design)
+    hj.plot.spectrum(plan, model)
+    ```
+
+    **Before:** `hj.optimal_design`. **After:** `hj.run_experiments`.
     """
     signals = {*model.inputs, *model.outputs}
     if model.n_sections != plan.design.n_sections or not signals <= set(plan.rms):
@@ -65,15 +84,31 @@ def standard_errors(
     *,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """The standard error against the number of cycles, on logarithmic axes.
+    """Draw the standard error against the number of cycles, on logarithmic axes.
 
-    Lines are bounds for the optimal design and that which it improves. Points are standard errors
-    of studies after each block, the first of which has that design. For several quantities, the
-    root of the sum of squares is drawn.
+    Lines are Cramer-Rao bounds for the optimal design and for the design that it improves. Points
+    are standard errors of sequential designs after each block of experiments; the first block has
+    the design that is improved. For several quantities, the root of the sum of squares is drawn.
 
-    **Arguments:** `studies`: by label, one study or several.
+    **Arguments:**
 
-    **Raises:** `DefinitionError` for a study without a block.
+    - `plan`: result of `hj.optimal_design`.
+    - `studies`: by label, one `hj.designs.SequentialDesign` or several. Default: None.
+    - `ax`: one Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1). Standard errors are in the unit of the quantity
+    of interest; multipliers have none.
+
+    **Raises:** `DefinitionError` for a study without a block, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    plan = hj.optimal_design(model, design)
+    hj.plot.standard_errors(plan)
+    ```
+
+    **Before:** `hj.optimal_design`. **After:** `hj.designs.SequentialDesign`.
     """
     with panels(ax, height=2.4) as axes:
         panel = axes[0, 0]

@@ -266,12 +266,26 @@ def explore(
 
     **Arguments:**
 
-    - `system`: with a default guess, or a limit cycle of it. `parameters`: names.
+    - `system`: a system with a default guess, or one of its limit cycles.
+    - `parameters`: names of the parameters that get sliders.
     - `ranges`: least and largest value by name. Default: half and 1.5 times the present value.
     - `x`, `y`: names of the states or outputs that are drawn. Default: the first two states.
 
+    **Returns:** `hj.plot.Explorer` with the present `cycle`, a `message` if the cycle was lost, and
+    the `figure`. Parameters are in their units.
+
     **Raises:** `DefinitionError` for a parameter that does not exist, a range without its present
     value, and as `find_limit_cycle`; `ComputationError` if there is no cycle to begin with.
+
+    **Example:**
+
+    ```python
+    explorer = hj.explore(hopper, "k", ranges={"k": (8.0, 12.0)})
+    print(explorer.cycle.multipliers)
+    ```
+
+    **Before:** `hj.HybridSystem`, or `hj.find_limit_cycle`. **After:** `hj.continuation`,
+    `hj.sweep`.
     """
     with searching("as `system`", (ComputationError, DefinitionError)):
         cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)

@@ -46,7 +46,7 @@ def htf(
     decades: Positive = 5,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """|H_m| against the input frequency, on a logarithmic scale.
+    """Draw |H_m| against the input frequency, on a logarithmic scale.
 
     One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`) at the
     frequencies of the first HTF, are drawn as broad pale lines under the estimates, in any order of
@@ -58,12 +58,25 @@ def htf(
     - `htfs`: one HTF or several, for a panel with one output; or a dict by name (the paper's Fig.
       3), for a column for each name and a row for each output. An entry is an HTF, or several (an
       estimate, and an exact HTF or a model); all have the same outputs, and a row shares one scale.
-    - `output`, `input`: names or indices. Default: the first; all outputs of a dict. The axis names
-      the input if there are several.
-    - `decades`: how far below the largest value the scale reaches. Default: 5.
-    - `ax`: Axes. Default: a new figure.
+    - `output`: name or index. Default: the first; all outputs of a dict.
+    - `input`: name or index. The axis names the input if there are several. Default: 0.
+    - `harmonics`: the m of the H_m. Default: (0, 1, -1).
+    - `decades`: number of decades of the scale below the largest value. Default: 5.
+    - `ax`: one Axes per panel. Default: a new figure.
 
-    **Raises:** `DefinitionError` for an output, input or harmonic that is not there.
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), or (outputs, names) of a dict. Frequencies are
+    in cycles per period, magnitudes in units of the output per unit of the input.
+
+    **Raises:** `DefinitionError` for an output, input or harmonic that does not exist, for models
+    without an HTF, or if `ax` does not hold one Axes per panel.
+
+    **Example:**
+
+    ```python
+    hj.plot.htf(htf, model, output="yM", harmonics=(0, 1))
+    ```
+
+    **Before:** `hj.estimate_htf`. **After:** `hj.fit_multipliers`.
     """
     families = _families(htfs)
     if families is None:
@@ -129,8 +142,7 @@ def bode(
     input: str | int | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Magnitude and phase of one harmonic for several outputs and inputs, with fits in black on
-    top.
+    """Draw magnitude and phase of one harmonic for several outputs and inputs, with fits in black.
 
     **Arguments:**
 
@@ -140,14 +152,26 @@ def bode(
       the true values with a probability of 95 %. Their phase is not drawn where the band of the
       magnitude contains zero.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
-      that it has; by name beside a dict of HTFs.
+      that it has; by name beside a dict of HTFs. Default: none.
+    - `harmonic`: the m of H_m. Default: 0.
     - `outputs`: names of outputs. Default: all.
-    - `input`: name or index of one input. Default: all. Each output and input has a curve of its
-      own color.
-    - `ax`: two Axes, for magnitude and phase. Default: a new figure.
+    - `input`: name or index of one input. Each output and input has a curve of its own color.
+      Default: all.
+    - `ax`: two Axes, for magnitude and phase; two per name of a dict. Default: a new figure.
 
-    **Raises:** `DefinitionError` for a name or harmonic that is not there, and for fits that have
-    none of the inputs.
+    **Returns:** `hj.plot.Plot` with `axes` (2, 1), or (2, names) of a dict. Frequencies are in
+    cycles per period, magnitudes in units of the output per unit of the input, phases in degrees.
+
+    **Raises:** `DefinitionError` for a name or harmonic that does not exist, for fits that have
+    none of the inputs, for models without an HTF, or if `ax` does not hold one Axes per panel.
+
+    **Example:**
+
+    ```python
+    hj.plot.bode(htf, model, fits=fit, outputs=("yM",))
+    ```
+
+    **Before:** `hj.estimate_htf`. **After:** `hj.fit_multipliers`.
     """
     families = _families(htfs)
     if families is not None:

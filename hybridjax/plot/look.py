@@ -68,10 +68,24 @@ def _load_backend() -> None:
 
 
 def style() -> contextlib.AbstractContextManager:
-    """The package's look, for figures of your own: `with hj.plot.style(): ...`.
+    """Use the package's look for your own figures.
 
-    Functions of this module use it for figures that they create; they do not change the fonts and
+    Functions of `hj.plot` use it for figures that they create; they do not change the fonts and
     sizes of given Axes. Global settings of matplotlib are never changed.
+
+    **Returns:** a context manager. Figures that are made inside of it have the look.
+
+    **Raises:** `ImportError` if matplotlib cannot load its backend.
+
+    **Example:**
+
+    ```python
+    with hj.plot.style():
+        figure, panel = plt.subplots()
+        panel.plot(*cycle.trajectory()("yM", "vM")[1:])
+    ```
+
+    **Before:** any result. **After:** `hj.plot.save`.
     """
     _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
@@ -220,12 +234,24 @@ def save(
 ) -> tuple[Path, ...]:
     """Write a figure, in one file for each format.
 
-    **Arguments:** `path` without suffix (a suffix of a format is dropped); `plot`, or any figure or
-    Axes of matplotlib; `formats`, of "png" (150 dots per inch), "pdf" and "svg".
+    **Arguments:**
 
-    **Returns:** the paths.
+    - `path`: path without suffix; a suffix of a format is dropped.
+    - `plot`: result of a function of `hj.plot`, or any figure or Axes of matplotlib.
+    - `formats`: "png" (150 dots per inch), "pdf" and "svg", one or several. Default: ("png",).
 
-    **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
+    **Returns:** the paths, a tuple with one `pathlib.Path` for each format.
+
+    **Raises:** `DefinitionError` if the files cannot be written, and for a suffix of another
+    format.
+
+    **Example:**
+
+    ```python
+    hj.plot.save("orbit", hj.plot.cycle(cycle, "yM", "vM"), formats=("png", "svg"))
+    ```
+
+    **Before:** any function of `hj.plot`. **After:** none; the files are complete.
     """
     if isinstance(plot, Axes):
         figure = cast(Figure, plot.get_figure(root=True))

@@ -188,20 +188,28 @@ def animate(
         value of the parameter. Where `hj.systems.Symmetric(half_period=)` halves a cycle, both
         halves are drawn, with the multipliers of the whole (not beside `sections` or `perturbed`).
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
-    - `sections`: from `place_sections`, on this cycle.
+    - `sections`: from `hj.sections.place_sections`, on this cycle. Default: None.
     - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
         `hj.experiments.perturbed_trajectory`; or data of experiments at `sections`, of which the
-        inputs of the first are applied, to the cycle, for four periods.
+        inputs of the first are applied, to the cycle, for four periods. Default: None.
     - `traces`: names of states or outputs that are drawn over time. Default: `x` if the system has
         a picture, else up to four states.
     - `speed`: multiple of real speed. Default: 1. A motion of less than 0.25 s or more than 20 s,
         or without a unit of time, takes 2 s over `speed`.
 
-    **Returns:** an animation of matplotlib, which a notebook shows. Its method `save` writes a GIF,
-    an MP4 or a page.
+    **Returns:** `hj.plot.Motion`, an animation of matplotlib, which a notebook shows. Its `times`
+    (n,) are in the system's unit of time; its method `save` writes a GIF, an MP4 or a page.
 
     **Raises:** `DefinitionError` for a name that does not exist, a cycle that was not found, and
     sections or a perturbed motion of another system.
+
+    **Example:**
+
+    ```python
+    motion = hj.plot.animate(cycle, "yM", "vM", speed=0.5)
+    ```
+
+    **Before:** `hj.find_limit_cycle` or `hj.simulate`. **After:** `motion.save`.
     """
     if isinstance(motion, Branch):
         return _of_branch(motion, x, y, 1 / (_RATE * (speed or 1.0)))

@@ -48,7 +48,7 @@ def cycle(
     perturbed: Trajectory | None = None,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """The limit cycle in the plane of two states or outputs, colored by chart.
+    """Draw a limit cycle in the plane of two states or outputs, colored by chart.
 
     An arrow shows the direction. Events are marked by dots, resets that move the point by dashed
     lines, sections by short bars. A bar lies along the section if this is a curve in the plane (its
@@ -56,13 +56,26 @@ def cycle(
 
     **Arguments:**
 
+    - `cycle`: result of `hj.find_limit_cycle`.
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
-    - `sections`: from `place_sections`, drawn as bars; about 8 are numbered.
-    - `perturbed`: a trajectory from `simulate`, drawn over the cycle.
-    - `ax`: where to draw; a new figure of one column's width by default.
+    - `sections`: from `hj.sections.place_sections`, drawn as bars; about 8 are numbered. Default:
+      None.
+    - `perturbed`: a trajectory from `hj.simulate`, drawn over the cycle. Default: None.
+    - `ax`: one Axes. Default: a new figure of one column's width.
 
-    **Raises:** `DefinitionError` for a name that does not exist, sections of another system, or a
-    cycle that was not found.
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), states in their units.
+
+    **Raises:** `DefinitionError` for a name that does not exist, sections of another system, a
+    cycle that was not found, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    placed = hj.sections.place_sections(cycle, sections)
+    hj.plot.cycle(cycle, "yM", "vM", sections=placed)
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.sections.place_sections`.
     """
     cycle.require_found()
     s = cycle.structure

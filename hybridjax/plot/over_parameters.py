@@ -29,19 +29,30 @@ _MARKS = dict(
 def branch(
     *branches: Branch, output: str | None = None, ax: AxesLike | None = None
 ) -> Plot:
-    """Branches of limit cycles, with marks where their stability changes.
+    """Draw branches of limit cycles, with marks where their stability changes.
 
     Stable cycles are drawn by full lines and unstable ones by dashed lines, one color per branch.
 
     **Arguments:**
 
-    - `branches`: from `continuation`, all along the same parameter.
-    - `output`: the name of a state or output, whose largest value on each cycle is drawn; by
-        default the first state of the chart in which the cycle begins.
-    - `ax`: where to draw; a new figure of one column's width by default.
+    - `branches`: results of `hj.continuation`, all along the same parameter.
+    - `output`: name of a state or output, whose largest value on each cycle is drawn. Default: the
+      first state of the chart in which the cycle begins.
+    - `ax`: one Axes. Default: a new figure of one column's width.
 
-    **Raises:** `DefinitionError` for branches along different parameters, or a name that does not
-    exist.
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), parameter and output in their units.
+
+    **Raises:** `DefinitionError` for branches along different parameters, a name that does not
+    exist, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    branch = hj.continuation(cycle, "k", (10.0, 11.0), step=0.5)
+    hj.plot.branch(branch, output="yM")
+    ```
+
+    **Before:** `hj.continuation`. **After:** `hj.plot.save`.
     """
     names = {b.parameter for b in branches}
     if len(names) != 1:
@@ -111,9 +122,21 @@ def sweep(
 
     - `maps`: the dataset that `hj.sweep` returns.
     - `name`: the quantity. Default: "spectral_radius".
-    - `ax`: Axes to draw on. Default: a new figure of one column's width.
+    - `ax`: one Axes. Default: a new figure of one column's width.
 
-    **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters.
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1).
+
+    **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters, or
+    if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    maps = hj.sweep(hopper, {"k": np.linspace(9, 11, 5)})
+    hj.plot.sweep(maps, "spectral_radius")
+    ```
+
+    **Before:** `hj.sweep`. **After:** `hj.plot.save`.
     """
     if not isinstance(getattr(maps, "data_vars", None), Mapping):
         raise DefinitionError(

@@ -39,13 +39,24 @@ def multipliers(
 
     **Arguments:**
 
-    - `true`: multipliers, or a `LimitCycle` or `LDTP` that has them; or the estimate with which
-        others are compared, such as a `SeriesFit`.
+    - `true`: multipliers (d,), or a `LimitCycle` or `LDTP` that has them; or the estimate with
+        which others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
-        `SeriesFit` or the result of `cramer_rao`, or multipliers.
-    - `zoom`: draw the inset.
+        `SeriesFit` or the result of `hj.identify.cramer_rao`, or multipliers (d,). Default: none.
+    - `zoom`: whether to draw the inset. Default: True.
+    - `ax`: one Axes. Default: a new figure.
 
-    **Raises:** `DefinitionError` if there are no multipliers.
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1). Multipliers have no unit.
+
+    **Raises:** `DefinitionError` if there are no multipliers, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    hj.plot.multipliers(cycle, {"structured fit": fit})
+    ```
+
+    **Before:** `hj.fit_multipliers`. **After:** `hj.plot.save`.
     """
     reference = "estimate" if isinstance(true, MultiplierFit) else "exact"
     borders = _borders({reference: true, **(estimates or {})})
@@ -107,15 +118,31 @@ class _Markers(NamedTuple):
 
 @checked
 def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) -> Plot:
-    """Poles (crosses) and zeros (circles) of rational fits in the z-plane, one column per output.
+    """Draw poles (crosses) and zeros (circles) of rational fits in the z-plane, a column per
+    output.
 
-    The upper row shows them all, the lower one the surroundings of the poles. A family of
-    sections has one color, so that one sees whether another family moves poles or zeros. The
-    multipliers are the N-th powers of the poles.
+    The upper row shows them all, the lower one the surroundings of the poles. Each family of
+    sections has one color, so that a family that moves poles or zeros is seen. The multipliers are
+    the N-th powers of the poles.
 
-    **Arguments:** `fits`: by name of the section family, all with the same outputs.
+    **Arguments:**
 
-    **Raises:** `DefinitionError` if there are none, or their outputs differ.
+    - `fits`: results of `hj.identify.fit_rational` by name of the section family, all with the same
+      outputs and number of sections.
+    - `ax`: two Axes per output. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (2, ny).
+
+    **Raises:** `DefinitionError` if there are no fits, if their outputs or sections differ, or if
+    `ax` does not hold two Axes per output.
+
+    **Example:**
+
+    ```python
+    hj.plot.poles_zeros({"clock": hj.identify.fit_rational(htf)})
+    ```
+
+    **Before:** `hj.identify.fit_rational`. **After:** `hj.plot.save`.
     """
     if not fits or len({(fit.outputs, fit.n_sections) for fit in fits.values()}) != 1:
         raise DefinitionError(

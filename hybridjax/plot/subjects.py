@@ -14,8 +14,33 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, colored, panels
 def forest(
     population: Population, quantity: str, *, ax: AxesLike | None = None
 ) -> Plot:
-    """Draw the estimate of each subject with its 95 % interval, its prediction (open circle), and
-    the mean of each group and condition (diamond: its 95 % interval)."""
+    """Draw the estimate of each subject, and the mean of each group and condition.
+
+    Estimates are squares with their 95 % intervals, predictions open circles, and means diamonds,
+    as wide as their 95 % intervals.
+
+    **Arguments:**
+
+    - `population`: a `hj.recordings.Population`, also that of `hj.identify_subjects`.
+    - `quantity`: name of the quantity, such as "modulus".
+    - `ax`: one Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), the quantity in its unit.
+
+    **Raises:** `DefinitionError` for a quantity that does not exist, too few subjects for a mean,
+    or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    gain = np.array([0.61, 0.58, 0.66, 0.63])
+    table = {"subject": ["S1", "S2", "S3", "S4"]}
+    people = hj.recordings.Population(table, {"gain": gain}, {"gain": 0.02 + 0 * gain})
+    hj.plot.forest(people, "gain")
+    ```
+
+    **Before:** `hj.identify_subjects`. **After:** `hj.plot.paired`.
+    """
     means = population.mean(quantity)
     subjects = population.predictions(quantity)
     names = []
@@ -59,10 +84,32 @@ def paired(
     *,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Draw the estimates of two conditions or groups as dots with standard errors, those of a
-    subject joined by a line, beside the means with 95 % intervals.
+    """Draw the estimates in two conditions or groups, and the means with 95 % intervals.
 
-    **Raises:** `DefinitionError` as `Population.difference`.
+    Dots are estimates with their standard errors; a line joins those of a subject. Diamonds are
+    means. The title gives the mean difference and its 95 % interval.
+
+    **Arguments:**
+
+    - `population`: a `hj.recordings.Population`, also that of `hj.identify_subjects`.
+    - `quantity`: name of the quantity, such as "modulus".
+    - `a`, `b`: the two conditions, or the two groups.
+    - `ax`: one Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), the quantity in its unit.
+
+    **Raises:** `DefinitionError` as `Population.difference`, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    gain = np.array([0.61, 0.58, 0.66, 0.68, 0.63, 0.71])
+    table = {"subject": ["S1", "S2", "S3"] * 2, "condition": ["slow"] * 3 + ["fast"] * 3}
+    people = hj.recordings.Population(table, {"gain": gain}, {"gain": 0.02 + 0 * gain})
+    hj.plot.paired(people, "gain", "fast", "slow")
+    ```
+
+    **Before:** `hj.identify_subjects`. **After:** `hj.plot.save`.
     """
     (test,) = population.difference(quantity, a, b).itertuples()
     subjects = population.predictions(quantity)
@@ -100,11 +147,31 @@ def paired(
 
 @checked
 def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
-    """Draw a mean or a difference over subjects. A curve: each subject as a thin line, the mean,
-    its band, and the significant points (bar). A map: its values, with outlined significant
-    points; of complex values the magnitude.
+    """Draw a mean or a difference over subjects.
 
-    **Raises:** `DefinitionError` for maps with more than two axes.
+    A curve: each subject as a thin line, the mean, its band, and the significant points (bar). A
+    map: its values, with outlined significant points. Of complex values, the magnitude is drawn.
+
+    **Arguments:**
+
+    - `result`: result of `mean` or `difference` of a `hj.recordings.PopulationMaps`.
+    - `ax`: one Axes. Default: a new figure.
+
+    **Returns:** `hj.plot.Plot` with `axes` (1, 1), the values in `result.unit`.
+
+    **Raises:** `DefinitionError` for maps with more than two axes, or if `ax` is not one Axes.
+
+    **Example:**
+
+    ```python
+    phase = np.arange(8) / 8
+    curves = np.sin(2 * np.pi * phase) + 0.1 * np.random.default_rng(0).normal(size=(5, 8))
+    table = {"subject": ["S1", "S2", "S3", "S4", "S5"]}
+    maps = hj.recordings.PopulationMaps(table, curves, {"phase": phase}, "mm/N")
+    hj.plot.subject_maps(maps.mean())
+    ```
+
+    **Before:** `hj.recordings.PopulationMaps`. **After:** `hj.plot.save`.
     """
     is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray

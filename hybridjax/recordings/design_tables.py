@@ -22,11 +22,30 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
     Experiment s was applied in trial s, from the first whole cycle on, and each value held from its
     section to the next. Sample such inputs in the middle: `sample_sections(..., sampled="middle")`.
 
-    **Arguments:** `path`: a table by phase that `Design.write` wrote.
+    **Arguments:**
+
+    - `recording`: the recording, one trial per experiment, in the order of the table.
+    - `phase`: result of `estimate_phase` for this recording.
+    - `path`: a table by phase that `Design.write` wrote.
+
+    **Returns:** `hj.Recording` with the same trials and the commanded inputs as further signals, in
+    the units of the design.
 
     **Raises:** `FileFormatError` if the file is no table by phase, or has experiments of different
     lengths; `DefinitionError` if the numbers of trials and experiments differ, or the recording has
     a signal of the same name.
+
+    **Example:**
+
+    ```python
+    command = hj.multisine(8, 16, frequencies=(0, 0.5), inputs="command")
+    command.write("design.csv", cycles=48)
+    phase = hj.recordings.estimate_phase(recording, apex)
+    both = hj.recordings.attach_design(recording, phase, "design.csv")
+    ```
+
+    **Before:** `design.write`, `hj.recordings.estimate_phase`. **After:**
+    `hj.recordings.sample_sections`.
     """
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(BY_PHASE) <= set(columns):

@@ -87,13 +87,32 @@ def diagnose(
     """List the reasons to doubt a fit to recorded data.
 
     They are: too few strides for the unknowns, more multipliers than the data support, inputs
-    without power at the frequencies of the multipliers, redundant outputs, inputs that answer the
-    outputs, confidence intervals that reach the unit circle, an iteration that did not converge,
-    gaps and spikes.
+    without power at the frequencies of the multipliers, redundant outputs, inputs that respond to
+    the outputs, confidence intervals that reach the unit circle, an iteration that did not
+    converge, gaps and spikes.
 
-    **Arguments:** `data`: the data at the sections. `fit`: the result of `fit_series`.
-    `validation`: a validation on held-out strides, whose tests are reported. `findings`: findings
-    of an inspection and of other estimates, which come first. Default: none.
+    **Arguments:**
+
+    - `data`: the data at the sections, result of `sample_sections`.
+    - `fit`: result of `fit_series`.
+    - `validation`: a validation on held-out strides, whose tests are reported. Default: None.
+    - `findings`: findings of an inspection and of other estimates, which come first. Default: none.
+
+    **Returns:** `hj.recordings.Diagnosis`: `findings`; `plain` (d,), multipliers of a plain
+    regression; `bandwidths`, one per input, in cycles per period; `expected` (k, d), the standard
+    errors that `cycles` (k,) would give.
+
+    **Raises:** `DefinitionError` for data without inputs, and with too few cycles for the order of
+    the fit.
+
+    **Example:**
+
+    ```python
+    print(hj.recordings.diagnose(result.data, result.fit))
+    ```
+
+    **Before:** `hj.fit_series`, `hj.recordings.hold_out`. **After:** a longer recording, or
+    `hj.plot.multipliers`.
     """
     prepared = PreparedRecords(data, free_start=True)
     diagnosis = diagnosis_of(data, prepared, fit, validation)

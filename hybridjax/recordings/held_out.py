@@ -143,7 +143,25 @@ def hold_out(data: SectionData, order: Order) -> HeldOut:
     If this part of a record would be shorter than twelve cycles, whole records are held out
     instead, a quarter of them. At most the first 1000 cycles of a recording are used.
 
+    **Arguments:**
+
+    - `data`: the data at the sections, result of `sample_sections`.
+    - `order`: d, the number of multipliers.
+
+    **Returns:** `hj.recordings.HeldOut`, a pair: `fit`, the `SeriesFit` to the first part, and
+    `validation`, its `Validation` on the last.
+
     **Raises:** `DefinitionError` if too few cycles are left for either.
+
+    **Example:**
+
+    ```python
+    fit, validation = hj.recordings.hold_out(result.data, order=2)
+    print(validation)
+    ```
+
+    **Before:** `hj.recordings.sample_sections`, `hj.select_order`. **After:**
+    `hj.recordings.diagnose`.
     """
     return split(data).fit(order)
 

@@ -135,8 +135,11 @@ def identify_recording(
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
 
-    **Arguments:** those of `sample_sections`, and
+    **Arguments:**
 
+    - `recording`: the recording, perturbed by the inputs.
+    - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
+      `sample_sections`, with the same defaults.
     - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
       that the reference determines, up to 4.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
@@ -145,8 +148,22 @@ def identify_recording(
     - `references`: signals that enter a control loop from outside, at least as many as inputs. The
       controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
 
+    **Returns:** `hj.recordings.Identification` with the results of all steps: `phase`, `data`,
+    `fit` (a `SeriesFit` with `multipliers` (d,)), `held_out`, `responses` and `diagnosis`. Its
+    method `write_report` writes a page.
+
     **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
     `sample_sections` and `fit_series`; `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    options = {"inputs": "u", "outputs": ("yM", "vM"), "order": 2, "n_sections": 8}
+    result = hj.identify_recording(recording, apex, **options)
+    print(result.fit.multipliers)
+    ```
+
+    **Before:** `hj.read_recording`. **After:** `result.write_report`, `hj.identify_subjects`.
     """
     require_x64()
     say("inspection")

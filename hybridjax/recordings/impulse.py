@@ -96,14 +96,28 @@ def impulse_responses(
 
     **Arguments:**
 
-    - `fit`: the fit. `data`: the data that were fitted; their times give the area of an input that
-      is held for a section.
+    - `fit`: result of `fit_series`.
+    - `data`: the data that were fitted; their times give the area of an input that is held for a
+      section.
     - `cycles`: duration of the responses. Default: 3, or longer if the push is wide.
     - `width`: standard deviation of the push (Gaussian), in cycles. 0: the push is held for one
       section. Default: the smallest width for which the spectrum of the push lies in the band of
       the inputs, because the response of the system is unknown outside of this band.
 
+    **Returns:** `hj.recordings.ImpulseResponses`: `values` and `errors` (N, lags, ny, nu), in units
+    of the output per unit of the input times second; `phase` (N,) and `lag` (lags,), in cycles.
+
     **Raises:** `DefinitionError` if fit and data have different sections or names.
+
+    **Example:**
+
+    ```python
+    responses = hj.recordings.impulse_responses(result.fit, result.data, cycles=2)
+    print(responses.values.shape)
+    ```
+
+    **Before:** `hj.fit_series`. **After:** `hj.plot.impulse_responses`,
+    `hj.recordings.PopulationMaps`.
     """
     require_same("fit and data", fit, data)
     N, R = fit.numerators.shape[:2]

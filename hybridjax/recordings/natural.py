@@ -167,9 +167,24 @@ def natural_multipliers(
     - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
       one multiplier more contradicts the largest modulus, `findings` say so. Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
-      (Künsch 1989), within each record; whole records where these are short.
+      (Künsch 1989), within each record; whole records where these are short. Default: 0.
+
+    **Returns:** `hj.recordings.NaturalMultipliers`: `multipliers` (d,), complex, without unit;
+    `draws` (B, d) of the bootstrap, from which `interval` follows; `plain` (d,), those of a plain
+    regression; `findings`.
 
     **Raises:** `DefinitionError` for too few cycles or signals.
+
+    **Example:**
+
+    ```python
+    names = {"inputs": (), "outputs": ("yM", "vM")}
+    strides = hj.recordings.sample_sections(recording, apex, n_sections=8, **names)
+    natural = hj.recordings.natural_multipliers(strides, order=2)
+    print(natural.multipliers, natural.interval())
+    ```
+
+    **Before:** `hj.recordings.sample_sections(..., inputs=())`. **After:** `natural.interval`.
     """
     result = _estimate(data, order, seed)
     findings = list(about_natural_multipliers(result))

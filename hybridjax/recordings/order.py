@@ -42,20 +42,27 @@ def select_order(
     part. At most the first 1000 cycles are used. If the data are too few to try a larger number, a
     warning gives the reason.
 
-    ```python
-    hj.select_order(hj.estimate_htf(data)).order
-    ```
-
     **Arguments:**
 
     - `data`: HTFs, or data as for `fit_series`, of experiments or recordings.
     - `max_order`: the largest number. Default: 5 of HTFs, 4 of data.
-    - `extra_lags`: as in `fit_multipliers`, for HTFs.
+    - `extra_lags`: as in `fit_multipliers`, for HTFs. Default: N.
 
-    **Returns:** the comparison, whose `order` is the number that is selected.
+    **Returns:** `hj.identify.OrderSelection` for HTFs, `hj.recordings.HeldOutOrders` for data. Its
+    `order` is the number that is selected; `orders` (k,) are those compared.
 
     **Raises:** `DefinitionError` for HTFs as `fit_multipliers`; for data with too few cycles for
     one multiplier.
+
+    **Example:**
+
+    ```python
+    print(hj.select_order(htf))
+    fit = hj.fit_multipliers(htf, hj.select_order(htf).order)
+    ```
+
+    **Before:** `hj.estimate_htf` or `hj.recordings.sample_sections`. **After:**
+    `hj.fit_multipliers`, `hj.fit_series`.
     """
     if isinstance(data, HTF):
         return compare_orders(data, max_order or 5, extra_lags)

@@ -48,6 +48,7 @@ def estimate_phase(
 
     **Arguments:**
 
+    - `recording`: the recording.
     - `sections`, one of
         - a `KinematicPhase`: the angle of two signals about a center, counted in the sense in which
           it turns.
@@ -68,9 +69,22 @@ def estimate_phase(
     from below and one from above. Stretches end at gaps longer than a quarter of a cycle: in the
     signals of an angle, or in all signals where the phase comes from crossings or events.
 
+    **Returns:** `hj.recordings.Phase`: `stretches`, for each trial the times in seconds and the
+    phase in cycles; `periods`, for each trial the durations of its cycles (n,), and `period`, their
+    median, in seconds.
+
     **Raises:** `DefinitionError` for unknown signals or events, sections that a recording cannot
     have (functions of a state, charts), a phase that does not wind, or a recording of less than two
     cycles.
+
+    **Example:**
+
+    ```python
+    phase = hj.recordings.estimate_phase(recording, hj.Crossing("vM", "falling"))
+    print(phase.period)
+    ```
+
+    **Before:** `hj.recordings.check_recording`. **After:** `hj.recordings.sample_sections`.
     """
     if isinstance(sections, KinematicPhase):
         angles = _angles(recording, sections, bandwidth)

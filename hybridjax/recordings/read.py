@@ -53,14 +53,33 @@ def read_recording(
     Times are converted to seconds from s, ms, us, ns, min or h; times without a unit are taken as
     seconds, with one of the recording's `findings`.
 
-    **Arguments:** `time`: name of the column with the times. Default: "time". `signals`: names of
-    the signals to be read, or of groups, structs, markers and topics; only these take memory.
-    Default: all. `units`: units by name of the signal, for all files.
+    **Arguments:**
+
+    - `paths`: paths of the files, or lists of them.
+    - `time`: name of the column with the times. Default: "time".
+    - `signals`: names of the signals to be read, or of groups, structs, markers and topics; only
+      these take memory. Default: all.
+    - `units`: units by name of the signal, for all files. Default: those in the files.
+
+    **Returns:** `hj.Recording` with one trial per file, in the order of the paths. Times are in
+    seconds, signals in the units of the files.
 
     **Raises:** `DefinitionError` for files that do not exist, columns or signals that they do not
     have, unknown units of time, columns that differ between files, events that are all outside of
     the recording, packages that are not installed, and as `Recording`; `FileFormatError` for files
     that cannot be read, with the line.
+
+    **Example:**
+
+    ```python
+    walk = np.array([[0, 0.0, 1.00], [10, 1.0, 1.01], [20, 0.0, 1.02]])
+    header = "time (ms),force (N),hip (m)"
+    np.savetxt("walk.csv", walk, delimiter=",", header=header, comments="")
+    recording = hj.read_recording("walk.csv", signals=("force", "hip"))
+    print(recording)
+    ```
+
+    **Before:** a measurement. **After:** `hj.recordings.check_recording`, `hj.identify_recording`.
     """
     files: list[str | os.PathLike[str]] = []
     for path in paths:

@@ -55,6 +55,17 @@ class Recording(Showable, eqx.Module):
     - `trials`: one or several `Trial`s with the same signals.
     - `signals`: names of the signals. `units`: a unit for each, "" where none was given.
     - `findings`: assumptions made while files were read.
+
+    **Example:**
+
+    ```python
+    t = np.arange(0, 20, 0.01)
+    signals = {"push": np.cos(3 * t), "angle": np.sin(2 * np.pi * t)}
+    walk = hj.Recording(t, signals, events={"heel": np.arange(1, 20)}, units={"push": "N"})
+    ```
+
+    **Before:** a measurement, or `hj.read_recording`. **After:** `hj.recordings.check_recording`,
+    `hj.identify_recording`.
     """
 
     trials: tuple[Trial, ...]

@@ -69,7 +69,8 @@ def sample_sections(
 
     **Arguments:**
 
-    - `sections`: the result of `estimate_phase`, or what it takes as `sections`.
+    - `recording`: the recording.
+    - `sections`: the result of `estimate_phase`, or its argument `sections`.
     - `inputs`, `outputs`: names of signals. Without outputs, `()`, only the times of the events are
       known: `timing` is then "duration". Without inputs, `()`, the data are for
       `natural_multipliers`.
@@ -89,9 +90,23 @@ def sample_sections(
     that remains (`SectionSeries.drift`). Drift of sensors also moves the phase: remove it from the
     signals before (`without_drift`), as `identify_recording` does.
 
+    **Returns:** `hj.recordings.SectionData`: `records`, a tuple of `SectionSeries` with inputs u
+    (n, nu) and outputs y (n, ny), deviations from the average cycle in units of the signals;
+    `times`, in seconds; `cycle_inputs` (N, nu) and `cycle_outputs` (N, ny), the average cycle.
+
     **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs or times
     that repeat from cycle to cycle, a bandwidth below the rate of the rhythm, another number of
     sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
+
+    **Example:**
+
+    ```python
+    names = {"inputs": "u", "outputs": ("yM", "vM")}
+    sampled = hj.recordings.sample_sections(recording, apex, n_sections=8, **names)
+    fit = hj.fit_series(sampled, order=2)
+    ```
+
+    **Before:** `hj.recordings.estimate_phase`. **After:** `hj.select_order`, `hj.fit_series`.
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)

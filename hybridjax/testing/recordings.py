@@ -51,14 +51,27 @@ def simulate_recording(
 
     **Arguments:**
 
-    - `cycle`: the limit cycle on which all trials start. `force`: samples of S trials.
+    - `cycle`: the limit cycle on which all trials start.
+    - `force` (S, n, nu): samples of S trials, in units of the inputs.
     - `outputs`: names or `Output`s to be recorded in addition to the inputs.
     - `rate`: samples per unit of time, changed slightly so that a whole number of them fits into
-      a period. Default: 500. `steps`: steps of the force from sample to sample. Default: 4.
+      a period. Default: 500.
+    - `steps`: number of steps of the force from sample to sample. Default: 4.
 
-    **Returns:** a `Recording` with S trials. A trial that fails ends there.
+    **Returns:** `hj.Recording` with S trials of inputs and outputs, in their units. A trial that
+    fails ends there.
 
     **Raises:** `DefinitionError` as `response_function`.
+
+    **Example:**
+
+    ```python
+    force = hj.experiments.random_input(60, 50, bandwidth=8, rms=0.02, seed=1)
+    recording = hj.testing.simulate_recording(cycle, force[None], ("yM", "vM"), rate=50, steps=1)
+    ```
+
+    **Before:** `hj.find_limit_cycle`, `hj.experiments.random_input`. **After:**
+    `hj.identify_recording`.
     """
     recorded = check_outputs(cycle, outputs)
     force = np.asarray(force, float)
@@ -114,16 +127,29 @@ def add_artifacts(
 
     **Arguments:**
 
-    - `signals`: the corrupted signals; all others stay as they are.
+    - `recording`: the recording, which stays as it is.
+    - `signals`: names of the corrupted signals; all others stay as they are.
     - `noise`: standard deviation of white noise. `quantum`: step to which values are rounded. Both
       in the unit of the signals. Default: 0.
-    - `missing`: fraction of samples that are lost (NaN). Default: 0. `gap`: times of the start and
-      the end of an interval without samples. Default: None.
+    - `missing`: fraction of samples that are lost (NaN). Default: 0.
+    - `gap`: times of the start and the end of an interval without samples, in seconds. Default:
+      None.
     - `spikes`: fraction of samples that are off by 20 standard deviations of their signal. Default:
-      0. `seed`: seed of the random numbers.
+      0.
+    - `seed`: seed of the random numbers. Default: 0.
+
+    **Returns:** `hj.Recording` with the same trials, times, signals and events.
 
     **Raises:** `DefinitionError` for a signal that does not exist, and a gap that ends before it
     starts.
+
+    **Example:**
+
+    ```python
+    poor = hj.testing.add_artifacts(recording, ("yM", "vM"), noise=1e-4, missing=0.01, seed=1)
+    ```
+
+    **Before:** `hj.testing.simulate_recording`. **After:** `hj.recordings.check_recording`.
     """
     if gap is not None and gap[0] >= gap[1]:
         raise DefinitionError(f"`gap` must end after it starts, but is {gap}.")
@@ -162,17 +188,29 @@ def simulate_beats(
 
     **Arguments:**
 
-    - `curve`: Z at n equal steps of the phase from 0 on, in cycles per second and unit of the
+    - `curve` (n,): Z at n equal steps of the phase from 0 on, in cycles per second and unit of the
       input; linear in between.
-    - `force`: I, for S trials of m samples; linear between samples. `rate`: samples per second.
-      Default: 500.
+    - `force` (S, m): I, for S trials of m samples; linear between samples.
+    - `rate`: samples per second. Default: 500.
     - `rhythm`: w, in cycles per second, for all trials or for each. Default: 1.
-    - `jitter`: s, standard deviation that a cycle adds to the phase. Default: 0.
+    - `jitter`: s, standard deviation that a cycle adds to the phase, in cycles. Default: 0.
+    - `seed`: seed of the random numbers. Default: 0.
 
-    **Returns:** a `Recording` with S trials, the input `u` and the events `beat`.
+    **Returns:** `hj.Recording` with S trials, the input `u` and the events `beat`, times in
+    seconds.
 
     **Raises:** `DefinitionError` for a curve or a force without values, not as many rhythms as
     trials, or a rhythm above the `rate` of the force.
+
+    **Example:**
+
+    ```python
+    z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
+    force = 0.5 * np.ones((2, 1000))
+    beats = hj.testing.simulate_beats(z, force, rate=100, jitter=0.02)
+    ```
+
+    **Before:** none; the curve is known. **After:** `hj.recordings.phase_response`.
     """
     force = np.asarray(force, float)
     table = np.asarray(curve, float)

@@ -42,11 +42,25 @@ _BLOCKS = {
 
 
 def synthetic_ldtp() -> LDTP:
-    """An `LDTP` of 6 sections with the dimensions 3, 2, 3, 2, 3, 2, two inputs and two outputs.
+    """Return an `LDTP` of 6 sections, two inputs and two outputs, with the dimensions 3, 2, 3, 2,
+    3, 2.
 
     Its matrices are arbitrary, without a physical system and without symmetries that could hide an
     error. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there is a
-    structural zero beside them.
+    structural zero, too.
+
+    **Returns:** `hj.linear.LDTP`, without units.
+
+    **Raises:** nothing; there are no arguments.
+
+    **Example:**
+
+    ```python
+    system = hj.testing.synthetic_ldtp()
+    print(system.multipliers)
+    ```
+
+    **Before:** none. **After:** `hj.experiments.simulate_experiments`.
     """
     A, B, C, D = ([np.array(x, float) for x in blocks] for blocks in _BLOCKS.values())
     return LDTP.from_blocks(A, B, C, D)

@@ -276,10 +276,23 @@ def fit_ldtp(
     a finding reports that a controller could cause the dependence. If the data do not determine
     D, the printed fit reports this.
 
+    **Returns:** `hj.identify.LDTPFit`: `model`, the fitted `hj.linear.LDTP`; `multipliers` (d,),
+    without unit, with `standard_errors` (d,) and `covariance` (d, d), that of their coefficients;
+    `findings`.
+
     **Raises:** `DefinitionError` for both `dims` and `initial`, if data and initial model do not
     fit together, for NaN in the HTFs, variances that are not positive, an unobservable initial
     model, fewer numbers in the data than unknowns, outputs that do not respond to the inputs, or
     records with `lead`.
+
+    **Example:**
+
+    ```python
+    fit = hj.fit_ldtp(htf, dims=2)
+    print(fit.multipliers, fit.model)
+    ```
+
+    **Before:** `hj.estimate_htf`, or data as for `hj.fit_series`. **After:** `hj.validate`.
     """
     require_x64()
     free_start = start == "free"

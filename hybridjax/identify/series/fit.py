@@ -260,8 +260,21 @@ def fit_series(
       instrumental variables, which are consistent for any noise and controller. `start` has no
       effect: the first cycles of each record are not used. Default: None.
 
+    **Returns:** `hj.identify.SeriesFit`: `multipliers` (d,), complex, without unit, by decreasing
+    modulus; `standard_errors` (d,); `noise` (ny,), standard deviations in units of the outputs;
+    `findings`. `fit.htf(frequencies)` returns the HTFs.
+
     **Raises:** `DefinitionError` for records that do not fit together, inputs that are zero, too
     few cycles (the message says how many are needed), or an order that the data do not support.
+
+    **Example:**
+
+    ```python
+    fit = hj.fit_series(data, order=2)
+    print(fit.multipliers, fit.standard_errors)
+    ```
+
+    **Before:** `hj.run_experiments` or `hj.recordings.sample_sections`. **After:** `hj.validate`.
     """
     require_x64()
     order = order.rank() if isinstance(order, LDTP) else order

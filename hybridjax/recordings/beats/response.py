@@ -131,13 +131,30 @@ def phase_response(
 
     **Arguments:**
 
+    - `recording`: the recording, with the events and the input.
     - `sections`: the event at which each cycle begins, or a `Phase` estimated from events or
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback). The curve and the rates are those at its mean in each trial.
 
+    **Returns:** `hj.recordings.PhaseResponse`: `values` and `errors` (P,), in cycles per second and
+    unit of the input, at the phases `phase` (P,) in cycles; `rates` (trials,), in cycles per
+    second; `findings`.
+
     **Raises:** `DefinitionError` for an input that is missing or constant, a phase that is an
     angle, and too few intervals.
+
+    **Example:**
+
+    ```python
+    force = np.random.default_rng(0).normal(size=(1, 10_000))
+    force = np.repeat(force[:, ::50], 50, axis=1)
+    z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
+    beats = hj.testing.simulate_beats(z, force, rate=100, jitter=0.01)
+    curve = hj.recordings.phase_response(beats, hj.AtEvent("beat"), input="u")
+    ```
+
+    **Before:** `hj.read_recording`. **After:** `hj.plot.phase_response`.
     """
     phase = sections
     if not isinstance(phase, Phase):

@@ -48,11 +48,26 @@ def check_recording(
     `phase` and `data`, the function also finds trials with another period or cycle, slow changes of
     the outputs, inputs to which the outputs do not respond, and inputs that depend on the outputs.
 
-    **Arguments:** `inputs`, `outputs`: names of signals; others are not inspected. `phase`, `data`:
-    phase and data at the sections, of this recording or of the one that an inspection returned.
-    Default: None.
+    **Arguments:**
+
+    - `recording`: the recording.
+    - `inputs`, `outputs`: names of signals; others are not inspected.
+    - `phase`, `data`: phase and data at the sections, of this recording or of the one that an
+      inspection returned. Default: None.
+
+    **Returns:** `hj.recordings.Inspection`: `findings`, a tuple of `hj.errors.Finding`, and the
+    `recording` in which samples that were certainly not measured are missing.
 
     **Raises:** `DefinitionError` for unknown names, and for an output that is an input.
+
+    **Example:**
+
+    ```python
+    checked = hj.recordings.check_recording(recording, inputs="u", outputs=("yM", "vM"))
+    print(checked)
+    ```
+
+    **Before:** `hj.read_recording`. **After:** `hj.recordings.estimate_phase`.
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)

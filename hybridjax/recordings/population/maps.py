@@ -83,6 +83,19 @@ class PopulationMaps:
     - `axes`: coordinates by name, in the order of the grid. `unit` of the values. Default: none.
 
     **Raises:** `DefinitionError` for shapes that do not fit together, and as `Population`.
+
+    **Example:**
+
+    ```python
+    phase = np.arange(8) / 8
+    curves = np.sin(2 * np.pi * phase) + 0.1 * np.random.default_rng(0).normal(size=(5, 8))
+    table = {"subject": ["S1", "S2", "S3", "S4", "S5"]}
+    maps = hj.recordings.PopulationMaps(table, curves, {"phase": phase}, "mm/N")
+    print(maps.mean())
+    ```
+
+    **Before:** `hj.recordings.impulse_responses`, `hj.recordings.phase_response`. **After:**
+    `hj.plot.subject_maps`.
     """
 
     def __init__(

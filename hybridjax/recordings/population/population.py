@@ -49,6 +49,18 @@ class Population(Showable):
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
     subject in two groups, errors that are not positive, and if pandas is not installed.
+
+    **Example:**
+
+    ```python
+    gain = np.array([0.61, 0.58, 0.66, 0.68, 0.63, 0.71])
+    table = {"subject": ["S1", "S2", "S3"] * 2, "condition": ["slow"] * 3 + ["fast"] * 3}
+    people = hj.recordings.Population(table, {"gain": gain}, {"gain": 0.02 + 0 * gain})
+    print(people.difference("gain", "fast", "slow"))
+    ```
+
+    **Before:** `hj.identify_subjects`, or estimates with standard errors. **After:**
+    `hj.plot.forest`, `hj.plot.paired`.
     """
 
     def __init__(
