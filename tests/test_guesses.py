@@ -56,12 +56,12 @@ def names():
 RUN = """
 hj.simulate(hopper, hopper.guess(), 0.5)
 hopper.replace(k=9.0)
-cycle.is_stable
+cycle.stable
 cycle.modulus
 cycle.findings
 cycle.plot()
 cycle.to_pandas()
-model.is_stable
+model.stable
 model.simulate(np.zeros(16))
 model.plot()
 model.to_pandas()
@@ -126,6 +126,7 @@ hj.save(fit, "fit.npz")                                 -> wrong order
 hj.save("cycle.npz", cycle)                             -> cycle.to_pandas()
 hj.sweep(hopper, k=[8, 9])                              -> {'k': values}
 cycle.T                                                 -> `period`
+cycle.is_stable                                         -> `stable`
 cycle.eigenvalues                                       -> `multipliers`
 cycle.trajectories                                      -> `trajectory`
 model.poles                                             -> `multipliers`

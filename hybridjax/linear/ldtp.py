@@ -186,7 +186,7 @@ class LDTP(Showable, eqx.Module):
         return np.abs(self.multipliers)
 
     @property
-    def is_stable(self) -> bool:
+    def stable(self) -> bool:
         """True if all multipliers lie inside the unit circle."""
         return bool((self.modulus < 1).all())
 

@@ -268,8 +268,6 @@ class LimitCycle(Showable, eqx.Module):
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
 
-    is_stable = stable
-
     @property
     def modulus(self) -> Float[np.ndarray, " r"]:
         """The moduli of the multipliers: the parts of deviations that are left after a period."""
