@@ -69,7 +69,7 @@ class Fit(Showable, eqx.Module):
 
     @property
     def chi2_per_dof(self) -> float:
-        """Chi-square (`cost`) per degree of dof (`dof`), of fits that have both: about 1 if the
+        """Chi-square (`cost`) per degree of freedom (`dof`), of fits that have both: about 1 if the
         model and the standard deviations of the data are right."""
         return self.cost / self.dof if self.dof else np.nan
 

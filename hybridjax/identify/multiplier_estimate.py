@@ -347,7 +347,8 @@ class MultiplierFit(Fit):
         return [Finding("order", text)]
 
     def _summary(self) -> str:
-        about = "; ".join(filter(None, [self.show_multipliers(), self._about()]))
+        parts = self.show_multipliers(), self._shown_moduli(), self._about()
+        about = "; ".join(filter(None, parts))
         return folded(f"{type(self).__name__}({about})")
 
     def _page(self) -> tuple[str, ...]:
@@ -374,6 +375,27 @@ class MultiplierFit(Fit):
             for z, error in zip(self.multipliers, self.standard_errors, strict=True)
         )
         return folded(f"multipliers (± standard error) {', '.join(shown)}")
+
+    def _shown_moduli(self) -> str:
+        """Return the moduli and their intervals, of a pair of complex multipliers once."""
+        if self.result != Result.OK:
+            return ""
+        shown = []
+        for z, modulus, bounds in zip(
+            self.multipliers, self.modulus, self.interval(), strict=True
+        ):
+            if np.imag(z) < 0:
+                continue
+            if not np.isfinite(bounds).all():
+                shown.append(f"{modulus:.4f}")
+                continue
+            # (As many digits as the interval leaves.)
+            width = max(bounds[1] - bounds[0], 1e-12)
+            digits = max(2, int(np.ceil(-np.log10(width / 2))))
+            low, high = np.maximum(bounds, 0.0)
+            shown.append(f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})")
+        label = "modulus" if len(shown) == 1 else "moduli"
+        return folded(f"{label} (95 % interval) {', '.join(shown)}")
 
     def _radius(self, level: float, equations: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""

@@ -123,7 +123,7 @@ class HTF(Showable, eqx.Module):
       experiments reveal. None if it is unknown.
     - `noise_variance` (M, F, ny, nu): the part of `variance` that is noise, from repeated periods.
       The remainder is nonlinear distortion, which random phases make random. None if it is unknown.
-    - `variance_dof`: degrees of dof of `variance`; None if the variance is exact.
+    - `variance_dof`: degrees of freedom of `variance`; None if the variance is exact.
     - `power` (F, nu): excitation of each frequency, in any unit. Fits take errors as inversely
       proportional to it where `variance` is None. Default: the same for all.
 
