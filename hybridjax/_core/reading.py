@@ -340,18 +340,18 @@ class Reading:
         """Test for values that cannot be read here, and list them."""
         for name in path[1:]:
             if isinstance(value, types.ModuleType | type):
-                value = getattr(value, name, None)
+                value = _attribute(value, name)
         if value is sys.modules:
             self._hide(x, "sys.modules")
             return True
         if _moves(value):
-            name = str(getattr(value, "__name__", ""))
+            name = str(_attribute(value, "__name__") or "")
             text = f"`{x.__qualname__}` uses `{name}`, which changes by itself"
             self.moving.append(text)
             self.unread.append(text)
-        if not callable(value) or not is_packaged(getattr(value, "__module__", None)):
+        if not callable(value) or not is_packaged(_attribute(value, "__module__")):
             return False
-        name = str(getattr(value, "__name__", ""))
+        name = str(_attribute(value, "__name__") or "")
         reads_file = _FILES.fullmatch(name) and not self._classes
         if _HIDDEN.fullmatch(name) or reads_file:
             self._hide(x, name)
@@ -520,12 +520,12 @@ def _moves(x: Any) -> bool:
     """Test for functions of packages that draw random numbers or read the clock."""
     if not callable(x):
         return False
-    owner = getattr(x, "__self__", None)
+    owner = _attribute(x, "__self__")
     if isinstance(owner, np.random.RandomState | random.Random):
         return True
-    if isinstance(owner, type) and getattr(x, "__name__", "") in _CLOCKS:
+    if isinstance(owner, type) and _attribute(x, "__name__") in _CLOCKS:
         return True
-    module = str(getattr(x, "__module__", None))
+    module = str(_attribute(x, "__module__"))
     is_function = isinstance(x, types.FunctionType | types.BuiltinFunctionType)
     return is_function and module.partition(".")[0] in _MOVING
 
@@ -534,7 +534,7 @@ _HEAP = 1 << 9  # Python's flag of classes that are made while it runs
 
 
 def _listed(x: Any) -> Any:
-    return list(x) if hasattr(x, "__next__") else x
+    return x if _attribute(x, "__next__") is None else list(x)
 
 
 def _state_of(x: Any) -> dict[str, Any]:
@@ -552,9 +552,17 @@ def _state_of(x: Any) -> dict[str, Any]:
                 name = f"_{base.__name__.lstrip('_')}{name}"  # (as Python keeps it)
             with contextlib.suppress(AttributeError):  # of a slot that is not filled
                 state[name] = getattr(x, name)
-    if hasattr(x, "__wrapped__") and "__wrapped__" not in state:
-        state["__wrapped__"] = x.__wrapped__
+    wrapped = _attribute(x, "__wrapped__")
+    if wrapped is not None and "__wrapped__" not in state:
+        state["__wrapped__"] = wrapped
     return state
+
+
+def _attribute(x: Any, name: str) -> Any:
+    """An attribute of a user's object; None for none. (`__getattr__` may raise any error.)"""
+    with contextlib.suppress(Exception):
+        return getattr(x, name, None)
+    return None
 
 
 def _is_option(cell: types.CellType) -> bool:

@@ -54,6 +54,14 @@ CHANGES = {
             "Pair.k = classmethod(lambda cls: 2.0)",
         ),
     ],
+    "a name that `__getattr__` looks up, which raises another error for unknown ones": [
+        (
+            "names = {'k': 1.0}\nclass Names:\n"
+            "    def __getattr__(self, name): return names[name]\n"
+            "n = Names()\ndef f(x): return n.k * x",
+            "names['k'] = 2.0",
+        ),
+    ],
     "a property of a named tuple": [
         (
             PAIR + "    @property\n    def k(self): return self.a\n"
