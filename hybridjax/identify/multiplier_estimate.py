@@ -393,7 +393,9 @@ class MultiplierFit(Fit):
             width = max(bounds[1] - bounds[0], 1e-12)
             digits = max(2, int(np.ceil(-np.log10(width / 2))))
             low, high = np.maximum(bounds, 0.0)
-            shown.append(f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})")
+            shown.append(
+                f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+            )
         label = "modulus" if len(shown) == 1 else "moduli"
         return folded(f"{label} (95 % interval) {', '.join(shown)}")
 
