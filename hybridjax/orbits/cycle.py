@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
@@ -646,6 +647,28 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
             basis = np.pad(across, [(1, 0), (0, 0)])
         frames.append((np.append(map.expected, sizes), basis))
     return frames
+
+
+def derived_if_found(cycle: LimitCycle) -> LimitCycle:
+    """A traced cycle whose derivatives are NaN where it is none."""
+    found = (cycle.result == Result.OK) | (cycle.result == Result.SINGULAR)
+
+    def numbers(x: LimitCycle):
+        return x.period, x.anchor.q, x.legs.t, x.legs.q, x.factors
+
+    derived = tuple(_derived_where(found, x) for x in numbers(cycle))
+    return eqx.tree_at(numbers, cycle, derived)
+
+
+@jax.custom_jvp
+def _derived_where(found: Array, x: Array) -> Array:
+    return x
+
+
+@_derived_where.defjvp
+def _derived_where_jvp(primals, tangents):
+    found, x = primals
+    return x, tangents[1] * jnp.where(found, 1.0, jnp.nan)
 
 
 def log_determinant(cycle: LimitCycle) -> float:

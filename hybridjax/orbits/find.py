@@ -29,7 +29,7 @@ from . import checks
 from .coincidence import SAME, check_begin, coincident, commutes, events_of, meet
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
-from .cycle import LimitCycle
+from .cycle import LimitCycle, derived_if_found
 from .guess import (
     after_rarest_event,
     is_default,
@@ -306,7 +306,7 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
         together = meet(map.structure, solution.turn.period, solution.turn.tapes)
         code = update_result(solution.result, together, Result.SIMULTANEOUS)
         solution = solution._replace(result=code)
-    cycle = _cycle(map, solution, known.event_sequence)
+    cycle = derived_if_found(_cycle(map, solution, known.event_sequence))
     keep_turn(cycle, solution.turn)
     return cycle
 

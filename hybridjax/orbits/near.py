@@ -23,7 +23,7 @@ from ..engine.lanes import Lanes
 from ..systems.system import copies_of
 from ..systems.transition import TOGETHER
 from .crossing import AtEvent
-from .cycle import LimitCycle
+from .cycle import LimitCycle, derived_if_found
 from .linear_flow import hosted, last_turn
 from .repeat import (
     Corrected,
@@ -95,6 +95,7 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
     few = sum(traced) <= JACOBIAN_COLUMNS
     found = by_jacobian(find)(map) if few else find(map, reverse=True)
     cycle = _cycle(route.finer, route, map, found, _result(route, map, found))
+    cycle = derived_if_found(cycle)
     _beside.recall(cycle, None, lambda: known)
     return cycle
 

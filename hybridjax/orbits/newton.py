@@ -324,8 +324,6 @@ def _root(map, max_steps):
 def _root_jvp(primals, tangents):
     """The implicit derivative: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (The derivative of
     optimistix cannot be taken twice, since JAX cannot vectorize that of `flow_jacobian`.)"""
-    import lineax as lx
-
     map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
     q, turn, steps = root(*primals)
     fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
@@ -336,12 +334,10 @@ def _root_jvp(primals, tangents):
     jacobian = (
         map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
     )
-    operator = lx.MatrixLinearOperator(jacobian)
-    step = lx.linear_solve(
-        operator, by_parameters / sizes, _linear_solver(), throw=False
-    )
+    # (Solvers of lineax raise errors in reverse mode where derivatives are NaN.)
+    step = jnp.linalg.pinv(jacobian, rtol=SINGULAR) @ (by_parameters / sizes)
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
-    return (q, turn, steps), (-step.value * sizes, *nothing)
+    return (q, turn, steps), (-step * sizes, *nothing)
 
 
 def _linear_solver():

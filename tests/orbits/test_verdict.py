@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -159,10 +160,15 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
     assert (ghosts.result == Result.GUARD_BEYOND).all()
     with pytest.raises(hj.errors.DefinitionError, match="guess is none"):
         hj.sweep(SchmittTrigger(), {"width": np.asarray(widths)}, guess=ghost)
-    result = eqx.filter_jit(
-        lambda w: hj.find_limit_cycle(SchmittTrigger(width=w), ghost).result
-    )(jnp.asarray(0.3))
-    assert int(result) == Result.GUARD_BEYOND
+
+    def state(width):
+        found = hj.find_limit_cycle(SchmittTrigger(width=width), ghost)
+        return found.anchor.q[0, 0], found.result
+
+    for derived in (jax.grad, lambda f, **options: jax.jit(jax.grad(f, **options))):
+        slope, result = derived(state, has_aux=True)(0.3)
+        assert int(result) == Result.GUARD_BEYOND
+        assert np.isnan(slope), "there is no cycle to differentiate"
 
 
 def test_a_branch_does_not_begin_beyond_a_guard():
