@@ -232,7 +232,9 @@ def simulate(
 
     **Arguments:**
 
-    - `chart`, `state`, `time`: the start. A guard that is zero or negative there is not an
+    - `system`: a `HybridSystem`.
+    - `chart`, `state` (n,), `time`: the start, with the states of the chart in order. Default of
+        `time`: 0. A guard that is zero or negative there is not an
         event: a ball that starts below the floor falls on. `findings` of the trajectory name such
         guards.
     - `duration`: length in the system's unit of time.
@@ -244,8 +246,21 @@ def simulate(
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`
         has the reason.
 
+    **Returns:** a `Trajectory`: the ends of its steps `t` (n,), the states `before` and `after` (n,
+    d) events, `events` with their names and times, and `at(t)`, which interpolates.
+
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
     and the step limit, if `throw`.
+
+    **Example:**
+
+    ```python
+    trajectory = hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), 3.0)
+    print(trajectory.result, [event.name for event in trajectory.events])
+    ```
+
+    **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `hj.find_limit_cycle`,
+    `hj.plot.animate`.
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings

@@ -347,7 +347,7 @@ class LimitCycle(eqx.Module):
         **Raises:** `DefinitionError` for an output that a chart of the cycle does not define, an
         input that does not exist, and frequencies at a pole, as whole ones of autonomous cycles.
         """
-        return continuous_htf(self._checked(), f, harmonics, outputs, inputs)
+        return continuous_htf(self._checked(), frequencies, harmonics, outputs, inputs)
 
     def sensitivity(self, parameter: str) -> Sensitivity:
         """Derivatives of the period, of times of events and of the shape by a parameter.

@@ -75,9 +75,23 @@ def parameter(
     An array is differentiable, and another value does not cause recompilation; a Python float has
     neither property. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
 
-    **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
-    `unit`, as text; `positive`, whether zero and negative values are refused, as of a mass.
-    Default: False.
+    **Arguments:**
+
+    - `default`: a number. Default: None; the constructor of the system then needs one.
+    - `doc`: the meaning, as text. Default: none.
+    - `unit`: the unit, as text. Default: none.
+    - `positive`: whether zero and negative values raise an error, as for a mass. Default: False.
+
+    **Returns:** a field for the body of a class.
+
+    **Example:**
+
+    ```python
+    class Pendulum(hj.HybridSystem):
+        length: hj.Parameter = hj.parameter(1.0, unit="m", doc="of the rod", positive=True)
+    ```
+
+    **After:** `hj.HybridSystem`.
     """
     metadata = {"doc": doc, "unit": unit, "positive": positive}
     options: dict[str, Any] = {} if default is None else {"default": default}
