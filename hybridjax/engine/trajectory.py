@@ -233,10 +233,9 @@ def simulate(
     **Arguments:**
 
     - `system`: a `HybridSystem`.
-    - `chart`, `state` (n,), `time`: the start, with the states of the chart in order. Default of
-        `time`: 0. A guard that is zero or negative there is not an
-        event: a ball that starts below the floor falls on. `findings` of the trajectory name such
-        guards.
+    - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
+        and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
+        that starts below the floor falls on. `findings` of the trajectory list such guards.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -246,8 +245,8 @@ def simulate(
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`
         has the reason.
 
-    **Returns:** a `Trajectory`: the ends of its steps `t` (n,), the states `before` and `after` (n,
-    d) events, `events` with their names and times, and `at(t)`, which interpolates.
+    **Returns:** a `Trajectory`: the ends of its steps `t` (n,), the states `before` and `after`
+    events (n, d), `events` with their names and times, and `at(t)`, which interpolates.
 
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
     and the step limit, if `throw`.

@@ -151,7 +151,7 @@ def identifiability(
 
     ```python
     observed = hj.fitting.ObservedHTF(htf, sections)
-    print(hj.fitting.identifiability(hopper, observed, ("M", "k", "b"), guess=cycle))
+    print(hj.fitting.identifiability(hopper, observed, ("k", "b")))
     ```
 
     **Before:** `hj.fitting.ObservedHTF`, `hj.fitting.ObservedSeries` or `hj.fitting.ObservedCycle`.

@@ -66,8 +66,8 @@ def linearize(
       section n are those of one delay earlier. Coordinates are the states at that earlier time,
       then past inputs whose effect has not ended. Default: none.
 
-    **Returns:** an `LDTP` with N sections: `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d), `D` (N,
-    ny, nu), `dims` (N,) and the `multipliers` (d,).
+    **Returns:** an `LDTP` with N sections: `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d),
+    `D` (N, ny, nu), `dims` (N,) and the `multipliers` (d,).
 
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or uses the time without having the period of a clock, or an input that does not exist,
