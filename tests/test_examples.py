@@ -75,9 +75,9 @@ def test_public_functions_name_each_argument():
 def test_places_in_the_chain_are_public_names():
     """Namespaces count, and what is reached through a class."""
     known = {*places().values(), *(f"hj.{name}" for name in hj.__all__)}
-    for place, text in FUNCTIONS.items():
+    for place, (text, _) in TEXTS.items():
         for line in re.findall(
-            r"^\*\*(?:Before|After):\*\*.*", text, re.MULTILINE | re.DOTALL
+            r"^\*\*(?:Before|After):\*\*.*", text or "", re.MULTILINE | re.DOTALL
         ):
             named = re.findall(r"`(hj\.[\w.]+)", line)
             assert set(named) <= known, place

@@ -34,6 +34,15 @@ class ProcessNoise:
     - `memory`: correlation time in cycles. The correlation of noise k sections apart is
       $e^{-k / (N \tau)}$. The noise is stationary from the start of an experiment on. Default: 0,
       white noise.
+
+    **Example:**
+
+    ```python
+    gusts = hj.experiments.ProcessNoise(std=1e-4, seed=1)
+    noisy = hj.experiments.simulate_experiments(model, design, process_noise=gusts)
+    ```
+
+    **After:** `hj.run_experiments`, `hj.experiments.simulate_experiments`.
     """
 
     std: Annotated[Numbers, Reals(sign="nonnegative")]

@@ -39,6 +39,15 @@ class Output(Definition):
         such functions. If the output is needed in a chart that is not in the mapping, an error is
         raised.
     - `unit`: its unit, for figures and printed summaries.
+
+    **Example:**
+
+    ```python
+    momentum = hj.Output("momentum", lambda t, q, u: hopper.M * q[1], unit="kg m/s")
+    print(hj.linearize(cycle, sections, momentum).outputs)
+    ```
+
+    **After:** `hj.linearize`, `hj.run_experiments`.
     """
 
     name: str = eqx.field(static=True)
@@ -188,6 +197,15 @@ class Guess(eqx.Module):
 
     `after` names the event that has just led to this state. For an autonomous system, the return
     map is then taken right after this event, unless a section is given.
+
+    **Example:**
+
+    ```python
+    guess = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
+    print(hj.find_limit_cycle(hopper, guess).period)
+    ```
+
+    **After:** `hj.find_limit_cycle`.
     """
 
     chart: str = eqx.field(static=True)

@@ -136,7 +136,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
 
     # (Those of a function are not declared.)
     setattr(call, "kinds", kinds)  # noqa: B010
-    setattr(call, "__signature__", ShortSignature(function))  # noqa: B010
+    setattr(call, "__signature__", ShortSignature(function, cls))  # noqa: B010
     return call
 
 

@@ -10,21 +10,24 @@ from typing import Any
 
 
 class ShortSignature(inspect.Signature):
-    """The signature of a function. An annotation such as `Count` has its name here, not the text of
-    its check.
+    """The signature of a function, or of the constructor of a class. An annotation such as `Count`
+    has its name here, not the text of its check.
 
     It is made when it is first read: reading the sources of all public functions would slow down
     the import.
     """
 
-    def __init__(self, function: Callable):
+    def __init__(self, function: Callable, cls: type | None = None):
         super().__init__()
         self._function = function
+        self._cls = cls
 
     @functools.cached_property
     def _readable(self) -> inspect.Signature:
         signature = inspect.signature(self._function)
-        written = _annotations(self._function)
+        written = _of_function(self._function)
+        if not written and self._cls is not None:
+            written = _of_fields(self._cls)
         parameters = [
             x.replace(annotation=written.get(x.name, x.annotation))
             for x in signature.parameters.values()
@@ -61,13 +64,10 @@ class _WithoutChecks(ast.NodeTransformer):
         return self.generic_visit(node)
 
 
-def _annotations(function: Callable) -> dict[str, _Written]:
-    """Those of a function's source, by parameter and for "return"; none without a source."""
-    try:
-        source = textwrap.dedent(inspect.getsource(function))
-        (definition,) = ast.parse(source).body
-    except (OSError, TypeError, SyntaxError):
-        return {}
+def _of_function(function: Callable) -> dict[str, _Written]:
+    """Annotations in the source of a function, by parameter and for "return"; none without a
+    source."""
+    definition = _definition(function)
     if not isinstance(definition, ast.FunctionDef):
         return {}
     nodes = {
@@ -75,6 +75,27 @@ def _annotations(function: Callable) -> dict[str, _Written]:
     }
     nodes["return"] = definition.returns
     return {name: _written(node) for name, node in nodes.items() if node is not None}
+
+
+def _of_fields(cls: type) -> dict[str, _Written]:
+    """Annotations of the fields of a class whose constructor `dataclasses` has made."""
+    written = {}
+    for base in reversed(cls.__mro__):
+        definition = _definition(base)
+        lines = definition.body if isinstance(definition, ast.ClassDef) else []
+        for line in lines:
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+                written[line.target.id] = _written(line.annotation)
+    return written
+
+
+def _definition(thing: Any) -> ast.stmt | None:
+    """The source of a function or class; None if there is none."""
+    try:
+        source = textwrap.dedent(inspect.getsource(thing))
+        return ast.parse(source).body[0]
+    except (OSError, TypeError, SyntaxError):
+        return None
 
 
 def _written(node: ast.expr) -> _Written:
