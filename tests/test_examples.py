@@ -14,6 +14,8 @@ from .sessions import ROOT, fences
 EXAMPLE = re.compile(
     r"^\*\*Example:\*\*\n\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL
 )
+# The functions before and after one: the last paragraph.
+CHAIN = re.compile(r"^\*\*(?:Before|After):\*\*.*", re.MULTILINE | re.DOTALL)
 
 # Examples that cannot run in the process of the tests, and why.
 NOT_RUN = {
@@ -22,24 +24,31 @@ NOT_RUN = {
 }
 
 
-def text_of(place):
-    """The docstring of a public function or class; None for modules and constants."""
+def thing_at(place):
     thing = hj
     for name in place.split(".")[1:]:
         thing = getattr(thing, name)
-    is_function = inspect.isfunction(thing)
-    if not is_function and not inspect.isclass(thing):
-        return None, is_function
-    own = thing.__doc__ or ""
-    return inspect.cleandoc(own), is_function
+    return thing
 
 
-TEXTS = {place: text_of(place) for place in places().values()}
-FUNCTIONS = {place: text for place, (text, is_function) in TEXTS.items() if is_function}
+def text_of(thing):
+    return inspect.cleandoc(thing.__doc__ or "")
+
+
+THINGS = {place: thing_at(place) for place in places().values()}
+FUNCTIONS = {
+    place: text_of(thing)
+    for place, thing in THINGS.items()
+    if inspect.isfunction(thing)
+}
+CLASSES = {
+    place: text_of(thing) for place, thing in THINGS.items() if inspect.isclass(thing)
+}
+TEXTS = FUNCTIONS | CLASSES
 EXAMPLES = {
     place: "\n".join(EXAMPLE.findall(text))
-    for place, (text, _) in TEXTS.items()
-    if text and EXAMPLE.search(text)
+    for place, text in TEXTS.items()
+    if EXAMPLE.search(text)
 }
 
 
@@ -57,30 +66,20 @@ def test_public_functions_have_an_example():
 
 
 def test_public_functions_name_each_argument():
-    def arguments(place):
-        function = hj
-        for name in place.split(".")[1:]:
-            function = getattr(function, name)
-        return inspect.signature(function).parameters
-
     missing = {
         f"{place}({name})"
         for place, text in FUNCTIONS.items()
-        for name in arguments(place)
+        for name in inspect.signature(THINGS[place]).parameters
         if not re.search(rf"`\*{{0,2}}{name}`", text)
     }
     assert missing == set()
 
 
 def test_places_in_the_chain_are_public_names():
-    """Namespaces count, and what is reached through a class."""
     known = {*places().values(), *(f"hj.{name}" for name in hj.__all__)}
-    for place, (text, _) in TEXTS.items():
-        for line in re.findall(
-            r"^\*\*(?:Before|After):\*\*.*", text or "", re.MULTILINE | re.DOTALL
-        ):
-            named = re.findall(r"`(hj\.[\w.]+)", line)
-            assert set(named) <= known, place
+    for place, text in TEXTS.items():
+        chain = "".join(CHAIN.findall(text))
+        assert set(re.findall(r"`(hj\.[\w.]+)", chain)) <= known, place
 
 
 @pytest.fixture(scope="module")
