@@ -6,9 +6,9 @@ import re
 import pytest
 
 import hybridjax as hj
-from hybridjax._core.public import places
 
 from .sessions import ROOT, fences
+from .test_names import all_members
 
 
 EXAMPLE = re.compile(
@@ -24,18 +24,11 @@ NOT_RUN = {
 }
 
 
-def thing_at(place):
-    thing = hj
-    for name in place.split(".")[1:]:
-        thing = getattr(thing, name)
-    return thing
-
-
 def text_of(thing):
     return inspect.cleandoc(thing.__doc__ or "")
 
 
-THINGS = {place: thing_at(place) for place in places().values()}
+THINGS = dict(all_members())
 FUNCTIONS = {
     place: text_of(thing)
     for place, thing in THINGS.items()
@@ -76,7 +69,7 @@ def test_public_functions_name_each_argument():
 
 
 def test_places_in_the_chain_are_public_names():
-    known = {*places().values(), *(f"hj.{name}" for name in hj.__all__)}
+    known = {*THINGS, *(f"hj.{name}" for name in hj.__all__)}
     for place, text in TEXTS.items():
         chain = "".join(CHAIN.findall(text))
         assert set(re.findall(r"`(hj\.[\w.]+)", chain)) <= known, place

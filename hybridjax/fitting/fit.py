@@ -150,8 +150,9 @@ def identifiability(
     **Example:**
 
     ```python
-    observed = hj.fitting.ObservedHTF(htf, sections)
-    print(hj.fitting.identifiability(hopper, observed, ("k", "b")))
+    events = [hj.AtEvent("liftoff"), hj.AtEvent("touchdown")]
+    observed = hj.fitting.ObservedCycle(events, times=(0.5163, 1.3510), times_std=0.001)
+    print(hj.fitting.identifiability(hopper, observed, ("M", "k", "b")))
     ```
 
     **Before:** `hj.fitting.ObservedHTF`, `hj.fitting.ObservedSeries` or `hj.fitting.ObservedCycle`.
