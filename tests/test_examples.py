@@ -2,6 +2,8 @@
 
 import inspect
 import re
+import sys
+import types
 
 import pytest
 
@@ -80,7 +82,7 @@ def objects():
     """Those that the page of the reference makes."""
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
-    made = {"__name__": "examples"}
+    made = {}
     page = (ROOT / "docs/reference/index.md").read_text()
     for language, code in fences(page):
         assert language == "python"
@@ -91,4 +93,8 @@ def objects():
 @pytest.mark.parametrize("place", sorted(EXAMPLES.keys() - NOT_RUN.keys()))
 def test_examples_run(place, objects, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(EXAMPLES[place], place, "exec"), dict(objects))
+    # (Classes with annotations in quotation marks look for their module.)
+    module = types.ModuleType("example")
+    monkeypatch.setitem(sys.modules, "example", module)
+    vars(module).update(objects, __name__="example")
+    exec(compile(EXAMPLES[place], place, "exec"), vars(module))

@@ -259,6 +259,8 @@ class _DefaultInputs:
 class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
+    **Example:**
+
     ```python
     class Ball(hj.HybridSystem):
         g: hj.Parameter = hj.parameter(9.81)
