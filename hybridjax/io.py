@@ -74,8 +74,19 @@ def save(path: FilePath, thing: Written) -> None:
     - `path`: ends in `.npz` or `.mat`; its folder must exist.
     - `thing`: a `Design`, `ExperimentData`, `HTF`, `LDTP`, `SectionSeries`, or any fit.
 
+    **Returns:** None.
+
     **Raises:** `DefinitionError` for other objects, traced or batched ones, another suffix, and
     where the file cannot be written; `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    hj.save("htf.npz", htf)
+    hj.save("htf.mat", htf)
+    ```
+
+    **Before:** any function that returns one of these objects. **After:** `hj.load`.
     """
     path = Path(path)
     if isinstance(thing, ModelFit):
@@ -97,9 +108,24 @@ def save(path: FilePath, thing: Written) -> None:
 def load(path: FilePath) -> Saved:
     """Read an object that `save` has written.
 
+    **Arguments:**
+
+    - `path`: the file, which ends in `.npz`.
+
+    **Returns:** an object of the type that was saved, with the same numbers bit by bit.
+
     **Raises:** `FileFormatError` if the file is damaged, was not written by `save`, or is of
     another format version; `DefinitionError` if it is not there or cannot be read;
     `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    hj.save("fit.npz", fit)
+    fit = hj.load("fit.npz")
+    ```
+
+    **Before:** `hj.save`.
     """
     require_x64()
     return read_module(Path(path), KINDS)

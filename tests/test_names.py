@@ -61,7 +61,7 @@ def test_the_first_level_holds_what_a_first_day_needs():
 
 def test_each_namespace_has_a_page():
     pages = {page.stem for page in (ROOT / "docs/reference").glob("*.md")}
-    assert pages == {*NAMESPACES, "session"}
+    assert pages == {*NAMESPACES, "index", "session"}
 
 
 def test_each_name_has_one_place():

@@ -142,7 +142,11 @@ def test_public_signatures_say_what_they_take():
         for parameter in inspect.signature(function).parameters.values():
             allowed = {name, f"{name}.{parameter.name}"} & ALLOWED
             if parameter.name not in ("self", "cls") and not allowed:
-                vague = parameter.annotation in (inspect.Parameter.empty, typing.Any)
+                vague = parameter.annotation in (
+                    inspect.Parameter.empty,
+                    typing.Any,
+                    "Any",
+                )
                 assert not vague, f"{name}({parameter.name})"
 
 

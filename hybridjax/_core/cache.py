@@ -40,6 +40,14 @@ def enable_compilation_cache(folder: FilePath | None = None) -> pathlib.Path | N
 
     **Raises:** `DefinitionError` if the folder of the argument or of `$HYBRIDJAX_CACHE` cannot be
     used.
+
+    **Example:**
+
+    ```python
+    hj.scale.enable_compilation_cache()
+    ```
+
+    **After:** every function that computes.
     """
     given = folder or os.environ.get("HYBRIDJAX_CACHE")
     try:

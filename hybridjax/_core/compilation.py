@@ -49,8 +49,20 @@ def enable_loop_kernels() -> None:
     environment variable `XLA_FLAGS`, so it holds for all programs of JAX in this process and in
     those that it starts. On other devices than CPU it changes nothing.
 
+    **Returns:** None.
+
     **Raises:** `ComputationError`, on CPU, if XLA has read its options already, or does not have
     this option.
+
+    **Example:**
+
+    ```python
+    import hybridjax as hj
+
+    hj.scale.enable_loop_kernels()
+    ```
+
+    **After:** every function that computes.
     """
     before = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = " ".join(

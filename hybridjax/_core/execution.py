@@ -33,6 +33,15 @@ class Execution:
       Default: the size that is usually fastest.
     - `workers`: threads that run such calls at the same time. Default: all cores on CPU, and one on
       an accelerator.
+
+    **Example:**
+
+    ```python
+    single = hj.scale.Execution(workers=1)
+    data = hj.run_experiments(cycle, sections, design, outputs, execution=single)
+    ```
+
+    **After:** `hj.run_experiments`, `hj.orbits.find_limit_cycles`.
     """
 
     batch: ExperimentCount | None = None

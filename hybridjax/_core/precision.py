@@ -17,6 +17,16 @@ def enable_x64() -> None:
     hybridjax never does this at import, since the switch is global to JAX. Call it once, before
     anything is computed. Models, guesses, sections and settings may be built earlier; arrays of
     `jax.numpy` that were made earlier stay 32 bit, and raise an error.
+
+    **Returns:** None.
+
+    **Example:**
+
+    ```python
+    hj.enable_x64()
+    ```
+
+    **After:** every function that computes.
     """
     jax_compat.use_double_precision()
 

@@ -57,6 +57,20 @@ def enable_progress(enabled: bool = True) -> None:
     """Print the current step of long calls to standard error, or with `False` do not print it.
 
     If this function is not called, steps are printed in terminals and in Jupyter only.
+
+    **Arguments:**
+
+    - `enabled`: whether steps are printed. Default: True.
+
+    **Returns:** None.
+
+    **Example:**
+
+    ```python
+    hj.scale.enable_progress(False)
+    ```
+
+    **After:** `hj.run_experiments`, `hj.sweep` and other long calls.
     """
     global _enabled
     _enabled = enabled

@@ -43,9 +43,20 @@ def to_lti(model: LDTP) -> LDTP:
     Its response G at $z = e^{2 \pi i f}$, f in cycles per period, holds all harmonics:
     $H_m(f) = \frac{1}{N} \sum_{n, r} G_{n r}\, e^{-2 \pi i (f + m) n / N} e^{2 \pi i f r / N}$.
 
+    **Arguments:** `model`: an `LDTP` of N sections.
+
     **Returns:** an `LDTP` of one section, with the dimension of the state at section 0.
 
     **Raises:** `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    lifted = hj.convert.to_lti(model)
+    print(lifted.multipliers, lifted.inputs)
+    ```
+
+    **Before:** `hj.linearize`, `hj.fit_ldtp`.
     """
     require_x64(model)
     A = model.A
@@ -91,10 +102,24 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     - An `HTF` becomes a `control.FrequencyResponseData` with an output `y[m]` for each output y and
       harmonic m: `H_m` at the *input* frequency. All outputs of the first harmonic come first.
 
-    **Arguments:** `period`: the length of a period, in seconds for example. Default: 1, so that
-    times are counted in periods.
+    **Arguments:**
+
+    - `thing`: an `LDTP` or an `HTF`.
+    - `period`: the length of a period, in seconds for example. Default: 1, so that times are
+      counted in periods.
+
+    **Returns:** a `control.StateSpace` or `control.FrequencyResponseData`.
 
     **Raises:** `DefinitionError` where python-control is not installed.
+
+    **Example:**
+
+    ```python
+    lifted = hj.convert.to_control(model, period=float(cycle.period))
+    print(lifted.poles())
+    ```
+
+    **Before:** `hj.linearize`, `hj.fit_ldtp` or `hj.estimate_htf`.
     """
     if isinstance(thing, LDTP):
         lti = to_lti(thing)
@@ -162,12 +187,25 @@ def to_harmonic_state_space(
 
     **Arguments:**
 
+    - `cycle`: result of `hj.find_limit_cycle`.
     - `order`: the largest harmonic. Default: the first of 2, 4, ..., 64 whose `error`, compared
       with `cycle.htf`, is below `tolerance` (default: 1e-6).
     - `outputs`, `inputs`: as in `LimitCycle.htf`.
 
+    **Returns:** a `HarmonicStateSpace` with the matrices `A` (a, a), `B` (a, b), `C` (c, a), `D`
+    (c, b), where a = d (2 order + 1), and likewise b for inputs and c for outputs.
+
     **Raises:** `DefinitionError` for cycles with events at which deviations jump;
     `ComputationError` if no order is large enough.
+
+    **Example:**
+
+    ```python
+    driven = hj.find_limit_cycle(hj.models.Duffing())
+    print(hj.convert.to_harmonic_state_space(driven, order=4).A.shape)
+    ```
+
+    **Before:** `hj.find_limit_cycle`.
     """
     exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
     map = hosted(cycle).return_map
@@ -223,7 +261,28 @@ def _toeplitz(
 
 @checked
 def to_scipy(model: LDTP, *, period: Positive = 1.0) -> Any:
-    """Return the lifted system (`to_lti`) as `scipy.signal.dlti`, with dt = `period`."""
+    """Return the lifted system (`to_lti`) as `scipy.signal.dlti`, with dt = `period`.
+
+    **Arguments:**
+
+    - `model`: an `LDTP`.
+    - `period`: the length of a period, in seconds for example. Default: 1, so that times are
+      counted in periods.
+
+    **Returns:** a discrete-time state space with one input for each input and section of the model,
+    and likewise its outputs.
+
+    **Raises:** `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    lifted = hj.convert.to_scipy(model, period=float(cycle.period))
+    print(np.linalg.eigvals(lifted.A), lifted.dt)
+    ```
+
+    **Before:** `hj.linearize`, `hj.fit_ldtp`.
+    """
     from scipy.signal import dlti
 
     return dlti(*_matrices(to_lti(model)), dt=period)

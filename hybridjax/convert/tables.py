@@ -63,8 +63,23 @@ def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
     and multipliers their modulus, too. `standard_error` is the root of the expected squared
     distance from the true value; `real_error` and `imaginary_error` are those of the parts.
 
+    **Arguments:**
+
+    - `thing`: an object of one of these types.
+
+    **Returns:** a `pandas.DataFrame`.
+
     **Raises:** `DefinitionError` where pandas, or xarray, is not installed, and for a result that
     is no table.
+
+    **Example:**
+
+    ```python
+    hj.convert.to_pandas(htf).to_csv("htf.csv")
+    print(hj.convert.to_pandas(fit))
+    ```
+
+    **Before:** a recording, limit cycles, HTFs or a fit.
     """
     return package("pandas").DataFrame(_columns(thing))
 

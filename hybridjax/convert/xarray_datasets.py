@@ -68,8 +68,23 @@ def to_xarray(
     - `LimitCycles` (along `system`) and `Branch` (along `point`): periods, multipliers and
       iterations; parameters are coordinates.
 
+    **Arguments:**
+
+    - `thing`: an object of one of these types.
+
+    **Returns:** an `xarray.Dataset`.
+
     **Raises:** `DefinitionError` where xarray is not installed, for traced or batched objects, and
     for signals that are called like a coordinate; `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    dataset = hj.convert.to_xarray(htf)
+    print(dataset.H.sel(harmonic=0, output="yM"))
+    ```
+
+    **Before:** any function that returns one of these objects. **After:** `hj.convert.from_xarray`.
     """
     require_x64()
     if isinstance(thing, ModelFit):
@@ -85,11 +100,24 @@ def to_xarray(
 
 @checked
 def from_xarray(dataset: Any) -> Saved:
-    """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit. It
-    must be an object that `hj.save` can write. The dataset may be a selection of harmonics,
-    frequencies, experiments, signals, or samples that follow each other from section 0 on.
+    """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit.
+
+    **Arguments:** `dataset`: an `xarray.Dataset` that `to_xarray` has made of an object that
+    `hj.save` can write, or a selection of its harmonics, frequencies, experiments, signals, or of
+    samples that follow each other from section 0 on.
+
+    **Returns:** an object of the type that `to_xarray` was given.
 
     **Raises:** `DefinitionError` for other datasets; `PrecisionError` in single precision.
+
+    **Example:**
+
+    ```python
+    dataset = hj.convert.to_xarray(htf)
+    low = hj.convert.from_xarray(dataset.sel(harmonic=[-1, 0, 1]))
+    ```
+
+    **Before:** `hj.convert.to_xarray`.
     """
     require_x64()
     try:

@@ -231,10 +231,24 @@ def draw_models(fit: LDTPFit, count: Count, seed: Seed = 0) -> list[LDTP]:
     The draws are Gaussian with the covariance of the fit; those with a multiplier of modulus one or
     more are discarded.
 
-    **Arguments:** `fit`: result of `fit_ldtp`. `count`: number of models. `seed`: seed of the
-    draws. Default: 0.
+    **Arguments:**
+
+    - `fit`: result of `fit_ldtp`.
+    - `count`: number of models.
+    - `seed`: seed of the draws. Default: 0.
+
+    **Returns:** a list of `count` models, each an `LDTP` with the sections and signals of the fit.
 
     **Raises:** `DefinitionError` if hardly any are stable.
+
+    **Example:**
+
+    ```python
+    models = hj.designs.draw_models(hj.fit_ldtp(htf, dims=2), 3)
+    plan = hj.optimal_design(models, design)
+    ```
+
+    **Before:** `hj.fit_ldtp`. **After:** `hj.optimal_design`.
     """
     rng = np.random.default_rng(seed)
     models = []

@@ -27,6 +27,15 @@ class MultiplierGoal(eqx.Module):
     - `harmonics`: harmonics that the estimator uses. Default: -2 to 2 for `fit_multipliers`, all
       for `fit_ldtp`.
     - `extra_lags`: argument of `fit_multipliers`.
+
+    **Example:**
+
+    ```python
+    goal = hj.designs.MultiplierGoal(0, "modulus")
+    print(hj.optimal_design(model, design, goal=goal).standard_errors)
+    ```
+
+    **After:** `hj.optimal_design`.
     """
 
     which: Index | None = eqx.field(static=True, default=None)
@@ -56,6 +65,14 @@ class ParameterGoal(eqx.Module):
     - `free`: names of all unknown parameters. `quantities`: those whose errors matter. Default:
       all.
     - `harmonics`: harmonics of the HTFs. Default: -2 to 2.
+
+    **Example:**
+
+    ```python
+    goal = hj.designs.ParameterGoal(cycle, sections, ("k", "b"), quantities="k")
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.optimal_design`.
     """
 
     cycle: LimitCycle
@@ -78,6 +95,15 @@ class ResponseGoal(eqx.Module):
     **Arguments:** `frequencies`: the lowest and the highest input frequency, cycles per period.
     `quantities`: the harmonics of interest. Default: 0. `harmonics`: those that the estimator uses.
     Default: all.
+
+    **Example:**
+
+    ```python
+    goal = hj.designs.ResponseGoal((0.1, 1.0))
+    print(hj.optimal_design(model, design, goal=goal).criterion)
+    ```
+
+    **After:** `hj.optimal_design`.
     """
 
     frequencies: tuple[NonNegative, Positive] = eqx.field(static=True)

@@ -58,6 +58,15 @@ class Distortion(eqx.Module):
     - `rms`: largest distortion of outputs by name, in their units, over all experiments.
 
     **Raises:** `DefinitionError` if `rms` is empty.
+
+    **Example:**
+
+    ```python
+    small = hj.designs.Distortion(cycle, sections, {"yM": 1e-5})
+    limits = hj.designs.Limits(rms={"u": 0.01}, distortion=small)
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.designs.Limits`.
     """
 
     cycle: LimitCycle
@@ -90,6 +99,15 @@ class Limits(eqx.Module):
     - `cycles`: those of all experiments together, without those that are discarded. Default: as
       many as in `design`.
     - `distortion`: limit of the nonlinear distortion of outputs.
+
+    **Example:**
+
+    ```python
+    limits = hj.designs.Limits(rms={"u": 0.01}, peak={"u": 0.02})
+    print(hj.optimal_design(model, design, limit=limits).limited)
+    ```
+
+    **After:** `hj.optimal_design`.
     """
 
     rms: Mapping[str, Level] | Words = eqx.field(default_factory=dict)

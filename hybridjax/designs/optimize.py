@@ -56,7 +56,7 @@ class OptimalDesign(Showable, eqx.Module):
 
     **Fields:**
 
-    - `design`: the experiments, for `run_experiments`, or `inputs()` for hardware.
+    - `design`: the experiments, for `run_experiments`, or `signals()` for hardware.
     - `usual`: the design that it improves, scaled to the same limits.
     - `names` (g,) of the quantities of interest; `variances` (g,) with `design`, `usual_variances`
       with `usual`.
@@ -256,12 +256,6 @@ def optimal_design(
 ) -> OptimalDesign:
     r"""Find the amplitudes with which a quantity of interest is estimated in the fewest cycles.
 
-    ```python
-    plan = hj.optimal_design(model)               # multipliers, the input's power limited
-    plan = hj.optimal_design(model, limit={"yM": 0.01, "vM": 0.05})     # or the deviations
-    data = hj.run_experiments(cycle, sections, plan.design, outputs)
-    ```
-
     The minimized variance is the Cramer-Rao bound of the `goal`, a convex function of the powers of
     the cosines; `certificate` in the result bounds the distance from the optimum. Strong cosines
     are excited in several experiments, weak ones in only one. If variances are to be estimated
@@ -289,9 +283,23 @@ def optimal_design(
     - `robust`: with several models, minimize the `"mean"` of their criteria, or the `"worst"` one
       (approximately: a power mean with exponent 16). Default: `"mean"`.
 
+    **Returns:** an `OptimalDesign`: `design` for `hj.run_experiments`, `standard_errors` (g,) of
+    the quantities of interest, `cycles_for` and `advice`.
+
     **Raises:** `DefinitionError` for limits that nothing satisfies, goals that the data do not
     identify, multipliers that are not simple, unstable models, and arguments that do not fit
     together.
+
+    **Example:**
+
+    ```python
+    plan = hj.optimal_design(model, design)
+    deviations = hj.optimal_design(model, design, limit={"yM": 0.01, "vM": 0.05})
+    print(plan.advice)
+    ```
+
+    **Before:** `hj.linearize`, `hj.fit_ldtp` or `hj.fit_multipliers`. **After:**
+    `hj.run_experiments`, `hj.plot.spectrum`, `hj.plot.standard_errors`.
     """
     models = [model] if isinstance(model, Model) else list(model)
     if not models:

@@ -50,15 +50,6 @@ class History(NamedTuple):
 class SequentialDesign(Showable, eqx.Module):
     r"""A sequence of experiments that starts without a model, and ends at a requested precision.
 
-    ```python
-    study = hj.designs.SequentialDesign(hj.multisine(lines="odd").scaled(0.001), order=2,
-    standard_error=1e-4) while not study.done:
-        data = hj.run_experiments(cycle, sections, study.design, outputs, start="steady")
-        study = study.add(data)     # in a laboratory: hj.identify.remove_transient(data).data
-    print(study)
-    study.fit.contains(true)         # confidence regions, valid at the time of stopping
-    ```
-
     The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
     `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
     these, and as many experiments as the standard error still requires, but at most twice the
@@ -93,6 +84,19 @@ class SequentialDesign(Showable, eqx.Module):
       the first. Default: 0.
 
     **Raises:** `DefinitionError` for several inputs, other estimators, and a limit of cycles.
+
+    **Example:**
+
+    ```python
+    study = hj.designs.SequentialDesign(design, order=2, standard_error=5e-4)
+    while not study.done:
+        clean = hj.experiments.simulate_experiments(model, study.design, start="periodic")
+        data = hj.experiments.add_noise(clean, std=1e-5, seed=study.blocks)
+        study = study.add(data)  # in a laboratory: hj.identify.remove_transient(data).data
+    print(study, study.fit.contains(model.multipliers))
+    ```
+
+    **Before:** `hj.multisine`. **After:** `hj.run_experiments`, `hj.identify.remove_transient`.
     """
 
     first: Design

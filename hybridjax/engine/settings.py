@@ -49,6 +49,15 @@ class Settings(eqx.Module):
 
     The estimated error of a step in state k of chart a is at most
     `rtol * |q[k]| + atol * scale[a, k]`. Defaults of `rtol` and `atol` are those of the call.
+
+    **Example:**
+
+    ```python
+    settings = hj.orbits.Settings(rtol=1e-8, atol=1e-8)
+    print(hj.find_limit_cycle(hopper, settings=settings).residual)
+    ```
+
+    **After:** `hj.find_limit_cycle`, `hj.simulate`.
     """
 
     rtol: Float[Array, ""] | None

@@ -233,9 +233,11 @@ def simulate(
 
     **Arguments:**
 
-    - `chart`, `state`, `time`: the start. A guard that is zero or negative there is not an
-        event: a ball that starts below the floor falls on. `findings` of the trajectory name such
-        guards. A `Guess` stands for all three: `hj.simulate(system, guess, duration)`.
+    - `system`: a `HybridSystem`.
+    - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
+        and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
+        that starts below the floor falls on. `findings` of the trajectory list such guards. A
+        `Guess` stands for all three: `hj.simulate(system, guess, duration)`.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -245,8 +247,21 @@ def simulate(
     - `throw`: raise an error if the trajectory ends early. Default: True; with False, its `result`
         has the reason.
 
+    **Returns:** a `Trajectory`: the ends of its steps `t` (n,), the states `before` and `after`
+    events (n, d), `events` with their names and times, and `at(t)`, which interpolates.
+
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` for grazing, Zeno, blow-up
     and the step limit, if `throw`.
+
+    **Example:**
+
+    ```python
+    trajectory = hj.simulate(hopper, "flight", (2.0, 1.0, 0.0, 0.0), 3.0)
+    print(trajectory.result, [event.name for event in trajectory.events])
+    ```
+
+    **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `hj.find_limit_cycle`,
+    `hj.plot.animate`.
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings

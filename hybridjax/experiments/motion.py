@@ -33,8 +33,21 @@ def perturbed_trajectory(
     - `inputs` (n, nu), in whole periods, such as `data.u[0]`. (An experiment that did not start on
         the cycle differs until its transient has decayed.)
 
+    **Returns:** a `Trajectory` of n / N periods.
+
     **Raises:** `DefinitionError` for inputs of another shape; `ComputationError` if a section is
     not reached.
+
+    **Example:**
+
+    ```python
+    placed = hj.sections.place_sections(cycle, sections)
+    motion = hj.experiments.perturbed_trajectory(placed, data.u[0, :16])
+    hj.plot.cycle(cycle, perturbed=motion)
+    ```
+
+    **Before:** `hj.sections.place_sections`, `hj.run_experiments`. **After:** `hj.plot.animate`,
+    `hj.plot.cycle`.
     """
     require_x64()
     held: np.ndarray = np.asarray(inputs)

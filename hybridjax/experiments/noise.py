@@ -34,6 +34,15 @@ class ProcessNoise:
     - `memory`: correlation time in cycles. The correlation of noise k sections apart is
       $e^{-k / (N \tau)}$. The noise is stationary from the start of an experiment on. Default: 0,
       white noise.
+
+    **Example:**
+
+    ```python
+    gusts = hj.experiments.ProcessNoise(std=1e-4, seed=1)
+    noisy = hj.experiments.simulate_experiments(model, design, process_noise=gusts)
+    ```
+
+    **After:** `hj.run_experiments`, `hj.experiments.simulate_experiments`.
     """
 
     std: Annotated[Numbers, Reals(sign="nonnegative")]
@@ -111,6 +120,16 @@ def simulate_experiments(
     **Raises:** `DefinitionError` if N (also of the process noise) or the inputs differ, if cycles
     of an unstable model are discarded, or if a periodic response does not exist (a multiplier that
     is a P-th root of one).
+
+    **Example:**
+
+    ```python
+    linear = hj.experiments.simulate_experiments(model, design, start="periodic")
+    print(hj.estimate_htf(linear))
+    ```
+
+    **Before:** `hj.linearize` or `hj.fit_ldtp`, and `hj.multisine`. **After:**
+    `hj.experiments.add_noise`, `hj.estimate_htf`.
     """
     require_inputs(design, "model", ldtp.n_sections, ldtp.inputs)
     if discard is None:
@@ -152,14 +171,28 @@ def add_noise(
 
     **Arguments:**
 
-    - `std`: standard deviation, one number, one for each output, or (N, ny) also by section; or
+    - `data`: `ExperimentData`.
+    - `std`: standard deviation in units of the outputs: one number, one for each output, or (N, ny)
+      also by section; or
     - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
       all samples and OK experiments) and of the noise, in dB, for each output.
     - `memory`: correlation time in cycles, as in `ProcessNoise`. Default: 0, white noise.
     - `seed`: seed of the random numbers. Default: 0.
 
+    **Returns:** `ExperimentData` with the noise in `y` (S, n, ny).
+
     **Raises:** `DefinitionError` unless exactly one of `std` and `snr` is given, with a shape that
     fits the outputs and sections.
+
+    **Example:**
+
+    ```python
+    noisy = hj.experiments.add_noise(data, std=1e-4)
+    loud = hj.experiments.add_noise(data, snr=20.0, seed=1)
+    ```
+
+    **Before:** `hj.run_experiments` or `hj.experiments.simulate_experiments`. **After:**
+    `hj.estimate_htf`, `hj.fit_series`.
     """
     if (std is None) == (snr is None):
         raise DefinitionError("add_noise needs either `std` or `snr`.")

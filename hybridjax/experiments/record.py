@@ -39,6 +39,16 @@ class SectionSeries(Showable, eqx.Module):
     - `drift`: number of cycles. The outputs at each section may also contain an unknown drift that
       is slower than this. Infinite: the drift is a constant, such as an error of the subtracted
       average cycle. None: no drift. Fits cut records of more than 50 times this number.
+
+    **Example:**
+
+    ```python
+    units = {"yM": "m", "vM": "m/s"}
+    series = hj.experiments.SectionSeries(data.u[0], data.y[0], n_sections=8, outputs=units)
+    print(hj.fit_series(series, order=2).multipliers)
+    ```
+
+    **After:** `hj.fit_series`, `hj.fit_ldtp`.
     """
 
     u: Float[np.ndarray, "n nu"]

@@ -247,24 +247,31 @@ def response_function(
     """Return the computation of `run_experiments` as a function for `jit`, `vmap`, `grad` and
     `jacfwd`.
 
-    ```python
-    response = hj.experiments.response_function(cycle, sections, ("yM", "vM"))
-
-    @eqx.filter_jit
-    @eqx.filter_grad
-    def gradient(system):
-        return jnp.sum((response(u, system=system).y - measured) ** 2)
-    ```
-
     It has exact derivatives with respect to inputs, start and parameters, in both modes. Reverse
     mode stores the states at the sections and recomputes the flow between them, so its memory grows
     by a few hundred bytes per sample. Outputs of an experiment are NaN after it failed: select
     experiments by `result` before you average.
 
-    **Arguments:** as for `run_experiments`. The cycle may be unstable if experiments are short.
+    **Arguments:** `cycle`, `sections`, `outputs` and `accuracy`: as for `run_experiments`. The
+    cycle may be unstable if experiments are short.
+
+    **Returns:** a `ResponseFunction`. Called with inputs (S, n, nu), and with `system=` another
+    system of the same class, it returns a `Response` with the outputs `y` (S, n, ny) minus those on
+    the cycle, and a code `result` (S,) for each experiment.
 
     **Raises:** `DefinitionError` for outputs or sections that do not exist, or an accuracy out of
     range.
+
+    **Example:**
+
+    ```python
+    response = hj.experiments.response_function(cycle, sections, ("yM", "vM"))
+    def misfit(system):
+        return ((response(data.u[:1, :16], system=system).y - data.y[:1, :16]) ** 2).sum()
+    print(misfit(hj.models.VerticalHopper(k=10.1)))  # also jax.grad(misfit)(hopper)
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** transformations of JAX.
     """
     placed = as_placed(cycle, sections)
     z = check_outputs(cycle, outputs)

@@ -202,12 +202,7 @@ def run_experiments(
 
     The experiments of a batch run in one compiled call, and the batches on all cores. An experiment
     that fails (a section missed, events in another order, ...) stops there; the others continue.
-    With `chunk` or `store`, records need not fit into memory:
-
-    ```python
-    chunks = hj.run_experiments(cycle, sections, design, "yM", chunk=640)
-    estimate = hj.estimate_htf(chunks)
-    ```
+    With `chunk` or `store`, records need not fit into memory.
 
     Without a `store`, each chunk is run when the iterator gets to it. With a `store`, all chunks
     are run and kept. Experiments that are in the store already are not run again: after an
@@ -216,6 +211,7 @@ def run_experiments(
 
     **Arguments:**
 
+    - `cycle`: a stable limit cycle, result of `hj.find_limit_cycle`.
     - `sections`: a family, or `PlacedSections`.
     - `design`: a `Design`, or inputs (S, n, nu) that are constant from section to section. n must
         be a whole number of periods. All periods after the discarded ones are used for estimation.
@@ -243,15 +239,27 @@ def run_experiments(
     - `client`: a `distributed.Client`, whose workers fill the store. Each of them gets the
         `design`, so pass a `Design` or a small array. Default: None.
 
-    **Returns:** `ExperimentData`; with a `chunk` an iterator over those of consecutive experiments;
-    with a `store` the `StoredExperiments`. `data.summary()` lists failures with their causes. With
-    `feedback` its inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
+    **Returns:** `ExperimentData` with inputs `u` (S, n, nu) and outputs `y` (S, n, ny); with a
+    `chunk` an iterator over those of consecutive experiments; with a `store` the
+    `StoredExperiments`. `data.summary()` lists failures with their causes. With `feedback` its
+    inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
 
     **Raises:** `DefinitionError` for arguments that do not fit together, if the store holds other
     experiments (with the difference) or cannot be written, or if the workers of the client cannot
     run them; `ComputationError` for an
     unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
     found, or if the cluster is lost.
+
+    **Example:**
+
+    ```python
+    data = hj.run_experiments(cycle, sections, design, ("yM", "vM"))
+    chunks = hj.run_experiments(cycle, sections, design, "yM", chunk=4)
+    htf = hj.estimate_htf(chunks)
+    ```
+
+    **Before:** `hj.find_limit_cycle`, `hj.multisine` or `hj.optimal_design`. **After:**
+    `hj.experiments.add_noise`, `hj.estimate_htf`, `hj.fit_series`, `hj.validate`.
     """
     if outputs is None:
         outputs = cycle.structure.states_everywhere()

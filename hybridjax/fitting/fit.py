@@ -67,11 +67,6 @@ def fit_model(
     through the cycle, its events and its sections. Parameters do not move along combinations that
     the data do not identify, and the result lists these.
 
-    ```python
-    fit = hj.fit_model(hopper, hj.fitting.ObservedHTF(estimate, sections), ("M", "k", "b"),
-    guesses=4)
-    ```
-
     **Arguments:**
 
     - `system`: its parameters are the first guess.
@@ -95,6 +90,17 @@ def fit_model(
 
     The function is compiled at the first call for each class of systems and type of data; calls
     with other values of parameters and data reuse it.
+
+    **Example:**
+
+    ```python
+    observed = hj.fitting.ObservedHTF(htf, sections)
+    found = hj.fit_model(hj.models.VerticalHopper(k=10.2), observed, ("k", "b"))
+    print(found.values, found.standard_errors)
+    ```
+
+    **Before:** `hj.estimate_htf`, with `hj.fitting.ObservedHTF`; `hj.fitting.identifiability`.
+    **After:** `hj.validate`, `hj.linearize`, `hj.save`.
     """
     problem, near = _prepare(system, data, free, guess)
     parameters = problem.parameters
@@ -134,12 +140,23 @@ def identifiability(
 ) -> Identifiability:
     """Find the combinations of parameters that data identify, without a fit.
 
-    **Arguments:** as in `fit_model`. The values of the data have no effect, but their type and
-    their standard deviations have.
+    **Arguments:** `system`, `data`, `free` and `guess`: as in `fit_model`. The values of the data
+    have no effect, but their type and their standard deviations have.
 
     **Returns:** an `Identifiability`, at the parameters of `system`.
 
     **Raises:** as `fit_model`; `ComputationError` if `system` cannot produce such data.
+
+    **Example:**
+
+    ```python
+    events = [hj.AtEvent("liftoff"), hj.AtEvent("touchdown")]
+    observed = hj.fitting.ObservedCycle(events, times=(0.5163, 1.3510), times_std=0.001)
+    print(hj.fitting.identifiability(hopper, observed, ("M", "k", "b")))
+    ```
+
+    **Before:** `hj.fitting.ObservedHTF`, `hj.fitting.ObservedSeries` or `hj.fitting.ObservedCycle`.
+    **After:** `hj.fit_model`.
     """
     problem, near = _prepare(system, data, free, guess)
     parameters = problem.parameters

@@ -95,6 +95,14 @@ class ObservedHTF(AbstractObservation):
 
     With `delay`, a pair, inputs act later, and outputs are measured later. `fit_model` fits these
     delays if `free` contains "input_delay" or "output_delay".
+
+    **Example:**
+
+    ```python
+    observed = hj.fitting.ObservedHTF(htf, sections)
+    ```
+
+    **Before:** `hj.estimate_htf`. **After:** `hj.fit_model`, `hj.fitting.identifiability`.
     """
 
     frequencies: Float[Array, " F"]
@@ -154,6 +162,14 @@ class ObservedSeries(AbstractObservation):
     differences of the outputs, otherwise of their deviations from the cycle. Residuals are in units
     of `std`, or relative to the rms of each output's deviations. Experiments that failed are left
     out.
+
+    **Example:**
+
+    ```python
+    observed = hj.fitting.ObservedSeries(data, sections, std=1e-5)
+    ```
+
+    **Before:** `hj.run_experiments`. **After:** `hj.fit_model`, `hj.fitting.identifiability`.
     """
 
     u: Float[Array, "S n nu"]
@@ -228,6 +244,15 @@ class ObservedCycle(AbstractObservation):
 
     Residuals are in units of the standard deviations where these are given, otherwise relative to
     the rms of each output, to the measured period, and for times to the period of the guess.
+
+    **Example:**
+
+    ```python
+    events = [hj.AtEvent("liftoff"), hj.AtEvent("touchdown")]
+    observed = hj.fitting.ObservedCycle(events, times=(0.5163, 1.3510), times_std=0.001)
+    ```
+
+    **After:** `hj.fit_model`, `hj.fitting.identifiability`.
     """
 
     sections: AbstractSections

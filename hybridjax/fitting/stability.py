@@ -16,9 +16,9 @@ from ..orbits.cycle import LimitCycle
 def spectral_radius(
     model: LDTP | LimitCycle, smoothing: Probability = 1e-3
 ) -> Float[Array, ""]:
-    r"""A smooth upper bound of the largest modulus of the Floquet multipliers.
+    r"""Return a smooth upper bound of the largest modulus of the Floquet multipliers.
 
-    The number $\rho_\epsilon$ with
+    It is the number $\rho_\epsilon$ with
 
     $$\sum_{j \ge 0} \rho_\epsilon^{-2j}\, \lVert \Phi^j \rVert_F^2 = d / \epsilon$$
 
@@ -38,7 +38,18 @@ def spectral_radius(
     $-c_1$ and $(-1)^d c_d$.
 
     **Arguments:** `model`: result of `linearize` or `find_limit_cycle`; for a batch use `jax.vmap`.
-    `smoothing`: $\epsilon$, between 0 and 1; the larger, the smoother.
+    `smoothing`: $\epsilon$, between 0 and 1; the larger, the
+    smoother. Default: 0.001.
+
+    **Returns:** a number.
+
+    **Example:**
+
+    ```python
+    print(hj.fitting.spectral_radius(model), abs(model.multipliers).max())
+    ```
+
+    **Before:** `hj.find_limit_cycle` or `hj.linearize`. **After:** `jax.grad`.
     """
     if isinstance(model, LimitCycle):
         model.require_found()

@@ -128,6 +128,15 @@ class HTF(Showable, eqx.Module):
       proportional to it where `variance` is None. Default: the same for all.
 
     **Raises:** `DefinitionError` if these do not fit together.
+
+    **Example:**
+
+    ```python
+    flat = hj.linear.HTF([0.1, 0.2], np.ones((1, 2, 1, 1)), harmonics=0, n_sections=8)
+    print(flat)
+    ```
+
+    **After:** `hj.fit_multipliers`, `hj.fit_ldtp`, `hj.plot.bode`.
     """
 
     frequencies: Float[Array, " F"]

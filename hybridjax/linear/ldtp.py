@@ -65,6 +65,15 @@ class LDTP(Showable, eqx.Module):
 
     **Raises:** `DefinitionError` for shapes, names or dimensions that do not fit, for entries
     outside the valid blocks, for NaN and infinity; `PrecisionError` for single precision.
+
+    **Example:**
+
+    ```python
+    decay = hj.linear.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]])
+    print(decay.multipliers, decay.htf([0.1, 0.2]).H)
+    ```
+
+    **After:** `hj.experiments.simulate_experiments`, `hj.optimal_design`, `hj.convert.to_lti`.
     """
 
     A: Float[Array, "N d d"]

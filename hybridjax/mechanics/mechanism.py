@@ -58,14 +58,6 @@ def _no_potential(q):
 class Mechanism(eqx.Module):
     """A mechanism with n coordinates q and velocities v = dq/dt, given by its energies.
 
-    ```python
-    def kinetic(q, v):
-        return 0.5 * m * l**2 * v[0] ** 2
-
-    pendulum = hj.systems.Mechanism(kinetic, lambda q: -m * g * l * jnp.cos(q[0]))
-    acceleration = pendulum.acceleration(q, v, force)  # in the field of a chart
-    ```
-
     **Fields:**
 
     - `kinetic`: T(q, v) -> number, a polynomial of degree two in v; from a mass matrix,
@@ -78,6 +70,18 @@ class Mechanism(eqx.Module):
     operations without LAPACK. If the mass matrix is singular or not positive, or contacts are not
     independent, methods raise `DefinitionError` for arrays of numbers. In fields and resets they
     return NaN, and the trajectory ends with `Result.FIELD_NOT_FINITE`.
+
+    **Example:**
+
+    ```python
+    import jax.numpy as jnp
+
+    kinetic = lambda q, v: 0.5 * v[0] ** 2
+    pendulum = hj.systems.Mechanism(kinetic, lambda q: -9.81 * jnp.cos(q[0]))
+    print(pendulum.acceleration(jnp.array([0.1]), jnp.array([0.0]), jnp.array([0.0])))
+    ```
+
+    **After:** `hj.Chart`, whose vector field uses `acceleration`.
     """
 
     kinetic: Callable[[Any, Any], Any]

@@ -179,11 +179,6 @@ def continuation(
     ends of the range, around folds in between. Points at which a multiplier crosses
     the unit circle are located to rounding errors. The cycle may be unstable.
 
-    ```python
-    branch = hj.continuation(hj.find_limit_cycle(buck), "Vin", (20.0, 26.0))
-    hj.plot.branch(branch, output="v")
-    ```
-
     **Arguments:**
 
     - `cycle`: the first cycle. The value of the parameter in its system lies between the first and
@@ -203,6 +198,15 @@ def continuation(
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of the values.
+
+    **Example:**
+
+    ```python
+    branch = hj.continuation(cycle, "k", (10.0, 11.0), step=0.5)
+    print(branch.values, branch.stable)
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `hj.convert.to_pandas`.
     """
     values = _check(cycle, range)
     cycle = _at_event(cycle)

@@ -69,6 +69,22 @@ def simultaneous_events(cycle: LimitCycle) -> list[SimultaneousEvents]:
     If the orders of a group commute, `find_limit_cycle`, sweeps and `continuation` treat the cycle
     as ok; otherwise its result is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it with
     `throw=False`). A group contains at least one event that is not scheduled.
+
+    **Arguments:**
+
+    - `cycle`: result of `hj.find_limit_cycle`, with `throw=False` if its orders do not commute.
+
+    **Returns:** a list of `SimultaneousEvents`, with the `time`, the `orders` of the events, and a
+    derivative of the map over the group for each; empty if no events coincide.
+
+    **Example:**
+
+    ```python
+    groups = hj.orbits.simultaneous_events(cycle)
+    print([group.orders for group in groups])  # [], since no events of this cycle coincide
+    ```
+
+    **Before:** `hj.find_limit_cycle`.
     """
     return [group for group in _groups(cycle) if group is not None]
 

@@ -37,6 +37,15 @@ class Crossing(Definition):
     - `value`: the level, in the function's unit. Default: 0.
     - `charts`: names of the charts in which it is crossed. Default: all in which the function is
       defined.
+
+    **Example:**
+
+    ```python
+    apex = hj.Crossing("vM", "falling")
+    high = hj.Crossing(lambda t, q: q[0], "rising", 1.9, charts="flight")
+    ```
+
+    **After:** `hj.ClockPhase`, `hj.find_limit_cycle`, `hj.recordings.estimate_phase`.
     """
 
     signal: str | Output | Callable[..., Any]
@@ -100,6 +109,15 @@ class AtEvent(eqx.Module):
     """A hybrid boundary as a section: the state right after the event `name` and its reset.
 
     In a recording (`hj.recordings.estimate_phase`) the event is the beginning of each cycle.
+
+    **Example:**
+
+    ```python
+    sections = [hj.AtEvent("touchdown"), apex]
+    print(hj.sections.place_sections(cycle, sections).duration)
+    ```
+
+    **After:** `hj.find_limit_cycle`, `hj.linearize`, `hj.recordings.estimate_phase`.
     """
 
     name: str = eqx.field(static=True)

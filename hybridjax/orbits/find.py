@@ -113,6 +113,7 @@ def find_limit_cycle(
 
     **Arguments:**
 
+    - `system`: a `HybridSystem`: one of `hj.models`, or your own.
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
         With a cycle, leave out `settle` and `max_period`; a clocked system begins at the same phase
         of its own clock, or, if an event has passed this phase, far from events. Default: the
@@ -145,6 +146,9 @@ def find_limit_cycle(
     - `throw`: raise an error on failure; otherwise the cycle's `result` holds the reason.
         Default: True.
 
+    **Returns:** a `LimitCycle`: `period` in the system's unit of time, `multipliers` (d,),
+    `stable`, `state()` and `trajectory()`, and `result`, a code of `hj.errors.Result`.
+
     **Raises:** `DefinitionError` for bad arguments, and for functions whose dependence on time
     contradicts `system.period()`; `ComputationError` if no isolated cycle is found: no
     convergence, an event or section that is not reached, events that coincide, grazing, an
@@ -154,6 +158,18 @@ def find_limit_cycle(
     Under a JAX transformation of `system`, give a `LimitCycle` as the guess: the cycle is then
     differentiated implicitly. Its `result` reports success; derivatives of a cycle that was not
     found are meaningless, and usually NaN.
+
+    **Example:**
+
+    ```python
+    cycle = hj.find_limit_cycle(hopper)
+    oscillator = hj.models.VanDerPol(mu=1.0)
+    free = hj.find_limit_cycle(oscillator, section=hj.Crossing("v", "falling"))
+    print(cycle.period, free.multipliers)
+    ```
+
+    **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `hj.linearize`,
+    `hj.run_experiments`, `hj.continuation`, `hj.plot.cycle`.
     """
     settings = Settings() if settings is None else settings
     if settings.solver == "auto":

@@ -191,6 +191,16 @@ def find_limit_cycles(
     for those.
 
     **Raises:** `DefinitionError` for systems that do not belong together, or have no parameters.
+
+    **Example:**
+
+    ```python
+    systems = [hj.models.VerticalHopper(k=k) for k in (9.5, 10.0, 10.5)]
+    cycles = hj.orbits.find_limit_cycles(systems, cycle)
+    print(cycles.period, cycles.multipliers)
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.convert.to_pandas`.
     """
     execution = Execution() if execution is None else execution
     systems = _stacked(systems)

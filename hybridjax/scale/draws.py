@@ -34,15 +34,6 @@ def monte_carlo(
 ) -> Any:
     """Draw a random computation many times.
 
-    ```python
-    def error(rng):
-        data = hj.experiments.add_noise(clean, 1e-4, seed=int(rng.integers(2**31)))
-        return hj.fit_multipliers(hj.estimate_htf(data), order=2).multipliers
-
-    errors = hj.scale.monte_carlo(error, 1000, client=client)
-    errors.value.std("draw")
-    ```
-
     Draw i has its own stream of random numbers, that of
     `numpy.random.SeedSequence(seed, spawn_key=(i,))`. So results do not depend on the number of
     processes nor on interruptions, and with more draws the first ones stay the same.
@@ -62,6 +53,19 @@ def monte_carlo(
     **Raises:** `DefinitionError` for results that are no numbers, or that change their names, their
     shapes, or from real to complex ones, and as `sweep`; `ComputationError` if all draws
     fail; any other error that `function` raises.
+
+    **Example:**
+
+    ```python
+    def multipliers(rng):
+        noisy = hj.experiments.add_noise(data, std=1e-5, seed=int(rng.integers(2**31)))
+        return hj.fit_multipliers(hj.estimate_htf(noisy), order=2).multipliers
+    drawn = hj.scale.monte_carlo(multipliers, 4)
+    print(drawn.value.std("draw"))
+    ```
+
+    **Before:** `hj.run_experiments`, `hj.experiments.simulate_experiments`. **After:** functions of
+    `xarray`.
     """
     blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
     return fill(Draws(function, seed, blocks), store, client).dataset()

@@ -36,7 +36,17 @@ Axes = Mapping[str, Vector]
 
 @checked
 class SweepPoints:
-    """A list of points for `sweep`, each with one value of every parameter."""
+    """A list of points for `sweep`, each with one value of every parameter.
+
+    **Example:**
+
+    ```python
+    points = hj.scale.SweepPoints({"k": [9.5, 10.0, 10.5], "b": [4.5, 5.0, 5.5]})
+    print(hj.sweep(hopper, points).spectral_radius)
+    ```
+
+    **After:** `hj.sweep`.
+    """
 
     def __init__(self, values: Axes):
         """**Arguments:** `values` of each parameter by name, all of one length.

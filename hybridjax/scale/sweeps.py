@@ -68,12 +68,6 @@ def sweep(
 ) -> Any:
     """Find limit cycles over a space of parameters, as a labelled array.
 
-    ```python
-    values = {"k": np.linspace(8, 13, 100), "b": np.linspace(3, 7, 100)}
-    map = hj.sweep(hj.models.VerticalHopper(), values)
-    map.spectral_radius.plot()
-    ```
-
     If there are several pieces, a coarse pass first finds cycles at points all over the space. A
     piece of neighboring points then starts from these cycles, and continues from its own solved
     points. A piece does not depend on which process computes it, nor when: results are the same to
@@ -108,6 +102,17 @@ def sweep(
     exist or change their shape, if the store holds another sweep (with the difference) or cannot be
     written, and for a client whose workers cannot run the job; `ComputationError` if there is no
     cycle in the middle, or the cluster is lost.
+
+    **Example:**
+
+    ```python
+    values = {"k": np.linspace(9, 11, 4), "b": np.linspace(4, 6, 3)}
+    found = hj.sweep(hopper, values)
+    found.spectral_radius.plot()
+    ```
+
+    **Before:** a model, `hj.models` or `hj.HybridSystem`; `hj.find_limit_cycle`, for a guess.
+    **After:** functions of `xarray`.
     """
     require_x64()
     given = values.values if isinstance(values, SweepPoints) else values

@@ -139,6 +139,15 @@ class ClockPhase(_Anchored):
 
     **Fields:** `n_sections`, the number N; `anchor`, the position of section 0: a `Crossing` on the
     cycle, or a time of the clock in periods of the cycle. Default: 0.
+
+    **Example:**
+
+    ```python
+    sections = hj.ClockPhase(8, anchor=apex)
+    print(hj.sections.place_sections(cycle, sections).duration)
+    ```
+
+    **Before:** `hj.Crossing`. **After:** `hj.linearize`, `hj.run_experiments`.
     """
 
     label: ClassVar[str] = "isochron"
@@ -172,6 +181,15 @@ class ArcLength(_Anchored):
     - `scale`: one positive number for each signal, in its unit; lengths are of the signals divided
       by them. Default: 1.
     - `anchor`: a `Crossing` on the cycle at which section 0 lies.
+
+    **Example:**
+
+    ```python
+    pieces = hj.sections.ArcLength(8, ("yM", "vM"), apex, scale=(0.3, 1.9))
+    print(hj.sections.place_sections(cycle, pieces).duration)
+    ```
+
+    **Before:** `hj.Crossing`. **After:** `hj.linearize`, `hj.run_experiments`.
     """
 
     label: ClassVar[str] = "arc length"
@@ -226,6 +244,16 @@ class KinematicPhase(_Anchored):
     - `anchor`: the position of section 0: a `Crossing` on the cycle, or an angle in radians. At
       angle 0 the velocity is that of the center, and the position is larger than that of the
       center. Default: 0.
+
+    **Example:**
+
+    ```python
+    angles = hj.KinematicPhase(8, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=apex)
+    print(hj.sections.place_sections(cycle, angles).duration)
+    ```
+
+    **Before:** `hj.Crossing`. **After:** `hj.linearize`, `hj.run_experiments`,
+    `hj.recordings.estimate_phase`.
     """
 
     label: ClassVar[str] = "kinematic"
@@ -315,6 +343,15 @@ class SectionList(AbstractSections):
     """Sections one by one, in the order in which the cycle crosses them.
 
     **Fields:** `items`: a list of `Crossing` and `AtEvent`.
+
+    **Example:**
+
+    ```python
+    listed = hj.sections.SectionList([apex, hj.AtEvent("touchdown")])
+    print(hj.sections.place_sections(cycle, listed).duration)
+    ```
+
+    **Before:** `hj.Crossing`, `hj.AtEvent`. **After:** `hj.linearize`, `hj.run_experiments`.
     """
 
     label: ClassVar[str] = "sections"

@@ -57,6 +57,7 @@ def linearize(
 
     **Arguments:**
 
+    - `cycle`: result of `hj.find_limit_cycle`.
     - `sections`: a family or `PlacedSections`.
     - `outputs`: names or `Output`s. Default: all states that every chart defines.
     - `inputs`: names. Default: all.
@@ -65,9 +66,23 @@ def linearize(
       section n are those of one delay earlier. Coordinates are the states at that earlier time,
       then past inputs whose effect has not ended. Default: none.
 
+    **Returns:** an `LDTP` with N sections: `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d),
+    `D` (N, ny, nu), `dims` (N,) and the `multipliers` (d,).
+
     **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
     lies, or uses the time without having the period of a clock, or an input that does not exist,
     or for `delay` with other sections; `ComputationError` as `place_sections`.
+
+    **Example:**
+
+    ```python
+    model = hj.linearize(cycle, hj.ClockPhase(8, anchor=apex), ("yM", "vM"))
+    print(model.multipliers, model.A.shape)
+    exact = model.htf([0.1, 0.2], harmonics=(-1, 0, 1))
+    ```
+
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.optimal_design`, `hj.validate`,
+    `hj.plot.multipliers`, `hj.convert.to_lti`.
     """
     if delay is not None:
         return Delayed.of(cycle, sections, outputs, inputs, delay).to_ldtp()

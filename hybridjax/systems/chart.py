@@ -26,6 +26,8 @@ class Chart(eqx.Module):
     Subclass it, name the states, and write the field for a single state; the package batches, pads
     and differentiates it.
 
+    **Example:**
+
     ```python
     class Flight(hj.Chart):
         states = ("y", "v")

@@ -53,6 +53,14 @@ class Radau(eqx.Module):
     the error of the step.
 
     **Arguments:** `stages`, 3, 5 or 7.
+
+    **Example:**
+
+    ```python
+    stiff = hj.models.VanDerPol(mu=100.0, solver=hj.systems.Radau())
+    ```
+
+    **After:** `hj.HybridSystem`, `hj.orbits.Settings`.
     """
 
     stages: Literal[3, 5, 7] = eqx.field(static=True, default=5)

@@ -32,19 +32,7 @@ def filippov(
     surface: Callable[[Any, Any], Any],
     name: str = "slides",
 ) -> FilippovParts:
-    """Charts and transitions of a system whose field jumps at a surface.
-
-    ```python
-    def charts(self):
-        return self.parts().charts
-
-    def transitions(self):
-        return self.parts().transitions
-
-    def parts(self):
-        sides = {"ahead": Slips(self, 1.0), "behind": Slips(self, -1.0)}
-        return hj.systems.filippov(sides, lambda t, q: q[1] - self.belt, "sticks")
-    ```
+    """Return charts and transitions of a system whose vector field jumps at a surface.
 
     Let a and b be the rates of h in the fields f_a (where h > 0) and f_b (where h < 0). A state
     that reaches the surface h = 0 crosses it if the field of the other side leads away from the
@@ -56,10 +44,30 @@ def filippov(
 
     - `charts`: two charts with the same states, by name: first the one in which h > 0, then the one
       in which h < 0. Their fields must extend smoothly beyond the surface.
-    - `surface`: h(t, q) -> number.
-    - `name`: name of the chart of sliding, which has the same states.
+    - `surface`: the function h(t, q), which returns a number.
+    - `name`: name of the chart of sliding, which has the same states. Default:
+      "slides".
+
+    **Returns:** `FilippovParts`: `charts` by name, and `transitions`, for the methods of the same
+    names of a `HybridSystem`.
 
     **Raises:** `DefinitionError` if the charts are not two with the same states and inputs.
+
+    **Example:**
+
+    ```python
+    class Drift(hj.Chart):
+        states = ("x",)
+        speed: float
+        def field(self, t, q, u):
+            return (self.speed,)
+
+    sides = {"above": Drift(-1.0), "below": Drift(3.0)}
+    parts = hj.systems.filippov(sides, lambda t, q: q[0])
+    print(parts.charts, parts.transitions)
+    ```
+
+    **Before:** `hj.Chart`. **After:** `hj.HybridSystem`.
     """
     if len(charts) != 2:
         raise DefinitionError(

@@ -49,6 +49,15 @@ class Output(Definition):
         such functions. If the output is needed in a chart that is not in the mapping, an error is
         raised.
     - `unit`: its unit, for figures and printed summaries.
+
+    **Example:**
+
+    ```python
+    momentum = hj.Output("momentum", lambda t, q, u: hopper.M * q[1], unit="kg m/s")
+    print(hj.linearize(cycle, sections, momentum).outputs)
+    ```
+
+    **After:** `hj.linearize`, `hj.run_experiments`.
     """
 
     name: str = eqx.field(static=True)
@@ -85,9 +94,23 @@ def parameter(
     An array is differentiable, and another value does not cause recompilation; a Python float has
     neither property. Declare it as `k: hj.Parameter = hj.parameter(10.0, unit="N/m")`.
 
-    **Arguments:** `default`, a number (without it, the constructor needs one); `doc`, what it is;
-    `unit`, as text; `positive`, whether zero and negative values are refused, as of a mass.
-    Default: False.
+    **Arguments:**
+
+    - `default`: a number. Default: None; the constructor of the system then needs one.
+    - `doc`: the meaning, as text. Default: none.
+    - `unit`: the unit, as text. Default: none.
+    - `positive`: whether zero and negative values raise an error, as for a mass. Default: False.
+
+    **Returns:** a field for the body of a class.
+
+    **Example:**
+
+    ```python
+    class Pendulum(hj.HybridSystem):
+        length: hj.Parameter = hj.parameter(1.0, unit="m", doc="of the rod", positive=True)
+    ```
+
+    **After:** `hj.HybridSystem`.
     """
     metadata = {"doc": doc, "unit": unit, "positive": positive}
     options: dict[str, Any] = {} if default is None else {"default": default}
@@ -184,6 +207,15 @@ class Guess(eqx.Module):
 
     `after` names the event that has just led to this state. For an autonomous system, the return
     map is then taken right after this event, unless a section is given.
+
+    **Example:**
+
+    ```python
+    guess = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
+    print(hj.find_limit_cycle(hopper, guess).period)
+    ```
+
+    **After:** `hj.find_limit_cycle`.
     """
 
     chart: str = eqx.field(static=True)
@@ -236,6 +268,8 @@ class _DefaultInputs:
 
 class HybridSystem(Definition):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
+
+    **Example:**
 
     ```python
     class Ball(hj.HybridSystem):

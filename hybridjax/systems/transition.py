@@ -33,7 +33,16 @@ SAME_TIME = 1e-11
 
 @checked
 class Scheduled(eqx.Module):
-    """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge."""
+    """Events at known times `offset + k * period`, k an integer: a tick of a clock, a PWM edge.
+
+    **Example:**
+
+    ```python
+    tick = hj.Transition("tick", "on", "off", hj.systems.Scheduled(0.5, offset=0.1))
+    ```
+
+    **After:** `hj.Transition`.
+    """
 
     period: Float[Array, ""]
     offset: Float[Array, ""]
@@ -93,6 +102,16 @@ class Transition(eqx.Module):
 
     Scheduled transitions with the same formulas for period and offset are those of one clock: each
     tick leads to one event.
+
+    **Example:**
+
+    ```python
+    height = lambda t, q, u: q[0] - 1.0
+    bounce = lambda t, q, u: (q[0], -0.7 * q[1])
+    lands = hj.Transition("touchdown", "flight", "flight", height, reset=bounce)
+    ```
+
+    **Before:** `hj.Chart`. **After:** `hj.HybridSystem`.
     """
 
     name: str = eqx.field(static=True)

@@ -16,6 +16,7 @@ from ..executor import as_numpy, is_hidden
 from ..memo import Memory
 from . import leads
 from .kinds import kind_of
+from .signature import ShortSignature
 from .values import Kind, Misfit
 
 
@@ -129,7 +130,9 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
             f"{name} needs values, but JAX traces them here: call it outside of jit, vmap and grad."
         )
 
-    setattr(call, "kinds", kinds)  # noqa: B010 (that of a function is not declared)
+    # (Those of a function are not declared.)
+    setattr(call, "kinds", kinds)  # noqa: B010
+    setattr(call, "__signature__", ShortSignature(function, cls))  # noqa: B010
     return call
 
 

@@ -57,6 +57,16 @@ class Design(Showable, eqx.Module):
     - `channel`: index of the input it is applied to.
     - `amplitude`: in units of the input. `phase`: in rad, at section 0 of the experiment.
     - `n_sections`: N. `periods`: P. `experiments`: their number S. `inputs`: names of the inputs.
+
+    **Example:**
+
+    ```python
+    lines = [[0.25, 0.375], [0.75]]
+    design = hj.experiments.Design.from_lines(lines, 0.001, n_sections=8, periods=16)
+    print(design.signals().shape)
+    ```
+
+    **Before:** `hj.multisine` or `hj.optimal_design`. **After:** `hj.run_experiments`.
     """
 
     experiment: Int[np.ndarray, " K"]

@@ -24,10 +24,26 @@ def random_input(
     The filter is a Butterworth filter of order 4, applied forwards and backwards. The perturbation
     is not aligned to any phase, so any hardware that plays a file can apply it.
 
-    **Arguments:** `duration` in seconds. `rate` in samples per second. `bandwidth` in Hz, where
-    half of the amplitude is left. `rms`. Default: 1. `seed`.
+    **Arguments:**
+
+    - `duration`: in seconds.
+    - `rate`: samples per second.
+    - `bandwidth`: the frequency in Hz at which half of the amplitude is left.
+    - `rms`: rms value, in the unit of the input. Default: 1.
+    - `seed`: seed of the noise. Default: 0.
+
+    **Returns:** the samples (n, 1), with n the duration times the rate.
 
     **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
+
+    **Example:**
+
+    ```python
+    force = hj.experiments.random_input(60, 50, bandwidth=8, rms=0.02)
+    np.savetxt("force.txt", force)
+    ```
+
+    **After:** hardware that plays it, or `hj.testing.simulate_recording`.
     """
     if bandwidth >= rate / 2:
         raise DefinitionError(

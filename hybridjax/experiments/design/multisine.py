@@ -87,8 +87,21 @@ def multisine(
       amplitudes must be small. Default: the fewest possible.
     - `inputs`: number or names of the inputs. Default: 1.
 
+    **Returns:** a `Design`: `frequency` (K,) of each cosine in cycles per period, `amplitude` (K,)
+    in units of the input, and `signals()`, the samples (S, n, nu) for hardware.
+
     **Raises:** `DefinitionError` for a band that holds no frequency or exceeds N/2, for too few
     experiments (the message has the minimum), and for choices that exclude each other.
+
+    **Example:**
+
+    ```python
+    design = hj.multisine(8, 16, (0, 3), amplitude=0.001, lines="odd")
+    print(design.cycles, design.crest_factors())
+    ```
+
+    **After:** `hj.run_experiments`, `hj.experiments.simulate_experiments`,
+    `hj.experiments.optimize_phases`, `hj.optimal_design`.
     """
     names = input_names(inputs)
     check_window(n_sections, periods)
@@ -215,7 +228,24 @@ def paper_design(
     kinematic sections, this divides the median (over 24 seeds) of the largest error of H_0 by 6 for
     yM and 18 for vM, the maximum by 21 and 40 (`benchmarks/second_order.py`).
 
+    **Arguments:**
+
+    - `n_sections`: N. Default: 32. `periods`: P, the periods in one window. Default: 64.
+    - `seed`: seed of the phases and of the division. Default: 0.
+    - `division`: the division of frequencies among experiments, as in `multisine`. Default:
+      "sum-free".
+    - `experiments`: number of experiments. Default: 80.
+
     **Raises:** `DefinitionError` as `multisine`.
+
+    **Example:**
+
+    ```python
+    paper = hj.experiments.paper_design()
+    print(paper)
+    ```
+
+    **After:** `hj.run_experiments`.
     """
     return multisine(
         n_sections,
@@ -238,9 +268,21 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     contain the distortion. Phases of lines that are measured in several experiments together
     (multiples of 1/2, orthogonal experiments) are kept.
 
-    **Arguments:** `seed`: seed of the random phases at the start of the minimization. Default: 0.
+    **Arguments:** `design`: a `Design`. `seed`: seed of the random phases at the start of the
+    minimization. Default: 0.
+
+    **Returns:** a `Design` with the frequencies and amplitudes of the one that was given.
 
     **Raises:** `DefinitionError` if there is no phase to choose.
+
+    **Example:**
+
+    ```python
+    flat = hj.experiments.optimize_phases(design)
+    print(design.crest_factors(), flat.crest_factors())
+    ```
+
+    **Before:** `hj.multisine` or `hj.optimal_design`. **After:** `hj.run_experiments`.
     """
     nu = len(design.inputs)
     length = design.n_sections * design.periods
