@@ -281,6 +281,8 @@ def recordings(t):
     yield hj.recordings.sample_sections, take
     yield hj.identify_recording, take | dict(order=1)
     yield t.section_data.experiments, dict(periods=4)
+    yield t.section_data.of_inputs, dict(names=("f",))
+    yield t.section_data.with_drift, dict(cycles=10)
     yield (
         hj.recordings.check_recording,
         dict(recording=t.recording, inputs="f", outputs=("x", "v")),
@@ -353,6 +355,8 @@ def conversions(t):
     yield hj.convert.to_scipy, dict(model=t.model)
     yield hj.convert.to_control, dict(thing=t.model)
     yield hj.convert.to_harmonic_state_space, dict(cycle=t.cycle)
+    lifted = hj.convert.to_harmonic_state_space(t.cycle)
+    yield lifted.transfer, dict(frequencies=[0.1], period=1.0)
     yield hj.convert.to_xarray, dict(thing=t.model)
     yield hj.convert.to_pandas, dict(thing=t.fit)
     yield hj.convert.from_xarray, dict(dataset=hj.convert.to_xarray(t.model))
@@ -379,6 +383,7 @@ def plots(t):
     yield plot.section_data, dict(data=t.section_data)
     yield plot.validation, dict(validation=t.validation)
     yield plot.save, dict(path="missing/figure", plot=t.plot)
+    yield t.plot.save, dict(path="missing/figure")
 
 
 def rhythms(t):
@@ -396,6 +401,9 @@ def rhythms(t):
     yield t.beats, at
     yield t.beats.interval, at
     yield hj.recordings.natural_multipliers, dict(data=t.variability)
+    natural = hj.recordings.natural_multipliers(t.variability)
+    yield natural.compare, dict(true=[0.5])
+    yield natural.contains, dict(true=[0.5])
     yield hj.testing.simulate_beats, dict(curve=[1.0], force=jnp.ones((1, 99)))
 
 

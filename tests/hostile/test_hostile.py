@@ -46,7 +46,7 @@ CALLED_BY_THE_ENGINE = {
     "TwoLeggedBar",
     "VerticalHopper",
 }
-SLOW_TO_MAKE = {"ModelFit", "StoredExperiments"}
+SLOW_TO_MAKE = {"ModelFit", "StoredExperiments", "SubjectStudy"}
 # Results of methods of results, whose tests call them.
 FURTHER_RESULTS = {"Coupling", "Explorer", "Fluctuations", "Responses", "Trajectory"}
 
