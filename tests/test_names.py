@@ -3,10 +3,12 @@
 import ast
 import importlib
 import inspect
+import pickle
 import types
 import typing
 from collections import Counter
 
+import cloudpickle
 import numpy as np
 import pytest
 
@@ -210,3 +212,8 @@ def test_the_table_of_earlier_names_leads_to_what_exists():
             words |= set(inspect.signature(function).parameters)
         assert word not in words, key
         assert set(now.split("` or `")) <= words, key
+
+
+def test_namespaces_travel_to_other_processes():
+    """Functions that use them are pickled with them, for processes and Dask's workers."""
+    assert pickle.loads(cloudpickle.dumps(hj.plot)) is hj.plot

@@ -105,6 +105,10 @@ _WORDS = {
 class Namespace(types.ModuleType):
     """A module that says what to call, if it is called itself."""
 
+    def __reduce__(self) -> Any:
+        # (Pickles of functions that use a module know plain modules only.)
+        return importlib.import_module, (self.__name__,)
+
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         raise TypeError(_leads().about_called(self.__name__))
 
