@@ -31,7 +31,7 @@ from .plants.cycle import Returns
 from .recordings.natural import NaturalMultipliers
 
 
-Saved = (
+Saved: typing.TypeAlias = (
     Design
     | ExperimentData
     | HTF

@@ -19,7 +19,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from errno import EINVAL
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
@@ -116,7 +116,7 @@ def _fields_of(kind: type) -> list[_Field]:
         hints = typing.get_type_hints(kind)
         return [_Field(name, x, x is bool, True) for name, x in hints.items()]
     fields = []
-    for x in dataclasses.fields(kind):
+    for x in dataclasses.fields(cast(Any, kind)):
         is_static = x.metadata.get("static", False)
         is_required = x.default is dataclasses.MISSING
         fields.append(_Field(x.name, x.type, is_static, is_required))

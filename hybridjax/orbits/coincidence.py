@@ -255,7 +255,7 @@ def together(
     is_first = np.diff(row, prepend=-1) > 0
     before = np.where(is_first, begin[row], np.roll(time, 1))
     close = time - before <= TOGETHER * period[row]
-    out = (rivals >= 0).any(axis=1)
+    out = np.asarray((rivals >= 0).any(axis=1))
     out[row[close]] = True
     return out
 

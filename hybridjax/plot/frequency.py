@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ def htf(
     """
     families = _families(htfs)
     if families is None:
-        drawn = _exact_first(htfs)
+        drawn = _exact_first(cast(Sequence[Transfer], htfs))
         shown = 0 if output is None else output
         with panels(ax, height=2.2) as axes:
             _magnitude(axes[0, 0], drawn, shown, input, harmonics, decades)
@@ -178,7 +178,7 @@ def bode(
         return _bodes(families, fits, harmonic, outputs, input, ax)
     if isinstance(fits, Mapping):
         raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
-    drawn = _exact_first(htfs)
+    drawn = _exact_first(cast(Sequence[Transfer], htfs))
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
     curves = _curves(drawn[0], outputs, input)

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Wanted:
         system: HybridSystem,
     ):
         is_one = isinstance(quantities, str) or callable(quantities)
-        items = [quantities] if is_one else list(quantities)
+        items: list[Any] = [quantities] if is_one else list(cast(Sequence, quantities))
         self.names = tuple(dict.fromkeys(x for x in items if isinstance(x, str)))
         functions = [x for x in items if not isinstance(x, str)]
         self.measures = {getattr(f, "__name__", ""): f for f in functions}

@@ -151,7 +151,8 @@ def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 def walk_with(cycle: LimitCycle, family: AbstractSections, walk: Walk | None) -> None:
     """Have a traced cycle follow a walk to the sections of a family."""
     if walk is not None:
-        _walks.recall(cycle, None, list).append((family, walk))
+        noted: list[tuple] = _walks.recall(cycle, None, list)
+        noted.append((family, walk))
 
 
 def walked(

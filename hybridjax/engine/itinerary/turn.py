@@ -112,7 +112,7 @@ def follow(
         one = lambda both, row: (steps.row(constants, row, *both), None)  # noqa: E731
         for _ in range(passes):
             both = steps.depart(constants, state.course.ends)
-            (state, flags), _ = jax.lax.scan(one, both, rows)
+            state, flags = jax.lax.scan(one, both, rows)[0]
     return _passage(state, flags, form, columns, travelers.many)
 
 
