@@ -46,7 +46,9 @@ def folded(text: str, indent: str = "") -> str:
     on a line of its own, indented below the first."""
     if len(text) <= _WIDTH:
         return text
-    parts = re.split(r";\s+", text.replace(" ± ", "\0±\0"))  # (never apart)
+    # (Numbers with their errors, and the two of a range, are never apart.)
+    joined = re.sub(r"(?<=\d) to (?=\d)", "\0to\0", text.replace(" ± ", "\0±\0"))
+    parts = re.split(r";\s+", joined)
     width = _WIDTH - 2 - len(indent)
     lines = [textwrap.fill(x, width, subsequent_indent="  ") for x in parts]
     whole = ";\n".join(lines).replace("\0", " ")

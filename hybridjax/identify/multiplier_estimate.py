@@ -347,7 +347,7 @@ class MultiplierFit(Fit):
         return [Finding("order", text)]
 
     def _summary(self) -> str:
-        parts = self.show_multipliers(), self._shown_moduli(), self._about()
+        parts = self._shown_multipliers(), self._shown_moduli(), self._about()
         about = "; ".join(filter(None, parts))
         return folded(f"{type(self).__name__}({about})")
 
@@ -367,6 +367,9 @@ class MultiplierFit(Fit):
 
     def show_multipliers(self) -> str:
         """Return the multipliers of a minimum and their standard errors, for a `repr`."""
+        return folded(self._shown_multipliers())
+
+    def _shown_multipliers(self) -> str:
         if self.result != Result.OK:
             reason = Result(self.result).message
             return f"no multipliers: {reason} (`multipliers` holds its last step)"
@@ -374,7 +377,7 @@ class MultiplierFit(Fit):
             f"{_short(z)} ± {error:.1e}"
             for z, error in zip(self.multipliers, self.standard_errors, strict=True)
         )
-        return folded(f"multipliers (± standard error) {', '.join(shown)}")
+        return f"multipliers (± standard error) {', '.join(shown)}"
 
     def _shown_moduli(self) -> str:
         """Return the moduli and their intervals, of a pair of complex multipliers once."""
@@ -397,7 +400,7 @@ class MultiplierFit(Fit):
                 f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
             )
         label = "modulus" if len(shown) == 1 else "moduli"
-        return folded(f"{label} (95 % interval) {', '.join(shown)}")
+        return f"{label} (95 % interval) {', '.join(shown)}"
 
     def _radius(self, level: float, equations: int | np.ndarray) -> np.ndarray | float:
         """Quantile of `distance`."""
