@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import equinox as eqx
 import jax
@@ -129,22 +129,24 @@ class StoredExperiments(Showable):
         )
 
 
+class _Options(TypedDict, total=False):
+    """What `run_experiments` takes in any of its forms."""
+
+    start: StartName
+    discard: Index | None
+    process_noise: ProcessNoise | None
+    accuracy: Accuracy
+    execution: Execution | None
+    feedback: LDTP | Gain | None
+
+
 @overload
 def run_experiments(
     cycle: LimitCycle,
     sections: SectionsLike,
     design: DesignLike,
     outputs: OutputNames | None = None,
-    *,
-    start: StartName = "cycle",
-    discard: Index | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy = EXPERIMENT,
-    execution: Execution | None = None,
-    feedback: LDTP | Gain | None = None,
-    chunk: None = None,
-    store: None = None,
-    client: None = None,
+    **options: Unpack[_Options],
 ) -> ExperimentData: ...
 @overload
 def run_experiments(
@@ -153,15 +155,8 @@ def run_experiments(
     design: DesignLike,
     outputs: OutputNames | None = None,
     *,
-    start: StartName = "cycle",
-    discard: Index | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy = EXPERIMENT,
-    execution: Execution | None = None,
-    feedback: LDTP | Gain | None = None,
     chunk: ExperimentCount,
-    store: None = None,
-    client: None = None,
+    **options: Unpack[_Options],
 ) -> Iterator[ExperimentData]: ...
 @overload
 def run_experiments(
@@ -170,15 +165,10 @@ def run_experiments(
     design: DesignLike,
     outputs: OutputNames | None = None,
     *,
-    start: StartName = "cycle",
-    discard: Index | None = None,
-    process_noise: ProcessNoise | None = None,
-    accuracy: Accuracy = EXPERIMENT,
-    execution: Execution | None = None,
-    feedback: LDTP | Gain | None = None,
     chunk: ExperimentCount | None = None,
     store: FilePath,
     client: DaskClient | None = None,
+    **options: Unpack[_Options],
 ) -> StoredExperiments: ...
 @checked
 @working("run_experiments")
@@ -246,9 +236,8 @@ def run_experiments(
 
     **Raises:** `DefinitionError` for arguments that do not fit together, if the store holds other
     experiments (with the difference) or cannot be written, or if the workers of the client cannot
-    run them; `ComputationError` for an
-    unstable cycle or loop, because experiments would diverge from it, and if a steady start is not
-    found, or if the cluster is lost.
+    run them; `ComputationError` for an unstable cycle or loop, because experiments would diverge
+    from it, if a steady start is not found, or if the cluster is lost.
 
     **Example:**
 

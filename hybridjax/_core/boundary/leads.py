@@ -77,7 +77,7 @@ STEPS = {
     (
         "ExperimentData",
         "LDTP",
-    ): "`hj.run_experiments(model, ...)` makes data of a model",
+    ): "`hj.experiments.simulate_experiments(model, design)` makes data of a model",
     (
         "HasRecords",
         "HTF",
