@@ -28,7 +28,6 @@ MAKERS = {
     "HasMultipliers": "limit cycles, models and fits have them",
     "HasRecords": "`hj.run_experiments(cycle, sections, design, outputs)` makes data, and "
     "`hj.identify_recording` those of a recording",
-    "Identification": "`hj.identify_recording(recording, ...)` makes one",
     "LDTP": "`hj.linearize(cycle, sections)` or `hj.fit_ldtp(data, ...)` makes one",
     "LimitCycle": "`hj.find_limit_cycle(system)` makes one",
     "LimitCycles": "`hj.orbits.find_limit_cycles(systems)` makes one",
@@ -37,7 +36,6 @@ MAKERS = {
     "OptimalDesign": "`hj.optimal_design(model)` makes one",
     "Phase": "`hj.recordings.estimate_phase(recording, sections)` makes one",
     "Plant": "`hj.plants` has ready ones",
-    "Plot": "functions of `hj.plot` make one",
     "RationalFit": "`hj.identify.fit_rational(htf)` makes one",
     "SectionSeries": "`data.records` has them",
     "Recording": "`hj.read_recording(path)`, or `hj.Recording(time, signals)` of arrays, makes one",
@@ -128,7 +126,7 @@ stands for those derived from it."""
 WORDS = {
     "A": ("amplitude",),
     "N": ("n_sections",),
-    "T": ("period", "duration", "t_end"),
+    "T": ("period", "duration"),
     "X": ("data", "htf"),
     "alpha": ("level", "alpha"),
     "amp": ("amplitude",),
@@ -147,14 +145,14 @@ WORDS = {
     "df": ("dof",),
     "doubts": ("findings",),
     "dt": ("settings", "rate"),
-    "duration": ("duration", "t_end"),
+    "duration": ("duration",),
     "eigenvalues": ("multipliers",),
     "errors": ("standard_errors", "standard_error", "covariance"),
     "estimates": ("values", "multipliers"),
     "event": ("sections", "section", "events"),
     "file": ("path", "paths", "folder"),
     "free": ("free", "parameter", "parameters"),
-    "freq": ("frequencies", "f", "frequency", "band", "range"),
+    "freq": ("frequencies", "frequency", "range"),
     "fs": ("rate", "time"),
     "guess": ("guess", "initial", "state"),
     "harmonic": ("harmonics", "harmonic"),
@@ -168,16 +166,16 @@ WORDS = {
     "names": ("signals", "outputs", "names", "states"),
     "noise": ("std", "process_noise", "noise"),
     "nperiods": ("periods", "cycles"),
-    "order": ("order", "dims", "guess"),
+    "order": ("order", "dims"),
     "output": ("outputs", "output", "y"),
     "overlay": ("fits",),
     "params": ("values", "coefficients", "free", "parameters", "parameter", "numbers"),
-    "reference": ("reference", "references"),
+    "reference": ("references",),
     "period": ("period", "periods"),
     "phase": ("sections", "phase", "anchor"),
     "poles": ("poles", "order", "multipliers"),
     "predict": ("predict", "simulate", "htf"),
-    "range": ("range", "values", "over", "band"),
+    "range": ("range", "values"),
     "residuals": ("residuals", "residual", "noise"),
     "sections": ("sections", "section", "phase"),
     "seed": ("seed",),
@@ -197,8 +195,8 @@ WORDS = {
     "step": ("settings", "step"),
     "system": ("system", "cycle", "model"),
     "t": ("time", "t", "times"),
-    "t_span": ("duration", "t_end"),
-    "tf": ("htf", "duration", "t_end"),
+    "t_span": ("duration",),
+    "tf": ("htf", "duration"),
     "threshold": ("value", "threshold"),
     "time": ("time", "t", "times"),
     "tol": ("accuracy", "settings", "tolerance"),
@@ -261,8 +259,8 @@ n_points: npoints num_points n_pts
 plot: draw figure visualize plot_2d imshow
 points: bifurcations special_points bifurcation_points
 save: savefig write to_file export dump to_csv
-to_pandas: to_data_frame to_dataframe to_df df dataframe as_dataframe frame table
-order: model_degree dims guess
+to_pandas: to_data_frame to_dataframe to_df dataframe as_dataframe frame table
+order: model_degree dims
 output: outputs y_names output_name observable observe measured
 overlay: fit model_fit
 params: parameters param theta_ params_ best_params_ x_opt p parameter parameter_names
@@ -288,7 +286,7 @@ tf: transfer_function freqresp frequency_response frequency_responses evalfr htf
 threshold: level value crossing_value
 tol: rtol xtol ftol eps tolerance precision gtol rel_tol
 trials: n_trials_ segments
-values: value array numpy to_numpy
+values: array numpy to_numpy
 x0: y0 z0 q0 u0 state0 initial_state initial_states
 y: ys
 """
@@ -308,9 +306,8 @@ KEYWORDS = {
     "simulate.t_eval": "`trajectory.at(times)` has the states at any times",
     "simulate.saveat": "`trajectory.at(times)` has the states at any times",
     "simulate.args": "parameters belong to the system: `system.replace(k=9.0)` changes them",
-    "simulate.settings": "steps "
-    "follow from the accuracy: pass `settings=hj.orbits.Settings(rtol=1e-9)`; "
-    "`trajectory.dense()` has values between steps",
+    "simulate.settings": "steps follow from the accuracy: pass "
+    "`settings=hj.orbits.Settings(rtol=1e-9)`; `trajectory.dense()` has values between steps",
     "simulate.guess": "pass the name of a chart and a state there, or a guess: "
     "`hj.simulate(system, guess, duration)`",
     "multisine.amplitude": "pass `amplitude`, of each cosine; `design.scaled(rms)` sets the rms",
@@ -343,9 +340,8 @@ ATTRIBUTES = {
     "Fit.pvalue": "`fit.compare(other)` returns one",
     "Fit.pvalues": "`fit.compare(other)` returns them",
     "Fit.score": "`hj.validate(fit, data)` compares a fit with data",
-    "Fit.predict": "`hj.validate(fit, data)` "
-    "compares it with data, and `fit.htf(frequencies)` is its "
-    "response",
+    "Fit.predict": "`hj.validate(fit, data)` compares it with data, and `fit.htf(frequencies)` is "
+    "its response",
     "Fit.fit": "`hj.fit_multipliers`, `hj.fit_series`, `hj.fit_ldtp` and `hj.fit_model` fit",
     "Fit.summary": "`print(fit)` shows a summary",
     "HTF.coherence": "`htf.variance` and `htf.standard_error` have the errors",
@@ -363,8 +359,6 @@ ATTRIBUTES = {
     "LDTP.dt": "a model has `n_sections` samples in a period; time is not part of it",
     "LDTP.n_states": "`model.dims` has the dimension of the state at each section",
     "LDTP.step_response": "`model.simulate(np.ones((n, nu)))` returns it",
-    "LimitCycle.trajectory": "`cycle.plot()` draws it, and `hj.simulate(system, guess)` returns a "
-    "trajectory",
     "LimitCycle.monodromy": "`cycle.multipliers` has the eigenvalues, and "
     "`hj.sections.section_map(cycle, sections, 0, 0)` the return map between sections",
     "LimitCycle.frequency": "`1 / cycle.period` is the frequency",
@@ -414,7 +408,7 @@ IN_NAMESPACES = {
     "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
     "other fields are arrays",
     "models": "`dir(hj.models)` lists them",
-    "plot": "`result.plot()` draws any result, and `dir(hj.plot)` lists all figures",
+    "plot": "`result.plot()` draws a result, and `dir(hj.plot)` lists all figures",
 }
 """Where a name is none of a namespace's, and close to no other one."""
 
