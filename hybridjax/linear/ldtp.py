@@ -321,7 +321,8 @@ class LDTP(Showable, eqx.Module):
         if not regular:
             raise DefinitionError(
                 "an inverse needs a square and invertible D at all sections, since it would have "
-                "to know later outputs without: invert the HTFs, `model.htf(f).inverse()`."
+                "to know later outputs without: invert the HTFs, "
+                "`model.htf(frequencies).inverse()`."
             )
         A, B, C, D = to_host(self.matrices[:4])
         D = namespace(D).linalg.inv(D)

@@ -423,7 +423,7 @@ def asymptotic_phase(
     raise ComputationError(
         f"the state did not come to the cycle within {turns} crossings of its section (at t = "
         f"{lanes.t[0]:.6g}: {Result(int(moved.result[0])).message}): start nearer to a stable "
-        "cycle, or allow more `turns`."
+        "cycle, or allow more `cycles`."
     )
 
 

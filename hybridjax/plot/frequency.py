@@ -348,7 +348,7 @@ def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
     grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
         raise DefinitionError(
-            "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(f)`."
+            "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(frequencies)`."
         )
     drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
     return sorted(drawn, key=lambda htf: htf.source != "exact")

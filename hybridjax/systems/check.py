@@ -36,7 +36,7 @@ _passed: dict[Hashable, tuple[str, ...]] = {}
 
 _ARGUMENTS = (
     " (fields, guards, resets and outputs take (t, q, u), after `self` in a class; functions of "
-    "`Crossing`, `sliding` and `half_period` take (t, q))"
+    "`Crossing`, `filippov` and `half_period` take (t, q))"
 )
 
 
