@@ -29,7 +29,7 @@ from .limits import PowerLimits
 # Powers never fall below this part of the largest one during the search, so that numerators stay
 # determined at all lines. Larger: variances are larger by as little. Smaller: rounding errors.
 _FLOOR = 1e-9
-# Excess of the certificate at which powers are accepted. Larger: more strides than necessary (by a
+# Excess of the certificate at which powers are accepted. Larger: more cycles than necessary (by a
 # tenth of it, typically). Smaller: many more steps for a gain that no experiment shows.
 ENOUGH = 0.02
 # Largest number of steps. Fewer: several limits end with a certificate above 1.02.

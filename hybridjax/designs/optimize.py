@@ -42,7 +42,7 @@ from .limits import (
 )
 
 
-# Ratio of strides from which on `advice` recommends the design. Larger: designs that save a third
+# Ratio of cycles from which on `advice` recommends the design. Larger: designs that save a third
 # are called nearly optimal. Smaller: savings within the uncertainty of the model are advertised.
 _WORTH_IT = 1.5
 

@@ -27,7 +27,7 @@ from .optimize import OptimalDesign, optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
 
 
-# A block has at most so many times the cycles of all before it. Larger: more strides for a design
+# A block has at most so many times the cycles of all before it. Larger: more cycles for a design
 # from a poor estimate. Smaller: more blocks.
 _GROWTH = 2.0
 # Part by which a block is longer than predicted. Larger: too many cycles where the prediction was

@@ -1,4 +1,4 @@
-"""Measured data: phase, section data, advice, designs for hardware."""
+"""Measured data: phase, section data, diagnosis, designs for hardware."""
 
 from .._core.public import attach
 

@@ -25,7 +25,7 @@ NAME_REFERENCE = (
 
 
 class Inspection(Showable, eqx.Module):
-    """The result of `inspect`. Printing it shows the findings.
+    """The result of `check_recording`. Printing it shows the findings.
 
     **Fields:** `findings`; `recording`, in which samples that are left out are missing (NaN).
     """

@@ -55,10 +55,10 @@ MEANING = (
 class Identification(Showable, eqx.Module):
     """The results of `identify_recording`, step by step.
 
-    **Fields:** `recording`, without the samples that `inspect` leaves out; `findings` of the
-    inspection; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the
+    **Fields:** `recording`, without the samples that `check_recording` leaves out; `findings`
+    of that check; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the
     first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
-    curve of events alone under one input (else None); `advice`.
+    curve of events alone under one input (else None); `diagnosis`.
     """
 
     recording: Recording
