@@ -329,11 +329,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 return {
                     m.filename.removesuffix(".npy"): _array(archive, m) for m in members
                 }
-        except (
-            Exception
-        ) as error:  # whatever broken bytes make zipfile and numpy stumble over
-            # (A place outside of the file is EINVAL; what else the system reports is no damage. The
-            # text is for the user, and nothing reads it.)
+        except Exception as error:
+            # (Whatever broken bytes make zipfile and numpy stumble over. A place outside of the
+            # file is EINVAL; what else the system reports is no damage. The text is for the user,
+            # and nothing reads it.)
             if (
                 isinstance(error, MemoryError)
                 or getattr(error, "errno", EINVAL) != EINVAL

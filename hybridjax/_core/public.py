@@ -114,7 +114,7 @@ class Namespace(types.ModuleType):
 
 
 def _leads() -> Any:
-    """Return the tables of errors. (Where names are right, they are not imported.)"""
+    """Return the module with the tables of errors. (It imports this one.)"""
     return importlib.import_module(".boundary.leads", __package__)
 
 

@@ -78,7 +78,7 @@ class Validation(Showable, eqx.Module):
     - `whiteness` (ny,): p-value of the hypothesis that the residuals are white: they are not where
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
-      input, or of the reference of a loop: the model is wrong where it is small.
+      input, or on the references of a loop: the model is wrong where it is small.
     - `alpha`: significance level of both tests, for all outputs together.
     - `visible` (ny,): the smallest misfit that the test of independence would detect in four of
       five such data: rms of the response to lagged inputs that the model lacks, relative to
@@ -213,7 +213,7 @@ def validate(
     - `alpha`: significance level of the tests. Default: 0.01.
     - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs, which respond to noise; `model` is that of the plant from these to the
-      outputs. Residuals are tested for independence of the reference. Default: None.
+      outputs. Residuals are tested for independence of the references. Default: None.
 
     **Returns:** `hj.identify.Validation`: for each output (ny,) the `fit` in percent, the `noise`
     in units of the output, and p-values, `whiteness` and `independence`. Printing it gives a

@@ -347,9 +347,8 @@ class LimitCycle(Showable, eqx.Module):
         An input $e^{2 \pi i f t / T}$ has the response
         $\sum_m H_m(f) e^{2 \pi i (f + m) t / T}$, with the period T and the time t of the system's
         clock, or since the anchor of an autonomous cycle. Inputs that guards and resets use act at
-        events. An output that jumps at an event
-        whose time moves has an impulse there, which its harmonics include: their moduli do not
-        decay.
+        events. An output that jumps at an event whose time moves has an impulse there, which its
+        harmonics include: their moduli do not decay.
 
         **Arguments:**
 

@@ -92,9 +92,12 @@ class Route(NamedTuple):
 
 
 def has_route(map: ReturnMap) -> bool:
-    """Test whether the flags of a route tell all that may happen beside it: not whether a cycle of
-    several turns closes sooner, a scheduled event has become enabled, or a field has a pulse that
-    is shorter than a step. (A pulse at a pole reaches the nodes of the two integrations.)"""
+    """Test whether the flags of a route tell all that may happen beside it.
+
+    They do not tell whether a cycle of several turns closes sooner, a scheduled event has become
+    enabled, or a field has a pulse that is shorter than a step. (A pulse at a pole reaches the
+    nodes of the two integrations.)
+    """
     s = map.structure
     scheduled = [x for x in s.transitions if isinstance(x.guard, Scheduled)]
     if map.multiplicity > 1 or any(x.enabled is not None for x in scheduled):

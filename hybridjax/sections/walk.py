@@ -91,8 +91,8 @@ _walks = Memory()
 
 
 def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
-    """The walk of a known cycle; None where flags cannot tell if a neighbor keeps it, or for
-    sections that more than one point of the cycle decides on.
+    """The walk of a known cycle; None where flags cannot tell if a neighbor keeps it, or where the
+    family needs more than one point of the cycle.
 
     **Raises:** as `place_sections`.
     """

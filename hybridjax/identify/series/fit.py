@@ -96,10 +96,10 @@ class SeriesFit(MultiplierFit):
     - `noise` (ny,): standard deviation of the residuals.
     - `n_sections`, `inputs`, `outputs`. `lead`: the first lag of the numerators is -lead, as given
       by the records.
-    - `references`: signals that enter the loop from outside. With a references, `noise` is the
-      standard deviation of $\chi y$.
+    - `references`: signals that enter the loop from outside. With them, `noise` is the standard
+      deviation of $\chi y$.
     - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
-      more multiplier or two, give multipliers outside of each other's confidence regions;
+      multiplier more, or two, give multipliers outside of each other's confidence regions;
       "feedback" if inputs answer earlier residuals, as by a controller: the fit is then biased;
       "undetermined"; "no convergence".
     """
