@@ -57,6 +57,9 @@ def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
       with the number of the experiment, the cycle and the section.
     - `Design`: a row for each cosine. `Trajectory`: a row for each end of a step.
     - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
+    - `PhaseCurve`, `ImpulseResponses`: a row for each value. `Sensitivity`: a row for each event.
+      `Identifiability`: a row for each parameter. `PlantCycle`: a row for each section.
+      `Population`: its `table`.
     - Other results that have findings: a row for each.
 
     Complex numbers get columns for their real and imaginary part, which R and CSV files can hold; H

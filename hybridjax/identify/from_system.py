@@ -100,8 +100,6 @@ def identify_model(
     """Identify the multipliers of a system from simulated experiments, with defaults for all steps:
     limit cycle, design, experiments, HTFs and fit.
 
-    Before: a system. After: `fit.interval()`, `hj.validate`, or the same steps one by one.
-
     **Arguments:**
 
     - `system`: a system with a guess of its own, or a limit cycle.
@@ -125,6 +123,9 @@ def identify_model(
     result = hj.identify_model(hj.models.VerticalHopper(), hj.ClockPhase(8), "yM")
     print(result)
     ```
+
+    **Before:** a system. **After:** `result.fit.interval()`, `hj.validate`, or the same steps one
+    by one.
     """
     say("limit cycle")
     cycle = system if isinstance(system, LimitCycle) else find_limit_cycle(system)
