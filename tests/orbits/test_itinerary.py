@@ -130,16 +130,34 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
     assert result(2.0) == hj.errors.Result.EVENT_ORDER
 
 
-def test_gradients_inside_of_programs_are_differences(free):
-    """By the field's parameters, and by the rate of the clock, which sets the period."""
+def test_an_event_in_the_last_step_of_a_turn_is_noticed():
+    """Also if the guard is positive again where the turn ends."""
+    gain = amplitude(1.0)
+    peak = np.arctan2(0.4 * 1.3, 1 - 1.3**2) / 1.3
+    after = hj.Guess("free", (0.9, -0.1), time=peak + 0.1)
+    known = hj.find_limit_cycle(Rebound(drive=0.99 / gain), after)
+
+    @jax.jit
+    def result(drive):
+        return hj.find_limit_cycle(Rebound(drive=drive), known).result
+
+    assert result(0.9999 / gain) == hj.errors.Result.OK
+    assert result(1.0005 / gain) == hj.errors.Result.EVENT_ORDER
+
+
+def test_gradients_inside_of_programs_are_differences():
+    """By the field's parameters, and by the rate of the clock, which sets the period. (With the
+    rebound, multipliers depend on the state, too.)"""
+    bouncing = hj.find_limit_cycle(Rebound(drive=2.0))
+    assert bouncing.event_sequence
 
     def state(drive, damping, rate):
         system = Rebound(drive=drive, damping=damping, rate=rate)
-        cycle = hj.find_limit_cycle(system, free)
+        cycle = hj.find_limit_cycle(system, bouncing)
         monodromy = jnp.linalg.multi_dot(cycle.factors[::-1])
         return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
 
-    value, at, h = jax.jit(state), np.array([0.5, 0.4, 1.3]), 1e-4
+    value, at, h = jax.jit(state), np.array([2.0, 0.4, 1.3]), 1e-4
     gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
         difference = (value(*(at + step)) - value(*(at - step))) / (2 * h)

@@ -19,6 +19,10 @@ FAMILIES = {
     "a list": hj.sections.SectionList(
         [hj.AtEvent("liftoff"), APEX, hj.AtEvent("touchdown")]
     ),
+    # (On each section the next one's function is negative, and rises before it falls.)
+    "two heights": hj.sections.SectionList(
+        [hj.Crossing("yM", "falling", value=2.0), hj.Crossing("vM", "falling")]
+    ),
 }
 
 
