@@ -167,7 +167,7 @@ class Bodies:
         q, u = self._state(a, course), self._no_input
         field = self._field(a, course.t, q)
         now = self._watched(a, row, course.t, q, field)
-        flags = self._noted(a, row, flags, _still(now))
+        flags = self._noted(a, row, flags, _still(now), same=body.at_once)
         delay, late = course.delay, jnp.zeros(())
         if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
             delay = jnp.zeros_like(delay)
@@ -304,28 +304,33 @@ class Bodies:
         inputs = () if self.inputs is None else (self.inputs,)
         return jax.vmap(function)(*columns, *inputs)
 
-    def _noted(self, a: int, row: Rows, flags: Flags, now: Watched) -> Flags:
-        """The flags at a row, where watched functions have these values."""
-        left = flags.left | self._has_left(row, flags.before, now, self._functions(a))
+    def _noted(
+        self, a: int, row: Rows, flags: Flags, now: Watched, same: bool = False
+    ) -> Flags:
+        """The flags at a row, where watched functions have these values; `same`: they must have the
+        signs of the recorded trajectory."""
+        if not self._functions(a):
+            return flags._replace(before=now)
+        left = flags.left | self._has_left(row, flags.before, now, same)
         return flags._replace(before=now, left=left)
 
     def _has_left(
-        self, row: Rows, before: Watched, now: Watched, functions: int
+        self, row: Rows, before: Watched, now: Watched, same: bool
     ) -> Bool[Array, ""]:
         """Test whether the itinerary is left between the row before and this one.
 
-        - Where a leg begins, watched functions must have the signs of the recorded trajectory.
+        - Where a leg begins, functions that were positive must be positive. One that was negative
+          may have risen sooner, unless signs must be the `same`: at an event at once.
         - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or
           later than recorded. (A fall is no event where its predicate does not hold.)
         - The one at whose zero the leg ends must have been positive, and must fall.
         """
-        if not functions:
-            return jnp.asarray(False)
         known = row.signs != 0
         known = known & (jnp.arange(self.width) != row.target)
         begins = jnp.isinf(before.value)
         # (Comparisons with NaN are false.)
-        other = begins & known & ~(jnp.sign(now.value) * row.signs > 0)
+        compared = known if same else known & (row.signs > 0)
+        other = begins & compared & ~(jnp.sign(now.value) * row.signs > 0)
         unknown = known & ~jnp.isfinite(now.value) & ~begins
         returns = known & ~begins & dips(before, now, jnp.sign(now.value))
         positive = (before.value > 0) & ~begins
