@@ -1,3 +1,12 @@
+"""Limit cycles of rhythmic hybrid systems, and how fast they recover from a small push.
+
+From equations, simulators or recordings to Floquet multipliers, transfer functions and their
+confidence regions. `hj.find_limit_cycle`, `hj.linearize`, `hj.run_experiments`,
+`hj.estimate_htf` and `hj.fit_multipliers` are steps of one path; `hj.identify_recording` and
+`hj.identify_model` take all steps at once. `dir(hj)` lists the names of a first day, and each
+namespace (`dir(hj.plot)`, ...) the others.
+"""
+
 from ._core.public import attach
 
 

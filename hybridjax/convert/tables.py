@@ -16,6 +16,7 @@ from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..experiments.record import SectionSeries
 from ..fitting.model_fit import Identifiability, ParameterComparison, ParameterFit
+from ..identify.from_system import ModelIdentification
 from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
 from ..identify.multipliers import OrderSelection
 from ..identify.rational import RationalFit
@@ -180,8 +181,9 @@ def _(thing: RationalFit) -> Any:
     return {"output": outputs, **poles, **_parts("", thing.multipliers.ravel())}
 
 
-@_columns.register
-def _(thing: Identification) -> Any:
+@_columns.register(Identification)
+@_columns.register(ModelIdentification)
+def _(thing: Identification | ModelIdentification) -> Any:
     return _columns(thing.fit)
 
 

@@ -37,8 +37,12 @@ def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
     zero = chart * 0
     armed = np.zeros((len(s.transitions), t.shape[0]), bool)
-    pace = np.array([[0.0], [np.inf], [0.0], [0.0]]) + zero
-    return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace)
+    return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace_of(zero))
+
+
+def pace_of(events: Index) -> Float[Array, "4 L"]:
+    """The pace (see `Lanes`) of lanes that have had no events, from an integer zero for each."""
+    return np.array([[0.0], [np.inf], [0.0], [0.0]]) + 0 * events
 
 
 def lane_at(s: Structure, chart: str, state: Array, t: ArrayLike, name: str) -> Lanes:

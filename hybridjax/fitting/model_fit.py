@@ -19,7 +19,7 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import p_value
 from ..errors import DefinitionError
-from ..identify.fit import Fit, not_converged
+from ..identify.fit import Fit, WithCost, not_converged
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
@@ -184,7 +184,7 @@ Truth = Union[HybridSystem, LimitCycle, "ParameterFit", Mapping[str, float]]
 """Values of parameters by name, or what has them."""
 
 
-class ParameterFit(Fit):
+class ParameterFit(WithCost, Fit):
     """What all fits of parameters share, with their system or without.
 
     **Fields:**
@@ -242,11 +242,11 @@ class ParameterFit(Fit):
             given = true
         if more := [name for name in given if name not in self.names]:
             raise DefinitionError(
-                f"`true` has another '{more[0]}', which was not fitted: free it."
+                f"the other values have another '{more[0]}', which was not fitted: free it."
             )
         if missing := [name for name in self.names if name not in given]:
             raise DefinitionError(
-                f"`true` must have a value of '{missing[0]}', which was fitted."
+                f"the other values lack '{missing[0]}', which was fitted."
             )
         return np.array([float(given[name]) for name in self.names])
 
@@ -264,6 +264,7 @@ class ParameterFit(Fit):
         weights = np.linalg.pinv(correlation, rcond=_RANK, hermitian=True)
         return float(missed / size @ weights @ (missed / size))
 
+    @checked
     def chi_square(self, true: Truth) -> float:
         """Return the squared distance of the values from other ones, in units of the covariance."""
         return self._distance(self._values_of(true) - self.values, self.covariance)

@@ -68,12 +68,6 @@ class Fit(Showable, eqx.Module):
         return np.abs(self.multipliers)
 
     @property
-    def chi2_per_dof(self) -> float:
-        """Chi-square (`cost`) per degree of freedom (`dof`), of fits that have both: about 1 if the
-        model and the standard deviations of the data are right."""
-        return self.cost / self.dof if self.dof else np.nan
-
-    @property
     @abstractmethod
     def standard_errors(self) -> Float[np.ndarray, " k"]:
         """Standard error of each estimated number."""
@@ -129,6 +123,22 @@ class Fit(Showable, eqx.Module):
 
     def _shown_findings(self) -> str:
         return print_findings(self.findings, "  ")
+
+
+class WithCost:
+    """A fit that minimizes a sum of squares."""
+
+    if TYPE_CHECKING:
+        cost: float
+
+        @property
+        def dof(self) -> float: ...
+
+    @property
+    def chi2_per_dof(self) -> float:
+        """Chi-square (`cost`) per degree of freedom (`dof`): about 1 if the model and the standard
+        deviations of the data are right."""
+        return self.cost / self.dof if self.dof else np.nan
 
 
 def not_converged(result: int) -> list[Finding]:

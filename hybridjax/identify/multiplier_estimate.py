@@ -248,7 +248,7 @@ class MultiplierFit(Fit):
         return self.multipliers[index] + x + 1j * y
 
     @checked
-    def compare(self, true: Truth) -> MultiplierComparison:
+    def compare(self, other: Truth) -> MultiplierComparison:
         """Pair the multipliers with true ones, or with those of another fit, and test whether all
         are equal; printing the result shows a table.
 
@@ -257,12 +257,12 @@ class MultiplierFit(Fit):
         each pair of multipliers to first order (Bonferroni). Estimated covariances are allowed for
         with the fewer degrees of freedom of both.
 
-        **Arguments:** `true`: multipliers, or a cycle, a model or a fit that has them.
+        **Arguments:** `other`: multipliers, or a cycle, a model or a fit that has them.
         """
-        paired = compare_multipliers(self.multipliers, true)
-        if isinstance(true, MultiplierFit):
-            p = self._p_value_of_fit(true, paired)
-        elif isinstance(true, Fit):
+        paired = compare_multipliers(self.multipliers, other)
+        if isinstance(other, MultiplierFit):
+            p = self._p_value_of_fit(other, paired)
+        elif isinstance(other, Fit):
             p = None  # (The covariance of its multipliers is unknown.)
         else:
             p = self._p_value_of_truth(paired.true)

@@ -22,7 +22,7 @@ from ..linear.ldtp import LDTP
 from . import variable_projection as varpro, weights
 from .denominator import divided_by_chi, multipliers_of
 from .descent import ROUNDING, Coefficients
-from .fit import not_converged
+from .fit import WithCost, not_converged
 from .multiplier_estimate import (
     FitWithoutModel,
     RoughFit,
@@ -34,7 +34,7 @@ from .multiplier_estimate import (
 _REWEIGHTINGS = 2
 
 
-class StructuredFit(FitWithoutModel):
+class StructuredFit(WithCost, FitWithoutModel):
     r"""All harmonics, outputs and inputs with one denominator in $z^{-N}$.
 
     $$H_m(z) = \frac{B_m(z^{-1})}{\chi(z^{-N})}, \qquad

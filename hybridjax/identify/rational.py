@@ -88,7 +88,7 @@ class RationalFit(Showable, eqx.Module):
 
     @checked
     def compare(
-        self, true: Truth, output: str | int | None = None
+        self, other: Truth, output: str | int | None = None
     ) -> MultiplierComparison:
         """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
         There is no test: the errors of this fit are not known.
@@ -98,7 +98,7 @@ class RationalFit(Showable, eqx.Module):
         chosen = range(len(self.outputs))
         if output is not None:
             chosen = [channel_index("output", output, self.outputs)]
-        parts = [compare_multipliers(self.multipliers[k], true) for k in chosen]
+        parts = [compare_multipliers(self.multipliers[k], other) for k in chosen]
         names: list[str] = []
         for k, part in zip(chosen, parts, strict=True):
             names += [self.outputs[k]] * len(part.true)

@@ -650,7 +650,7 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
 
 def derived_if_found(cycle: LimitCycle) -> LimitCycle:
     """A traced cycle whose derivatives are NaN where it is none."""
-    found = (cycle.result == Result.OK) | (cycle.result == Result.SINGULAR)
+    found = jnp.isin(cycle.result, jnp.array(_FOUND))
 
     def numbers(x: LimitCycle):
         return x.period, x.anchor.q, x.legs.t, x.legs.q, x.factors

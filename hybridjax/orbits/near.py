@@ -19,7 +19,7 @@ from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
 from ..engine.itinerary.rows import Form, Itinerary
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, pace_of
 from ..systems.system import copies_of
 from ..systems.transition import TOGETHER
 from .crossing import AtEvent
@@ -202,15 +202,13 @@ def _cycle(
 ) -> LimitCycle:
     """The cycle that Newton's method has found on an itinerary of a route."""
     passage = found.passage
-    K = len(itinerary.charts)
-    pace = np.tile([[0.0], [np.inf], [0.0], [0.0]], K)
     legs = Lanes(
         passage.legs_t,
         itinerary.charts,
         passage.legs_q.T,
         itinerary.armed,
         itinerary.begins,
-        pace,
+        pace_of(itinerary.begins),
     )
     anchor = map.anchor._replace(q=found.q[:, None])
     return LimitCycle(

@@ -16,6 +16,7 @@ from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
 from ..experiments.record import SectionSeries
 from ..fitting.model_fit import Identifiability, ParameterFit
+from ..identify.from_system import ModelIdentification
 from ..identify.loops import Loop
 from ..identify.multiplier_estimate import MultiplierComparison, MultiplierFit
 from ..identify.multipliers import OrderSelection
@@ -100,6 +101,11 @@ def _(result: LimitCycles, **options: Any) -> Plot:
 @draw.register
 def _(result: Identification, **options: Any) -> Plot:
     return draw(result.fit, **options)
+
+
+@draw.register
+def _(result: ModelIdentification, **options: Any) -> Plot:
+    return plane.multipliers(result.model, {"fit": result.fit}, **options)
 
 
 @draw.register

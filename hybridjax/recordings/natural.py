@@ -96,10 +96,10 @@ class NaturalMultipliers(Showable, eqx.Module):
         low, high = self.interval(level)[order].T
         return (low <= np.abs(paired.true)) & (np.abs(paired.true) <= high)
 
-    def compare(self, true: Truth) -> MultiplierComparison:
+    def compare(self, other: Truth) -> MultiplierComparison:
         """Pair the multipliers with true ones, or with those of another fit. There is no test: see
         `interval`."""
-        return compare_multipliers(self.multipliers, true)
+        return compare_multipliers(self.multipliers, other)
 
     def interval(
         self,

@@ -23,7 +23,7 @@ from .._core.results import Result, update_result
 from ..engine.arrays import Array
 from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded_walk
 from ..engine.itinerary.turn import Passage, Travelers, follow
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, pace_of
 from ..engine.target import AbstractLevels
 from ..orbits.crossing import Crossing, ListLevels
 from ..orbits.cycle import LimitCycle
@@ -185,7 +185,7 @@ def walked(
         q=passage.legs_q.T,
         armed=jnp.asarray(walk.armed),
         events=jnp.asarray(walk.events),
-        pace=jnp.tile(jnp.array([[0.0], [jnp.inf], [0.0], [0.0]]), N),
+        pace=pace_of(jnp.asarray(walk.events)),
     )
     duration = jnp.diff(passage.legs_t, append=passage.t[None])
     fields = bound, lanes, None, duration, jnp.full(N, code)

@@ -359,6 +359,10 @@ ATTRIBUTES = {
     "LDTP.dt": "a model has `n_sections` samples in a period; time is not part of it",
     "LDTP.n_states": "`model.dims` has the dimension of the state at each section",
     "LDTP.step_response": "`model.simulate(np.ones((n, nu)))` returns it",
+    "LimitCycle.simulate": "`cycle.trajectory()` follows the cycle, and "
+    "`hj.simulate(system, chart, state, duration)` another state",
+    "LimitCycle.step": "`cycle.responses()` has the responses to brief pushes, and "
+    "`cycle.sensitivity(parameter)` those to lasting changes",
     "LimitCycle.monodromy": "`cycle.multipliers` has the eigenvalues, and "
     "`hj.sections.section_map(cycle, sections, 0, 0)` the return map between sections",
     "LimitCycle.frequency": "`1 / cycle.period` is the frequency",
@@ -429,11 +433,15 @@ NAMES = {
     "bode_plot": "hj.plot.bode(htf)",
     "compare": "fit.compare(other)",
     "convert.to_numpy": "result.to_pandas().to_numpy()",
+    "create_info": "hj.Recording(time, signals, units=...)",
+    "cross_val_score": "hj.validate(fit, data)",
     "cycle": "hj.find_limit_cycle(system)",
+    "datasets": "hj.testing.simulate_recording(cycle, inputs, outputs, rate)",
     "diffeqsolve": "hj.simulate(system, chart, state, duration)",
     "dlsim": "model.simulate(u)",
     "eigenvalues": "cycle.multipliers",
     "enable_double": "hj.enable_x64()",
+    "find_events": "hj.Crossing('y', 'falling')",
     "fit": "hj.fit_multipliers(htf, order) or hj.fit_series(data, order)",
     "floquet": "hj.find_limit_cycle(system).multipliers",
     "floquet_multipliers": "hj.find_limit_cycle(system).multipliers",
@@ -444,8 +452,12 @@ NAMES = {
     "impulse_response": "model.impulse_response(n_lags)",
     "initial_response": "model.simulate(u, x0)",
     "integrate": "hj.simulate(system, chart, state, duration)",
+    "load_dataset": "hj.read_recording(path)",
     "load_recording": "hj.read_recording(path)",
     "lsim": "model.simulate(u)",
+    "metrics": "hj.validate(fit, data)",
+    "models.Hopper": "hj.models.VerticalHopper()",
+    "models.Walker": "hj.models.CompassGait()",
     "monodromy": "hj.linearize(cycle, sections)",
     "multipliers": "hj.find_limit_cycle(system).multipliers",
     "noise": "hj.experiments.add_noise(data, std=...)",
@@ -460,9 +472,12 @@ NAMES = {
     "poles": "model.multipliers",
     "prc": "cycle.responses()",
     "random_walk": "hj.experiments.random_input(duration, rate, bandwidth)",
+    "RawArray": "hj.Recording(time, signals)",
+    "StateSpace": "hj.linear.LDTP(A, B, C, D)",
     "read_c3d": "hj.read_recording(path)",
     "read_csv": "hj.read_recording(path)",
     "read_mat": "hj.read_recording(path)",
+    "read_raw": "hj.read_recording(path)",
     "return_map": "hj.sections.section_map(cycle, sections, i, j)",
     "run": "hj.run_experiments(cycle, sections, design, outputs)",
     "shooting": "hj.find_limit_cycle(system)",
@@ -476,6 +491,7 @@ NAMES = {
     "subjects": "hj.identify_subjects(table, folder)",
     "tf": "model.htf(frequencies)",
     "transfer_function": "model.htf(frequencies)",
+    "train_test_split": "hj.recordings.hold_out(data, order)",
     "trajectory": "hj.simulate(system, chart, state, duration)",
 }
 """Names that a module has not, and the call that does what they mean. Those of the package stand
@@ -518,6 +534,10 @@ class UnknownAttribute(HybridJaxError, AttributeError):
 
     def __str__(self) -> str:
         return about_attribute(*self._of)
+
+    def __reduce__(self) -> Any:
+        # (Processes hand on the sentence: the class may not exist elsewhere.)
+        return AttributeError, (str(self),)
 
 
 def missing_attribute(self: Any, name: str) -> Any:
@@ -587,13 +607,17 @@ NEEDS = {
     "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
     "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
+    "estimate_phase.sections": "an event that happens once a cycle, such as "
+    "`hj.Crossing('y', 'falling')` of a signal 'y'",
+    "identify_recording.sections": "an event that happens once a cycle, such as "
+    "`hj.Crossing('y', 'falling')` of a signal 'y'",
 }
-"""What a missing argument is."""
+"""What a missing argument is, of any function or of one."""
 
 
 def about_missing(function: str, name: str, kind: Kind | None) -> str:
     """Return the sentence about an argument that a function needs."""
-    lead = NEEDS.get(name)
+    lead = NEEDS.get(f"{function.rpartition('.')[2]}.{name}", NEEDS.get(name))
     if lead is not None:
         return f"{function} needs `{name}`: {lead}."
     about = "" if kind is None else f" ({kind.allowed})"

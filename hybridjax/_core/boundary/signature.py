@@ -43,6 +43,9 @@ class ShortSignature(inspect.Signature):
     def return_annotation(self) -> Any:
         return self._readable.return_annotation
 
+    def __reduce__(self) -> Any:
+        return self._readable.__reduce__()
+
     def replace(self, **changes: Any) -> inspect.Signature:  # type: ignore[override]
         return self._readable.replace(**changes)
 

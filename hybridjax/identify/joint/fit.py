@@ -26,7 +26,7 @@ from ...linear.ldtp import LDTP
 from .. import weights
 from ..denominator import Covariance, multipliers_of
 from ..descent import Spread
-from ..fit import not_converged
+from ..fit import WithCost, not_converged
 from ..instrument import in_loop
 from ..multiplier_estimate import MultiplierFit, RoughFit
 from ..periodic import (
@@ -60,7 +60,7 @@ Guess = LDTP | Dimensions
 _ANSWERED = 5.0
 
 
-class LDTPFit(MultiplierFit):
+class LDTPFit(WithCost, MultiplierFit):
     r"""A linear periodic model that maximizes the likelihood, and its uncertainty.
 
     **Fields** beside those of every `Fit`:
