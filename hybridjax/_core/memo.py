@@ -1,5 +1,6 @@
 """Values that are computed once for an object, and forgotten with it."""
 
+import collections
 import functools
 import weakref
 from collections.abc import Callable, Hashable
@@ -39,6 +40,31 @@ class Memory:
             weakref.finalize(owner, self._values.pop, name, None).atexit = False
         values = self._values[name]
         return values[key] if key in values else values.setdefault(key, make())
+
+
+class Recent:
+    """The last values that were computed for objects. They may refer to these, which are kept, too:
+    a `Memory` of such values would keep all of them for ever."""
+
+    def __init__(self, size: int):
+        self._size = size
+        self._kept: collections.OrderedDict[tuple[int, ...], tuple] = (
+            collections.OrderedDict()
+        )
+
+    def get(self, *owners: Any) -> Any:
+        """Return the value that is kept for these objects, or None."""
+        kept = self._kept.get(tuple(map(id, owners)))
+        return None if kept is None else kept[1]
+
+    def keep(self, value: Value, *owners: Any) -> Value:
+        """Keep a value for these objects, in place of another one, and return it."""
+        key = tuple(map(id, owners))
+        self._kept[key] = owners, value
+        self._kept.move_to_end(key)
+        while len(self._kept) > self._size:
+            self._kept.popitem(last=False)
+        return value
 
 
 class remembered:  # noqa: N801 (a decorator, as `property` is)

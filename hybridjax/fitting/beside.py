@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from .._core.compilation import identity, whole
 from .._core.executor import on_the_cpu
+from .._core.memo import Recent
 from .._core.results import Result
 from ..engine.arrays import Array
 from ..orbits.cycle import LimitCycle
@@ -27,14 +28,22 @@ from .observations import ObservedHTF, ObservedSeries
 from .problem import FitProblem, evaluate
 
 
-# Evaluations of problems of a class after which they are compiled. Fewer: a program is compiled
-# that few evaluations use. More: many fits, as of a bootstrap, stay slow for longer.
-WORTH_COMPILING = 200
+# Evaluations of problems of a class after which they are compiled: compilation takes as long as so
+# many. Fewer: a program is compiled that few evaluations use. More: many fits, as of a bootstrap,
+# stay slow for longer.
+WORTH_COMPILING = 24
 # Directions that forward mode takes. More: a model with more free parameters needs no search, but
 # the memory of programs grows with their number.
 _MOST_DIRECTIONS = 64
 
+# Known cycles of a fit. Fewer: fits whose events pass sections search anew each time. More: each
+# evaluation that leaves the first takes longer.
+_MOST_KNOWN = 4
+
 _evaluations: collections.Counter = collections.Counter()
+_shared = Recent(8)
+"""Known cycles, with what is repeated beside them, by the cycle from which fits begin and the
+families of sections."""
 
 
 class Beside(NamedTuple):
@@ -49,14 +58,18 @@ class Beside(NamedTuple):
 class Model:
     """Residuals and their Jacobian, by a program beside known cycles.
 
-    Where the route of the known cycle is left, the search finds the cycle, which becomes the known
-    one; the program stays the same.
+    Where the routes of all known cycles are left, the search finds the cycle, which becomes one
+    more of these; the program stays the same. Fits that begin from the same cycle share them.
     """
 
     def __init__(self, problem: FitProblem, known: LimitCycle):
         self._problem, self._known = problem, known
-        self._beside: Beside | None = None
-        self._is_new = True
+        self._on_device = on_device(problem)
+        families = _families(problem.observations)
+        besides = _shared.get(known, *families)
+        if besides is None:
+            besides = _shared.keep([], known, *families)
+        self._besides: list[tuple[LimitCycle, Beside]] = besides
         self._class = identity((on_device(known.return_map), problem))
 
     def __call__(
@@ -66,24 +79,36 @@ class Model:
         _evaluations[self._class] += 1
         if _evaluations[self._class] <= WORTH_COMPILING:
             return evaluate(problem, x, guess)
-        if self._is_new:
-            self._beside, self._is_new = _beside(problem, self._known), False
         found = self._evaluated(x, guess)
-        if found is None and self._beside is not None:
-            cycle = self.cycle_at(x, guess)
-            if int(cycle.result) == Result.OK:
-                self._beside = _beside(problem, cycle)
-                found, guess = self._evaluated(x, cycle), cycle
+        if found is None:
+            found = self._with_another(x, guess)
         if found is None:
             return evaluate(problem, x, guess)
         near = dataclasses.replace(guess, anchor=found.anchor, period=found.period)
         return found.residuals, found.jacobian, near
 
+    @property
+    def known(self) -> LimitCycle | None:
+        """The cycle whose route the program has followed; None without a program."""
+        return self._besides[0][0] if self._besides else None
+
     def is_beside(self, x: np.ndarray, guess: LimitCycle) -> bool:
         """Test whether the cycle with the parameters at x is found without a search."""
         return self._evaluated(x, guess) is not None
 
-    def cycle_at(self, x: np.ndarray, guess: LimitCycle) -> LimitCycle:
+    def _with_another(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
+        """The model by one known cycle more: the first, or one that a search finds at x."""
+        cycle = self._cycle_at(x, guess) if self._besides else self._known
+        if int(cycle.result) != Result.OK:
+            return None
+        beside = _beside(self._problem, cycle)
+        if beside is None:
+            return None
+        self._besides.insert(0, (cycle, on_device(beside)))
+        del self._besides[_MOST_KNOWN:]
+        return self._evaluated(x, cycle)
+
+    def _cycle_at(self, x: np.ndarray, guess: LimitCycle) -> LimitCycle:
         """The cycle with the parameters at x, converged or not, by a search."""
         parameters = self._problem.parameters
         values = parameters.decode(jnp.asarray(x))
@@ -91,12 +116,15 @@ class Model:
         return find_limit_cycle(system, guess, throw=False)
 
     def _evaluated(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
-        if self._beside is None:
-            return None
-        q = np.asarray(guess.anchor.q)[:, 0]
-        found = _run(self._problem, np.asarray(x), q, self._beside)
-        well = int(found.result) == Result.OK and np.isfinite(found.residuals).all()
-        return found if well else None
+        """The model by a known cycle, which becomes the first to be tried; None if it leaves the
+        routes of all."""
+        for k, (_, beside) in enumerate(self._besides):
+            q = np.asarray(guess.anchor.q)[:, 0]
+            found = _run(self._on_device, np.asarray(x), q, beside)
+            if int(found.result) == Result.OK and np.isfinite(found.residuals).all():
+                self._besides.insert(0, self._besides.pop(k))
+                return found
+        return None
 
 
 class Evaluated(NamedTuple):
@@ -146,7 +174,6 @@ def _run(
     problem: FitProblem, x: np.ndarray, q: np.ndarray, beside: Beside
 ) -> Evaluated:
     """Residuals and Jacobian at coordinates x, from a state q near the cycle's beginning."""
-    problem, beside = on_device((problem, beside))
     with on_the_cpu():
         program = whole(_evaluated, (), (problem, beside), loops=True)
         return program(x, q)

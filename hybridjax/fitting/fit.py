@@ -11,11 +11,12 @@ from jaxtyping import Array, Float
 from .._core.arguments import searching
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Seed
+from .._core.memo import Recent
 from .._core.progress import counted, working
 from .._core.results import Result
 from ..errors import ComputationError, DefinitionError
 from ..orbits.curve import away_from_events
-from ..orbits.cycle import LimitCycle
+from ..orbits.cycle import LimitCycle, what_changed
 from ..orbits.find import find_limit_cycle
 from ..orbits.guess import require_similar
 from ..systems.quotient import check_symmetry
@@ -47,6 +48,9 @@ _PERFECT = 1e-12
 # less than so many of its standard deviations. Larger: local minima are accepted. Smaller: global
 # ones are not, and all guesses are tried.
 _LIKELY = 4.0
+
+_starts = Recent(8)
+"""The limit cycles from which fits of systems without a guess have begun."""
 
 
 @checked
@@ -127,7 +131,7 @@ def fit_model(
             f"none of {guesses} guesses has a limit cycle on which the data can be observed "
             f"({why}): give another system, or more `guesses`."
         )
-    return _summary(problem, system, ends, best)
+    return _summary(problem, system, ends, best, model.known or best.cycle)
 
 
 @checked
@@ -182,6 +186,22 @@ def _prepare(
             "`data` must be one observation or more, not an empty list."
         )
     parameters = free_parameters(system, free, observations)
+    near = _known_cycle(system, guess)
+    for name in {*parameters.names} - {*DELAYS}:
+        check_symmetry(near.system, near.structure.sizes(near.settings.scale), name)
+    prepared = tuple(observation.prepare(near) for observation in observations)
+    if len({bool(observation.weighted) for observation in prepared}) > 1:
+        raise DefinitionError("give standard deviations of all data, or of none.")
+    return FitProblem(parameters, prepared), near
+
+
+def _known_cycle(system: HybridSystem, guess: Guess | LimitCycle | None) -> LimitCycle:
+    """The cycle near which others are searched for. Fits of the same system from no guess, as of
+    many draws of data, share it, and what is recorded of it."""
+    if guess is None:
+        known: LimitCycle | None = _starts.get(system)
+        if known is not None and not what_changed(known.system, known.numbers):
+            return known
     with searching("as `guess`"):
         near = (
             guess if isinstance(guess, LimitCycle) else find_limit_cycle(system, guess)
@@ -190,12 +210,7 @@ def _prepare(
     moved = away_from_events(near)
     if moved is not near:
         near = find_limit_cycle(near.system, moved, settings=near.settings)
-    for name in {*parameters.names} - {*DELAYS}:
-        check_symmetry(near.system, near.structure.sizes(near.settings.scale), name)
-    prepared = tuple(observation.prepare(near) for observation in observations)
-    if len({bool(observation.weighted) for observation in prepared}) > 1:
-        raise DefinitionError("give standard deviations of all data, or of none.")
-    return FitProblem(parameters, prepared), near
+    return _starts.keep(near, system) if guess is None else near
 
 
 def _relative(
@@ -265,7 +280,11 @@ def _descend(
 
 
 def _summary(
-    problem: FitProblem, system: HybridSystem, ends: list[End], best: End
+    problem: FitProblem,
+    system: HybridSystem,
+    ends: list[End],
+    best: End,
+    near: LimitCycle,
 ) -> ModelFit:
     parameters = problem.parameters
 
@@ -278,7 +297,9 @@ def _summary(
         )
         for end in ends
     )
-    cycle = _cycle_at(problem, system, best.x, best.cycle)
+    cycle = _cycle_at(problem, system, best.x, near)
+    if int(cycle.result) != Result.OK:
+        cycle = _cycle_at(problem, system, best.x, best.cycle)
     values = decode(best.x)
     size = np.asarray(_sizes(jnp.asarray(values)))
     sensitivity = _relative(parameters, jnp.asarray(best.x), best.jacobian)

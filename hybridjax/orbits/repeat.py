@@ -249,6 +249,8 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
         closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
+        # (The next turn begins its corrections where those of this one ended.)
+        closed = closed & (passage.last <= LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
 
     def going(carry):

@@ -89,6 +89,8 @@ class Walk(eqx.Module):
 
 
 _walks = Memory()
+_recorded = Memory()
+"""Each family, whose number stays its own for that reason, with its walk."""
 
 
 def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
@@ -97,6 +99,12 @@ def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 
     **Raises:** as `place_sections`.
     """
+    return _recorded.recall(cycle, id(family), lambda: (family, _walk(cycle, family)))[
+        1
+    ]
+
+
+def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     if family.points > 1 or not has_route(cycle.return_map):
         return None
     with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
 import hybridjax as hj
 from hybridjax.fitting import beside
+
+from ..toys import Field
 
 
 APEX = hj.Crossing("vM", "falling")
@@ -36,3 +39,54 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     # (The Jacobian, by relative changes of the parameters.)
     found, known = (x.identifiability.sensitivity for x in (fit, expected))
     np.testing.assert_allclose(found, known, rtol=0, atol=1e-6 * np.abs(known).max())
+
+
+@pytest.mark.slow
+def test_later_fits_share_what_is_known_but_see_changes(monkeypatch):
+    """A second fit of a system searches nothing, and has the result of a first one for its data;
+    one after a change of the code has that of the new code."""
+    rate = 2.0
+
+    class Decay(hj.HybridSystem):
+        """Falls at a rate to 1, and jumps to 2."""
+
+        speed: Float[Array, ""] = hj.parameter(1.0, doc="of the fall")
+
+        def charts(self):
+            return {"fall": Field(("x",), lambda t, q, u: (-rate * self.speed * q[0],))}
+
+        def transitions(self):
+            jump = dict(guard=lambda t, q, u: q[0] - 1.0, reset=lambda t, q, u: (2.0,))
+            return (hj.Transition("jump", "fall", "fall", **jump),)
+
+        def guess(self):
+            return hj.Guess("fall", (1.5,))
+
+    def period(speed):
+        return np.log(2) / (rate * speed)
+
+    searches = []
+    search = beside.find_limit_cycle
+
+    def counted(*arguments, **options):
+        searches.append(arguments)
+        return search(*arguments, **options)
+
+    monkeypatch.setattr(beside, "WORTH_COMPILING", 0)
+    monkeypatch.setattr(beside, "find_limit_cycle", counted)
+    system = Decay()
+    at_jump = [hj.AtEvent("jump")]
+
+    def fitted(speed):
+        data = hj.fitting.ObservedCycle(at_jump, period=period(speed))
+        return hj.fit_model(system, data, ["speed"]).values[0]
+
+    assert fitted(1.1) == pytest.approx(1.1, rel=1e-8)
+    searches.clear()
+    assert fitted(0.95) == pytest.approx(0.95, rel=1e-8)
+    assert not searches
+    observed = period(0.95)
+    rate = 4.0
+    data = hj.fitting.ObservedCycle(at_jump, period=observed)
+    changed = hj.fit_model(system, data, ["speed"]).values[0]
+    assert changed == pytest.approx(0.95 / 2, rel=1e-8)

@@ -89,6 +89,78 @@ class Watched(NamedTuple):
         return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
 
 
+class Row(NamedTuple):
+    """One row for the program: its columns (see `Rows`), and numbers by its body."""
+
+    leg: Int[Array, ""]
+    target: Int[Array, ""]
+    place: Int[Array, ""]
+    piece: Int[Array, ""]
+    onward: Bool[Array, ""]
+    section: Int[Array, ""]
+    way: Int[Array, ""]
+    """Number among `Form.ways`."""
+    chart: Int[Array, ""]
+    """Number among `Form.charts`."""
+    kind: Int[Array, ""]
+    """Number among `Form.kinds`; for a level the one after them."""
+    ends_leg: Bool[Array, ""]
+    is_jump: Bool[Array, ""]
+    at_once: Bool[Array, ""]
+    scheduled: Bool[Array, ""]
+    """Whether it is a jump at a time of a schedule."""
+    fraction: Float[Array, ""]
+    signs: Int[Array, " G"]
+
+
+class Table(NamedTuple):
+    """R rows in few arrays: the program reads each at once."""
+
+    numbers: Int[Array, "R K"]
+    """The first fields of `Row`, in order, then the signs."""
+    fraction: Float[Array, " R"]
+
+    def row(self, k: Int[Array, ""]) -> Row:
+        return read(Table(self.numbers[k], self.fraction[k]))
+
+
+def read(one: Table) -> Row:
+    """The row in one line of a table."""
+    *fields, _, _ = Row._fields
+    values = {x: one.numbers[i] for i, x in enumerate(fields)}
+    for name in ("onward", "ends_leg", "is_jump", "at_once", "scheduled"):
+        values[name] = values[name] > 0
+    return Row(**values, fraction=one.fraction, signs=one.numbers[len(fields) :])
+
+
+def tabulated(s: Structure, form: Form, rows: Rows) -> Table:
+    """The rows of an itinerary for its program."""
+    ways, kinds = form.ways, form.kinds
+    chart = {a: k for k, a in enumerate(form.charts)}
+
+    def of_body(body: Body) -> tuple[int, ...]:
+        is_jump = body.does == JUMP
+        scheduled = is_jump and isinstance(
+            s.transitions[body.transition].guard, Scheduled
+        )
+        return (
+            ways.index(body.way),
+            chart.get(body.chart, 0),
+            kinds.index(body.kind) if is_jump else len(kinds),
+            body.does != STEP,
+            is_jump,
+            body.at_once,
+            scheduled,
+        )
+
+    by_body = jnp.asarray(np.array([of_body(x) for x in form.bodies], np.int32))
+    own = rows.leg, rows.target, rows.place, rows.piece, rows.onward, rows.section
+    columns = jnp.stack([jnp.asarray(x, jnp.int32) for x in own], axis=1)
+    signs = jnp.asarray(rows.signs, jnp.int32)
+    numbers = [columns, by_body[jnp.asarray(rows.body)], signs]
+    return Table(jnp.concatenate(numbers, axis=1), jnp.asarray(rows.fraction))
+
+
 class Travelers(NamedTuple):
     """Whose trajectories follow an itinerary: one system, or many in lanes.
 
@@ -115,7 +187,7 @@ class Constants(NamedTuple):
     numbers: Any
     levels: AbstractLevels | None
     settings: Settings
-    rows: Rows
+    rows: Table
     count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
     begin: tuple
     known: Float[Array, " E"] | None
@@ -134,14 +206,13 @@ class Bodies:
     solver: Callable[[int], steps.Solver]
     inputs: Float[Array, "C nu"] | None = None
 
-    def take(self, motion: Motion, row: Rows, course: Any, flags: Flags):
+    def take(self, motion: Motion, row: Row, course: Any, flags: Flags):
         """The course, which moves, and the flags after a row."""
         ways = self.form.ways
         branches = [ft.partial(self._way, way, motion, row) for way in ways]
-        number = self._by_body(row, lambda body: ways.index(body.way))
-        return chosen(number, branches, course, flags)
+        return chosen(row.way, branches, course, flags)
 
-    def _way(self, way: Body, motion: Motion, row: Rows, course, flags: Flags):
+    def _way(self, way: Body, motion: Motion, row: Row, course, flags: Flags):
         if way.does == NOTHING:
             return course, flags
         if way.does == SCHEDULE:
@@ -151,11 +222,10 @@ class Bodies:
             return motion.apply(self._lane(self._time, row), course, flags)
         return self._act(motion, row, course, flags)
 
-    def _act(self, motion: Motion, row: Rows, course, flags: Flags):
+    def _act(self, motion: Motion, row: Row, course, flags: Flags):
         """A row that begins in a chart: a step, or the end of a leg."""
         course, now = self._in_chart(motion, row, self._observe, course)
-        is_at_once = self._by_body(row, lambda body: body.at_once)
-        noted = self._lane(self._noted, row, is_at_once)
+        noted = self._lane(self._noted, row)
         flags, _ = Alone(motion.constants).apply(noted, flags, now)
         does = {body.does for body in self.form.bodies}
         branches = []
@@ -163,9 +233,7 @@ class Bodies:
             branches.append(ft.partial(self._step, motion, row))
         if does & {JUMP, LEVEL}:
             branches.append(ft.partial(self._end, motion, row))
-        ends_leg = self._by_body(row, lambda body: body.does != STEP)
-        course, flags = chosen(ends_leg.astype(int), branches, course, flags, now)
-        return course, flags
+        return chosen(row.ends_leg.astype(int), branches, course, flags, now)
 
     # Stages, and numbers of rows.
 
@@ -183,26 +251,16 @@ class Bodies:
         return stage
 
     def _in_chart(
-        self, motion: Motion, row: Rows, function: Callable, moving, notes=None
+        self, motion: Motion, row: Row, function: Callable, moving, notes=None
     ):
         """What moves, and the notes, after the stage of the chart in which a row begins."""
         stages = [self._lane(function, a, row) for a in self.form.charts]
-        return choose(motion, self._chart(row), stages, moving, notes)
-
-    def _by_body(self, row: Rows, of: Callable[[Body], int | bool]) -> Array:
-        """A number of a row by its body."""
-        return jnp.asarray(np.array([of(body) for body in self.form.bodies]))[row.body]
-
-    def _chart(self, row: Rows) -> Int[Array, ""]:
-        """The number among `form.charts` of the chart in which a row begins."""
-        charts = self.form.charts
-        number = {a: k for k, a in enumerate(charts)}
-        return self._by_body(row, lambda body: number.get(body.chart, 0))
+        return choose(motion, row.chart, stages, moving, notes)
 
     # Rows that begin in no chart.
 
     def _schedule(
-        self, g: int, row: Rows, s: Structure, _, course: Course, flags: Flags
+        self, g: int, row: Row, s: Structure, _, course: Course, flags: Flags
     ):
         """A leg begins whose end is known: the tick nearest to the guess."""
         guard = s.transitions[g].guard
@@ -210,7 +268,7 @@ class Bodies:
         tick = guard.nearest(course.ends[row.leg])
         return course._replace(ends=course.ends.at[row.leg].set(tick)), flags
 
-    def _time(self, row: Rows, s: Structure, _, course: Course, flags: Flags):
+    def _time(self, row: Row, s: Structure, _, course: Course, flags: Flags):
         """The arrival at a time that is known."""
         # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
         misses = course.ends[row.leg] - course.t
@@ -219,7 +277,7 @@ class Bodies:
 
     # What a row sees where it begins.
 
-    def _observe(self, a: int, row: Rows, s: Structure, constants, course: Course, _):
+    def _observe(self, a: int, row: Row, s: Structure, constants, course: Course, _):
         """The field of chart a, and its watched functions."""
         q = _state(s, a, course)
         t, u = course.t, jnp.zeros(s.nu)
@@ -243,15 +301,14 @@ class Bodies:
                 enabled = enabled.at[place].set(s.enabled(g, t, q, u))
         return course, _still(Watched(t, value, rate, enabled))
 
-    def _noted(self, row: Rows, same, s: Structure, _, flags: Flags, now: Watched):
-        """The flags at a row, where watched functions have these values; `same`: they must have the
-        signs of the recorded trajectory."""
-        left = flags.left | _has_left(row, flags.before, now, same)
+    def _noted(self, row: Row, s: Structure, _, flags: Flags, now: Watched):
+        """The flags at a row, where watched functions have these values."""
+        left = flags.left | _has_left(row, flags.before, now)
         return flags._replace(before=now, left=left), None
 
     # Steps.
 
-    def _step(self, motion: Motion, row: Rows, course, flags: Flags, now: Watched):
+    def _step(self, motion: Motion, row: Row, course, flags: Flags, now: Watched):
         """A part of the leg, or a Newton step on a watched function."""
         course, _ = motion.apply(self._lane(self._departed, row), course, None)
         moving, error = self._advanced(motion, row, course)
@@ -259,7 +316,7 @@ class Bodies:
         flags = flags._replace(error=jnp.maximum(flags.error, error))
         return course, self._without_tick(motion, row, course, flags)
 
-    def _departed(self, row: Rows, s: Structure, _, course: Course, notes):
+    def _departed(self, row: Row, s: Structure, _, course: Course, notes):
         """The course with the length of the step, and with columns that begin anew, if a piece
         begins. (`follow` keeps those of the piece before.)
 
@@ -273,7 +330,7 @@ class Bodies:
             unit = jnp.concatenate([-course.rate[None], jnp.eye(C - 1, d)])
             delay = delay.at[0].set(1.0)
         dims = jnp.asarray([s.dims[a] for a in self.form.charts])
-        unit = jnp.where(jnp.arange(d) < dims[self._chart(row)], unit, 0.0)
+        unit = jnp.where(jnp.arange(d) < dims[row.chart], unit, 0.0)
         begins = row.piece < self.form.pieces
         columns = jnp.where(begins, unit, course.y[1:])
         h = row.fraction * (course.ends[row.leg] - course.begin)
@@ -288,17 +345,17 @@ class Bodies:
         )
         return course, notes
 
-    def _advanced(self, motion: Motion, row: Rows, course):
+    def _advanced(self, motion: Motion, row: Row, course):
         """The course with the state and its columns after a step, and the error of the state
         relative to what is allowed."""
         charts = self.form.charts
         solvers = list(dict.fromkeys(self.solver(a) for a in charts))
         branches = [ft.partial(self._advanced_by, x, motion, row) for x in solvers]
         number = jnp.asarray([solvers.index(self.solver(a)) for a in charts])
-        y, error = chosen(number[self._chart(row)], branches, course)
+        y, error = chosen(number[row.chart], branches, course)
         settings = motion.constants.settings
         assert settings.scale is not None and settings.rtol is not None
-        scale = jnp.asarray(settings.scale)[jnp.asarray(charts)][self._chart(row)]
+        scale = jnp.asarray(settings.scale)[jnp.asarray(charts)][row.chart]
         begin = motion.values(course).y[..., 0, :]
         end = motion.values(y)[..., 0, :]
         allowed = settings.rtol * jnp.maximum(jnp.abs(begin), jnp.abs(end))
@@ -308,11 +365,11 @@ class Bodies:
         error = _still(jnp.max(relative, axis=-1, initial=0.0))
         return motion.join(course, y), error
 
-    def _advanced_by(self, solver: steps.Solver, motion: Motion, row: Rows, course):
+    def _advanced_by(self, solver: steps.Solver, motion: Motion, row: Row, course):
         """The state and its columns after a step of one of the solvers, and the error."""
         charts = [a for a in self.form.charts if self.solver(a) == solver]
-        number = {a: k for k, a in enumerate(charts)}
-        place = self._by_body(row, lambda body: number.get(body.chart, 0))
+        places = [charts.index(a) if a in charts else 0 for a in self.form.charts]
+        place = jnp.asarray(places)[row.chart]
         if steps.is_implicit(solver):
             stages = [self._lane(self._implicit_step, solver, a) for a in charts]
             return choose(motion, place, stages, course)
@@ -342,7 +399,7 @@ class Bodies:
 
     # Ends of legs.
 
-    def _end(self, motion: Motion, row: Rows, course, flags: Flags, now: Watched):
+    def _end(self, motion: Motion, row: Row, course, flags: Flags, now: Watched):
         """The event, or the arrival on a level, with which a leg ends."""
         course, _ = self._in_chart(motion, row, self._aimed, course)
         course, _ = motion.apply(self._lane(self._shifted), course, None)
@@ -351,20 +408,16 @@ class Bodies:
         stages = [self._lane(self._reset, kind, row) for kind in kinds]
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
-        number = {kind: k for k, kind in enumerate(kinds)}
-        which = self._by_body(row, lambda body: number.get(body.kind, len(stages) - 1))
-        course, _ = choose(motion, which, stages, course)
-        is_jump = self._by_body(row, lambda body: body.does == JUMP)
-        ended = self._lane(self._ended, row, is_jump)
+        course, _ = choose(motion, row.kind, stages, course)
+        ended = self._lane(self._ended, row)
         course, (flags, _) = motion.apply(ended, course, (flags, now))
         return course, flags
 
-    def _aimed(self, a: int, row: Rows, s: Structure, constants, course: Course, notes):
+    def _aimed(self, a: int, row: Row, s: Structure, constants, course: Course, notes):
         """The time to the end of a leg in chart a, with its columns: a watched function is zero
         then, or there is no time left."""
-        course = course._replace(h=jnp.zeros(()))
-        scheduled = self._by_body(row, lambda body: _is_scheduled(s, body))
-        course = course._replace(delay=jnp.where(scheduled, 0.0, course.delay))
+        delay = jnp.where(row.scheduled, 0.0, course.delay)
+        course = course._replace(h=jnp.zeros(()), delay=delay)
         if not _count_watched(s, a, constants.levels):
             return course, notes
         q, u = _state(s, a, course), jnp.zeros(s.nu)
@@ -389,7 +442,7 @@ class Bodies:
         moved = jnp.outer(jnp.append(course.h, course.delay), course.rate)
         return course._replace(t=course.t + course.h, y=course.y + moved), notes
 
-    def _reset(self, kind: Kind, row: Rows, s: Structure, _, course: Course, notes):
+    def _reset(self, kind: Kind, row: Row, s: Structure, _, course: Course, notes):
         """The state and its columns after a jump, at a fixed time again."""
         tr = s.transitions[kind[0]]
         a, b = s.chart_index(tr.source), s.chart_index(tr.target)
@@ -409,13 +462,13 @@ class Bodies:
         y = jnp.concatenate([after[None], columns])
         return course._replace(y=_padded(y, course.y)), notes
 
-    def _ended(self, row: Rows, is_jump, s: Structure, _, course: Course, notes):
+    def _ended(self, row: Row, s: Structure, _, course: Course, notes):
         """The course where a leg has ended, and the next one begins."""
         flags, now = notes
-        rival = is_jump & _has_rival(row, _still(course.begin), now)
+        rival = row.is_jump & _has_rival(row, _still(course.begin), now)
         unknown = Watched.unknown(_still(course.t), self.form.watched)
         on_level = _leveled(row, flags).before
-        select = ft.partial(jnp.where, is_jump)
+        select = ft.partial(jnp.where, row.is_jump)
         before = jax.tree_util.tree_map(select, unknown, on_level)
         flags = flags._replace(before=before, left=flags.left | rival)
         course, flags = _arrived(row, course, flags, course.h)
@@ -426,7 +479,7 @@ class Bodies:
         inputs = () if self.inputs is None else (self.inputs,)
         return jax.vmap(function)(*columns, *inputs)
 
-    def _without_tick(self, motion: Motion, row: Rows, course, flags: Flags) -> Flags:
+    def _without_tick(self, motion: Motion, row: Row, course, flags: Flags) -> Flags:
         """The flags where a scheduled event may have been due since the leg began."""
         if not any(self.travelers.structure.schedules(a) for a in self.form.charts):
             return flags
@@ -448,7 +501,8 @@ def _padded(
     x: Float[Array, "*C n"], like: Float[Array, "*C d"]
 ) -> Float[Array, "*C d"]:
     """`x` with zeros for numbers that a chart does not use."""
-    return jnp.zeros_like(like).at[..., : x.shape[-1]].set(x)
+    more = like.shape[-1] - x.shape[-1]
+    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, more)]) if more else x
 
 
 def _count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
@@ -456,18 +510,11 @@ def _count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
     return len(s.guards(a)) + has_level
 
 
-def _values(s: Structure, a: int, levels, row: Rows, t, q, u) -> Float[Array, " g"]:
+def _values(s: Structure, a: int, levels, row: Row, t, q, u) -> Float[Array, " g"]:
     """The watched functions of chart a."""
     from ..kernels import watched_at
 
     return watched_at(a, s.guard_kinds(a), s, levels, t, q, u, row.section)
-
-
-def _is_scheduled(s: Structure, body: Body) -> bool:
-    """Test whether rows with a body are scheduled events."""
-    if body.does != JUMP:
-        return False
-    return isinstance(s.transitions[body.transition].guard, Scheduled)
 
 
 def _after_step(_, moving, notes):
@@ -476,7 +523,7 @@ def _after_step(_, moving, notes):
     return course._replace(t=course.t + course.h, y=y), notes
 
 
-def _arrived(row: Rows, course: Course, flags: Flags, late):
+def _arrived(row: Row, course: Course, flags: Flags, late):
     """A course where a leg has ended, and the next one begins."""
     t = course.t
     flags = flags._replace(
@@ -486,11 +533,11 @@ def _arrived(row: Rows, course: Course, flags: Flags, late):
     return course._replace(begin=t, ends=course.ends.at[row.leg].set(t)), flags
 
 
-def _has_left(row: Rows, before: Watched, now: Watched, same) -> Bool[Array, ""]:
+def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     """Test whether the itinerary is left between the row before and this one.
 
     - Where a leg begins, functions that were positive must be positive. One that was negative may
-      have risen sooner, unless signs must be the `same`: at an event at once.
+      have risen sooner, except at an event at once.
     - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or later
       than recorded. (A fall is no event where its predicate does not hold.)
     - The one at whose zero the leg ends must have been positive, and must fall.
@@ -499,7 +546,7 @@ def _has_left(row: Rows, before: Watched, now: Watched, same) -> Bool[Array, ""]
     known = known & (jnp.arange(len(row.signs)) != row.target)
     begins = jnp.isinf(before.value)
     # (Comparisons with NaN are false.)
-    compared = known & ((row.signs > 0) | same)
+    compared = known & ((row.signs > 0) | row.at_once)
     other = begins & compared & ~(jnp.sign(now.value) * row.signs > 0)
     unknown = known & ~jnp.isfinite(now.value) & ~begins
     returns = known & ~begins & dips(before, now, jnp.sign(now.value))
@@ -510,7 +557,7 @@ def _has_left(row: Rows, before: Watched, now: Watched, same) -> Bool[Array, ""]
     return left | _misses(row, before, now)
 
 
-def _misses(row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
+def _misses(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     """Test whether the function at whose zero a leg ends does not fall to it. (The row of its first
     correction has its sign in the row before.)"""
     if not now.value.size:
@@ -520,7 +567,7 @@ def _misses(row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
     return (row.target >= 0) & ~(was_positive & falls)
 
 
-def _has_rival(row: Rows, begin, now: Watched) -> Bool[Array, ""]:
+def _has_rival(row: Row, begin, now: Watched) -> Bool[Array, ""]:
     """Test whether another function falls to zero where an event happens, so that it may come first
     (see `Tape.rival`)."""
     other = (row.signs > 0) & (jnp.arange(len(row.signs)) != row.target)
@@ -529,7 +576,7 @@ def _has_rival(row: Rows, begin, now: Watched) -> Bool[Array, ""]:
     return (other & falls & now.enabled).any()
 
 
-def _has_tick(a: int, row: Rows, s: Structure, _, left, passed):
+def _has_tick(a: int, row: Row, s: Structure, _, left, passed):
     """Test whether the itinerary was left, or a scheduled event of chart a was due between two
     times."""
     begin, t = passed
@@ -547,7 +594,7 @@ def _still(tree: Any) -> Any:
     return jax.lax.stop_gradient(tree)
 
 
-def _leveled(row: Rows, flags: Flags) -> Flags:
+def _leveled(row: Row, flags: Flags) -> Flags:
     """Flags on a section: of the level of the next one nothing is known. (Charts without a level
     have no such row: nothing is set.)"""
     value = flags.before.value

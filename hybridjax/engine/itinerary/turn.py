@@ -10,7 +10,17 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._core.loops import loop, pushed
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import Bodies, Constants, Course, Flags, Travelers, Watched
+from .bodies import (
+    Bodies,
+    Constants,
+    Course,
+    Flags,
+    Row,
+    Travelers,
+    Watched,
+    read,
+    tabulated,
+)
 from .motion import Alone, InDirections
 from .rows import Form, Rows
 from .steps import Solver, solver_of
@@ -77,9 +87,9 @@ def follow(
         reverse=count is None,
         passes=passes,
     )
-    rows = jax.tree_util.tree_map(jnp.asarray, rows)
+    table = tabulated(travelers.structure, form, rows)
     numbers = travelers.numbers
-    constants = Constants(numbers, levels, settings, rows, count, begin, known)
+    constants = Constants(numbers, levels, settings, table, count, begin, known)
     state, flags = steps.depart(constants, ends)
     if count is not None:
         every = passes * count
@@ -87,10 +97,10 @@ def follow(
             steps.take, steps.take_along, constants, state, flags, every
         )
     else:
-        one = lambda both, row: (steps.row(constants, row, *both), None)  # noqa: E731
+        one = lambda both, row: (steps.row(constants, read(row), *both), None)  # noqa: E731
         for _ in range(passes):
             both = steps.depart(constants, state.course.ends)
-            state, flags = jax.lax.scan(one, both, rows)[0]
+            state, flags = jax.lax.scan(one, both, table)[0]
     return _passage(state, flags, form, columns, travelers.many)
 
 
@@ -153,7 +163,7 @@ class _Steps:
         begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
         return _State(course, begun), _State(by_course, by_begun), flags
 
-    def row(self, constants: Constants, row: Rows, state: "_State", flags: Flags):
+    def row(self, constants: Constants, row: Row, state: "_State", flags: Flags):
         """What a row does."""
         ended = state.begun.ended(row, state.course)
         course, flags = self._bodies.take(Alone(constants), row, state.course, flags)
@@ -183,11 +193,11 @@ def _chosen(mask: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree_util.tree_map(lambda x, y: jnp.where(mask, x, y), yes, no)
 
 
-def _row(constants: Constants, k: Int[Array, ""]) -> Rows:
+def _row(constants: Constants, k: Int[Array, ""]) -> Row:
     """Row k, of the first or a later pass."""
     assert constants.count is not None
     place = k % constants.count
-    return jax.tree_util.tree_map(lambda x: x[place], constants.rows)
+    return constants.rows.row(place)
 
 
 def _departed(
@@ -254,7 +264,7 @@ class _Begun(NamedTuple):
     delay: Array
     rate: Array
 
-    def ended(self, row: Rows, course: Course, axis: int = 0) -> "_Begun":
+    def ended(self, row: Row, course: Course, axis: int = 0) -> "_Begun":
         """With the end of the piece before a row."""
         at = (slice(None),) * axis + (row.piece,)
         return self._replace(
@@ -263,7 +273,7 @@ class _Begun(NamedTuple):
             delay=self.delay.at[at].set(course.delay),
         )
 
-    def begun(self, row: Rows, course: Course, axis: int = 0) -> "_Begun":
+    def begun(self, row: Row, course: Course, axis: int = 0) -> "_Begun":
         """With the beginning of the piece at a row."""
         at = (slice(None),) * axis + (row.piece,)
         return self._replace(rate=self.rate.at[at].set(course.rate))
