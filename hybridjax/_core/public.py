@@ -5,7 +5,6 @@ The `__init__.pyi` of a namespace lists its public names. Each is imported when 
 """
 
 import ast
-import difflib
 import functools
 import importlib
 import pathlib
@@ -146,20 +145,12 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     asked = package.replace("hybridjax", "hj", 1) + f".{name}"
     if name in _NAMES:
         return f"{asked} is {_NAMES[name]}"
-    leads = _leads()
-    lead = leads.about_name(package, name)
-    if lead is not None:
-        return f"there is no {asked}: {lead}"
     place = place_of(name)
     if place is not None:
         return f"{asked} is {place}"
-    text = f"module {package!r} has no attribute {name!r}"
-    for known in (names, list(places())):
-        close = difflib.get_close_matches(name, known, n=1)
-        if close:
-            return f"{text}; did you mean {place_of(close[0])}?"
-    lead = leads.about_namespace(package)
-    return f"{text}: {lead}" if lead else text
+    namespace = package.replace("hybridjax", "hj", 1)
+    known = {own: f"{namespace}.{own}" for own in names} | places()
+    return f"there is no {asked}: {_leads().about_name(package, name, known)}"
 
 
 def place_of(name: str) -> str | None:
