@@ -278,6 +278,8 @@ def test_every_fit_does_what_fits_do(names, name):
     assert np.all(fit.contains(names["cycle"], level=1 - 1e-9))
     assert fit.compare(names["cycle"]).p_value > 1e-9
     assert "p " in repr(fit.compare(names["cycle"]))
+    assert "true" in repr(fit.compare(names["cycle"]))
+    assert "other fit" in repr(fit.compare(fit))
     assert fit.compare(fit).p_value > 0.99
     assert len(fit.to_pandas()) == len(values)
     assert fit.plot().axes.size

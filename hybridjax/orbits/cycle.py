@@ -28,7 +28,7 @@ from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
@@ -68,7 +68,7 @@ _LEAST_OF_IMPLICIT = 1e-10
 
 
 @checked_methods
-class LimitCycle(Showable, eqx.Module):
+class LimitCycle(WithMultipliers, eqx.Module):
     """A periodic orbit of a hybrid system.
 
     **Fields:**
@@ -268,11 +268,6 @@ class LimitCycle(Showable, eqx.Module):
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
-
-    @property
-    def modulus(self) -> Float[np.ndarray, " r"]:
-        """The moduli of the multipliers: the parts of deviations that are left after a period."""
-        return np.abs(self.multipliers)
 
     @property
     def state(self) -> dict[str, float]:
