@@ -181,6 +181,7 @@ cycle.stance_duration                                   -> event_sequence
 hj.identify_recording(rec, apex, outputs="yM")          -> natural_multipliers
 hj.identify_recording(rec, apex, inputs="u", outputs="yM", n_strides=9) -> all cycles
 hj.identify_recording(rec, "vM", inputs="u", outputs="yM") -> hj.Crossing(
+hj.identify_recording(rec, sections, inputs="u", outputs="yM") -> hj.AtEvent('tick')
 hj.read_recording(rec.to_pandas())                      -> from_frame
 hj.Recording(rec.time, rec["u"])                        -> {'name': samples}
 hj.continuation(cycle, k=(8, 12))                       -> (low, high)

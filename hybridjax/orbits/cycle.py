@@ -66,6 +66,10 @@ WEAKEST = 1e-5
 # multipliers. Larger: multipliers that are accurate are given as 0.
 _LEAST_OF_IMPLICIT = 1e-10
 
+# Residuals below this are rounding, whose digits differ between machines. Larger: a print hides how
+# well a cycle closes. Smaller: prints of the same cycle differ.
+_ROUNDING = 1e-12
+
 
 @checked_methods
 class LimitCycle(WithMultipliers, eqx.Module):
@@ -454,13 +458,15 @@ class LimitCycle(WithMultipliers, eqx.Module):
         names = [transition.name for transition in self.structure.transitions]
         events = [names[g] for g in self.event_sequence]
         begin = number(to_host(self.anchor).t[0], 6, time_unit)
-        residual = f"{float(self.residual):.2g}"
+        residual = float(self.residual)
+        is_rounding = residual < _ROUNDING
+        closes = f"below {_ROUNDING:g}" if is_rounding else f"{residual:.2g}"
         lines = {
             "period": number(self.period, 12, time_unit),
             f"at t = {begin}": self._state_text(),
             "events": ", ".join(events) or "none",
             **multipliers,
-            "residual": f"{residual} after {int(self.iterations)} Newton steps",
+            "residual": f"{closes} after {int(self.iterations)} Newton steps",
             **self._checks(),
         }
         stiff = stiff_charts(self.structure, to_host(self.legs), float(self.period))

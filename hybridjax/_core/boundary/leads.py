@@ -51,6 +51,15 @@ MAKERS = {
 
 STEPS = {
     (
+        "Phase",
+        "ClockPhase",
+    ): "recordings have no clock; its ticks are events: "
+    "`hj.Recording(time, signals, events={'tick': times})`, then `hj.AtEvent('tick')`",
+    (
+        "Phase",
+        "AbstractSections",
+    ): "`hj.Crossing('y', 'falling')` of a signal 'y', with `n_sections=8`, divides cycles by time",
+    (
         "Crossing",
         "str",
     ): "`hj.Crossing('y', 'falling')` of a signal 'y', or `hj.AtEvent('strike')` of an event, is "
