@@ -31,14 +31,6 @@ def test_help_does_not_import_jax(arguments, text):
     assert text in run_python("-c", code, *arguments.split())
 
 
-def test_without_a_command_all_are_listed(capsys):
-    with pytest.raises(SystemExit) as stopped:
-        main([])
-    assert stopped.value.code == 2
-    text = capsys.readouterr().err
-    assert all(name in text for name in ("reproduce", "identify", "sweep"))
-
-
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduce")
@@ -111,7 +103,10 @@ WRONG = {
     "identify x.csv --out x --inputs u": {
         "--phase y,v": "name --outputs, or choose --timing"
     },
-    "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
+    "": {
+        "": "find the multipliers of a recorded rhythm",
+        "fly": "invalid choice: 'fly'",
+    },
 }
 
 
