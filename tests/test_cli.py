@@ -104,7 +104,7 @@ WRONG = {
         "--phase y,v": "name --outputs, or choose --timing"
     },
     "": {
-        "": "find the multipliers of a recorded rhythm",
+        "": "name one of the commands",
         "fly": "invalid choice: 'fly'",
     },
 }

@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, more = parser.parse_known_args(arguments)
     if not hasattr(options, "run"):
         parser.print_help(sys.stderr)
-        sys.exit(2)
+        parser.exit(2, "\nhybridjax: error: name one of the commands\n")
     if more:
         options.parser.error(
             f"unrecognized arguments: {' '.join(more)} (names need commas)"
