@@ -186,7 +186,7 @@ def continuation(
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
-      last. It contains a cycle at each of the numbers, and further cycles in between.
+        last. It contains a cycle at each of the numbers, and further cycles in between.
     - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.
