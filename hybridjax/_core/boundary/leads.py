@@ -210,7 +210,8 @@ def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
             return lead
         meant = _spelled_alike(name, places, _SLIP)
     if meant is None:
-        lead = words.lead_of_part(words.NAMES, owners, name)
+        lead = words.lead_of_library([""], name)
+        lead = lead or words.lead_of_part(words.NAMES, owners, name)
         if lead is not None:
             return lead
         meant = _spelled_alike(name, places, _ALIKE) or words.with_part(name, places)
@@ -273,7 +274,7 @@ def _meant_attribute(cls: type, name: str) -> str:
     word = _synonym(name, attributes) or _attribute_of_part(cls, name)
     if word is not None:
         return f": use `{word}`"
-    lead = words.lead_of(words.OF_LIBRARIES, owners, name)
+    lead = words.lead_of_library(owners, name)
     if lead is not None:
         return f": {lead}"
     word = _spelled_alike(name, attributes, _SLIP) or _documented(cls, name)
@@ -371,7 +372,7 @@ def _meant_argument(
     if (place_of(function) or "").startswith("hj.plot."):
         owners.append("plot")
     for word in (name, *words.synonyms(name)):
-        lead = words.lead_of(words.KEYWORDS, owners, word)
+        lead = words.lead_of(words.KEYWORDS, owners[:1], word)
         if lead is not None:
             return f": {lead}"
     system = getattr(first, "system", first)
@@ -383,8 +384,7 @@ def _meant_argument(
     if word is not None:
         return f": use `{word}`"
     owners.append("")
-    lead = words.lead_of(words.OF_LIBRARIES, owners, name)
-    lead = lead or words.lead_of(words.KEYWORDS, owners, name)
+    lead = words.lead_of(words.KEYWORDS, owners, name)
     if lead is not None:
         return f": {lead}"
     word = _spelled_alike(name, parameters, _SLIP)

@@ -7,6 +7,7 @@ plural stands for its singular, too. Errors read these tables; nothing else does
 """
 
 import functools
+import importlib
 import re
 from collections.abc import Iterable, Iterator
 
@@ -191,6 +192,14 @@ _HELD_OUT = (
     "`hj.recordings.hold_out(result.data, order)` on cycles that were held out"
 )
 _AT_TIMES = "`trajectory.at(times)` has the states at any times"
+_SIGNAL = (
+    "`scipy.signal` has it, for arrays such as `recording[name]`; `bandwidth`, an argument of "
+    "`hj.identify_recording`, smooths signals"
+)
+_SOLVER = (
+    "`hj.simulate(system, guess, duration)` integrates, and "
+    "`hj.orbits.Settings(solver=diffrax.Tsit5(), rtol=1e-9)` sets solver and accuracy"
+)
 _DECAY = (
     "it follows from the modulus: a deviation is halved after "
     "`np.log(0.5) / np.log(max(result.modulus))` cycles"
@@ -234,6 +243,13 @@ KEYWORDS = {
     "bode htf": {
         "`plot.axes` are Axes of matplotlib, such as `plot.axes[0, 0].set_xscale('log')`": (
             "db deg degrees log logscale margins phase magnitude omega_limits range"
+        ),
+    },
+    "plot": {
+        "`ax` takes an `Axes` of matplotlib, and `plot.axes[0, 0]` can be changed afterwards": (
+            "bins c cmap color colors dpi figsize fontsize grid height hue label labels legend "
+            "linestyle linewidth logx logy ls lw marker markersize palette size style title "
+            "width xlabel xlim xscale ylabel ylim yscale"
         ),
     },
     "run_experiments": {
@@ -789,7 +805,10 @@ NAMES = {
             "run experiment experiments perturb collect"
         ),
         "use `hj.find_limit_cycle(system).stable`": "stability stable is_stable",
-        "use `model.simulate(np.ones((n, nu)))`": "step_response step_info",
+        "use `model.simulate(np.ones((n, nu)))`": "step_response step_info step dstep",
+        "use `hj.scale.enable_progress()`": (
+            "progress tqdmprogressmeter verbose set_log_level"
+        ),
         "use `hj.identify_subjects(table, folder)`": (
             "subjects group population groups study"
         ),
@@ -818,8 +837,7 @@ NAMES = {
             "psd psds welch spectrogram periodogram csd cpsd coherence cohere mscohere spectrum "
             "spectra spectral fft rfft stft tfe tfestimate etfe spa frequency"
         ),
-        "`scipy.signal` has it, for arrays such as `recording[name]`; `bandwidth`, an argument "
-        "of `hj.identify_recording`, smooths signals": (
+        _SIGNAL: (
             "butter filter filtfilt sosfilt lfilter resample detrend decimate savgol "
             "savgol_filter notch lowpass highpass bandpass firwin hilbert hann convolve "
             "correlate smooth smoothing medfilt interpolate"
@@ -841,7 +859,7 @@ NAMES = {
         ),
         _DECAY: "half_life time_constant settling_time decay",
         _AT_TIMES: "saveat t_eval subsaveat",
-        "`hj.orbits.Settings(solver=diffrax.Tsit5(), rtol=1e-9)` sets solver and accuracy": (
+        _SOLVER: (
             "odeterm term odesolver solver tsit5 dopri5 dopri8 kvaerno5 kvaerno3 stepsize "
             "stepsize_controller pid_controller stepto constantstepsize euler heun rk45 bdf "
             "lsoda options tolerances rtol integratoroptions settings"
@@ -851,7 +869,7 @@ NAMES = {
             "jacfwd gradient"
         ),
         "`hj.Transition(name, source, target, guard, reset)` is an event of a system": (
-            "reset guard impact discrete_event terminal switch jump"
+            "reset guard discreteterminatingevent impact discrete_event terminal switch jump"
         ),
         "subclasses of `hj.HybridSystem`, or `hj.HybridSystem.from_functions(states, field, "
         "events)`, are systems": (
@@ -898,9 +916,6 @@ NAMES = {
         "use `hj.scale.Execution(workers=2)`": (
             "parallel_map workers n_jobs pool multiprocessing"
         ),
-        "numpy has it: results hold arrays": (
-            "array linspace arange zeros_like ones pi mean std"
-        ),
     },
     "convert": {
         "use `result.to_pandas().to_numpy()`": "to_numpy numpy array",
@@ -945,40 +960,44 @@ NAMES = {
 """What to do instead of a name that a namespace has not; those of the package, "", also stand for
 those of a namespace."""
 
-OF_LIBRARIES = {
-    "Showable": {
-        "`result.to_pandas()` is a table of pandas, which has it": """
-abs agg aggregate all any apply assign astype at boxplot columns corr count cov
-cummax cumsum describe diff drop drop_duplicates dropna dtypes empty eq explode
-fillna filter first get groupby head hist iat iloc index info insert interpolate
-isna isnull items iterrows itertuples join keys kurt last loc map max mean median
-melt merge min mode ndim notna nunique pct_change pipe pivot pivot_table pop
-quantile query rank reindex rename reset_index resample rolling round sample
-select_dtypes set_index shift skew sort_index sort_values stack std style sum
-swaplevel tail to_clipboard to_csv to_dict to_excel to_feather to_hdf to_html
-to_json to_latex to_markdown to_parquet to_records to_sql to_stata to_string
-transpose tz_convert unique unstack value_counts var
-"""
-    },
+LIBRARIES = {
     "Plot": {
-        "`plot.axes[0, 0]` is an `Axes` of matplotlib, which has it": """
-add_artist annotate axhline axvline bar cla clear clf colorbar errorbar fill_between
-get_axes grid legend gca set set_ylabel set_xlabel set_title set_xlim set_ylim
-set_xscale set_yscale set_xticks set_yticks semilogx semilogy loglog scatter
-subplots subplots_adjust subplot suptitle text tick_params tight_layout title twinx
-xlabel xlim xscale xticks ylabel ylim yscale yticks
-"""
+        "matplotlib.axes.Axes": "`plot.axes[0, 0]` is an `Axes` of matplotlib, which has it",
+        "matplotlib.figure.Figure": "`plot.figure` is a `Figure` of matplotlib, which has it",
     },
-    "plot": {
-        "`ax` takes an `Axes` of matplotlib, and `plot.axes[0, 0]` can be changed afterwards": """
-bins c cmap color colors dpi figsize fontsize grid height hue label labels legend
-linestyle linewidth logx logy ls lw marker markersize palette size style title width
-xlabel xlim xscale ylabel ylim yscale
-"""
+    "Showable": {
+        "pandas.DataFrame": "`result.to_pandas()` is a table of pandas, which has it",
+    },
+    "": {
+        "control": _CONTROL,
+        "scipy.signal": _SIGNAL,
+        "diffrax": _SOLVER,
+        "numpy": "numpy has it: results hold arrays",
     },
 }
-"""Names of other libraries, for the class or namespace whose objects lead to theirs. (Whole names
-only: their parts mean other things.)"""
+"""Libraries, and their classes, whose names lead to them: on objects of a class, and in the
+namespaces of this package."""
+
+
+def lead_of_library(owners: Iterable[str], name: str) -> str | None:
+    """Return the sentence of the first library that has a name. (Libraries that are installed are
+    imported for that: an error has time.)"""
+    for owner in owners:
+        for path, sentence in LIBRARIES.get(owner, {}).items():
+            if _has(path, name):
+                return sentence
+    return None
+
+
+def _has(path: str, name: str) -> bool:
+    """Test whether a module, or a class in it, has a name."""
+    module, _, cls = path.rpartition(".")
+    is_class = cls[:1].isupper()
+    try:
+        thing = importlib.import_module(module if is_class else path)
+    except ImportError:
+        return False
+    return hasattr(getattr(thing, cls) if is_class else thing, name)
 
 
 def lead_of(table: dict, owners: Iterable[str], name: str) -> str | None:
