@@ -35,7 +35,7 @@ def names():
     data = hj.experiments.add_noise(clean, std=1e-5)
     est = hj.estimate_htf(data, harmonics=(-1, 0, 1))
     whole = hj.estimate_htf(data)
-    force = np.random.default_rng(0).normal(size=(1, 500, 1))
+    force = np.random.default_rng(0).normal(size=(1, 3000, 1))
     made = hj.testing.simulate_recording(cycle, 0.01 * force, OUTPUTS, rate=50)
     known = dict(
         hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
@@ -90,6 +90,7 @@ hj.validate(fit, data)
 hj.validate(phys, data).plot()
 hj.select_order(est).plot()
 hj.optimal_design(model, noise=1e-4).plot()
+hj.identify_recording(rec, apex, "u", "yM", n_sections=8, order=2)
 phys.compare({"k": 10.0, "b": 5.0})
 phys.compare(cycle)
 phys.contains(hopper)

@@ -117,9 +117,9 @@ class Identification(WithMultipliers, eqx.Module):
 def identify_recording(
     recording: Recording,
     sections: Phase | PhaseDefinition,
-    *,
     inputs: SignalNames,
     outputs: OptionalNames,
+    *,
     order: Order | None = None,
     n_sections: SectionCount | None = None,
     bandwidth: Bandwidth | None = None,
