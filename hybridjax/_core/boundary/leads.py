@@ -7,7 +7,7 @@ read only where an error is raised.
 import dataclasses
 import difflib
 import inspect
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..exceptions import HybridJaxError
@@ -199,25 +199,31 @@ def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
     namespace first.
     """
     namespace = package.rpartition(".")[2]
-    owners = ["" if namespace == "hybridjax" else namespace, ""]
-    lead = words.lead_of(words.NAMES, owners[:1], name)
-    if lead is not None:
-        return lead
-    meant = words.same_word(name, places)
-    if meant is None:
-        lead = words.lead_of(words.NAMES, owners, name)
+    for lead in _leads_of_name(namespace, name, places):
         if lead is not None:
             return lead
-        meant = _spelled_alike(name, places, _SLIP)
-    if meant is None:
-        lead = words.lead_of_library([""], name)
-        lead = lead or words.lead_of_part(words.NAMES, owners, name)
-        if lead is not None:
-            return lead
-        meant = _spelled_alike(name, places, _ALIKE) or words.with_part(name, places)
-    if meant is not None:
-        return f"did you mean {places[meant]}?"
     return IN_NAMESPACES.get(namespace, f"`dir(hj.{namespace})` lists its names")
+
+
+def _leads_of_name(
+    namespace: str, name: str, places: Mapping[str, str]
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+
+    def place(meant: str | None) -> str | None:
+        return None if meant is None else f"did you mean {places[meant]}?"
+
+    own = "" if namespace == "hybridjax" else namespace
+    yield words.lead_of(words.NAMES, [own], name)
+    yield place(words.same_word(name, places))
+    yield words.lead_of(words.NAMES, [""], name)
+    yield place(_spelled_alike(name, places, _SLIP))
+    yield words.lead_of_library([""], name)
+    for part in words.parts(name):
+        yield words.lead_of(words.NAMES, [own, ""], part)
+    yield place(_spelled_alike(name, places, _ALIKE))
+    for part in words.parts(name):
+        yield place(words.with_part(part, places))
 
 
 def about_called(package: str) -> str:
@@ -265,35 +271,36 @@ def about_attribute(cls: type, name: str) -> str:
 
 
 def _meant_attribute(cls: type, name: str) -> str:
-    """Return the rest of the sentence: certain leads first, and at the end all attributes."""
+    """Return the rest of the sentence: the most certain lead, or all attributes."""
     attributes = attributes_of(cls)
-    owners = [base.__name__ for base in cls.__mro__]
-    lead = words.lead_of(words.ATTRIBUTES, owners, name)
-    if lead is not None:
-        return f": {lead}"
-    word = _synonym(name, attributes) or _attribute_of_part(cls, name)
-    if word is not None:
-        return f": use `{word}`"
-    lead = words.lead_of_library(owners, name)
-    if lead is not None:
-        return f": {lead}"
-    word = _spelled_alike(name, attributes, _SLIP) or _documented(cls, name)
-    if word is not None:
-        return f": use `{word}`"
-    for part in words.parts(name):
-        lead = words.lead_of(words.ATTRIBUTES, owners, part)
+    for lead in _leads_of_attribute(cls, name, attributes):
         if lead is not None:
             return f": {lead}"
-        word = words.with_part(part, attributes)
-        if word is not None:
-            return f": use `{word}`"
-    word = _spelled_alike(name, attributes, _ALIKE)
-    if word is not None:
-        return f": use `{word}`"
+    return f"; it has {_some(attributes)}"
+
+
+def _leads_of_attribute(
+    cls: type, name: str, attributes: Collection[str]
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+    owners = [base.__name__ for base in cls.__mro__]
+    yield words.lead_of(words.ATTRIBUTES, owners, name)
+    yield _use(_synonym(name, attributes))
+    yield _use(_attribute_of_part(cls, name))
+    yield words.lead_of_library(owners, name)
+    yield _use(_spelled_alike(name, attributes, _SLIP))
+    yield _use(_documented(cls, name))
+    for part in words.parts(name):
+        yield words.lead_of(words.ATTRIBUTES, owners, part)
+        yield _use(words.with_part(part, attributes))
+    yield _use(_spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
     if function is not None:
-        return f": `{function}` is a function that may take it"
-    return f"; it has {_some(attributes)}"
+        yield f"`{function}` is a function that may take it"
+
+
+def _use(name: str | None) -> str | None:
+    return None if name is None else f"use `{name}`"
 
 
 def _documented(cls: type, name: str) -> str | None:
@@ -367,40 +374,33 @@ def about_keyword(
 def _meant_argument(
     function: str, name: str, parameters: Sequence[str], first: Any
 ) -> str:
-    """Return the rest of the sentence: certain leads first, and at the end all arguments."""
-    owners = [function]
-    if (place_of(function) or "").startswith("hj.plot."):
-        owners.append("plot")
-    for word in (name, *words.synonyms(name)):
-        lead = words.lead_of(words.KEYWORDS, owners[:1], word)
+    """Return the rest of the sentence: the most certain lead, or all arguments."""
+    for lead in _leads_of_argument(function, name, parameters, first):
         if lead is not None:
             return f": {lead}"
+    return f"; it has {_some(parameters)}"
+
+
+def _leads_of_argument(
+    function: str, name: str, parameters: Sequence[str], first: Any
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+    own = [function]
+    for word in (name, *words.synonyms(name)):
+        yield words.lead_of(words.KEYWORDS, own, word)
     system = getattr(first, "system", first)
     if hasattr(type(system), "charts") and name in attributes_of(type(system)):
-        lead = words.lead_of(words.KEYWORDS, owners, "parameter")
-        change = f"`system.replace({name}=...)` returns a system with another `{name}`"
-        return f": {lead or change}"
-    word = _synonym(name, parameters)
-    if word is not None:
-        return f": use `{word}`"
-    owners.append("")
-    lead = words.lead_of(words.KEYWORDS, owners, name)
-    if lead is not None:
-        return f": {lead}"
-    word = _spelled_alike(name, parameters, _SLIP)
-    if word is not None:
-        return f": use `{word}`"
+        yield words.lead_of(words.KEYWORDS, own, "parameter")
+        yield f"`system.replace({name}=...)` returns a system with another `{name}`"
+    yield _use(_synonym(name, parameters))
+    is_figure = (place_of(function) or "").startswith("hj.plot.")
+    owners = [function, "plot", ""] if is_figure else [function, ""]
+    yield words.lead_of(words.KEYWORDS, owners, name)
+    yield _use(_spelled_alike(name, parameters, _SLIP))
     for part in words.parts(name):
-        word = words.with_part(part, parameters)
-        if word is not None:
-            return f": use `{word}`"
-        lead = words.lead_of(words.KEYWORDS, owners, part)
-        if lead is not None:
-            return f": {lead}"
-    word = _spelled_alike(name, parameters, _ALIKE)
-    if word is not None:
-        return f": use `{word}`"
-    return f"; it has {_some(parameters)}"
+        yield _use(words.with_part(part, parameters))
+        yield words.lead_of(words.KEYWORDS, owners, part)
+    yield _use(_spelled_alike(name, parameters, _ALIKE))
 
 
 def _synonym(name: str, among: Collection[str]) -> str | None:

@@ -1010,16 +1010,6 @@ def lead_of(table: dict, owners: Iterable[str], name: str) -> str | None:
     return None
 
 
-def lead_of_part(table: dict, owners: Iterable[str], name: str) -> str | None:
-    """Return the sentence of a part of a name, the last one first: nouns end a name."""
-    owners = list(owners)
-    for part in parts(name):
-        sentence = lead_of(table, owners, part)
-        if sentence is not None:
-            return sentence
-    return None
-
-
 def synonyms(name: str) -> tuple[str, ...]:
     """Return the words of this package for a word of others, the best one first."""
     return WORDS.get(name) or _plain_words().get(_plain(name), ())
