@@ -117,6 +117,22 @@ def _leads() -> Any:
     return importlib.import_module(".boundary.leads", __package__)
 
 
+class UnknownName(AttributeError):
+    """A name that a namespace has not. The sentence is composed when it is read: Python asks
+    modules for many names that are not there."""
+
+    def __init__(self, *of: Any):
+        # (With a `name` Python would suggest one again.)
+        super().__init__(name="")
+        self._of = of
+
+    def __str__(self) -> str:
+        return about_name(*self._of)
+
+    def __reduce__(self) -> Any:
+        return AttributeError, (str(self),)
+
+
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
     `__init__.pyi`."""
@@ -127,8 +143,7 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     def __getattr__(name: str) -> Any:
         home = homes.get(name)
         if home is None:
-            # (With a `name` Python would suggest it again.)
-            raise AttributeError(about_name(package, name, names), name="")
+            raise UnknownName(package, name, names)
         module = importlib.import_module(home, package)
         is_namespace = home == f".{name}"
         return module if is_namespace else getattr(module, name)
