@@ -62,8 +62,8 @@ KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)
 def save(path: FilePath, thing: Written) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
-    Of a `ModelFit` the numbers are written, as its `estimate`: its system is code of the user,
-    which no file contains.
+    Files contain no code, hence no systems. A `ModelFit` is therefore written as its `estimate`,
+    which has its numbers.
 
     The file appears complete or not at all: an old file of that name stays until then. With the
     suffix `.mat` it is a MATLAB file of the same arrays, with `_` for `.` in their names, and of

@@ -103,7 +103,10 @@ WRONG = {
     "identify x.csv --out x --inputs u": {
         "--phase y,v": "name --outputs, or choose --timing"
     },
-    "": {"": "required: COMMAND", "fly": "invalid choice: 'fly'"},
+    "": {
+        "": "name one of the commands",
+        "fly": "invalid choice: 'fly'",
+    },
 }
 
 

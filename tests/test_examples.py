@@ -8,6 +8,7 @@ import types
 import pytest
 
 import hybridjax as hj
+from hybridjax._core.showable import Showable
 
 from .sessions import ROOT, fences
 from .test_names import all_members
@@ -39,7 +40,18 @@ FUNCTIONS = {
 CLASSES = {
     place: text_of(thing) for place, thing in THINGS.items() if inspect.isclass(thing)
 }
-TEXTS = FUNCTIONS | CLASSES
+# What results have in common, documented once in their base classes. (A study of subjects hands on
+# the methods of its population.)
+COMMON = "plot", "to_pandas", "modulus", "interval", "compare", "contains"
+METHODS = {
+    f"{base.__qualname__}.{name}": text_of(vars(base)[name])
+    for thing in THINGS.values()
+    for base in getattr(thing, "__mro__", ())
+    for name in COMMON
+    if issubclass(thing, Showable) and name in vars(base)
+    if base is not hj.recordings.SubjectStudy
+}
+TEXTS = FUNCTIONS | CLASSES | METHODS
 EXAMPLES = {
     place: "\n".join(EXAMPLE.findall(text))
     for place, text in TEXTS.items()
@@ -57,7 +69,7 @@ def test_public_functions_say_what_they_return():
 
 
 def test_public_functions_have_an_example():
-    assert FUNCTIONS.keys() - EXAMPLES.keys() == set()
+    assert (FUNCTIONS | METHODS).keys() - EXAMPLES.keys() == set()
 
 
 def test_public_functions_name_each_argument():

@@ -16,10 +16,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax._core.boundary import leads
-from hybridjax._core.showable import Showable
+from hybridjax._core.boundary import leads, words
+from hybridjax._core.showable import Showable, WithMultipliers
 
 from .conftest import APEX, OUTPUTS
+from .test_names import all_members
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def names():
     data = hj.experiments.add_noise(clean, std=1e-5)
     est = hj.estimate_htf(data, harmonics=(-1, 0, 1))
     whole = hj.estimate_htf(data)
-    force = np.random.default_rng(0).normal(size=(1, 500, 1))
+    force = np.random.default_rng(0).normal(size=(1, 3000, 1))
     made = hj.testing.simulate_recording(cycle, 0.01 * force, OUTPUTS, rate=50)
     known = dict(
         hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
@@ -72,6 +73,7 @@ data.to_pandas()
 data["yM"]
 len(data)
 est.plot(outputs="yM")
+hj.plot.bode([est, model.htf(est.frequencies)])
 est.plot().save("bode.pdf")
 est.standard_errors
 traj.plot()
@@ -88,6 +90,7 @@ hj.validate(fit, data)
 hj.validate(phys, data).plot()
 hj.select_order(est).plot()
 hj.optimal_design(model, noise=1e-4).plot()
+hj.identify_recording(rec, apex, "u", "yM", n_sections=8, order=2)
 phys.compare({"k": 10.0, "b": 5.0})
 phys.compare(cycle)
 phys.contains(hopper)
@@ -138,9 +141,60 @@ fit.save("fit.npz")                                     -> hj.save(path, result)
 rat.interval()                                          -> hj.fit_multipliers
 rec.ch_names                                            -> `signals`
 rec.sfreq                                               -> `rate`
-rec.pick("yM")                                          -> recording['yM']
+rec.pick("yM")                                          -> recording[name]
 est.plot().savefig("bode.png")                          -> plot.save(path)
 hopper.stiffness                                        -> `k`
+model.dcgain()                                          -> to_control
+model.nstates                                           -> `model.dims`
+hj.pole_zero_map(model)                                 -> poles_zeros
+hj.stability_margins(model)                             -> to_control
+hj.feedback(model, model)                               -> model.feedback
+fit.get_params()                                        -> `fit.coefficients`
+fit.n_components                                        -> len(fit.multipliers)
+hj.select_order(est, scoring="bic")                     -> `print`
+hj.validate(fit, data, cv=5)                            -> hold_out
+hj.validate(fit, data).r2                               -> `validation.fit`
+hj.KFold(5)                                             -> hold_out
+hj.sweep(hopper, param_grid={"k": [8.0]})               -> `values`
+hj.sweep(hopper, "k", [8.0, 9.0])                       -> {'k': values}
+rec.plot_psd()                                          -> welch
+rec.heel_strikes                                        -> recording.mark
+rec.drop_channels("u")                                  -> hj.Recording(time
+rec[["u", "yM"]]                                        -> to_pandas()
+hj.Epochs(rec, apex)                                    -> sample_sections
+hj.concatenate_recordings([rec, rec])                   -> Recording.join
+data.groupby("cycle")                                   -> result.to_pandas()
+est.to_dict()                                           -> result.to_pandas()
+est.plot().set_title("x")                               -> plot.axes[0, 0]
+est.plot(title="x")                                     -> plot.axes[0, 0]
+traj.stats                                              -> trajectory.result
+hj.SaveAt(ts=[0.1])                                     -> trajectory.at
+hj.PIDController(rtol=1e-6)                             -> Settings(
+hj.simulate(hopper, "flight", (2.0, 0.0, 1.0, 0.0), t0=0.0) -> `time`
+hj.estimate_htf(data, nperseg=8)                        -> without windows
+hj.coherence(data)                                      -> htf.variance
+hj.chirp(8, f0=0.1, f1=2)                               -> hj.multisine
+design.waveform()                                       -> design.signals
+hj.read_mot("walk.mot")                                 -> hj.read_recording
+hj.lyapunov_exponent(rec)                               -> multipliers
+fit.half_life                                           -> result.modulus
+cycle.stance_duration                                   -> event_sequence
+hj.identify_recording(rec, apex, outputs="yM")          -> natural_multipliers
+hj.identify_recording(rec, apex, inputs="u", outputs="yM", n_strides=9) -> all cycles
+hj.identify_recording(rec, "vM", inputs="u", outputs="yM") -> hj.Crossing(
+hj.identify_recording(rec, sections, inputs="u", outputs="yM") -> its `anchor`
+hj.identify_recording(rec, hj.ClockPhase(8), inputs="u", outputs="yM") -> hj.AtEvent('tick')
+hj.read_recording(rec.to_pandas())                      -> from_frame
+hj.Recording(rec.time, rec["u"])                        -> {'name': samples}
+hj.continuation(cycle, k=(8, 12))                       -> (low, high)
+hj.multisine(sections)                                  -> sections.n_sections
+hj.simulate(hopper, cycle, 2.0)                         -> cycle.trajectory
+hj.save(fit)                                            -> takes the name first
+hj.sosfiltfilt([1.0], rec["u"])                         -> scipy.signal
+data.nlargest(3)                                        -> result.to_pandas()
+est.plot().set_rasterization_zorder(1)                  -> plot.axes[0, 0]
+hj.findLimitCycle(hopper)                               -> hj.find_limit_cycle
+fit.Multiplier                                          -> `multipliers`
 """
 
 
@@ -166,10 +220,34 @@ def test_the_error_of_a_guess_leads_on(names, line):
 
 
 def test_errors_name_calls_that_exist():
-    for path in re.findall(r"hj(?:\.\w+)+", inspect.getsource(leads)):
+    tables = inspect.getsource(leads) + inspect.getsource(words)
+    for path in re.findall(r"hj(?:\.\w+)+", tables):
         thing = types.SimpleNamespace(hj=hj)
         for name in path.split("."):
             thing = getattr(thing, name)
+
+
+def test_tables_of_words_have_owners_that_exist():
+    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
+    classes = {
+        base.__name__ for x in places.values() for base in getattr(x, "__mro__", ())
+    }
+    for owners in words.ATTRIBUTES:
+        assert set(owners.split()) <= classes
+    for owners in words.KEYWORDS:
+        assert set(owners.split()) <= {*places, *hj.__all__}
+    for namespace in words.NAMES:
+        assert namespace == "" or namespace in hj.__all__
+
+
+def test_words_that_lead_on_are_no_names():
+    """Else nobody sees the sentence."""
+    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
+    for owners, sentences in words.ATTRIBUTES.items():
+        for owner in set(owners.split()) & places.keys():
+            names = leads.attributes_of(places[owner])
+            known = {name for row in sentences.values() for name in row.split()}
+            assert not known & set(names), owner
 
 
 def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
@@ -206,6 +284,8 @@ def test_every_fit_does_what_fits_do(names, name):
     assert np.all(fit.contains(names["cycle"], level=1 - 1e-9))
     assert fit.compare(names["cycle"]).p_value > 1e-9
     assert "p " in repr(fit.compare(names["cycle"]))
+    assert "true" in repr(fit.compare(names["cycle"]))
+    assert "other fit" in repr(fit.compare(fit))
     assert fit.compare(fit).p_value > 0.99
     assert len(fit.to_pandas()) == len(values)
     assert fit.plot().axes.size
@@ -345,5 +425,5 @@ def test_every_result_prints_itself():
     kinds = [Showable]
     for kind in kinds:
         kinds += kind.__subclasses__()
-        if kind is not Showable:
+        if kind not in (Showable, WithMultipliers):
             assert kind.__repr__ not in (eqx.Module.__repr__, object.__repr__), kind

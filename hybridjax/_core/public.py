@@ -5,7 +5,6 @@ The `__init__.pyi` of a namespace lists its public names. Each is imported when 
 """
 
 import ast
-import difflib
 import functools
 import importlib
 import pathlib
@@ -118,6 +117,22 @@ def _leads() -> Any:
     return importlib.import_module(".boundary.leads", __package__)
 
 
+class UnknownName(AttributeError):
+    """A name that a namespace has not. The sentence is composed when it is read: Python asks
+    modules for many names that are not there."""
+
+    def __init__(self, *of: Any):
+        # (With a `name` Python would suggest one again.)
+        super().__init__(name="")
+        self._of = of
+
+    def __str__(self) -> str:
+        return about_name(*self._of)
+
+    def __reduce__(self) -> Any:
+        return AttributeError, (str(self),)
+
+
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
     `__init__.pyi`."""
@@ -128,8 +143,7 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     def __getattr__(name: str) -> Any:
         home = homes.get(name)
         if home is None:
-            # (With a `name` Python would suggest it again.)
-            raise AttributeError(about_name(package, name, names), name="")
+            raise UnknownName(package, name, names)
         module = importlib.import_module(home, package)
         is_namespace = home == f".{name}"
         return module if is_namespace else getattr(module, name)
@@ -146,20 +160,12 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     asked = package.replace("hybridjax", "hj", 1) + f".{name}"
     if name in _NAMES:
         return f"{asked} is {_NAMES[name]}"
-    leads = _leads()
-    lead = leads.about_name(package, name)
-    if lead is not None:
-        return f"there is no {asked}: {lead}"
     place = place_of(name)
     if place is not None:
         return f"{asked} is {place}"
-    text = f"module {package!r} has no attribute {name!r}"
-    for known in (names, list(places())):
-        close = difflib.get_close_matches(name, known, n=1)
-        if close:
-            return f"{text}; did you mean {place_of(close[0])}?"
-    lead = leads.about_namespace(package)
-    return f"{text}: {lead}" if lead else text
+    namespace = package.replace("hybridjax", "hj", 1)
+    known = {own: f"{namespace}.{own}" for own in names} | places()
+    return f"there is no {asked}: {_leads().about_name(package, name, known)}"
 
 
 def place_of(name: str) -> str | None:

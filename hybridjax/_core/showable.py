@@ -1,7 +1,11 @@
-"""`Showable`: what every result of a public function can do besides its own."""
+"""What every result of a public function can do besides its own (`Showable`), and those with
+multipliers."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
 
 from .boundary.leads import missing_attribute
 from .findings import Finding
@@ -30,6 +34,13 @@ class Showable:
         **Returns:** a `Plot`, with `save(path)`, `show()` and `axes`.
 
         **Raises:** `DefinitionError` for a result that has no figure.
+
+        **Example:**
+
+        ```python
+        cycle.plot("yM", "vM").show()
+        htf.plot(outputs="yM").save("htf.pdf")
+        ```
         """
         # (By name: results know nothing of figures, which import all of them.)
         first = importlib.import_module("hybridjax.plot.first")
@@ -40,5 +51,34 @@ class Showable:
 
         **Raises:** `DefinitionError` where pandas is not installed, and for a result that is no
         table.
+
+        **Example:**
+
+        ```python
+        fit.to_pandas().to_csv("fit.csv")
+        print(data.to_pandas().head())
+        ```
         """
         return importlib.import_module("hybridjax.convert").to_pandas(self)
+
+
+class WithMultipliers(Showable):
+    """A result that has Floquet multipliers."""
+
+    if TYPE_CHECKING:
+        # (As `findings`.)
+        @property
+        def multipliers(self) -> Any: ...
+
+    @property
+    def modulus(self) -> Float[np.ndarray, "*n"]:
+        """The moduli of the multipliers: the parts of deviations that are left after a period.
+
+        **Example:**
+
+        ```python
+        print(cycle.modulus.max())
+        print(f"{fit.modulus[0]:.1%} of a deviation is left after a cycle")
+        ```
+        """
+        return np.abs(self.multipliers)

@@ -98,11 +98,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--version", action="version", version=f"hybridjax {__version__}"
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(metavar="COMMAND")
     _add_reproduce(commands)
     _add_identify(commands)
     _add_sweep(commands)
     options, more = parser.parse_known_args(arguments)
+    if not hasattr(options, "run"):
+        parser.print_help(sys.stderr)
+        parser.exit(2, "\nhybridjax: error: name one of the commands\n")
     if more:
         options.parser.error(
             f"unrecognized arguments: {' '.join(more)} (names need commas)"

@@ -171,10 +171,14 @@ def table(summary: dict) -> str:
         for output, errors in family["htf_error_of_max_H_0"].items():
             sizes = "  ".join(f"{m}: {e:.1e}" for m, e in errors.items())
             rows.append(f"  {name:10} {output:4} {sizes}")
-    rows += ["", "Observations of the paper (docs/paper-errata.md explains each [no ])"]
+    rows += [
+        "",
+        "Observations of the paper (docs/paper-errata.md explains what differs)",
+    ]
     for item in summary["observations"]:
-        rows.append(f"  [{'yes' if item['holds'] else 'no ':3}] {item['claim']}")
-        rows.append(f"        {item['measured']}")
+        found = "confirmed" if item["holds"] else "differs"
+        rows.append(f"  {found:9}  {item['claim']}")
+        rows.append(f"             {item['measured']}")
     return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s.", ""])
 
 

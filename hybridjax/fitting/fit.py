@@ -82,9 +82,9 @@ def fit_model(
     - `guess`: guess of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: largest number of guesses of the parameters: those of `system`, then random ones
-        with factors between exp(-0.2) and exp(0.2). Once one has converged to a cost that the data
-        explain (as expected from their standard deviations, or without these 1e-12 of the squared
-        data), no more are tried. Default: 1. `seed`: seed of the random guesses. Default: 0.
+        with factors between exp(-0.2) and exp(0.2). The search stops at the first guess whose cost
+        is as expected from the standard deviations of the data (without these: 1e-12 of the squared
+        data). Default: 1. `seed`: seed of the random guesses. Default: 0.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: no error
     is raised where a fit does not converge.

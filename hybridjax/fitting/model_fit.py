@@ -152,7 +152,7 @@ class ParameterComparison(Showable, eqx.Module):
 
     **Fields:** `names`; `true` and `estimated` (p,); `error` (p,), their difference, and
     `standard_errors` (p,), those of the difference; `p_value`: probability of differences as large
-    as these if all are equal.
+    as these if all are equal; `with_fit`: whether `true` are those of another fit.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -160,6 +160,7 @@ class ParameterComparison(Showable, eqx.Module):
     estimated: Float[np.ndarray, " p"]
     standard_errors: Float[np.ndarray, " p"]
     p_value: float = eqx.field(static=True)
+    with_fit: bool = eqx.field(static=True, default=False)
 
     @property
     def error(self) -> Float[np.ndarray, " p"]:
@@ -167,7 +168,10 @@ class ParameterComparison(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         width = max(9, *map(len, self.names))
-        heads = f"{'true':>12}  {'estimated':>12}  {'error':>9}  {'standard error':>14}"
+        names = ("true", "estimated", "error", "standard error")
+        if self.with_fit:
+            names = ("other fit", "this fit", "change", "standard error")
+        heads = "{:>12}  {:>12}  {:>9}  {:>14}".format(*names)
         rows = [f"{'parameter':>{width}}  {heads}"]
         columns = self.true, self.estimated, self.error, self.standard_errors
         for name, true, estimated, error, size in zip(
@@ -271,7 +275,16 @@ class ParameterFit(WithCost, Fit):
 
     @checked
     def contains(self, true: Truth, level: Probability = 0.95) -> bool:
-        """Test whether other values lie in the joint confidence region."""
+        """Test whether other values lie in the joint confidence region.
+
+        **Example:**
+
+        ```python
+        observed = hj.fitting.ObservedHTF(htf, sections)
+        found = hj.fit_model(hopper, observed, "k")
+        print(found.contains({"k": 10.0}, level=0.99))
+        ```
+        """
         return self._tail(self.chi_square(true), self.covariance_dof) >= 1 - level
 
     @checked
@@ -283,6 +296,14 @@ class ParameterFit(WithCost, Fit):
 
         **Raises:** `DefinitionError` if a value is missing or was not fitted, or if the fit has no
         standard errors.
+
+        **Example:**
+
+        ```python
+        observed = hj.fitting.ObservedHTF(htf, sections)
+        found = hj.fit_model(hopper, observed, "k")
+        print(found.compare({"k": 10.0}))
+        ```
         """
         true = self._values_of(other)
         errors = self.standard_errors
@@ -296,7 +317,10 @@ class ParameterFit(WithCost, Fit):
             distance = self.chi_square(other)
             dof = self.covariance_dof
         tail = self._tail(distance, dof)
-        return ParameterComparison(self.names, true, self.values, errors, tail)
+        with_fit = isinstance(other, ParameterFit)
+        return ParameterComparison(
+            self.names, true, self.values, errors, tail, with_fit
+        )
 
     def _tail(self, distance: float, dof: float) -> float:
         """Return the probability of a larger squared distance from the true values."""

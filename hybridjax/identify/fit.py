@@ -12,12 +12,12 @@ from .._core.boundary.kinds import Probability
 from .._core.findings import Finding, print_findings
 from .._core.html import card, text
 from .._core.results import Result
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP
 
 
-class Fit(Showable, eqx.Module):
+class Fit(WithMultipliers, eqx.Module):
     """A fit to data.
 
     **Fields** of all fits:
@@ -63,11 +63,6 @@ class Fit(Showable, eqx.Module):
         def contains(self, *args: Any, **options: Any) -> Any: ...
 
     @property
-    def modulus(self) -> Float[np.ndarray, " d"]:
-        """The moduli of the multipliers."""
-        return np.abs(self.multipliers)
-
-    @property
     @abstractmethod
     def standard_errors(self) -> Float[np.ndarray, " k"]:
         """Standard error of each estimated number."""
@@ -102,6 +97,13 @@ class Fit(Showable, eqx.Module):
 
         The values are the moduli of the multipliers, or the parameters. Bounds are infinite where
         the data do not determine a value.
+
+        **Example:**
+
+        ```python
+        low, high = fit.interval(0.95)[0]
+        print(f"modulus {fit.modulus[0]:.3f}, 95 %: {low:.3f} to {high:.3f}")
+        ```
         """
         from scipy import special  # (a fifth of a second)
 

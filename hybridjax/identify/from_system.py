@@ -5,7 +5,7 @@ from typing import Annotated, Any, cast
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
@@ -13,7 +13,7 @@ from .._core.boundary.kinds import Order, Seed
 from .._core.boundary.values import Reals
 from .._core.findings import Finding
 from .._core.progress import say, working
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from ..engine.trajectory import observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -45,7 +45,7 @@ _PER_STEP = 8
 _PERIODS, _REALIZATIONS = 16, 4
 
 
-class ModelIdentification(Showable, eqx.Module):
+class ModelIdentification(WithMultipliers, eqx.Module):
     """The results of `identify_model`, step by step.
 
     **Fields:** `cycle`; `model`, the exact linearization; `design`, `data` of its experiments,
@@ -64,11 +64,6 @@ class ModelIdentification(Showable, eqx.Module):
     def multipliers(self) -> Complex[np.ndarray, " d"]:
         """The estimated multipliers."""
         return self.fit.multipliers
-
-    @property
-    def modulus(self) -> Float[np.ndarray, " d"]:
-        """Their moduli."""
-        return self.fit.modulus
 
     @property
     def comparison(self) -> MultiplierComparison:

@@ -42,8 +42,9 @@ def estimate_htf(
     least-squares one. A line on a multiple of 1/2 (other than 0 and N/2) aliases with its own
     conjugate, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`; two or more experiments with
     different phases determine both unknowns. If m inputs excite the same line, at least m
-    experiments are needed to separate their responses. Failed experiments are left out. So are
-    frequencies that not every input has excited, and multiples of 1/2 without two phases.
+    experiments are needed to separate their responses. Failed experiments are left out. Frequencies
+    are left out if an input did not excite them, and multiples of 1/2 if all experiments have the
+    same phase there.
 
     The estimate is that of the best linear approximation for signals of the class that was applied
     (Pintelon and Schoukens 2012, ch. 3), with its `variance`. From several realizations of random
@@ -64,8 +65,9 @@ def estimate_htf(
       Raise it where the recorded input is noisy. Default: 1e-6.
     - `references`: names of the inputs that enter a control loop from outside. The controller makes
       the other inputs; the HTFs are those of the plant from these to the outputs, and noise that
-      the controller feeds back does not bias them (`identify/instrument.py`). References have to
-      excite all lines of a class f + integers, up to N/2. Default: None; there is no controller.
+      the controller feeds back does not bias them (`identify/instrument.py`). References that
+      excite f must also excite f + m for all integers m, up to N/2. Default: None; there is no
+      controller.
 
     **Returns:** `hj.linear.HTF`: `H` (M, F, ny, nu), complex, in units of the output per unit of
     the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.

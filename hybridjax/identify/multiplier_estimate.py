@@ -58,7 +58,7 @@ _BORDER_POINTS = 100
 
 
 class MultiplierComparison(Showable, eqx.Module):
-    """Estimated Floquet multipliers, each paired with a true one.
+    """Estimated Floquet multipliers, each paired with a true one, or with one of another fit.
 
     The pairing has the smallest sum of distances; if the numbers of multipliers differ, the
     unpaired ones are not listed. Printing it shows a table.
@@ -69,12 +69,14 @@ class MultiplierComparison(Showable, eqx.Module):
     - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
     - `p_value`: probability of distances as large as these if all are equal; None where the
       covariance is unknown.
+    - `with_fit`: whether `true` are those of another fit, and `error` the distance from them.
     """
 
     true: Complex[np.ndarray, " k"]
     estimated: Complex[np.ndarray, " k"]
     outputs: tuple[str, ...] = eqx.field(static=True, default=())
     p_value: float | None = eqx.field(static=True, default=None)
+    with_fit: bool = eqx.field(static=True, default=False)
 
     @property
     def error(self) -> Float[np.ndarray, " k"]:
@@ -87,7 +89,10 @@ class MultiplierComparison(Showable, eqx.Module):
     def __repr__(self) -> str:
         labels = [f"{name}  " for name in self.outputs] or [""] * len(self.true)
         width = max(map(len, labels))
-        rows = [" " * width + f"{'true':>26}  {'estimated':>26}  {'error':>8}"]
+        heads = ("true", "estimated", "error")
+        if self.with_fit:
+            heads = ("other fit", "this fit", "distance")
+        rows = [" " * width + "{:>26}  {:>26}  {:>8}".format(*heads)]
         pairs = zip(labels, self.true, self.estimated, self.error, strict=True)
         for label, true, estimated, error in pairs:
             numbers = f"{_show(true):>26}  {_show(estimated):>26}  {error:8.1e}"
@@ -117,7 +122,11 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     paired_values = values[rows]
     paired_truth = truth[columns]
     order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
-    return MultiplierComparison(paired_truth[order], paired_values[order])
+    # (Cycles and models have multipliers without errors.)
+    with_fit = hasattr(true, "standard_errors")
+    return MultiplierComparison(
+        paired_truth[order], paired_values[order], with_fit=with_fit
+    )
 
 
 class MultiplierFit(Fit):
@@ -222,6 +231,12 @@ class MultiplierFit(Fit):
         A conjugate pair is one hypothesis, not two.
 
         **Arguments:** `true`: multipliers, or a cycle, a model or a fit that has them.
+
+        **Example:**
+
+        ```python
+        print(fit.contains(cycle), fit.contains(0.0, level=0.99))
+        ```
         """
         truth = multipliers_from(true)
         equations = np.where(np.imag(truth) == 0, 1, 2)
@@ -258,6 +273,13 @@ class MultiplierFit(Fit):
         with the fewer degrees of freedom of both.
 
         **Arguments:** `other`: multipliers, or a cycle, a model or a fit that has them.
+
+        **Example:**
+
+        ```python
+        print(fit.compare(cycle))
+        print(fit.compare(result.fit).p_value)
+        ```
         """
         paired = compare_multipliers(self.multipliers, other)
         if isinstance(other, MultiplierFit):

@@ -14,7 +14,7 @@ from .._core.boundary.kinds import Index, Order, Scalar, Vector
 from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
@@ -38,7 +38,7 @@ _STARTS = (0, 1, 4, 29)
 _ACCURACY = 1e-8
 
 
-class RationalFit(Showable, eqx.Module):
+class RationalFit(WithMultipliers, eqx.Module):
     r"""Rational functions of $z = e^{2 \pi i f / N}$ fitted to $H_0$, one per output.
 
     $$H_0(z) \approx \frac{b_0 z^{-1} + b_1 z^{-2} + \ldots + b_q z^{-q-1}}
@@ -81,11 +81,6 @@ class RationalFit(Showable, eqx.Module):
         H = (top / bottom * delay).T[None, :, :, None]
         return HTF(f, H, 0, N, self.input, self.outputs, "rational fit")
 
-    @property
-    def modulus(self) -> Float[np.ndarray, "ny n"]:
-        """The moduli of the multipliers."""
-        return np.abs(self.multipliers)
-
     @checked
     def compare(
         self, other: Truth, output: str | int | None = None
@@ -94,6 +89,12 @@ class RationalFit(Showable, eqx.Module):
         There is no test: the errors of this fit are not known.
 
         **Raises:** `DefinitionError` for an output that is not there.
+
+        **Example:**
+
+        ```python
+        print(hj.identify.fit_rational(htf).compare(cycle, output="yM"))
+        ```
         """
         chosen = range(len(self.outputs))
         if output is not None:
@@ -106,6 +107,7 @@ class RationalFit(Showable, eqx.Module):
             np.concatenate([part.true for part in parts]),
             np.concatenate([part.estimated for part in parts]),
             tuple(names),
+            with_fit=parts[0].with_fit,
         )
 
     def __repr__(self) -> str:

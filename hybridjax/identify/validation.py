@@ -189,17 +189,17 @@ def validate(
     models McLeod 1994). The means of the correlations over the sections, and the deviations from
     these means, are tested separately; the p-value is the smaller one, corrected for the choice.
     *Independence*: the part of the residuals that lagged inputs explain, compared with the rest (an
-    F ratio for each section), for any spectrum of the input; its level holds for residuals that are
-    white. Both allow for the errors of numerators of `fit_series`, and of fits of `fit_ldtp` to
-    series. Errors of c are left out: right fits to far fewer cycles than are tested are called not
-    white too often.
+    F ratio for each section). It is valid for any spectrum of the input, and has the significance
+    level `alpha` if the residuals are white. Both tests allow for the errors of the numerators of
+    `fit_series`, and of fits of `fit_ldtp` to series. They ignore the errors of the multipliers: if
+    a correct fit used far fewer cycles than the test, whiteness is rejected too often.
 
     For a fit of `fit_ldtp` to series, the errors of predictions one step ahead are tested (Ljung
     1999): they are white for a true model if the fit also models the noise. All fields of the
     result then refer to these predictions.
 
-    Records with three samples or fewer for each unknown of their initial condition and drift are
-    left out: they agree with any model.
+    A record is left out if it has three samples or fewer for each unknown of its initial condition
+    and drift, because it would agree with any model.
 
     **Arguments:**
 

@@ -16,7 +16,7 @@ from .._core.executor import from_host, is_traced, namespace, to_host
 from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from .._core.text import folded, listed
 from ..errors import DefinitionError
 from . import algebra, time_response
@@ -43,7 +43,7 @@ _RESONANCE = 1e-8
 
 
 @checked
-class LDTP(Showable, eqx.Module):
+class LDTP(WithMultipliers, eqx.Module):
     r"""A linear discrete-time periodic system of period $N$ sections.
 
     $$x[n+1] = A[n]\,x[n] + B[n]\,u[n], \qquad y[n] = C[n]\,x[n] + D[n]\,u[n]$$
@@ -188,11 +188,6 @@ class LDTP(Showable, eqx.Module):
     def n_sections(self) -> int:
         """The number of sections in one period, `N`."""
         return self.A.shape[0]
-
-    @property
-    def modulus(self) -> Float[np.ndarray, " r"]:
-        """The moduli of the multipliers: the parts of deviations that are left after a period."""
-        return np.abs(self.multipliers)
 
     @property
     def stable(self) -> bool:

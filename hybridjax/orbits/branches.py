@@ -175,9 +175,9 @@ def continuation(
 ) -> Branch:
     """Continue a limit cycle in a parameter, and mark changes of its stability.
 
-    Pseudo-arclength continuation computes the branch in both directions from the cycle, to the
-    ends of the range, around folds in between. Points at which a multiplier crosses
-    the unit circle are located to rounding errors. The cycle may be unstable.
+    Pseudo-arclength continuation computes the branch in both directions from the cycle, to the ends
+    of the range, around folds in between. Points at which a multiplier crosses the unit circle are
+    accurate to rounding errors. The cycle may be unstable.
 
     **Arguments:**
 
@@ -186,11 +186,10 @@ def continuation(
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last. It contains a cycle wherever it passes one of the numbers, and further cycles in
-        between.
+        last. It contains a cycle at each of the numbers, and further cycles in between.
     - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
-    - `max_points`: largest number of cycles each way. Default: 1000.
+    - `max_points`: largest number of cycles in each direction. Default: 1000.
 
     **Returns:** a `Branch`. No error is raised if it ends earlier: `ends` has the reason (an event
     that grazes, is lost or comes out of order; no convergence even in the shortest step; an

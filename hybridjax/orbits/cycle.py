@@ -28,7 +28,7 @@ from .._core.meaning import change_of, require_as_made
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.results import Result
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from .._core.signal import unit_of, with_unit
 from .._core.text import number
 from ..engine.lanes import Lanes, Tape
@@ -66,9 +66,13 @@ WEAKEST = 1e-5
 # multipliers. Larger: multipliers that are accurate are given as 0.
 _LEAST_OF_IMPLICIT = 1e-10
 
+# Residuals below this are rounding, whose digits differ between machines. Larger: a print hides how
+# well a cycle closes. Smaller: prints of the same cycle differ.
+_ROUNDING = 1e-12
+
 
 @checked_methods
-class LimitCycle(Showable, eqx.Module):
+class LimitCycle(WithMultipliers, eqx.Module):
     """A periodic orbit of a hybrid system.
 
     **Fields:**
@@ -270,11 +274,6 @@ class LimitCycle(Showable, eqx.Module):
         return bool(np.sum(inside) == len(inside) - len(self.conserved))
 
     @property
-    def modulus(self) -> Float[np.ndarray, " r"]:
-        """The moduli of the multipliers: the parts of deviations that are left after a period."""
-        return np.abs(self.multipliers)
-
-    @property
     def state(self) -> dict[str, float]:
         """The state at `anchor`, by name."""
         _require_values(self, "state")
@@ -459,13 +458,15 @@ class LimitCycle(Showable, eqx.Module):
         names = [transition.name for transition in self.structure.transitions]
         events = [names[g] for g in self.event_sequence]
         begin = number(to_host(self.anchor).t[0], 6, time_unit)
-        residual = f"{float(self.residual):.2g}"
+        residual = float(self.residual)
+        is_rounding = residual < _ROUNDING
+        closes = f"below {_ROUNDING:g}" if is_rounding else f"{residual:.2g}"
         lines = {
             "period": number(self.period, 12, time_unit),
             f"at t = {begin}": self._state_text(),
             "events": ", ".join(events) or "none",
             **multipliers,
-            "residual": f"{residual} after {int(self.iterations)} Newton steps",
+            "residual": f"{closes} after {int(self.iterations)} Newton steps",
             **self._checks(),
         }
         stiff = stiff_charts(self.structure, to_host(self.legs), float(self.period))

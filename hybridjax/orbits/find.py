@@ -120,10 +120,10 @@ def find_limit_cycle(
         model's own guess.
     - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
-        the section, else where the flow from the guess first crosses it. Default: the section
-        right after the event that the guess names (`Guess(..., after="heelstrike")`), or else the
-        plane through the guess that is orthogonal to the flow (in scaled states), or if the flow
-        does not return to that, such a plane through the state to which it leads.
+        the section, else where the flow from the guess first crosses it. Default: the section right
+        after the event that the guess names (`Guess(..., after="heelstrike")`), or else the plane
+        through the guess that is orthogonal to the flow (in scaled states). If the flow does not
+        return to this plane, such a plane through a later state is taken.
     - `multiplicity`: number of periods of the clock, or returns to the section, after which the
         cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
         cycle that is the guess.
@@ -134,9 +134,9 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the
-        section is given up. Default: 1000 times the time scale of the states at the guess, or
-        where the search would be given up, if they are slower there (in charts with an implicit
-        method, that of the slowest mode).
+        section is given up. Default: 1000 times the time scale of the states, at the guess or at
+        the end of this search, where it is longer. In charts with an implicit method, the time
+        scale is that of the slowest mode.
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
         not depend on units (under a JAX transformation, those of the guess).

@@ -39,7 +39,7 @@ _FIT_NAMES: dict[type, str] = {
 
 @checked
 def htf(
-    *htfs: Transfer | Families,
+    *htfs: Transfer | Sequence[Transfer] | Families,
     output: str | int | None = None,
     input: str | int = 0,
     harmonics: Sequence[int] = (0, 1, -1),
@@ -55,9 +55,10 @@ def htf(
 
     **Arguments:**
 
-    - `htfs`: one HTF or several, for a panel with one output; or a dict by name (the paper's Fig.
-      3), for a column for each name and a row for each output. An entry is an HTF, or several (an
-      estimate, and an exact HTF or a model); all have the same outputs, and a row shares one scale.
+    - `htfs`: one HTF or several, also in a list, for a panel with one output; or a dict by name
+      (the paper's Fig. 3), for a column for each name and a row for each output. An entry is an
+      HTF, or several (an estimate, and an exact HTF or a model); all have the same outputs, and a
+      row shares one scale.
     - `output`: name or index. Default: the first; all outputs of a dict.
     - `input`: name or index. The axis names the input if there are several. Default: 0.
     - `harmonics`: the m of the H_m. Default: (0, 1, -1).
@@ -80,7 +81,7 @@ def htf(
     """
     families = _families(htfs)
     if families is None:
-        drawn = _exact_first(cast(Sequence[Transfer], htfs))
+        drawn = _exact_first(_one_by_one(htfs))
         shown = 0 if output is None else output
         with panels(ax, height=2.2) as axes:
             _magnitude(axes[0, 0], drawn, shown, input, harmonics, decades)
@@ -135,7 +136,7 @@ def _magnitude(
 
 @checked
 def bode(
-    *htfs: Transfer | Families,
+    *htfs: Transfer | Sequence[Transfer] | Families,
     fits: Fits | Mapping[str, Fits] = (),
     harmonic: int = 0,
     outputs: SignalNames | None = None,
@@ -146,11 +147,11 @@ def bode(
 
     **Arguments:**
 
-    - `htfs`: one HTF or several, or a dict of them by name (the paper's Fig. 4), for a column for
-      each name. Exact HTFs, and those of models (`LDTP`) at the frequencies of the first HTF, are
-      drawn as broad pale lines under the estimates. HTFs with a variance have bands that contain
-      the true values with a probability of 95 %. Their phase is not drawn where the band of the
-      magnitude contains zero.
+    - `htfs`: one HTF or several, also in a list; or a dict of them by name (the paper's Fig. 4),
+      for a column for each name. Exact HTFs, and those of models (`LDTP`) at the frequencies of the
+      first HTF, are drawn as broad pale lines under the estimates. HTFs with a variance have bands
+      that contain the true values with a probability of 95 %. Their phase is not drawn where the
+      band of the magnitude contains zero.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
       that it has; by name beside a dict of HTFs. Default: none.
     - `harmonic`: the m of H_m. Default: 0.
@@ -178,7 +179,7 @@ def bode(
         return _bodes(families, fits, harmonic, outputs, input, ax)
     if isinstance(fits, Mapping):
         raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
-    drawn = _exact_first(cast(Sequence[Transfer], htfs))
+    drawn = _exact_first(_one_by_one(htfs))
     fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
     fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
     curves = _curves(drawn[0], outputs, input)
@@ -300,7 +301,18 @@ def _bodes(
     return Plot(axes)
 
 
-def _families(htfs: Sequence[Transfer | Families]) -> Families | None:
+Given = Sequence[Transfer | Sequence[Transfer] | Families]
+
+
+def _one_by_one(htfs: Given) -> list[Transfer]:
+    """HTFs without the lists in which some were given."""
+    found: list[Transfer] = []
+    for given in htfs:
+        found += [given] if isinstance(given, Transfer) else cast(Sequence, given)
+    return found
+
+
+def _families(htfs: Given) -> Families | None:
     """HTFs by name, if a dict of them was given."""
     named = [x for x in htfs if isinstance(x, Mapping)]
     if not named:

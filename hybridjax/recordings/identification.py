@@ -9,7 +9,7 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import (
@@ -22,7 +22,7 @@ from .._core.boundary.kinds import (
 from .._core.findings import Finding, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from .._core.text import listed
 from ..errors import DefinitionError
 from ..identify.series.fit import SeriesFit, fit_series
@@ -52,7 +52,7 @@ MEANING = (
 )
 
 
-class Identification(Showable, eqx.Module):
+class Identification(WithMultipliers, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `findings`
@@ -99,11 +99,6 @@ class Identification(Showable, eqx.Module):
         """Those of the fit."""
         return self.fit.multipliers
 
-    @property
-    def modulus(self) -> Float[np.ndarray, " d"]:
-        """Moduli of the multipliers."""
-        return self.fit.modulus
-
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]
         results = [
@@ -122,9 +117,9 @@ class Identification(Showable, eqx.Module):
 def identify_recording(
     recording: Recording,
     sections: Phase | PhaseDefinition,
-    *,
     inputs: SignalNames,
     outputs: OptionalNames,
+    *,
     order: Order | None = None,
     n_sections: SectionCount | None = None,
     bandwidth: Bandwidth | None = None,

@@ -24,7 +24,7 @@ from .._core.boundary.kinds import Probability, Seed
 from .._core.boundary.values import Whole
 from .._core.findings import Finding, print_findings
 from .._core.progress import working
-from .._core.showable import Showable
+from .._core.showable import WithMultipliers
 from ..errors import DefinitionError
 from ..identify.multiplier_estimate import (
     MultiplierComparison,
@@ -50,7 +50,7 @@ MultiplierCount = Annotated[int, Whole(1, 12)]
 
 
 @checked_methods
-class NaturalMultipliers(Showable, eqx.Module):
+class NaturalMultipliers(WithMultipliers, eqx.Module):
     """Multipliers of a rhythm that nobody perturbed.
 
     **Fields:**
@@ -77,11 +77,6 @@ class NaturalMultipliers(Showable, eqx.Module):
     findings: tuple[Finding, ...] = ()
 
     @property
-    def modulus(self) -> Float[np.ndarray, " d"]:
-        """The moduli of the multipliers."""
-        return np.abs(self.multipliers)
-
-    @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
         """Standard deviation of each modulus over the resamplings."""
         return np.abs(self.draws).std(axis=0)
@@ -90,7 +85,15 @@ class NaturalMultipliers(Showable, eqx.Module):
         self, true: Truth, level: Probability = 0.95
     ) -> Bool[np.ndarray, " d"]:
         """Test whether the modulus of each true multiplier, paired with these, lies in its
-        interval."""
+        interval.
+
+        **Example:**
+
+        ```python
+        found = hj.recordings.natural_multipliers(result.data)
+        print(found.contains(0.9))
+        ```
+        """
         paired = self.compare(true)
         order = [int(np.argmin(abs(self.multipliers - z))) for z in paired.estimated]
         low, high = self.interval(level)[order].T
@@ -98,7 +101,15 @@ class NaturalMultipliers(Showable, eqx.Module):
 
     def compare(self, other: Truth) -> MultiplierComparison:
         """Pair the multipliers with true ones, or with those of another fit. There is no test: see
-        `interval`."""
+        `interval`.
+
+        **Example:**
+
+        ```python
+        found = hj.recordings.natural_multipliers(result.data)
+        print(found.compare(cycle))
+        ```
+        """
         return compare_multipliers(self.multipliers, other)
 
     def interval(
@@ -112,6 +123,13 @@ class NaturalMultipliers(Showable, eqx.Module):
 
         They are percentiles of the bootstrap, widened by the ratio of Student's distribution for so
         many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015).
+
+        **Example:**
+
+        ```python
+        found = hj.recordings.natural_multipliers(result.data)
+        (low, high), *_ = found.interval(0.9)
+        ```
         """
         blocks = max(self.cycles / self.block, 2.0)
         wider = np.sqrt(blocks / (blocks - 1))

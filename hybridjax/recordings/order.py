@@ -29,13 +29,13 @@ def select_order(
     r"""Compare numbers of multipliers.
 
     *HTFs, by rank*: the part of $H, z^{-N} H, \ldots, z^{-DN} H$ that numerators explain is
-    removed. The rest has one independent component for each multiplier (D at most), and noise.
-    Components are counted by generalized singular values: each above the largest value of noise
-    alone counts. *HTFs, by MDL*: Rissanen's criterion for a fit of each order, with numerators of
-    the degree that belongs to this order. Without variances the misfit of the largest order is
-    taken for noise, so that `max_order` must be no smaller than the number of multipliers; errors
-    that are not random (a transient, distortion by an input that was not drawn at random) then
-    look like multipliers.
+    removed. The rest has one independent component for each multiplier (D at most), and noise. The
+    number of components is the number of generalized singular values above the largest one of noise
+    alone. *HTFs, by MDL*: Rissanen's criterion for a fit of each order, with numerators of the
+    degree that belongs to this order. Without variances, the residuals of the largest order are
+    taken for noise. `max_order` must then be at least the number of multipliers, and errors that
+    are not random (a transient, or distortion by an input that was not drawn at random) look like
+    multipliers.
 
     *Data*: for each number, the model is estimated by total least squares (which is consistent)
     without the last quarter of every record (see `hj.recordings.hold_out`), and then simulates this

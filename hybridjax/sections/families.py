@@ -134,8 +134,8 @@ def _as_anchor(x: Crossing | Scalar) -> Crossing | Array:
 class ClockPhase(_Anchored):
     """N equally spaced phases of time: the isochrons of a clocked system (paper Sec. VI-B).
 
-    On an autonomous cycle these are equal steps of time from section 0; time has no natural
-    origin there, so one multiplier is 1.
+    On an autonomous cycle these are equal steps of time from section 0. An autonomous system does
+    not restore its phase, so that one multiplier is 1.
 
     **Fields:** `n_sections`, the number N; `anchor`, the position of section 0: a `Crossing` on the
     cycle, or a time of the clock in periods of the cycle. Default: 0.

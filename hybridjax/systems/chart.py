@@ -44,8 +44,8 @@ class Chart(eqx.Module):
     - `states`: the names of the states, in the order in which they stand in `q`.
     - `units`: units of the states, in the same order, for figures and printed summaries; none, or
         one for each.
-    - `inputs`: the names of the system's inputs that this chart uses, in the order in which they
-        stand in `u` (the map g_a of the paper: the others are ignored). `None` means all.
+    - `inputs`: the names of the system's inputs that this chart uses (the map g_a of the paper), in
+        the order in which they stand in `u`. The chart ignores other inputs. `None` means all.
     - `solver`: how the chart is integrated: a Runge-Kutta method of diffrax with an error estimate,
         or `hj.systems.Radau()`. `None` means the explicit pair of order 7, for charts that are not
         stiff. A `solver` of the system overrides it.

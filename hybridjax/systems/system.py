@@ -287,12 +287,12 @@ class HybridSystem(Definition):
     ```
 
     Every system defines `charts`, and `transitions` if it has events; `period`, `outputs` and
-    `guess` are optional. The class attribute `inputs` names the exogenous inputs û; `inputs = ()`
-    for a system without. `input_units` gives their units in the same order (none, or one for each),
-    and `time_unit` that of time. States, inputs and outputs share one space of names: without
-    `inputs`, there is one input `u`, or `input` if a state or an output is called `u`. `solver`, a
-    keyword of every constructor, is the method of integration of all charts, or of some by name
-    (`{"stance": hj.systems.Radau()}`); it overrides `Chart.solver`.
+    `guess` are optional. The class attribute `inputs` names the exogenous inputs û. A system
+    without inputs has `inputs = ()`. `input_units` gives their units in the same order (none, or
+    one for each), and `time_unit` the unit of time. States, inputs and outputs have different
+    names. If a class does not define `inputs`, there is one input `u`, or `input` if a state or an
+    output is called `u`. `solver`, a keyword of every constructor, is the method of integration of
+    all charts, or of some by name (`{"stance": hj.systems.Radau()}`); it overrides `Chart.solver`.
     """
 
     inputs: ClassVar[tuple[str, ...]] = _DefaultInputs()  # type: ignore[assignment]

@@ -96,11 +96,12 @@ class Transition(eqx.Module):
         time; where it is false there is no event.
 
     A guard is armed once it has left zero on the side from which it crosses, so that a guard that
-    was just crossed does not fire again. If a reset leads to a chart whose guard is at zero or
-    beyond it, and moves on, the event happens at once, unless the old chart has this guard, too. It
-    also happens at once if a reset within a chart leads across an armed guard.
+    was just crossed does not trigger again. In two cases an event happens at once after a reset: if
+    the reset enters another chart in which a guard is at zero or beyond it and moves away from zero
+    (unless the old chart has this guard, too), and if a reset within a chart moves the state across
+    an armed guard.
 
-    Scheduled transitions with the same formulas for period and offset are those of one clock: each
+    Scheduled transitions with the same formulas for period and offset belong to one clock: each
     tick leads to one event.
 
     **Example:**

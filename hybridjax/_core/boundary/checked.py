@@ -50,7 +50,7 @@ def checked(thing: Thing) -> Thing:
     is allowed and what was given. What fits is handed on in one form: see `Kind.take`. Defaults
     are not checked, nor are arguments without annotation, or with `Any`. Arguments that are
     missing, too many or unknown raise an error, which leads on as that of a wrong object does
-    (`leads.py`).
+    (`leads.py`, `words.py`).
 
     How a call is put right if JAX transforms it: numbers, words and switches refuse to be traced;
     arrays (`Reals`) may be, and their values are then not looked at. Where a function needs values
@@ -233,7 +233,8 @@ class _Kinds:
                 continue
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
-        return leads.about_object(self.function.__name__, kind, value)
+        called = self.function if self.cls is None else self.cls
+        return leads.about_object(called.__name__, kind, value)
 
     @functools.cached_property
     def _names(self) -> "_Names":

@@ -7,11 +7,12 @@ read only where an error is raised.
 import dataclasses
 import difflib
 import inspect
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..exceptions import HybridJaxError
 from ..public import about_word, place_of
+from . import words
 from .values import Kind, with_article
 
 
@@ -49,7 +50,30 @@ MAKERS = {
 """For each type, the call that makes an object of it."""
 
 STEPS = {
+    (
+        "Phase",
+        "ClockPhase",
+    ): "recordings have no clock; its ticks are events: "
+    "`hj.Recording(time, signals, events={'tick': times})`, then `hj.AtEvent('tick')`",
+    (
+        "Phase",
+        "AbstractSections",
+    ): "`hj.Crossing('y', 'falling')` of a signal 'y', with `n_sections=8`, divides cycles by time",
+    (
+        "Crossing",
+        "str",
+    ): "`hj.Crossing('y', 'falling')` of a signal 'y', or `hj.AtEvent('strike')` of an event, is "
+    "one",
     ("HTF", "ExperimentData"): "`hj.estimate_htf(data)` makes one of data",
+    (
+        "HTF",
+        "Identification",
+    ): "`result.fit` is a fit, and `hj.fit_series(result.data, order)` makes another",
+    ("HasRecords", "Identification"): "pass its `data`",
+    (
+        "ExperimentData",
+        "SectionData",
+    ): "`hj.fit_series(data, order)` fits data at sections",
     ("HTF", "SectionData"): "`hj.fit_series(data, order)` fits data at sections",
     ("HTF", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
     ("HTF", "LDTP"): "`model.htf(frequencies)` makes one of a model",
@@ -110,311 +134,38 @@ stands for those derived from it."""
 OBJECTS = {
     "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
     "fit_series.LDTP": "are the model and the data in the wrong order?",
+    "continuation.int": "pass `(low, high)`",
+    "continuation.float": "pass `(low, high)`",
+    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
+    "multisine.AbstractSections": "pass `sections.n_sections`",
+    "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
+    "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
+    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
+    "save.Showable": "`hj.save('name.npz', result)` takes the name first",
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
+    "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
     "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
     "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "save.HybridSystem": "a system is code: keep the script that makes it",
     "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
     "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
     "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
+    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
     "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
+    "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }
 """For a function, and the type of the object that it was given, what to do. A given type also
 stands for those derived from it."""
 
-WORDS = {
-    "A": ("amplitude",),
-    "N": ("n_sections",),
-    "T": ("period", "duration"),
-    "X": ("data", "htf"),
-    "alpha": ("level", "alpha"),
-    "amp": ("amplitude",),
-    "anchor": ("anchor", "start"),
-    "atol": ("accuracy", "settings"),
-    "batch_size": ("execution", "chunk"),
-    "channels": ("signals", "outputs"),
-    "chi2": ("chi2_per_dof", "chi_square", "cost"),
-    "ci": ("interval", "level", "alpha"),
-    "coef": ("coefficients", "values", "multipliers"),
-    "confidence": ("level", "interval"),
-    "cov": ("covariance",),
-    "cycles": ("cycles", "periods"),
-    "d": ("order",),
-    "data": ("data", "htf", "recording"),
-    "df": ("dof",),
-    "doubts": ("findings",),
-    "dt": ("settings", "rate"),
-    "duration": ("duration",),
-    "eigenvalues": ("multipliers",),
-    "errors": ("standard_errors", "standard_error", "covariance"),
-    "estimates": ("values", "multipliers"),
-    "event": ("sections", "section", "events"),
-    "file": ("path", "paths", "folder"),
-    "free": ("free", "parameter", "parameters"),
-    "freq": ("frequencies", "frequency", "range"),
-    "fs": ("rate", "time"),
-    "guess": ("guess", "initial", "state"),
-    "harmonic": ("harmonics", "harmonic"),
-    "input": ("inputs", "input", "u"),
-    "magnitude": ("H", "modulus"),
-    "max_iter": ("settings", "max_steps"),
-    "modulus": ("modulus", "multipliers"),
-    "n": ("n_sections", "order"),
-    "n_experiments": ("experiments", "realizations"),
-    "n_jobs": ("execution", "client"),
-    "names": ("signals", "outputs", "names", "states"),
-    "noise": ("std", "process_noise", "noise"),
-    "nperiods": ("periods", "cycles"),
-    "order": ("order", "dims"),
-    "output": ("outputs", "output", "y"),
-    "overlay": ("fits",),
-    "params": ("values", "coefficients", "free", "parameters", "parameter", "numbers"),
-    "reference": ("references",),
-    "period": ("period", "periods"),
-    "phase": ("sections", "phase", "anchor"),
-    "poles": ("poles", "order", "multipliers"),
-    "predict": ("predict", "simulate", "htf"),
-    "range": ("range", "values"),
-    "residuals": ("residuals", "residual", "noise"),
-    "sections": ("sections", "section", "phase"),
-    "seed": ("seed",),
-    "save": ("save", "to_pandas"),
-    "start": ("guess", "anchor", "initial", "state"),
-    "n_points": ("n_sections", "max_points", "count"),
-    "to_pandas": ("to_pandas",),
-    "plot": ("plot",),
-    "points": ("points",),
-    "signal": ("signal", "signals", "function"),
-    "size": ("n_sections", "experiments"),
-    "solver": ("settings", "solver"),
-    "spectral_radius": ("modulus", "multipliers"),
-    "stable": ("stable",),
-    "standard_errors": ("standard_errors", "standard_error", "std"),
-    "state": ("state", "states", "anchor", "guess"),
-    "step": ("settings", "step"),
-    "system": ("system", "cycle", "model"),
-    "t": ("time", "t", "times"),
-    "t_span": ("duration",),
-    "tf": ("htf", "duration"),
-    "threshold": ("value", "threshold"),
-    "time": ("time", "t", "times"),
-    "tol": ("accuracy", "settings", "tolerance"),
-    "trials": ("trials", "experiments", "repeats"),
-    "values": ("values", "H", "y"),
-    "window": ("periods", "window"),
-    "x": ("x", "inputs", "state", "signals", "data"),
-    "x0": ("guess", "initial", "state", "anchor", "start"),
-    "y": ("y", "outputs"),
-}
-"""The words of this package for what others call so, the best one first: arguments of functions
-and attributes of objects."""
-
-_ALIKE = """
-A: amplitudes ampl
-N: M num nsections
-T: T0 tau period_time
-X: dataset
-alpha: significance sig
-anchor: origin offset ref reference_section
-amp: rms peak height magnitude_in size_in
-atol: abs_tol
-batch_size: batch
-channels: ch_names columns picks channel pick ch chs
-chi2: chisq redchi fun loss objective cost misfit chi_square
-ci: conf_int confint confidence_interval confidence_intervals intervals bounds conf_interval
-coef: coef_ coefs coefficients beta theta popt weights
-confidence: conf conf_level cl coverage confidence_level
-cov: vcov pcov cov_params cov_x covariance_matrix
-cycles: n_cycles ncycles strides turns
-d: dim nx n_states n_modes n_multipliers n_poles num_poles model_order degree rank states_number
-data: experiments_data measurements records series
-df: df_resid nfree ndf freedom degrees_of_freedom
-doubts: warnings issues problems doubt messages flags notes message status success converged advice
-dt: dt0 h max_step step_size timestep time_step
-duration: t_end t1 tmax t_max tfinal t_final tend length total_time
-eigenvalues: eigs eigvals eig eigenvalue pole floquet_multipliers multiplier floquet roots lambdas \
-characteristic_multipliers poles_ exponents
-errors: error stderr se bse std_err std_errors sd uncertainty uncertainties sigma yerr error_bars \
-std_error
-estimates: estimate result_ results
-event: events poincare surface trigger crossing poincare_section
-file: filename fname filepath path file_name name_of_file outfile out folder
-free: free_parameters vary
-freq: freqs frequency omega w fmax fmin freq_range frequencies f band freqrange hz faxis
-fs: Fs sfreq srate sampling_rate sample_rate sampling_frequency rate sr sampling_freq
-guess: init initial initial_guess p0 initial_values start_values initial_condition ic
-harmonic: m n_harmonics harmonics k_harmonics harmonic_numbers
-input: inputs u in_names input_names input_name control force stimulus
-magnitude: mag gain amplitude_response abs
-max_iter: maxiter n_iter iterations max_iterations maxfev niter max_steps
-modulus: moduli radius decay
-n: n_samples
-n_experiments: realizations n_realizations n_trials n_repeats num_experiments nexp
-n_jobs: workers n_workers num_workers parallel threads nproc processes
-names: labels keys variables signal_names variable_names state_names output_names
-noise: noise_std noise_level snr sigma_noise
-nperiods: n_periods num_periods
-n_points: npoints num_points n_pts
-plot: draw figure visualize plot_2d imshow
-points: bifurcations special_points bifurcation_points
-save: savefig write to_file export dump to_csv
-to_pandas: to_data_frame to_dataframe to_df dataframe as_dataframe frame table
-order: model_degree dims
-output: outputs y_names output_name observable observe measured
-overlay: fit model_fit
-params: parameters param theta_ params_ best_params_ x_opt p parameter parameter_names
-period: periods
-phase: phi
-predict: forecast sim simulate lsim response fitted_values fittedvalues transform
-range: ranges values_range interval_of over grid limits par_range p_range span
-residuals: resid residual
-sections: section n_sections_or_family poincare_sections slices
-seed: random_state rng key random_seed
-signal: signals variable
-size: shape count
-solver: method integrator algorithm stepper
-stable: is_stable stability isstable
-standard_errors: standard_error
-state: q z
-states: x_names
-step: stepsize ds
-system: sys hs plant robot ode
-t: times ts t_eval time_points saveat
-t_span: tspan time_span
-tf: transfer_function freqresp frequency_response frequency_responses evalfr htfs transfer tfs
-threshold: level value crossing_value
-tol: rtol xtol ftol eps tolerance precision gtol rel_tol
-trials: n_trials_ segments
-values: array numpy to_numpy
-x0: y0 z0 q0 u0 state0 initial_state initial_states
-y: ys
-"""
-for _row in _ALIKE.strip().splitlines():
-    _word, _, _others = _row.partition(":")
-    for _other in _others.split():
-        WORDS.setdefault(_other, WORDS.get(_word, (_word,)))
-
-KEYWORDS = {
-    "run_experiments.noise": "`hj.experiments.add_noise(data, std=...)` adds noise to data, and "
-    "`process_noise` acts on the system",
-    "find_limit_cycle.period": "the period follows from the clock or the search; `max_period` "
-    "bounds it",
-    "find_limit_cycle.settings": "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=1000)`",
-    "simulate.events": "events are transitions of the system, as in "
-    "`hj.HybridSystem.from_functions(states, field, events)`",
-    "simulate.t_eval": "`trajectory.at(times)` has the states at any times",
-    "simulate.saveat": "`trajectory.at(times)` has the states at any times",
-    "simulate.args": "parameters belong to the system: `system.replace(k=9.0)` changes them",
-    "simulate.settings": "steps follow from the accuracy: pass "
-    "`settings=hj.orbits.Settings(rtol=1e-9)`; `trajectory.dense()` has values between steps",
-    "simulate.guess": "pass the name of a chart and a state there, or a guess: "
-    "`hj.simulate(system, guess, duration)`",
-    "multisine.amplitude": "pass `amplitude`, of each cosine; `design.scaled(rms)` sets the rms",
-    "multisine.realizations": "`design.realizations(4)` repeats a design with new phases",
-    "multisine.experiments": "`design.realizations(4)` repeats a design with new phases; "
-    "`experiments` is their number for one set of frequencies",
-    "Recording.rate": "pass `time`, the times of all samples: `np.arange(n) / rate`",
-    "read_recording.time": "the file has a column with times, which `time` names",
-    "identify_recording.time": "the recording has its times: `hj.Recording(time, signals)`",
-    "continuation.parameter": "pass its name and range: `hj.continuation(cycle, 'k', (low, high))`",
-    "sweep.parameter": "pass the values by name: `hj.sweep(system, {'k': values})`",
-    "sweep.range": "pass the values by name: `hj.sweep(system, {'k': values})`",
-    "linearize.settings": "pass `settings` to `find_limit_cycle`, whose cycle is linearized",
-    "run_experiments.execution": "pass `execution=hj.scale.Execution(workers=2)`",
-}
-"""More than a word for an argument that a function has not: `function.word`, where the word is the
-given one, or one of this package that it stands for."""
-
-ATTRIBUTES = {
-    "AbstractSections.on": "`hj.sections.place_sections(cycle, sections)` places them",
-    "Design.u": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
-    "Design.to_numpy": "`design.signals(cycles)` returns the inputs, (S, n, nu)",
-    "ExperimentData.duration": "each of the `len(data)` experiments has `data.u.shape[1]` samples",
-    "ExperimentData.fs": "samples lie on sections: there are `data.n_sections` in a period",
-    "ExperimentData.t": "samples lie on sections: sample i on section `i % data.n_sections`",
-    "ExperimentData.shape": "`data.u` is (S, n, nu) and `data.y` is (S, n, ny)",
-    "ExperimentData.mean": "`data.y.mean(axis=0)` averages experiments",
-    "Fit.aic": "`hj.select_order(htf)` compares orders",
-    "Fit.plot_residuals": "`hj.validate(model, data).plot()` shows residuals",
-    "Fit.pvalue": "`fit.compare(other)` returns one",
-    "Fit.pvalues": "`fit.compare(other)` returns them",
-    "Fit.score": "`hj.validate(fit, data)` compares a fit with data",
-    "Fit.predict": "`hj.validate(fit, data)` compares it with data, and `fit.htf(frequencies)` is "
-    "its response",
-    "Fit.fit": "`hj.fit_multipliers`, `hj.fit_series`, `hj.fit_ldtp` and `hj.fit_model` fit",
-    "Fit.summary": "`print(fit)` shows a summary",
-    "HTF.coherence": "`htf.variance` and `htf.standard_error` have the errors",
-    "HTF.magnitude": "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
-    "HTF.phase": "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
-    "HTF.harmonic": "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values",
-    "HTF.gain": "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it",
-    "HTF.bode": "`hj.plot.bode(htf)` draws it",
-    "HTF.shape": "`htf.H` has the shape (harmonics, frequencies, outputs, inputs)",
-    "HybridSystem.params": "print the system: its parameters are its attributes",
-    "HybridSystem.set": "`system.replace(k=9.0)` returns a system with other parameters",
-    "HybridSystem.set_params": "`system.replace(k=9.0)` returns a system with other parameters",
-    "HybridSystem.states": "`system.charts()` has the charts, each with its `states`",
-    "LDTP.bode": "`hj.plot.bode(model.htf(frequencies))` draws it",
-    "LDTP.dt": "a model has `n_sections` samples in a period; time is not part of it",
-    "LDTP.n_states": "`model.dims` has the dimension of the state at each section",
-    "LDTP.step_response": "`model.simulate(np.ones((n, nu)))` returns it",
-    "LimitCycle.simulate": "`cycle.trajectory()` follows the cycle, and "
-    "`hj.simulate(system, chart, state, duration)` another state",
-    "LimitCycle.step": "`cycle.responses()` has the responses to brief pushes, and "
-    "`cycle.sensitivity(parameter)` those to lasting changes",
-    "LimitCycle.monodromy": "`cycle.multipliers` has the eigenvalues, and "
-    "`hj.sections.section_map(cycle, sections, 0, 0)` the return map between sections",
-    "LimitCycle.frequency": "`1 / cycle.period` is the frequency",
-    "LimitCycle.freq": "`1 / cycle.period` is the frequency",
-    "LimitCycle.events": "`cycle.event_sequence` has the transitions of one period",
-    "LimitCycle.parameters": "`cycle.numbers` has the parameters, and `cycle.system` the system",
-    "LimitCycle.prc": "`cycle.responses()` has the phase responses",
-    "LimitCycle.phase_response": "`cycle.responses()` has the phase responses",
-    "LimitCycle.jacobian": "`cycle.multipliers` has the eigenvalues of the return map's Jacobian",
-    "LimitCycle.find": "`hj.find_limit_cycle(system)` finds one",
-    "Plot.savefig": "`plot.save(path)` writes the figure, and `plot.figure` is that of matplotlib",
-    "RationalFit.contains": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
-    "RationalFit.interval": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
-    "RationalFit.standard_errors": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
-    "Recording.crop": "`hj.Recording(time[part], {name: x[part]})` makes a part",
-    "Recording.data": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` all "
-    "signals",
-    "Recording.filter": "`bandwidth`, an argument of `hj.identify_recording`, smooths signals",
-    "Recording.get_data": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` "
-    "all signals",
-    "Recording.info": "`print(recording)` shows signals, units and rates",
-    "Recording.head": "`recording.to_pandas().head()` shows the first samples",
-    "Recording.pick": "`recording['yM']` has the samples of a signal",
-    "Recording.resample": "`hj.identify_recording` takes any rate, also uneven times",
-    "Recording.values": "`recording['yM']` has the samples of a signal, `recording.to_pandas()` "
-    "all signals",
-    "Recording.shape": "`recording.trials` has them, with `time` and `values`",
-    "Showable.copy": "results do not change, so that there is no need of a copy",
-    "Showable.export": "`hj.save(path, result)` writes it",
-    "Showable.save": "`hj.save(path, result)` writes it",
-    "Showable.show": "`result.plot().show()` shows the figure",
-    "Showable.to_csv": "`result.to_pandas().to_csv(path)` writes it",
-    "Showable.to_mat": "`hj.save('name.mat', result)` writes it",
-    "Showable.to_xarray": "`hj.convert.to_xarray(result)` returns a dataset",
-    "Showable.write": "`hj.save(path, result)` writes it",
-    "Trajectory.sol": "`trajectory.dense()` has values between steps",
-    "Trajectory.x": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.y": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.ys": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.states": "`trajectory.after` has the states (n, d) after each step",
-    "Trajectory.t_events": "`trajectory.events` has events with their `time`",
-    "Trajectory.y_events": "`trajectory.events` has events with the states before and after",
-}
-"""More than a word for an attribute that a class, or one derived from it, has not."""
-
 IN_NAMESPACES = {
     "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
     "other fields are arrays",
-    "models": "`dir(hj.models)` lists them",
+    "hybridjax": "`dir(hj)` lists its names, and those of the page of each namespace, such as "
+    "`hj.recordings`, are one level below",
     "plot": "`result.plot()` draws a result, and `dir(hj.plot)` lists all figures",
 }
-"""Where a name is none of a namespace's, and close to no other one."""
+"""Where a name is none of a namespace's, and close to no other one; `dir` in the others."""
 
 CALLED = {
     "identify": "`hj.fit_multipliers(htf, order)`, `hj.fit_series(data, order)` and "
@@ -429,91 +180,50 @@ CALLED = {
 }
 """What does what a call of a namespace means."""
 
-NAMES = {
-    "bode_plot": "hj.plot.bode(htf)",
-    "compare": "fit.compare(other)",
-    "convert.to_numpy": "result.to_pandas().to_numpy()",
-    "create_info": "hj.Recording(time, signals, units=...)",
-    "cross_val_score": "hj.validate(fit, data)",
-    "cycle": "hj.find_limit_cycle(system)",
-    "datasets": "hj.testing.simulate_recording(cycle, inputs, outputs, rate)",
-    "diffeqsolve": "hj.simulate(system, chart, state, duration)",
-    "dlsim": "model.simulate(u)",
-    "eigenvalues": "cycle.multipliers",
-    "enable_double": "hj.enable_x64()",
-    "find_events": "hj.Crossing('y', 'falling')",
-    "fit": "hj.fit_multipliers(htf, order) or hj.fit_series(data, order)",
-    "floquet": "hj.find_limit_cycle(system).multipliers",
-    "floquet_multipliers": "hj.find_limit_cycle(system).multipliers",
-    "forced_response": "model.simulate(u)",
-    "freqresp": "model.htf(frequencies)",
-    "frequency_response": "model.htf(frequencies)",
-    "identify_subject": "hj.identify_recording(recording, ...)",
-    "impulse_response": "model.impulse_response(n_lags)",
-    "initial_response": "model.simulate(u, x0)",
-    "integrate": "hj.simulate(system, chart, state, duration)",
-    "load_dataset": "hj.read_recording(path)",
-    "load_recording": "hj.read_recording(path)",
-    "lsim": "model.simulate(u)",
-    "metrics": "hj.validate(fit, data)",
-    "models.Hopper": "hj.models.VerticalHopper()",
-    "models.Walker": "hj.models.CompassGait()",
-    "monodromy": "hj.linearize(cycle, sections)",
-    "multipliers": "hj.find_limit_cycle(system).multipliers",
-    "noise": "hj.experiments.add_noise(data, std=...)",
-    "nyquist": "hj.plot.bode(htf)",
-    "odeint": "hj.simulate(system, chart, state, duration)",
-    "ode45": "hj.simulate(system, chart, state, duration)",
-    "periodic_orbit": "hj.find_limit_cycle(system)",
-    "plot_bode": "hj.plot.bode(htf)",
-    "poincare_map": "hj.sections.section_map(cycle, sections, i, j)",
-    "poincare_section": "hj.Crossing('y', 'falling')",
-    "pole": "model.multipliers",
-    "poles": "model.multipliers",
-    "prc": "cycle.responses()",
-    "random_walk": "hj.experiments.random_input(duration, rate, bandwidth)",
-    "RawArray": "hj.Recording(time, signals)",
-    "StateSpace": "hj.linear.LDTP(A, B, C, D)",
-    "read_c3d": "hj.read_recording(path)",
-    "read_csv": "hj.read_recording(path)",
-    "read_mat": "hj.read_recording(path)",
-    "read_raw": "hj.read_recording(path)",
-    "return_map": "hj.sections.section_map(cycle, sections, i, j)",
-    "run": "hj.run_experiments(cycle, sections, design, outputs)",
-    "shooting": "hj.find_limit_cycle(system)",
-    "solve_ivp": "hj.simulate(system, chart, state, duration)",
-    "ss": "hj.linear.LDTP(A, B, C, D)",
-    "plot.nyquist": "hj.plot.bode(htf)",
-    "plot.time_series": "recording.plot()",
-    "plot.trajectory": "cycle.plot()` or `trajectory.plot()",
-    "stability": "hj.find_limit_cycle(system).stable",
-    "step_response": "model.simulate(np.ones((n, nu)))",
-    "subjects": "hj.identify_subjects(table, folder)",
-    "tf": "model.htf(frequencies)",
-    "transfer_function": "model.htf(frequencies)",
-    "train_test_split": "hj.recordings.hold_out(data, order)",
-    "trajectory": "hj.simulate(system, chart, state, duration)",
-}
-"""Names that a module has not, and the call that does what they mean. Those of the package stand
-alone, and those of a namespace after its name."""
-
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
 # is longer than a line.
 _LISTED = 24
 
 
-def about_name(package: str, name: str) -> str | None:
-    """Return the rest of the sentence about a name that a namespace has not, where a call does what
-    it means; None if none is known."""
+# Likeness of two spellings, from 0 to 1, at which one is taken for a slip in the other, and at
+# which it is the last guess. Lower: names of other things are suggested. Higher: slips lead
+# nowhere.
+_SLIP = 0.85
+_ALIKE = 0.7
+
+
+def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
+    """Return the rest of the sentence about a name that a namespace has not.
+
+    **Arguments:** `places`: the places of all public names, such as `hj.plot.bode`; those of the
+    namespace first.
+    """
     namespace = package.rpartition(".")[2]
-    key = name if namespace == "hybridjax" else f"{namespace}.{name}"
-    call = NAMES.get(key)
-    return None if call is None else f"use `{call}`"
+    for lead in _leads_of_name(namespace, name, places):
+        if lead is not None:
+            return lead
+    return IN_NAMESPACES.get(namespace, f"`dir(hj.{namespace})` lists its names")
 
 
-def about_namespace(package: str) -> str:
-    """Return the rest of the sentence about a name that is close to no other one."""
-    return IN_NAMESPACES.get(package.rpartition(".")[2], "")
+def _leads_of_name(
+    namespace: str, name: str, places: Mapping[str, str]
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+
+    def place(meant: str | None) -> str | None:
+        return None if meant is None else f"did you mean {places[meant]}?"
+
+    own = "" if namespace == "hybridjax" else namespace
+    yield words.lead_of(words.NAMES, [own], name)
+    yield place(words.same_word(name, places))
+    yield words.lead_of(words.NAMES, [""], name)
+    yield place(_spelled_alike(name, places, _SLIP))
+    yield words.lead_of_library([""], name)
+    for part in words.parts(name):
+        yield words.lead_of(words.NAMES, [own, ""], part)
+    yield place(_spelled_alike(name, places, _ALIKE))
+    for part in words.parts(name):
+        yield place(words.with_part(part, places))
 
 
 def about_called(package: str) -> str:
@@ -557,21 +267,40 @@ def about_attribute(cls: type, name: str) -> str:
         return earlier
     head = f"{with_article(cls.__name__)} has no `{name}`"
     head = head[0].upper() + head[1:]
+    return f"{head}{_meant_attribute(cls, name)}."
+
+
+def _meant_attribute(cls: type, name: str) -> str:
+    """Return the rest of the sentence: the most certain lead, or all attributes."""
     attributes = attributes_of(cls)
-    for base in cls.__mro__:
-        lead = ATTRIBUTES.get(f"{base.__name__}.{name}")
+    for lead in _leads_of_attribute(cls, name, attributes):
         if lead is not None:
-            return f"{head}: {lead}."
-    word = closest(name, attributes) or _documented(cls, name)
-    if word is not None:
-        return f"{head}: use `{word}`."
-    part = _attribute_of_part(cls, name)
-    if part is not None:
-        return f"{head}: use `{part}`."
+            return f": {lead}"
+    return f"; it has {_some(attributes)}"
+
+
+def _leads_of_attribute(
+    cls: type, name: str, attributes: Collection[str]
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+    owners = [base.__name__ for base in cls.__mro__]
+    yield words.lead_of(words.ATTRIBUTES, owners, name)
+    yield _use(_synonym(name, attributes))
+    yield _use(_attribute_of_part(cls, name))
+    yield words.lead_of_library(owners, name)
+    yield _use(_spelled_alike(name, attributes, _SLIP))
+    yield _use(_documented(cls, name))
+    for part in words.parts(name):
+        yield words.lead_of(words.ATTRIBUTES, owners, part)
+        yield _use(words.with_part(part, attributes))
+    yield _use(_spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
     if function is not None:
-        return f"{head}: `{function}` is a function that may take it."
-    return f"{head}; it has {_some(attributes)}."
+        yield f"`{function}` is a function that may take it"
+
+
+def _use(name: str | None) -> str | None:
+    return None if name is None else f"use `{name}`"
 
 
 def _documented(cls: type, name: str) -> str | None:
@@ -609,6 +338,10 @@ NEEDS = {
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
     "estimate_phase.sections": "an event that happens once a cycle, such as "
     "`hj.Crossing('y', 'falling')` of a signal 'y'",
+    "signals": "`hj.Recording(time, {'name': samples})`, or `hj.Recording.from_frame(table)`",
+    "identify_recording.inputs": "the signals that perturb; without any, "
+    "`hj.recordings.natural_multipliers(hj.recordings.sample_sections(recording, sections, "
+    "inputs=(), outputs=...))` estimates multipliers from variability",
     "identify_recording.sections": "an event that happens once a cycle, such as "
     "`hj.Crossing('y', 'falling')` of a signal 'y'",
 }
@@ -634,37 +367,53 @@ def about_keyword(
     earlier = about_word(function, name)
     if earlier is not None:
         return earlier
-    short = function.rpartition(".")[2]
-    head = f"{function} has no argument `{name}`"
-    words = [name, *WORDS.get(name, ())]
-    for word in words:
-        lead = KEYWORDS.get(f"{short}.{word}")
+    lead = _meant_argument(function.rpartition(".")[2], name, parameters, first)
+    return f"{function} has no argument `{name}`{lead}."
+
+
+def _meant_argument(
+    function: str, name: str, parameters: Sequence[str], first: Any
+) -> str:
+    """Return the rest of the sentence: the most certain lead, or all arguments."""
+    for lead in _leads_of_argument(function, name, parameters, first):
         if lead is not None:
-            return f"{head}: {lead}."
-    if hasattr(type(first), "charts") and name in attributes_of(type(first)):
-        change = f"`system.replace({name}=...)` returns a system with another `{name}`"
-        return f"{head}: {KEYWORDS.get(f'{short}.parameter', change)}."
-    word = closest(name, parameters)
-    if word is not None:
-        return f"{head}: use `{word}`."
-    return f"{head}; it has {_some(parameters)}."
+            return f": {lead}"
+    return f"; it has {_some(parameters)}"
 
 
-def closest(name: str, among: Collection[str]) -> str | None:
-    """Return the name that is meant: a word for the same, or one that is spelled alike."""
-    for word in WORDS.get(name, ()):
+def _leads_of_argument(
+    function: str, name: str, parameters: Sequence[str], first: Any
+) -> Iterator[str | None]:
+    """Iterate over leads, certain ones first; None where there is none."""
+    own = [function]
+    for word in (name, *words.synonyms(name)):
+        yield words.lead_of(words.KEYWORDS, own, word)
+    system = getattr(first, "system", first)
+    if hasattr(type(system), "charts") and name in attributes_of(type(system)):
+        yield words.lead_of(words.KEYWORDS, own, "parameter")
+        yield f"`system.replace({name}=...)` returns a system with another `{name}`"
+    yield _use(_synonym(name, parameters))
+    is_figure = (place_of(function) or "").startswith("hj.plot.")
+    owners = [function, "plot", ""] if is_figure else [function, ""]
+    yield words.lead_of(words.KEYWORDS, owners, name)
+    yield _use(_spelled_alike(name, parameters, _SLIP))
+    for part in words.parts(name):
+        yield _use(words.with_part(part, parameters))
+        yield words.lead_of(words.KEYWORDS, owners, part)
+    yield _use(_spelled_alike(name, parameters, _ALIKE))
+
+
+def _synonym(name: str, among: Collection[str]) -> str | None:
+    """Return the name that means the same, or that is written otherwise."""
+    for word in words.synonyms(name):
         if word in among:
             return word
-    by_case = {word.lower(): word for word in among}
-    if name.lower() in by_case:
-        return by_case[name.lower()]
-    ending = f"_{name}"
-    named = [x for x in among if x.endswith(ending) or x.startswith(f"{name}_")]
-    alike = difflib.get_close_matches(name, among, n=1, cutoff=0.7)
-    for found in (alike, named):
-        if found:
-            return found[0]
-    return None
+    return words.same_word(name, among)
+
+
+def _spelled_alike(name: str, among: Collection[str], likeness: float) -> str | None:
+    alike = difflib.get_close_matches(name, among, n=1, cutoff=likeness)
+    return alike[0] if alike else None
 
 
 def about_object(function: str, kind: Kind | None, value: Any) -> str:

@@ -84,7 +84,18 @@ class PhaseResponse(PhaseCurve):
         level: Probability = 0.95,
     ) -> tuple[Series, Series]:
         """Return lower and upper bounds that hold the curve with this probability, as a mean over
-        the phases: they are too narrow where it changes faster than elsewhere."""
+        the phases: they are too narrow where it changes faster than elsewhere.
+
+        **Example:**
+
+        ```python
+        force = hj.experiments.random_input(100, 100, bandwidth=8)
+        z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
+        beats = hj.testing.simulate_beats(z, force.T, rate=100, jitter=0.01)
+        curve = hj.recordings.phase_response(beats, hj.AtEvent("beat"), input="u")
+        low, high = curve.interval(np.linspace(0, 1, 5))
+        ```
+        """
         waves = self._waves(phase)
         error = _errors(waves, self.covariance)
         reach = float(stats.t.ppf((1 + level) / 2, self.dof)) * error
