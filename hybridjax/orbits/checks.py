@@ -24,9 +24,10 @@ from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import SAME_TIME, Scheduled
-from .coincidence import SAME, coincident, events_of
+from .coincidence import SAME
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
+from .rivals import coincident
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 from .verdict import verdict
 
@@ -475,7 +476,7 @@ def _about_decisions(s: Structure) -> str:
 
 def _about_guards(s: Structure, turn: Turn, better: str) -> str:
     """The values of the guards, if none of them led to an event."""
-    if events_of(turn) or not s.transitions:
+    if turn.events or not s.transitions:
         return ""
     values: dict[int, list[float]] = {}
     for a, t, q in points(s, turn.legs):

@@ -182,7 +182,9 @@ class Curve:
         is no obstacle to the cycle.
         """
         legs = point.turn.legs
-        events = point.turn.times[point.turn.codes >= 0]
+        tapes = point.turn.tapes
+        assert tapes is not None
+        events = tapes.t[tapes.code >= 0]
         if self.map.base is not None or not len(events):
             return None
         k = far_from_events(legs.t, events, float(point.turn.period))
@@ -241,12 +243,16 @@ class Curve:
         varied = Varied(self.system_at(z[-1]), self.parameter)
         with on_the_cpu(), at_ease():
             map = to_host(map.at_phase_of(varied.system))
-            return map.turn_with_jacobian(z[:-1], varied=varied)._replace(tapes=None)
+            turn = map.turn_with_jacobian(z[:-1], varied=varied)
+        assert turn.tapes is not None
+        # (Points keep what tells their events; states would fill the memory.)
+        tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
+        return turn._replace(tapes=tapes)
 
     def _failure(self, turn: Turn) -> Result | None:
         if int(turn.result) != Result.OK:
             return Result(int(turn.result))
-        sequence = _rotated(int(g) for g in np.ravel(turn.codes) if g >= 0)
+        sequence = _rotated(turn.events)
         if sorted(sequence) != sorted(self.sequence):
             return Result.GRAZING  # events come and go where a guard is touched
         if sequence != self.sequence or not np.all(np.isfinite(turn.residual)):

@@ -26,7 +26,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
-from .coincidence import SAME, check_begin, coincident, commutes, events_of, meet
+from .coincidence import SAME, check_begin, commutes
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle, derived_if_found
@@ -40,6 +40,7 @@ from .linear_flow import keep_turn, last_turn, remembering
 from .near import repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
+from .rivals import coincident, meet
 from .scale import (
     Sizes,
     given_sizes,
@@ -318,8 +319,9 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
     near = last_turn(known)
     solution = solve(map, True, True, near)
     # (Of events that coincide on the guess, too, its search has compared the orders.)
-    if near is None or not meet(map.structure, known.period, near[1]):
-        together = meet(map.structure, solution.turn.period, solution.turn.tapes)
+    if near is None or not meet(known.return_map, near[1], known.period):
+        assert solution.turn.tapes is not None
+        together = meet(map, solution.turn.tapes, solution.turn.period)
         code = update_result(solution.result, together, Result.SIMULTANEOUS)
         solution = solution._replace(result=code)
     cycle = derived_if_found(_cycle(map, solution, known.event_sequence))
@@ -446,8 +448,7 @@ def _judged(
 
 def kept(map: ReturnMap, solution: Solution) -> LimitCycle:
     """The cycle of a solution, which remembers its last turn."""
-    events = tuple(event for event, _ in events_of(solution.turn))
-    cycle = _cycle(map, solution, events)
+    cycle = _cycle(map, solution, solution.turn.events)
     keep_turn(cycle, solution.turn)
     return cycle
 

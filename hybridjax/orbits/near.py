@@ -19,10 +19,9 @@ from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
 from ..engine.itinerary.rows import Form, Itinerary
+from ..engine.itinerary.turn import Passage
 from ..engine.lanes import Lanes, pace_of
 from ..systems.system import copies_of
-from ..systems.transition import TOGETHER
-from .crossing import AtEvent
 from .cycle import LimitCycle, derived_if_found
 from .linear_flow import hosted, last_turn
 from .repeat import (
@@ -42,6 +41,7 @@ from .repeat import (
     travel,
 )
 from .return_map import ReturnMap
+from .rivals import coincide_on
 from .verdict import verdict
 
 
@@ -137,25 +137,15 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
     result = update_result(result, ~converged, Result.NOT_CONVERGED)
     result = update_result(result, ~kept, Result.EVENT_ORDER)
     result = update_result(result, ~fine, Result.STEP_LIMIT)
-    together = _coincide(route, found, expected)
+    together = _coincide(route, map, still(found.passage))
     return update_result(result, together, Result.SIMULTANEOUS)
 
 
-def _coincide(route: Route, found: Corrected, expected):
-    """Whether two events come together that do not on the known cycle."""
-    s, events = route.map.structure, route.first.events
-    ends, known = found.passage.ends, jnp.asarray(route.first.ends)
-    together = jnp.asarray(False)
-    for k in range(1, len(events)):
-        if s.clocks[events[k]] >= 0 and s.clocks[events[k - 1]] >= 0:
-            continue  # (Of two that are scheduled, the order is known.)
-        were_apart = known[k] - known[k - 1] > TOGETHER * route.map.expected
-        meet = ends[k] - ends[k - 1] <= TOGETHER * expected
-        together = together | (were_apart & meet)
-    if isinstance(route.map.base, AtEvent) and len(events) > 1:
-        since_begin = ends[0] - found.passage.legs_t[0]
-        together = together | (since_begin <= TOGETHER * expected)
-    return together
+def _coincide(route: Route, map: ReturnMap, passage: Passage):
+    """Whether events coincide that do not on the known cycle."""
+    begin = passage.legs_t[0]
+    together = coincide_on(map, route.first.events, passage.ends, begin, passage.t)
+    return (together & ~route.together).any()
 
 
 def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
@@ -184,7 +174,9 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
             return None
         program = whole(_travel, (route.other.form,), (arrays,), loops=True)
         other = program(Plan.of(route.other), found.q, found.passage.ends)
-    if not agrees(route, found.q, other) or _coincide(route, found, expected):
+    if not agrees(route, found.q, other):
+        return None
+    if _coincide(route, map, found.passage):
         return None
     return from_host(_cycle(itinerary, route, map, found, np.int32(Result.OK)))
 

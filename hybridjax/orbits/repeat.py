@@ -27,6 +27,7 @@ from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
+from .rivals import coincide_on
 from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
 
@@ -89,6 +90,8 @@ class Route(NamedTuple):
     finer: Itinerary
     other: Itinerary
     """Of the second integration."""
+    together: Bool[np.ndarray, " E"]
+    """Which events of the known cycle have a rival (see `coincide_on`)."""
 
 
 def has_route(map: ReturnMap) -> bool:
@@ -116,7 +119,11 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     # (Steps of implicit methods differ much in length: joined ones have large errors.)
     density = _FINER if has_implicit(s) else _DENSITY
     densities = density, density * _FINER, density * _OTHER
-    return Route(map, *(recorded(s, pieces, levels, density) for density in densities))
+    first, finer, other = (recorded(s, pieces, levels, x) for x in densities)
+    begin = map.anchor.t[0]
+    ends = begin + first.ends
+    together = coincide_on(map, first.events, ends, begin, ends[first.last])
+    return Route(map, first, finer, other, together)
 
 
 class Corrected(NamedTuple):

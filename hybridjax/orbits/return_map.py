@@ -102,10 +102,6 @@ class Turn(NamedTuple):
     direction of the flow."""
     codes: Int[Array, "K R"]
     """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
-    times: Float[Array, "K R"]
-    """Times of these events. (None in sweeps.)"""
-    rivals: Int[Array, "K R"]
-    """Transitions that were due at these events, too (see `Tape`). (None in sweeps.)"""
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
     meetings: Int[Array, ""]
@@ -119,6 +115,11 @@ class Turn(NamedTuple):
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
         """True if the turn ends at its beginning (also of many turns at once, on the host)."""
         return self.distance <= CLOSED
+
+    @property
+    def events(self) -> tuple[int, ...]:
+        """The events of a single turn on the host, by index of the transition."""
+        return tuple(self.codes[self.codes >= 0].tolist())
 
 
 class ReturnMap(eqx.Module):
@@ -301,8 +302,6 @@ class ReturnMap(eqx.Module):
         distance = (
             xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
         )
-        times = each(xp.moveaxis(tapes.t, -1, 0))
-        rivals = each(xp.moveaxis(tapes.rival, -1, 0))
         meetings = self._meetings(lanes, codes)
         legs = jax.tree_util.tree_map(
             lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs
@@ -314,8 +313,6 @@ class ReturnMap(eqx.Module):
             legs,
             factors,
             codes,
-            times,
-            rivals,
             distance,
             meetings,
             record,

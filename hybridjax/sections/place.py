@@ -39,7 +39,7 @@ from ..orbits.linear_flow import beginning, last_turn, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..orbits.scale import has_implicit
 from ..systems.structure import Structure
-from ..systems.transition import TOGETHER, Scheduled
+from ..systems.transition import Scheduled, at_one_time
 from . import families
 from .along import flow_along, levels_at
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
@@ -231,9 +231,8 @@ def _near_events(
         [*is_scheduled, True]
     )  # (the last one is for moves without an event)
     when = xp.where(ignored[xp.maximum(tape.code, -1)], xp.nan, tape.t)
-    late = TOGETHER * map.expected
-    at_start = (xp.abs(when - starts.t) <= late).any(axis=0)
-    at_end = (xp.abs(when - ends.t) <= late).any(axis=0)
+    at_start = at_one_time(when, starts.t, map.expected).any(axis=0)
+    at_end = at_one_time(when, ends.t, map.expected).any(axis=0)
     return xp.isfinite(bound.time) & (at_start | xp.roll(at_end, 1))
 
 
@@ -485,10 +484,10 @@ def _require_order(placed: PlacedSections) -> None:
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} {_AGAIN}{_remedy(placed, 0)}")
-    apart = np.abs(duration - period * np.rint(duration / period))
-    nearest = int(np.argmin(apart))
+    whole = period * np.rint(duration / period)
+    nearest = int(np.argmin(np.abs(duration - whole)))
     i, j = sorted((nearest, (nearest + 1) % N))
-    if i < j and apart[nearest] <= TOGETHER * period:
+    if i < j and at_one_time(duration[nearest], whole[nearest], period):
         raise ComputationError(
             f"{name(j)} coincides with section {i} on the cycle: leave one out."
         )
