@@ -5,6 +5,7 @@ derivatives. Outside of these, what leaves the route goes to the search.
 """
 
 import collections
+import dataclasses
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from .._core.jax_compat import outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
-from ..engine.itinerary.rows import Form, Itinerary
+from ..engine.itinerary.rows import Itinerary
 from ..engine.itinerary.turn import Passage
 from ..engine.lanes import Lanes, pace_of
 from ..systems.system import copies_of
@@ -121,22 +122,17 @@ def _found(
     map: ReturnMap,
     reverse: bool = False,
 ) -> Corrected:
-    itinerary = route.finer  # (steps cannot be divided later)
-    count = None if reverse else jnp.asarray(itinerary.count)
-    plan = Plan(itinerary.rows, count, jnp.asarray(itinerary.last))
-    options: Any = dict(derivatives=derivatives)
-    return correct(maps_of(map), itinerary.form, plan, *begin, **options)
+    plan = Plan.of(route.finer)  # (steps cannot be divided later)
+    if reverse:
+        plan = dataclasses.replace(plan, count=None)
+    return correct(maps_of(map), plan, *begin, derivatives=derivatives)
 
 
 def _result(route: Route, map: ReturnMap, found: Corrected):
     """The code of a cycle."""
     still = jax.lax.stop_gradient
     t, expected = still(map.anchor.t[0]), still(map.expected)
-    converged, kept, fine = judge(route, still(found), t, expected)
-    result = jnp.zeros_like(found.turns, dtype=jnp.int32)
-    result = update_result(result, ~converged, Result.NOT_CONVERGED)
-    result = update_result(result, ~kept, Result.EVENT_ORDER)
-    result = update_result(result, ~fine, Result.STEP_LIMIT)
+    result = judge(route, still(found), t, expected)
     together = _coincide(route, map, still(found.passage))
     return update_result(result, together, Result.SIMULTANEOUS)
 
@@ -164,15 +160,15 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
-            program = whole(_correct, (itinerary.form,), (arrays,), loops=True)
+            program = whole(_correct, (), (arrays,), loops=True)
             found = program(Plan.of(itinerary), *begin)
-            converged, kept, fine = judge(route, found, t, expected)
-            if fine or not (converged and kept):
+            code = judge(route, found, t, expected)
+            if code != Result.STEP_LIMIT:
                 break
             begin = [found.q, found.passage.ends]
-        if not (converged and kept and fine):
+        if code != Result.OK:
             return None
-        program = whole(_travel, (route.other.form,), (arrays,), loops=True)
+        program = whole(_travel, (), (arrays,), loops=True)
         other = program(Plan.of(route.other), found.q, found.passage.ends)
     if not agrees(route, found.q, other):
         return None
@@ -181,12 +177,12 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     return from_host(_cycle(itinerary, route, map, found, np.int32(Result.OK)))
 
 
-def _correct(form: Form, map: ReturnMap, plan: Plan, q, ends) -> Corrected:
-    return correct(maps_of(map), form, plan, q, ends)
+def _correct(map: ReturnMap, plan: Plan, q, ends) -> Corrected:
+    return correct(maps_of(map), plan, q, ends)
 
 
-def _travel(form: Form, map: ReturnMap, plan: Plan, q, ends):
-    return travel(maps_of(map), form, plan, q, ends)
+def _travel(map: ReturnMap, plan: Plan, q, ends) -> Passage:
+    return travel(maps_of(map), plan, q, ends)
 
 
 def _cycle(

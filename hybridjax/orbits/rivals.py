@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import Array, namespace, on_host, stop_gradient
+from .._core.executor import Array, namespace, on_host, stop_gradient, to_host
 from ..engine.lanes import Tape
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled, at_one_time
@@ -119,14 +119,17 @@ def coincide_on(
 
 
 def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
-    """Two transitions of a turn, by index, that are due at the same time; the turn may have passed
-    over one of them."""
-    assert turn.tapes is not None
-    events = events_on(map, turn.tapes)
-    rivals = rivals_of(map.structure, events, turn.period)
+    """Two transitions of a turn, by index, that are due at the same time: the first one that
+    happens, and another one, which the turn may have passed over."""
+    # (JAX would compile a program for each operation.)
+    map, tapes, period = to_host((map, turn.tapes, turn.period))
+    events = events_on(map, tapes)
+    rivals = rivals_of(map.structure, events, period)
+    before = None
     for code, rival in zip(events.codes.tolist(), rivals.tolist(), strict=True):
         if rival >= 0:
-            return rival, code
+            return (rival, code) if rival == before else (code, rival)
+        before = code
     return None
 
 
