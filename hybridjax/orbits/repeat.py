@@ -18,10 +18,11 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import namespace, on_host, svdvals, to_host
 from .._core.results import Result, update_result
-from .._core.vector_math import factorizations
+from .._core.vector_math.factorizations import solve_by_columns
 from ..engine.arrays import Array
+from ..engine.itinerary.bodies import Travelers
 from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
-from ..engine.itinerary.turn import Passage, Travelers, follow
+from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..engine.unresolved import POLES, may_have_pulses
 from ..linear.time_response import monodromy
@@ -229,7 +230,10 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
         is_last = jnp.arange(ends.shape[-1]) >= plan.last
         known = jnp.where(is_last, end, jnp.inf)
     travelers = Travelers(
-        lambda numbers: maps.of(numbers).structure, maps.numbers, maps.many
+        lambda numbers: maps.of(numbers).structure,
+        maps.numbers,
+        maps.many,
+        maps.map.structure,
     )
     passage = follow(
         travelers,
@@ -256,17 +260,9 @@ def _newton(map: ReturnMap, factors, residual, q):
     product = jnp.where(map.valid[:, None], monodromy(factors), 0.0)
     jacobian = product - jnp.eye(len(q)) - map.held(q)[1]
     sizes = map.sizes
-    step = -_solve(jacobian * sizes / sizes[:, None], residual / sizes)
+    step = -solve_by_columns(jacobian * sizes / sizes[:, None], residual / sizes)
     excess = jnp.max(jnp.abs(step) / (ATOL + RTOL * jnp.abs(q / sizes)))
     return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
-
-
-def _solve(
-    matrix: Float[Array, "d d"], right: Float[Array, " d"]
-) -> Float[Array, " d"]:
-    if len(right) <= factorizations.MOST_ROWS:
-        return factorizations.solve(matrix, right)
-    return jnp.linalg.solve(matrix, right)
 
 
 def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:

@@ -21,8 +21,9 @@ from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result
 from ..engine.arrays import Array
+from ..engine.itinerary.bodies import Travelers
 from ..engine.itinerary.rows import recorded_walk
-from ..engine.itinerary.turn import Passage, Travelers, follow
+from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, pace_of
 from ..engine.target import AbstractLevels
 from ..orbits.crossing import Crossing, ListLevels
@@ -206,7 +207,7 @@ def _followed(
             lambda numbers: maps.of(numbers).structure,
             maps.numbers,
             False,
-            map.structure.nu,
+            map.structure,
         )
         settings = jax.lax.stop_gradient(map.settings)
         table = path.form, path.rows, path.count if few else None

@@ -2,28 +2,34 @@ r"""What the rows of an itinerary do: steps in charts, jumps at events, arrivals
 
 Beside the state $q$ run columns $v$, its derivatives in some directions at a fixed time. Between
 events they obey $\dot v = f_q v + f_u w$, where w is the constant input of the direction. An event
-of the guard h takes place later by $\delta = -(h_q v + h_u w) / \dot h$, and leaves
-$v^+ = R_q (v + f^- \delta) + R_t \delta + R_u w - f^+ \delta$ with the reset R: the saltation
-formula (M. A. Aizerman and F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11,
-1958). On a section the state has moved by $v + f \delta$ where the section is a level, and by v
-where it is a time.
+of the guard h takes place later by $\delta = -(h_q v + h_u w) / \dot h$. At its time the columns
+are $v + f^- \delta$; after the reset R, and at a fixed time again, they are
+$R_q (v + f^- \delta) + R_t \delta + R_u w - f^+ \delta$: the saltation formula (M. A. Aizerman and
+F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11, 1958). On a section they are
+$v + f \delta$ where the section is a level, and v where it is a time.
+
+All rows that do the same share one piece of the program. Only the functions of a system (fields,
+guards, resets) are chosen among, by the number of the chart or of the kind of transition.
 """
 
 import dataclasses
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from ...systems.structure import Member, Structure
+from ...systems.structure import Kind, Member, Structure
 from ...systems.transition import SAME_TIME, TOGETHER, Scheduled
 from ..arrays import Array
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
-from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Rows
+from .motion import Alone, Motion, choose, chosen
+from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Form, Rows
 
 
 # Times of a schedule are equal if they differ by less than this part of its period. Larger: an
@@ -38,14 +44,20 @@ class Course(NamedTuple):
     t: Float[Array, ""]
     y: Float[Array, "1+C d"]
     """The state, then its columns."""
-    rate: Float[Array, " d"]
-    """The field where the last step began."""
     begin: Float[Array, ""]
     """Time at which the present leg began."""
     delay: Float[Array, " C"]
     """Columns of the time of the last event, or of the arrival on a section."""
     ends: Float[Array, " E"]
     """Ends of legs: as guessed, and as found once they are past."""
+    rate: Float[Array, " d"]
+    """The field where the present row begins."""
+    value: Float[Array, ""]
+    """The watched function that the row brings to zero there, if it does,"""
+    slope: Float[Array, ""]
+    """and its rate along the flow."""
+    h: Float[Array, ""]
+    """The time that the row takes."""
 
 
 class Flags(NamedTuple):
@@ -77,313 +89,471 @@ class Watched(NamedTuple):
         return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
 
 
-@dataclasses.dataclass(frozen=True)
-class Bodies:
-    """Functions of a row and a course for every kind of row.
+class Travelers(NamedTuple):
+    """Whose trajectories follow an itinerary: one system, or many in lanes.
 
-    **Fields:** `levels`: of the sections, if there are any; `width`: largest number of watched
-    functions of a chart; `pieces`: their number; `pairs`: a solver for each chart; `inputs`: those
-    of each column, None for columns without inputs.
+    Lanes stand on the first axis of arrays. Only what a row does is vectorized over them: JAX takes
+    many times as long to vectorize the loop over the rows.
     """
 
-    s: Structure
+    of: Callable[[Any], Structure]
+    """The structure by its numbers."""
+    numbers: Any
+    """Of one system, or of all lanes."""
+    many: bool
+    structure: Structure
+    """With any numbers: those that it needs for nothing else."""
+
+    def each(self, function: Callable) -> Callable:
+        """A function of the numbers and further arrays of one lane, for all."""
+        return jax.vmap(function) if self.many else function
+
+
+class Constants(NamedTuple):
+    """Numbers that all rows use; see `follow`."""
+
+    numbers: Any
     levels: AbstractLevels | None
     settings: Settings
-    width: int
-    pieces: int
-    pairs: Callable[[int], steps.Solver]
+    rows: Rows
+    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
+    begin: tuple
+    known: Float[Array, " E"] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """What rows do, in stages (see `motion.py`) of all lanes.
+
+    **Fields:** `solver`: of each chart; `inputs`: those of each column, None for columns without
+    inputs.
+    """
+
+    travelers: Travelers
+    form: Form
+    solver: Callable[[int], steps.Solver]
     inputs: Float[Array, "C nu"] | None = None
 
-    def of(self, body: Body) -> Callable[[Rows, Course, Flags], tuple[Course, Flags]]:
-        """The function of rows with this body."""
-        work: Any = {
-            NOTHING: lambda body, row, course, flags: (course, flags),
-            SCHEDULE: self._schedule,
-            STEP: self._step,
-            JUMP: self._jump,
-            LEVEL: self._level,
-            TIME: self._time,
-        }[body.does]
-        return lambda row, course, flags: work(body, row, course, flags)
+    def take(self, motion: Motion, row: Rows, course: Any, flags: Flags):
+        """The course, which moves, and the flags after a row."""
+        ways = self.form.ways
+        branches = [ft.partial(self._way, way, motion, row) for way in ways]
+        number = self._by_body(row, lambda body: ways.index(body.way))
+        return chosen(number, branches, course, flags)
 
-    def _schedule(self, body: Body, row: Rows, course: Course, flags: Flags):
+    def _way(self, way: Body, motion: Motion, row: Rows, course, flags: Flags):
+        if way.does == NOTHING:
+            return course, flags
+        if way.does == SCHEDULE:
+            stage = self._lane(self._schedule, way.transition, row)
+            return motion.apply(stage, course, flags)
+        if way.does == TIME:
+            return motion.apply(self._lane(self._time, row), course, flags)
+        return self._act(motion, row, course, flags)
+
+    def _act(self, motion: Motion, row: Rows, course, flags: Flags):
+        """A row that begins in a chart: a step, or the end of a leg."""
+        course, now = self._in_chart(motion, row, self._observe, course)
+        is_at_once = self._by_body(row, lambda body: body.at_once)
+        noted = self._lane(self._noted, row, is_at_once)
+        flags, _ = Alone(motion.constants).apply(noted, flags, now)
+        does = {body.does for body in self.form.bodies}
+        branches = []
+        if STEP in does:
+            branches.append(ft.partial(self._step, motion, row))
+        if does & {JUMP, LEVEL}:
+            branches.append(ft.partial(self._end, motion, row))
+        ends_leg = self._by_body(row, lambda body: body.does != STEP)
+        course, flags = chosen(ends_leg.astype(int), branches, course, flags, now)
+        return course, flags
+
+    # Stages, and numbers of rows.
+
+    def _lane(self, function: Callable, *fixed: Any) -> Callable:
+        """The stage of all lanes, for that of one, `function(*fixed, structure, constants, moving,
+        notes)`."""
+
+        def stage(constants: Constants, moving, notes):
+            def of_lane(numbers, moving, notes):
+                s = self.travelers.of(numbers)
+                return function(*fixed, s, constants, moving, notes)
+
+            return self.travelers.each(of_lane)(constants.numbers, moving, notes)
+
+        return stage
+
+    def _in_chart(
+        self, motion: Motion, row: Rows, function: Callable, moving, notes=None
+    ):
+        """What moves, and the notes, after the stage of the chart in which a row begins."""
+        stages = [self._lane(function, a, row) for a in self.form.charts]
+        return choose(motion, self._chart(row), stages, moving, notes)
+
+    def _by_body(self, row: Rows, of: Callable[[Body], int | bool]) -> Array:
+        """A number of a row by its body."""
+        return jnp.asarray(np.array([of(body) for body in self.form.bodies]))[row.body]
+
+    def _chart(self, row: Rows) -> Int[Array, ""]:
+        """The number among `form.charts` of the chart in which a row begins."""
+        charts = self.form.charts
+        number = {a: k for k, a in enumerate(charts)}
+        return self._by_body(row, lambda body: number.get(body.chart, 0))
+
+    # Rows that begin in no chart.
+
+    def _schedule(
+        self, g: int, row: Rows, s: Structure, _, course: Course, flags: Flags
+    ):
         """A leg begins whose end is known: the tick nearest to the guess."""
-        guard = self.s.transitions[body.transition].guard
+        guard = s.transitions[g].guard
         assert isinstance(guard, Scheduled)
         tick = guard.nearest(course.ends[row.leg])
         return course._replace(ends=course.ends.at[row.leg].set(tick)), flags
 
-    def _step(self, body: Body, row: Rows, course: Course, flags: Flags):
-        """A part of the leg, or a Newton step on a watched function."""
-        a = body.chart
-        q = self._state(a, course)
-        field = self._field(a, course.t, q)
-        # (Corrections converge, so that the rate of their function needs no derivative.)
-        now = self._watched(a, row, *_still((course.t, q, field)))
-        flags = self._noted(a, row, flags, now)
-        course = self._begun(a, row, course, field)
-        h = row.fraction * (course.ends[row.leg] - course.begin)
-        if self._functions(a):
-            is_correction = row.target >= 0
-            value = self._values(a, row, course.t, q, self._no_input)[row.target]
-            # (Where none is made, the rate may be zero, and NaN would enter reverse mode.)
-            rate = jnp.where(is_correction, now.rate[row.target], 1.0)
-            h = jnp.where(is_correction, -value / rate, h)
-        y, error = self._advanced(a, course, h)
-        course = course._replace(t=course.t + h, y=y)
-        flags = flags._replace(
-            error=jnp.maximum(flags.error, error),
-            left=flags.left | self._has_tick(a, course),
-        )
-        return course, flags
+    def _time(self, row: Rows, s: Structure, _, course: Course, flags: Flags):
+        """The arrival at a time that is known."""
+        # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
+        misses = course.ends[row.leg] - course.t
+        course = course._replace(delay=jnp.zeros_like(course.delay))
+        return _arrived(row, course, _leveled(row, flags), misses)
 
-    def _begun(self, a: int, row: Rows, course: Course, field) -> Course:
-        """The course with columns that begin anew, if a piece begins. (`follow` keeps those of the
-        piece before.)
+    # What a row sees where it begins.
+
+    def _observe(self, a: int, row: Rows, s: Structure, constants, course: Course, _):
+        """The field of chart a, and its watched functions."""
+        q = _state(s, a, course)
+        t, u = course.t, jnp.zeros(s.nu)
+        field = steps.field(s, a, t, q)
+        course = course._replace(rate=_padded(field, course.rate))
+        if not _count_watched(s, a, constants.levels):
+            return course, Watched.unknown(_still(t), self.form.watched)
+
+        def values(t, q):
+            return _values(s, a, constants.levels, row, t, q, u)
+
+        value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
+        course = course._replace(value=value[row.target], slope=rate[row.target])
+        more = self.form.watched - len(value)
+        # (Rates of what is not watched are 1: nothing divides by zero.)
+        value = jnp.pad(value, (0, more), constant_values=jnp.inf)
+        rate = jnp.pad(rate, (0, more), constant_values=1.0)
+        enabled = jnp.ones(self.form.watched, bool)
+        for place, g in enumerate(s.guards(a)):
+            if s.transitions[g].enabled is not None:
+                enabled = enabled.at[place].set(s.enabled(g, t, q, u))
+        return course, _still(Watched(t, value, rate, enabled))
+
+    def _noted(self, row: Rows, same, s: Structure, _, flags: Flags, now: Watched):
+        """The flags at a row, where watched functions have these values; `same`: they must have the
+        signs of the recorded trajectory."""
+        left = flags.left | _has_left(row, flags.before, now, same)
+        return flags._replace(before=now, left=left), None
+
+    # Steps.
+
+    def _step(self, motion: Motion, row: Rows, course, flags: Flags, now: Watched):
+        """A part of the leg, or a Newton step on a watched function."""
+        course, _ = motion.apply(self._lane(self._departed, row), course, None)
+        moving, error = self._advanced(motion, row, course)
+        course, _ = motion.apply(_after_step, moving, None)
+        flags = flags._replace(error=jnp.maximum(flags.error, error))
+        return course, self._without_tick(motion, row, course, flags)
+
+    def _departed(self, row: Rows, s: Structure, _, course: Course, notes):
+        """The course with the length of the step, and with columns that begin anew, if a piece
+        begins. (`follow` keeps those of the piece before.)
 
         On a section, the first one is that of the time: who begins later is behind by the flow.
         """
-        n, d, C = self.s.dims[a], course.y.shape[1], course.y.shape[0] - 1
-        rate = jnp.pad(field, (0, d - n))
+        C, d = len(course.y) - 1, course.y.shape[1]
         delay = jnp.zeros(C)
         if self.inputs is None:
             unit = jnp.eye(C, d)
         else:
-            unit = jnp.concatenate([-rate[None], jnp.eye(C - 1, d)])
+            unit = jnp.concatenate([-course.rate[None], jnp.eye(C - 1, d)])
             delay = delay.at[0].set(1.0)
-        unit = jnp.where(jnp.arange(d) < n, unit, 0.0)
-        begins = row.piece < self.pieces
+        dims = jnp.asarray([s.dims[a] for a in self.form.charts])
+        unit = jnp.where(jnp.arange(d) < dims[self._chart(row)], unit, 0.0)
+        begins = row.piece < self.form.pieces
         columns = jnp.where(begins, unit, course.y[1:])
-        return course._replace(
+        h = row.fraction * (course.ends[row.leg] - course.begin)
+        is_correction = row.target >= 0
+        # (Corrections converge, so that the rate of their function needs no derivative. Where none
+        # is made, the rate may be zero, and NaN would enter reverse mode.)
+        slope = jnp.where(is_correction, _still(course.slope), 1.0)
+        course = course._replace(
             y=course.y.at[1:].set(columns),
-            rate=rate,
             delay=jnp.where(begins, delay, course.delay),
+            h=jnp.where(is_correction, -course.value / slope, h),
         )
+        return course, notes
 
-    def _jump(self, body: Body, row: Rows, course: Course, flags: Flags):
-        """An event, and the reset."""
-        s, a, member = self.s, body.chart, Member(body.kind, row.place)
-        b = s.chart_index(s.transitions[body.kind[0]].target)
-        q, u = self._state(a, course), self._no_input
-        field = self._field(a, course.t, q)
-        now = self._watched(a, row, course.t, q, field)
-        flags = self._noted(a, row, flags, _still(now), same=body.at_once)
-        delay, late = course.delay, jnp.zeros(())
-        if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
-            delay = jnp.zeros_like(delay)
-        elif not body.at_once:
-            late = _newton(now, row.target)
-            delay = self._delay(a, row, course, q, now)
-        has_rival = self._has_rival(row, *_still((course.begin, now)))
-        t, q = course.t + late, q + field * late
-        after = s.reset(member, t, q, u)
-        onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
-
-        def reset(t, q, u):
-            return s.reset(member, t, q, u)
-
-        def column(v, delay, w=u):
-            along = delay, v + field * delay, w
-            return jax.jvp(reset, (t, q, u), along)[1] - onward * delay
-
-        columns = self._each(column, course.y[1:, : s.dims[a]], delay)
-        moved = jnp.concatenate([after[None], columns])
-        y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
-        moved = course._replace(t=t, y=y)
-        unknown = Watched.unknown(_still(t), self.width)
-        left = flags.left | has_rival | self._has_tick(a, moved)
-        flags = flags._replace(before=unknown, left=left)
-        return self._arrived(row, moved, flags, late, delay)
-
-    def _level(self, body: Body, row: Rows, course: Course, flags: Flags):
-        """The arrival on a level."""
-        a = body.chart
-        n, q = self.s.dims[a], self._state(a, course)
-        field = self._field(a, course.t, q)
-        now = self._watched(a, row, course.t, q, field)
-        flags = self._noted(a, row, flags, _still(now))
-        late = _newton(now, row.target)
-        delay = self._delay(a, row, course, q, now)
-        arrived = jnp.outer(jnp.append(late, delay), field)
-        y = course.y.at[:, :n].add(arrived)
-        course = course._replace(t=course.t + late, y=y)
-        left = flags.left | self._has_tick(a, course)
-        flags = _leveled(flags._replace(left=left), row)
-        return self._arrived(row, course, flags, late, delay)
-
-    def _time(self, body: Body, row: Rows, course: Course, flags: Flags):
-        """The arrival at a time that is known."""
-        # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
-        misses = course.ends[row.leg] - course.t
-        delay = jnp.zeros_like(course.delay)
-        return self._arrived(row, course, _leveled(flags, row), misses, delay)
-
-    def _arrived(self, row: Rows, course: Course, flags: Flags, late, delay):
-        """A course where a leg has ended, and the next one begins."""
-        t, late = course.t, _still(late)
-        flags = flags._replace(
-            last=jnp.maximum(flags.last, jnp.abs(late)),
-            left=flags.left | _still(t < course.begin),
-        )
-        ends = course.ends.at[row.leg].set(t)
-        return course._replace(begin=t, delay=delay, ends=ends), flags
-
-    # Functions of a chart.
-
-    @property
-    def _no_input(self) -> Float[Array, " nu"]:
-        return jnp.zeros(self.s.nu)
-
-    def _state(self, a: int, course: Course) -> Float[Array, " n"]:
-        return course.y[0, : self.s.dims[a]]
-
-    def _field(self, a: int, t, q) -> Float[Array, " n"]:
-        return steps.field(self.s, a, t, q)
-
-    def _advanced(self, a: int, course: Course, h):
-        """The state and its columns after a step, and the error relative to what is allowed."""
-        n = self.s.dims[a]
-        solver, y = self.pairs(a), course.y[:, :n]
-        y, error = steps.step(self.s, a, solver, course.t, y, h, self.inputs)
-        settings = self.settings
+    def _advanced(self, motion: Motion, row: Rows, course):
+        """The course with the state and its columns after a step, and the error of the state
+        relative to what is allowed."""
+        charts = self.form.charts
+        solvers = list(dict.fromkeys(self.solver(a) for a in charts))
+        branches = [ft.partial(self._advanced_by, x, motion, row) for x in solvers]
+        number = jnp.asarray([solvers.index(self.solver(a)) for a in charts])
+        y, error = chosen(number[self._chart(row)], branches, course)
+        settings = motion.constants.settings
         assert settings.scale is not None and settings.rtol is not None
-        scale = settings.scale[a, :n]
-        allowed = settings.rtol * jnp.maximum(jnp.abs(course.y[0, :n]), jnp.abs(y[0]))
+        scale = jnp.asarray(settings.scale)[jnp.asarray(charts)][self._chart(row)]
+        begin = motion.values(course).y[..., 0, :]
+        end = motion.values(y)[..., 0, :]
+        allowed = settings.rtol * jnp.maximum(jnp.abs(begin), jnp.abs(end))
         allowed = allowed + settings.atol * scale
-        error = jax.lax.stop_gradient(jnp.max(jnp.abs(error) / allowed, initial=0.0))
-        return course.y.at[:, :n].set(y), error
+        # (Numbers that a chart does not use have no error.)
+        relative = jnp.where(error == 0, 0.0, jnp.abs(error) / allowed)
+        error = _still(jnp.max(relative, axis=-1, initial=0.0))
+        return motion.join(course, y), error
 
-    def _has_level(self, a: int) -> bool:
-        return self.levels is not None and self.levels.present(self.s, a)
+    def _advanced_by(self, solver: steps.Solver, motion: Motion, row: Rows, course):
+        """The state and its columns after a step of one of the solvers, and the error."""
+        charts = [a for a in self.form.charts if self.solver(a) == solver]
+        number = {a: k for k, a in enumerate(charts)}
+        place = self._by_body(row, lambda body: number.get(body.chart, 0))
+        if steps.is_implicit(solver):
+            stages = [self._lane(self._implicit_step, solver, a) for a in charts]
+            return choose(motion, place, stages, course)
 
-    def _functions(self, a: int) -> int:
-        """Number of watched functions."""
-        return len(self.s.guards(a)) + self._has_level(a)
+        # (The time within the step runs from 0 to 1.)
+        def rates(part, y):
+            stages = [self._lane(self._rates, a, part) for a in charts]
+            return choose(motion, place, stages, motion.join(course, y))[0]
 
-    def _values(self, a: int, row: Rows, t, q, u) -> Float[Array, " g"]:
-        """The watched functions."""
-        from ..kernels import watched_at
+        y, error = steps.unit_step(solver, rates, motion.part(course, "y"))
+        return y, motion.values(error)[..., 0, :]
 
-        kinds = self.s.guard_kinds(a)
-        return watched_at(a, kinds, self.s, self.levels, t, q, u, row.section)
+    def _rates(self, a: int, part, s: Structure, _, moving, notes):
+        """Rates of the state and of its columns within a step of chart a."""
+        course, y = moving
+        t = course.t + part * course.h
+        rates = steps.rates(s, a, t, y[:, : s.dims[a]], self.inputs)
+        return _padded(course.h * rates, y), notes
 
-    def _watched(self, a: int, row: Rows, t, q, field) -> Watched:
-        if not self._functions(a):
-            return Watched.unknown(t, self.width)
+    def _implicit_step(self, method, a: int, s: Structure, _, course: Course, notes):
+        """The state and its columns after a step of chart a, and the error."""
+        y = course.y[:, : s.dims[a]]
+        end, error = steps.implicit_step(
+            s, a, method, course.t, y, course.h, self.inputs
+        )
+        return _padded(end, course.y), _padded(_still(error), course.y[0])
 
-        def values(t, q):
-            return self._values(a, row, t, q, self._no_input)
+    # Ends of legs.
 
-        value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
-        more = self.width - len(value)
-        # (Rates of what is not watched are 1: nothing divides by zero.)
-        value = jnp.pad(value, (0, more), constant_values=jnp.inf)
-        rate = jnp.pad(rate, (0, more), constant_values=1.0)
-        enabled = jnp.ones(self.width, bool)
-        for place, g in enumerate(self.s.guards(a)):
-            if self.s.transitions[g].enabled is not None:
-                holds = self.s.enabled(g, t, q, self._no_input)
-                enabled = enabled.at[place].set(holds)
-        return Watched(t, value, rate, enabled)
+    def _end(self, motion: Motion, row: Rows, course, flags: Flags, now: Watched):
+        """The event, or the arrival on a level, with which a leg ends."""
+        course, _ = self._in_chart(motion, row, self._aimed, course)
+        course, _ = motion.apply(self._lane(self._shifted), course, None)
+        flags = self._without_tick(motion, row, course, flags)
+        kinds = self.form.kinds
+        stages = [self._lane(self._reset, kind, row) for kind in kinds]
+        if any(body.does == LEVEL for body in self.form.bodies):
+            stages.append(lambda _, course, notes: (course, notes))
+        number = {kind: k for k, kind in enumerate(kinds)}
+        which = self._by_body(row, lambda body: number.get(body.kind, len(stages) - 1))
+        course, _ = choose(motion, which, stages, course)
+        is_jump = self._by_body(row, lambda body: body.does == JUMP)
+        ended = self._lane(self._ended, row, is_jump)
+        course, (flags, _) = motion.apply(ended, course, (flags, now))
+        return course, flags
 
-    def _delay(self, a: int, row: Rows, course: Course, q, now: Watched):
-        """Columns of the time at which a watched function is zero."""
-        u = self._no_input
+    def _aimed(self, a: int, row: Rows, s: Structure, constants, course: Course, notes):
+        """The time to the end of a leg in chart a, with its columns: a watched function is zero
+        then, or there is no time left."""
+        course = course._replace(h=jnp.zeros(()))
+        scheduled = self._by_body(row, lambda body: _is_scheduled(s, body))
+        course = course._replace(delay=jnp.where(scheduled, 0.0, course.delay))
+        if not _count_watched(s, a, constants.levels):
+            return course, notes
+        q, u = _state(s, a, course), jnp.zeros(s.nu)
 
         def values(q, u):
-            return self._values(a, row, course.t, q, u)
+            return _values(s, a, constants.levels, row, course.t, q, u)
 
         def along(v, w=u):
             return jax.jvp(values, (q, u), (v, w))[1][row.target]
 
-        columns = course.y[1:, : self.s.dims[a]]
-        return -self._each(along, columns) / now.rate[row.target]
+        aims = row.target >= 0
+        slope = jnp.where(aims, course.slope, 1.0)
+        delay = -self._each(along, course.y[1:, : s.dims[a]]) / slope
+        course = course._replace(
+            h=jnp.where(aims, -course.value / slope, 0.0),
+            delay=jnp.where(aims, delay, course.delay),
+        )
+        return course, notes
+
+    def _shifted(self, s: Structure, _, course: Course, notes):
+        """The state when the leg ends, and its columns at that time."""
+        moved = jnp.outer(jnp.append(course.h, course.delay), course.rate)
+        return course._replace(t=course.t + course.h, y=course.y + moved), notes
+
+    def _reset(self, kind: Kind, row: Rows, s: Structure, _, course: Course, notes):
+        """The state and its columns after a jump, at a fixed time again."""
+        tr = s.transitions[kind[0]]
+        a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+        member = Member(kind, row.place)
+        t, q, u = course.t, _state(s, a, course), jnp.zeros(s.nu)
+
+        def reset(t, q, u):
+            return s.reset(member, t, q, u)
+
+        after = reset(t, q, u)
+        onward = jnp.where(row.onward, steps.field(s, b, t, after), 0.0)
+
+        def column(v, delay, w=u):
+            return jax.jvp(reset, (t, q, u), (delay, v, w))[1] - onward * delay
+
+        columns = self._each(column, course.y[1:, : s.dims[a]], course.delay)
+        y = jnp.concatenate([after[None], columns])
+        return course._replace(y=_padded(y, course.y)), notes
+
+    def _ended(self, row: Rows, is_jump, s: Structure, _, course: Course, notes):
+        """The course where a leg has ended, and the next one begins."""
+        flags, now = notes
+        rival = is_jump & _has_rival(row, _still(course.begin), now)
+        unknown = Watched.unknown(_still(course.t), self.form.watched)
+        on_level = _leveled(row, flags).before
+        select = ft.partial(jnp.where, is_jump)
+        before = jax.tree_util.tree_map(select, unknown, on_level)
+        flags = flags._replace(before=before, left=flags.left | rival)
+        course, flags = _arrived(row, course, flags, course.h)
+        return course, (flags, now)
 
     def _each(self, function: Callable, *columns: Array) -> Array:
         """A function of each column, and of its inputs where there are any."""
         inputs = () if self.inputs is None else (self.inputs,)
         return jax.vmap(function)(*columns, *inputs)
 
-    def _noted(
-        self, a: int, row: Rows, flags: Flags, now: Watched, same: bool = False
-    ) -> Flags:
-        """The flags at a row, where watched functions have these values; `same`: they must have the
-        signs of the recorded trajectory."""
-        if not self._functions(a):
-            return flags._replace(before=now)
-        left = flags.left | self._has_left(row, flags.before, now, same)
-        return flags._replace(before=now, left=left)
+    def _without_tick(self, motion: Motion, row: Rows, course, flags: Flags) -> Flags:
+        """The flags where a scheduled event may have been due since the leg began."""
+        if not any(self.travelers.structure.schedules(a) for a in self.form.charts):
+            return flags
+        now = _still(motion.values(course))
+        passed = now.begin, now.t
+        alone = Alone(motion.constants)
+        left, _ = self._in_chart(alone, row, _has_tick, flags.left, passed)
+        return flags._replace(left=left)
 
-    def _has_left(
-        self, row: Rows, before: Watched, now: Watched, same: bool
-    ) -> Bool[Array, ""]:
-        """Test whether the itinerary is left between the row before and this one.
 
-        - Where a leg begins, functions that were positive must be positive. One that was negative
-          may have risen sooner, unless signs must be the `same`: at an event at once.
-        - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or
-          later than recorded. (A fall is no event where its predicate does not hold.)
-        - The one at whose zero the leg ends must have been positive, and must fall.
-        """
-        known = row.signs != 0
-        known = known & (jnp.arange(self.width) != row.target)
-        begins = jnp.isinf(before.value)
-        # (Comparisons with NaN are false.)
-        compared = known if same else known & (row.signs > 0)
-        other = begins & compared & ~(jnp.sign(now.value) * row.signs > 0)
-        unknown = known & ~jnp.isfinite(now.value) & ~begins
-        returns = known & ~begins & dips(before, now, jnp.sign(now.value))
-        positive = (before.value > 0) & ~begins
-        falls = known & positive & ~(now.value > 0)
-        enabled = falls & (before.enabled | now.enabled)
-        return (other | unknown | returns | enabled).any() | self._misses(
-            row, before, now
-        )
+# Functions of one lane.
 
-    def _has_rival(self, row: Rows, begin, now: Watched) -> Bool[Array, ""]:
-        """Test whether another function falls to zero where an event happens, so that it may come
-        first (see `Tape.rival`)."""
-        other = (row.signs > 0) & (jnp.arange(self.width) != row.target)
-        close = TOGETHER * (now.t - begin) * jnp.abs(now.rate)
-        falls = (now.rate < 0) & (now.value <= close)
-        return (other & falls & now.enabled).any()
 
-    def _misses(self, row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
-        """Test whether the function at whose zero a leg ends does not fall to it. (The row of its
-        first correction has its sign in the row before.)"""
-        was_positive = (before.value[row.target] > 0) | (row.signs[row.target] <= 0)
-        falls = now.rate[row.target] < 0
-        return (row.target >= 0) & ~(was_positive & falls)
+def _state(s: Structure, a: int, course: Course) -> Float[Array, " n"]:
+    return course.y[0, : s.dims[a]]
 
-    def _has_tick(self, a: int, course: Course) -> Bool[Array, ""]:
-        """Test whether a scheduled event has been due since the leg began, and before now."""
-        due, t = jnp.asarray(False), course.t
-        for g in self.s.schedules(a):
-            guard = self.s.transitions[g].guard
-            assert isinstance(guard, Scheduled)
-            offset, period = guard.numbers(t)
-            before = jnp.floor((course.begin - offset) / period + _SAME_TICK)
-            last = jnp.ceil((t - offset) / period - _SAME_TICK) - 1
-            due = due | (last > before)
-        return jax.lax.stop_gradient(due)
+
+def _padded(
+    x: Float[Array, "*C n"], like: Float[Array, "*C d"]
+) -> Float[Array, "*C d"]:
+    """`x` with zeros for numbers that a chart does not use."""
+    return jnp.zeros_like(like).at[..., : x.shape[-1]].set(x)
+
+
+def _count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
+    has_level = levels is not None and levels.present(s, a)
+    return len(s.guards(a)) + has_level
+
+
+def _values(s: Structure, a: int, levels, row: Rows, t, q, u) -> Float[Array, " g"]:
+    """The watched functions of chart a."""
+    from ..kernels import watched_at
+
+    return watched_at(a, s.guard_kinds(a), s, levels, t, q, u, row.section)
+
+
+def _is_scheduled(s: Structure, body: Body) -> bool:
+    """Test whether rows with a body are scheduled events."""
+    if body.does != JUMP:
+        return False
+    return isinstance(s.transitions[body.transition].guard, Scheduled)
+
+
+def _after_step(_, moving, notes):
+    """The course after a step, with these states and columns."""
+    course, y = moving
+    return course._replace(t=course.t + course.h, y=y), notes
+
+
+def _arrived(row: Rows, course: Course, flags: Flags, late):
+    """A course where a leg has ended, and the next one begins."""
+    t = course.t
+    flags = flags._replace(
+        last=jnp.maximum(flags.last, jnp.abs(_still(late))),
+        left=flags.left | _still(t < course.begin),
+    )
+    return course._replace(begin=t, ends=course.ends.at[row.leg].set(t)), flags
+
+
+def _has_left(row: Rows, before: Watched, now: Watched, same) -> Bool[Array, ""]:
+    """Test whether the itinerary is left between the row before and this one.
+
+    - Where a leg begins, functions that were positive must be positive. One that was negative may
+      have risen sooner, unless signs must be the `same`: at an event at once.
+    - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or later
+      than recorded. (A fall is no event where its predicate does not hold.)
+    - The one at whose zero the leg ends must have been positive, and must fall.
+    """
+    known = row.signs != 0
+    known = known & (jnp.arange(len(row.signs)) != row.target)
+    begins = jnp.isinf(before.value)
+    # (Comparisons with NaN are false.)
+    compared = known & ((row.signs > 0) | same)
+    other = begins & compared & ~(jnp.sign(now.value) * row.signs > 0)
+    unknown = known & ~jnp.isfinite(now.value) & ~begins
+    returns = known & ~begins & dips(before, now, jnp.sign(now.value))
+    positive = (before.value > 0) & ~begins
+    falls = known & positive & ~(now.value > 0)
+    enabled = falls & (before.enabled | now.enabled)
+    left = (other | unknown | returns | enabled).any()
+    return left | _misses(row, before, now)
+
+
+def _misses(row: Rows, before: Watched, now: Watched) -> Bool[Array, ""]:
+    """Test whether the function at whose zero a leg ends does not fall to it. (The row of its first
+    correction has its sign in the row before.)"""
+    if not now.value.size:
+        return jnp.asarray(False)
+    was_positive = (before.value[row.target] > 0) | (row.signs[row.target] <= 0)
+    falls = now.rate[row.target] < 0
+    return (row.target >= 0) & ~(was_positive & falls)
+
+
+def _has_rival(row: Rows, begin, now: Watched) -> Bool[Array, ""]:
+    """Test whether another function falls to zero where an event happens, so that it may come first
+    (see `Tape.rival`)."""
+    other = (row.signs > 0) & (jnp.arange(len(row.signs)) != row.target)
+    close = TOGETHER * (now.t - begin) * jnp.abs(now.rate)
+    falls = (now.rate < 0) & (now.value <= close)
+    return (other & falls & now.enabled).any()
+
+
+def _has_tick(a: int, row: Rows, s: Structure, _, left, passed):
+    """Test whether the itinerary was left, or a scheduled event of chart a was due between two
+    times."""
+    begin, t = passed
+    for g in s.schedules(a):
+        guard = s.transitions[g].guard
+        assert isinstance(guard, Scheduled)
+        offset, period = guard.numbers(t)
+        before = jnp.floor((begin - offset) / period + _SAME_TICK)
+        last = jnp.ceil((t - offset) / period - _SAME_TICK) - 1
+        left = left | _still(last > before)
+    return left, passed
 
 
 def _still(tree: Any) -> Any:
     return jax.lax.stop_gradient(tree)
 
 
-def _leveled(flags: Flags, row: Rows) -> Flags:
+def _leveled(row: Rows, flags: Flags) -> Flags:
     """Flags on a section: of the level of the next one nothing is known. (Charts without a level
     have no such row: nothing is set.)"""
     value = flags.before.value
     if value.size:
         value = value.at[row.target].set(jnp.inf, mode="drop")
     return flags._replace(before=flags.before._replace(value=value))
-
-
-def _newton(now: Watched, target) -> Float[Array, ""]:
-    """The time to the zero of a watched function."""
-    return -now.value[target] / now.rate[target]
 
 
 def dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:

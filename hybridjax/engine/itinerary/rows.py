@@ -78,8 +78,14 @@ class Body(NamedTuple):
 
     @property
     def transition(self) -> int:
-        """Of a scheduled jump, which is the only one of its kind: its index."""
+        """Of a jump: the first transition of its kind, which is the only one if it is scheduled."""
         return self.kind[0]
+
+    @property
+    def way(self) -> "Body":
+        """One of the rows that share their way through the program: all that begin in a chart do,
+        and each schedule goes its own."""
+        return Body(STEP) if self.does in (STEP, JUMP, LEVEL) else self
 
 
 class Form(NamedTuple):
@@ -95,6 +101,21 @@ class Form(NamedTuple):
     @property
     def pieces(self) -> int:
         return self.sections or LEGS
+
+    @property
+    def ways(self) -> tuple[Body, ...]:
+        """The ways of rows through the program, see `Body.way`."""
+        return tuple(dict.fromkeys(body.way for body in self.bodies))
+
+    @property
+    def charts(self) -> tuple[int, ...]:
+        """The charts in which rows begin."""
+        return tuple(sorted({x.chart for x in self.bodies if x.way.does == STEP}))
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of jumps."""
+        return tuple(sorted({x.kind for x in self.bodies if x.does == JUMP}))
 
 
 class Itinerary(NamedTuple):

@@ -5,6 +5,7 @@ package, whose iterations carry derivatives.
 """
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, ClassVar, TypeAlias
 
 import jax
@@ -56,10 +57,13 @@ def field(s: Structure, a: int, t, q) -> Float[Array, " n"]:
     return s.field(a, t, q, jnp.zeros(s.nu))
 
 
-def _rates(
+def rates(
     s: Structure, a: int, t, y: Float[Array, "1+C n"], inputs
 ) -> Float[Array, "1+C n"]:
-    """Rates of a state and of its columns."""
+    """Rates of a state and of its columns.
+
+    **Arguments:** `inputs`: of each column; None if there are none.
+    """
     if len(y) == 1:
         return field(s, a, t, y[0])[None]
     if inputs is None:
@@ -72,31 +76,32 @@ def _rates(
     return jnp.concatenate([rate[None], columns])
 
 
-def step(
+def unit_step(solver: Solver, rates: Callable, y: Any) -> tuple[Any, Any]:
+    """The end of an explicit step of `rates(t, y)` from t = 0 to 1, and its estimated error."""
+    import diffrax
+
+    term = diffrax.ODETerm(lambda t, y, _: rates(t, y))
+    times = jnp.zeros(()), jnp.ones(())
+    begun = solver.init(term, *times, y, None)
+    end, error, _, _, _ = solver.step(term, *times, y, None, begun, False)
+    return end, error
+
+
+def is_implicit(solver: Solver) -> bool:
+    return isinstance(solver, Method)
+
+
+def implicit_step(
     s: Structure,
     a: int,
-    solver: Solver,
+    method: Method,
     t,
     y: Float[Array, "1+C n"],
     h,
-    inputs: Float[Array, "C nu"] | None = None,
+    inputs: Float[Array, "C nu"] | None,
 ) -> tuple[Float[Array, "1+C n"], Float[Array, " n"]]:
-    """A state and its columns after a step from t to t + h, and the state's estimated error.
-
-    **Arguments:** `inputs`: of each column; None if there are none.
-    """
-    if isinstance(solver, Method):
-        return _implicit(s, a, solver, t, y, h, inputs)
-    import diffrax
-
-    term = diffrax.ODETerm(lambda t, y, _: _rates(s, a, t, y, inputs))
-    begun = solver.init(term, t, t + h, y, None)
-    end, error, _, _, _ = solver.step(term, t, t + h, y, None, begun, False)
-    return end, error[0]
-
-
-def _implicit(s: Structure, a: int, method: Method, t, y, h, inputs):
-    """A step of an implicit method, and its columns as derivatives of the whole step."""
+    """A state and its columns after a step of an implicit method from t to t + h, as derivatives of
+    the whole step, and the state's estimated error."""
 
     def whole(q, u):
         def of_lane(t, q):

@@ -1,8 +1,6 @@
 """A trajectory that follows an itinerary."""
 
 import dataclasses
-import functools as ft
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._core.loops import loop, pushed
-from ...systems.structure import Structure
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import Bodies, Course, Flags, Watched
-from .rows import Body, Form, Rows
+from .bodies import Bodies, Constants, Course, Flags, Travelers, Watched
+from .motion import Alone, InDirections
+from .rows import Form, Rows
 from .steps import Solver, solver_of
 
 
@@ -42,26 +40,6 @@ class Passage(NamedTuple):
     """Largest last correction of the time of an event."""
     left: Bool[Array, ""]
     """Whether the itinerary was left."""
-
-
-class Travelers(NamedTuple):
-    """Whose trajectories follow an itinerary: one system, or many in lanes.
-
-    Lanes stand on the first axis of arrays. Only what a row does is vectorized over them: JAX takes
-    many times as long to vectorize the loop over the rows.
-    """
-
-    of: Callable[[Any], Structure]
-    """The structure by its numbers."""
-    numbers: Any
-    """Of one system, or of all lanes."""
-    many: bool
-    nu: int = 0
-    """Number of inputs; only columns between sections need it."""
-
-    def each(self, function: Callable) -> Callable:
-        """A function of the numbers and further arrays of one lane, for all."""
-        return jax.vmap(function) if self.many else function
 
 
 def follow(
@@ -101,7 +79,7 @@ def follow(
     )
     rows = jax.tree_util.tree_map(jnp.asarray, rows)
     numbers = travelers.numbers
-    constants = _Constants(numbers, levels, settings, rows, count, begin, known)
+    constants = Constants(numbers, levels, settings, rows, count, begin, known)
     state, flags = steps.depart(constants, ends)
     if count is not None:
         every = passes * count
@@ -134,7 +112,7 @@ class _Steps:
     reverse: bool
     passes: int
 
-    def depart(self, constants: "_Constants", ends) -> "tuple[_State, Flags]":
+    def depart(self, constants: Constants, ends) -> "tuple[_State, Flags]":
         """The beginning, with guessed ends of legs."""
         known = constants.known
         ends = jax.lax.stop_gradient(ends)
@@ -150,7 +128,7 @@ class _Steps:
         begun = _Begun(*map(kept, (course.t, course.y, course.delay, course.rate)))
         return _State(course, begun), flags
 
-    def take(self, constants: "_Constants", k, state: "_State", flags: Flags):
+    def take(self, constants: Constants, k, state: "_State", flags: Flags):
         """Step k, which may be the first of another pass."""
         if self.passes > 1:
             again = self._restart(constants, state, flags)
@@ -167,71 +145,35 @@ class _Steps:
             state, columns, flags = _chosen(_is_new(constants, k), again, carry)
         row = _row(constants, k)
 
-        # (Derivatives of the bodies, not of the choice among them: that takes many times as long.)
-        def along(body):
-            def of(row, course, by_course, flags):
-                one = ft.partial(self._body, body, row)
-                return pushed(one, constants, by_constants, course, by_course, flags)
-
-            return of
-
-        branches = [along(body) for body in self.form.bodies]
+        motion = InDirections(constants, by_constants)
         ended = state.begun.ended(row, state.course)
         by_ended = columns.begun.ended(row, columns.course, 1)
-        carry = state.course, columns.course, flags
-        course, by_course, flags = jax.lax.switch(row.body, branches, row, *carry)
+        both = state.course, columns.course
+        (course, by_course), flags = self._bodies.take(motion, row, both, flags)
         begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
         return _State(course, begun), _State(by_course, by_begun), flags
 
-    def row(self, constants: "_Constants", row: Rows, state: "_State", flags: Flags):
+    def row(self, constants: Constants, row: Rows, state: "_State", flags: Flags):
         """What a row does."""
-
-        # (Constants are no arguments: sections also hold names.)
-        def branch(body):
-            return lambda row, course, flags: self._body(
-                body, row, constants, course, flags
-            )
-
-        branches = [branch(body) for body in self.form.bodies]
         ended = state.begun.ended(row, state.course)
-        course, flags = jax.lax.switch(row.body, branches, row, state.course, flags)
+        course, flags = self._bodies.take(Alone(constants), row, state.course, flags)
         return _State(course, ended.begun(row, course)), flags
 
-    def _restart(self, constants: "_Constants", state: "_State", flags: Flags):
+    def _restart(self, constants: Constants, state: "_State", flags: Flags):
         return self.depart(constants, state.course.ends)
 
-    def _body(
-        self,
-        body: Body,
-        row: Rows,
-        constants: "_Constants",
-        course: Course,
-        flags: Flags,
-    ) -> tuple[Course, Flags]:
-        """What rows with a body do, in all lanes."""
+    @property
+    def _bodies(self) -> Bodies:
+        return Bodies(self.travelers, self.form, self._solver, self.inputs)
 
-        def of_lane(numbers, course, flags):
-            s = self.travelers.of(numbers)
-            bodies = Bodies(
-                s,
-                constants.levels,
-                constants.settings,
-                self.form.watched,
-                self.form.pieces,
-                lambda a: self._solver(s, a),
-                self.inputs,
-            )
-            return bodies.of(body)(row, course, flags)
-
-        return self.travelers.each(of_lane)(constants.numbers, course, flags)
-
-    def _solver(self, s: Structure, a: int) -> Solver:
+    def _solver(self, a: int) -> Solver:
+        """The solver of a chart."""
         if self.solver is not None:
             return self.solver
-        return solver_of(s.method(a), self.reverse)
+        return solver_of(self.travelers.structure.method(a), self.reverse)
 
 
-def _is_new(constants: "_Constants", k: Int[Array, ""]) -> Bool[Array, ""]:
+def _is_new(constants: Constants, k: Int[Array, ""]) -> Bool[Array, ""]:
     """Whether step k is the first of a later pass."""
     assert constants.count is not None
     return (k > 0) & (k % constants.count == 0)
@@ -241,7 +183,7 @@ def _chosen(mask: Bool[Array, ""], yes: Any, no: Any) -> Any:
     return jax.tree_util.tree_map(lambda x, y: jnp.where(mask, x, y), yes, no)
 
 
-def _row(constants: "_Constants", k: Int[Array, ""]) -> Rows:
+def _row(constants: Constants, k: Int[Array, ""]) -> Rows:
     """Row k, of the first or a later pass."""
     assert constants.count is not None
     place = k % constants.count
@@ -256,27 +198,18 @@ def _departed(
     course = Course(
         t=t,
         y=jnp.concatenate([q[None], jnp.eye(C, d)]),
-        rate=jnp.zeros(d),
         begin=t,
         delay=jnp.zeros(C),
         ends=ends,
+        rate=jnp.zeros(d),
+        value=jnp.zeros(()),
+        slope=jnp.ones(()),
+        h=jnp.zeros(()),
     )
     t = jax.lax.stop_gradient(t)
     zero = jnp.zeros_like(t)
     before = Watched.unknown(t, form.watched)
     return course, Flags(before, error=zero, last=zero, left=jnp.asarray(False))
-
-
-class _Constants(NamedTuple):
-    """Numbers that all rows use; see `follow`."""
-
-    numbers: Any
-    levels: AbstractLevels | None
-    settings: Settings
-    rows: Rows
-    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
-    begin: tuple
-    known: Float[Array, " E"] | None
 
 
 class _State(NamedTuple):
@@ -343,5 +276,5 @@ def _inputs_of_columns(
     inputs; None for columns of the state."""
     if not form.sections:
         return None
-    nu = travelers.nu
+    nu = travelers.structure.nu
     return jnp.eye(1 + d + nu, nu, -1 - d)
