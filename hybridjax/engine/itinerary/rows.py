@@ -272,7 +272,7 @@ def _written(
     **Arguments:** `pieces`: leg and number of the node at which each piece begins; node -1 for one
     that begins with the leg, on a section.
     """
-    begun = _Begun(s, legs)
+    begun = _Pieces(s, legs)
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
         begins = {j for j in range(-1, len(times)) if (k, j) in pieces}
         _rows_of_leg(s, table, k, leg, times, begun, begins)
@@ -298,7 +298,7 @@ def _written(
     )
 
 
-class _Begun:
+class _Pieces:
     """The pieces of an itinerary that have begun: their charts, the numbers of events before them,
     and the transitions that are armed."""
 
@@ -323,7 +323,7 @@ def _rows_of_leg(
     k: int,
     leg: _Leg,
     times: Float[np.ndarray, " 1+n"],
-    begun: _Begun,
+    begun: _Pieces,
     begins: set[int],
 ) -> None:
     """Add the rows of leg k until its end.
