@@ -473,7 +473,7 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         cycle.base,
         turn.period,
         anchor,
-        turn.legs,
+        turn.pieces,
         turn.factors,
         turn.distance,
         np.array([p.steps for p in points]),

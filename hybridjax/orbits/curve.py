@@ -56,7 +56,7 @@ class Point:
     @property
     def departure(self) -> Lanes:
         """The lane at which it begins."""
-        return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.legs)
+        return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.pieces)
 
     @property
     def value(self) -> float:
@@ -120,7 +120,7 @@ class Curve:
         self.value = float(parameter_of(cycle.system, parameter))
         self.least_range = SAME
         if not self.sequence:
-            first_ranges = self._ranges(to_host(cycle.legs))
+            first_ranges = self._ranges(to_host(cycle.pieces))
             self.least_range = max(SAME, _SHRUNK * float(np.max(first_ranges)))
 
     def system_at(self, value: float) -> HybridSystem:
@@ -181,19 +181,19 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        legs = point.turn.legs
+        pieces = point.turn.pieces
         tapes = point.turn.tapes
         assert tapes is not None
         events = tapes.t[tapes.code >= 0]
         if self.map.base is not None or not len(events):
             return None
-        k = far_from_events(legs.t, events, float(point.turn.period))
-        phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
-        anchor = point.anchor._replace(t=phase, chart=legs.chart[[k]])
+        k = far_from_events(pieces.t, events, float(point.turn.period))
+        phase = pieces.t[k : k + 1] / point.turn.period * float(self.map.expected)
+        anchor = point.anchor._replace(t=phase, chart=pieces.chart[[k]])
         if k == 0:
             return None
         forward = self._by_value() * np.sign(point.tangent[-1])
-        z = np.append(legs.q[:, k], point.value)
+        z = np.append(pieces.q[:, k], point.value)
         row = self._by_value(point.size)
         begin = anchor, point.period
         moved = self._correct(z, row, point.size, forward, begin)
@@ -261,15 +261,15 @@ class Curve:
             return Result.EXTRA_TURNS
         return None
 
-    def _ranges(self, legs: Lanes) -> Float[np.ndarray, " d"]:
+    def _ranges(self, pieces: Lanes) -> Float[np.ndarray, " d"]:
         """The range of each state over the beginnings of pieces, in sizes of the states."""
         scale = np.asarray(self.map.scale)
-        return np.ptp(legs.q / scale[legs.chart].T, axis=1)
+        return np.ptp(pieces.q / scale[pieces.chart].T, axis=1)
 
     def _settled(self, point: Point) -> Point | Result:
         """The point with a tangent, and sizes by the range of each state on the cycle."""
         scale = np.asarray(self.map.scale)
-        ranges = self._ranges(point.turn.legs)
+        ranges = self._ranges(point.turn.pieces)
         if self.map.base is not None and np.max(ranges) <= self.least_range:
             return Result.EQUILIBRIUM
         sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)

@@ -63,7 +63,7 @@ class LimitCycles(Showable, eqx.Module):
     **Fields**, with the systems on the first axis:
 
     - `systems`; `period` (S,), NaN where there is no cycle; `anchor`, the lanes at which they
-        begin; `legs`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+        begin; `pieces`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
     `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
@@ -73,7 +73,7 @@ class LimitCycles(Showable, eqx.Module):
     base: Crossing | AtEvent | None
     period: Float[np.ndarray, " S"]
     anchor: Lanes
-    legs: Lanes
+    pieces: Lanes
     factors: Float[np.ndarray, "S K d d"]
     residual: Float[np.ndarray, " S"]
     iterations: Int[np.ndarray, " S"]
@@ -97,7 +97,7 @@ class LimitCycles(Showable, eqx.Module):
             self.base,
             pick(self.period),
             pick(self.anchor),
-            pick(self.legs),
+            pick(self.pieces),
             pick(self.factors),
             pick(self.residual),
             pick(self.iterations),
@@ -295,7 +295,7 @@ def _some(systems: HybridSystem, rows) -> HybridSystem:
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
     """The cycles that were found on routes; NaN for the others."""
     found, s, S = solver.found, map.structure, len(solver.found.path)
-    G, K = len(s.transitions), found.legs_t.shape[1]
+    G, K = len(s.transitions), found.pieces_t.shape[1]
     chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
     armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
     for path, itinerary in enumerate(solver.itineraries):
@@ -308,15 +308,15 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         more[rows] = itinerary.events
         codes = _wider(codes, more)
     pace = np.array([0.0, np.inf, 0.0, 0.0])
-    legs = Lanes(
-        found.legs_t,
+    pieces = Lanes(
+        found.pieces_t,
         chart,
-        np.swapaxes(found.legs_q, 1, 2),
+        np.swapaxes(found.pieces_q, 1, 2),
         armed,
         events,
         np.tile(pace[:, None], (S, 1, K)),
     )
-    anchor = jax.tree_util.tree_map(lambda x: x[..., :1], legs)
+    anchor = jax.tree_util.tree_map(lambda x: x[..., :1], pieces)
     if map.event >= 0:
         anchor.armed[:, map.event] = False
     period = found.period if map.base is not None else solver.many.expected
@@ -326,7 +326,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         map.base,
         np.where(missing, np.nan, period),
         anchor._replace(q=found.q[..., None]),
-        legs,
+        pieces,
         found.factors,
         found.distance,
         found.turns,
@@ -392,7 +392,7 @@ def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:
     codes[rows] = -1
     more = np.full((len(cycles), others.codes.shape[1]), -1)
     more[rows] = others.codes
-    names = "period", "anchor", "legs", "factors", "residual", "iterations", "result"
+    names = "period", "anchor", "pieces", "factors", "residual", "iterations", "result"
     changed: Any = {
         name: jax.tree_util.tree_map(put, getattr(cycles, name), getattr(others, name))
         for name in names
@@ -412,7 +412,7 @@ def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         map.base,
         rounds.period,
         rounds.anchor,
-        turn.legs,
+        turn.pieces,
         turn.factors,
         turn.distance,
         rounds.steps,

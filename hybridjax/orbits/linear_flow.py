@@ -267,10 +267,10 @@ _hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
     """Keep the steps of a cycle's last turn, if the host took them: `last_turn` returns them."""
-    record = fixed((turn.legs, turn.tapes))
+    record = fixed((turn.pieces, turn.tapes))
     if turn.tapes is not None and not is_hidden(record):
-        legs, tapes = to_host(record)
-        _turns.recall(hosted(cycle), None, lambda: (legs, side_by_side(tapes)))
+        pieces, tapes = to_host(record)
+        _turns.recall(hosted(cycle), None, lambda: (pieces, side_by_side(tapes)))
 
 
 def remembering(cycle: Any, other: Any) -> Any:

@@ -20,7 +20,7 @@ from .._core.execution import in_threads
 from .._core.executor import on_the_cpu
 from .._core.results import Result
 from .._core.vector_math import factorizations
-from ..engine.itinerary.rows import LEGS, Itinerary
+from ..engine.itinerary.rows import PIECES, Itinerary
 from ..engine.itinerary.turn import Passage
 from .batches import nearest
 from .repeat import (
@@ -57,8 +57,8 @@ class Found(NamedTuple):
     """Number of the itinerary; negative for systems without a cycle."""
     q: Float[np.ndarray, "S d"]
     period: Float[np.ndarray, " S"]
-    legs_t: Float[np.ndarray, "S K"]
-    legs_q: Float[np.ndarray, "S K d"]
+    pieces_t: Float[np.ndarray, "S K"]
+    pieces_q: Float[np.ndarray, "S K d"]
     factors: Float[np.ndarray, "S K d d"]
     distance: Float[np.ndarray, " S"]
     turns: Int[np.ndarray, " S"]
@@ -155,9 +155,9 @@ class Solver:
         self.pending = np.flatnonzero(self._finite)
         self._ends: dict[int, np.ndarray] = {}
         blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
-        legs = blank(LEGS), blank(LEGS, d), blank(LEGS, d, d)
+        pieces = blank(PIECES), blank(PIECES, d), blank(PIECES, d, d)
         none = np.full(S, -1)
-        self.found = Found(none, blank(d), blank(), *legs, blank(), none + 1)
+        self.found = Found(none, blank(d), blank(), *pieces, blank(), none + 1)
 
     def run(self) -> None:
         """Find cycles on the known routes, then on new ones."""
@@ -220,8 +220,8 @@ class Solver:
         out.path[rows] = 2 * number + finer
         out.q[rows] = found.q[ok]
         out.period[rows] = (passage.t - self.many.t[attempt.rows])[ok]
-        out.legs_t[rows] = passage.legs_t[ok]
-        out.legs_q[rows] = passage.legs_q[ok]
+        out.pieces_t[rows] = passage.pieces_t[ok]
+        out.pieces_q[rows] = passage.pieces_q[ok]
         factors = factors_across(route.map, itinerary, passage)
         out.factors[rows] = factors[ok]
         out.distance[rows] = found.distance[ok]

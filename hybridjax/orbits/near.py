@@ -139,7 +139,7 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
 
 def _coincide(route: Route, map: ReturnMap, passage: Passage):
     """Whether events coincide that do not on the known cycle."""
-    begin = passage.legs_t[0]
+    begin = passage.pieces_t[0]
     together = coincide_on(map, route.first.events, passage.ends, begin, passage.t)
     return (together & ~route.together).any()
 
@@ -190,10 +190,10 @@ def _cycle(
 ) -> LimitCycle:
     """The cycle that Newton's method has found on an itinerary of a route."""
     passage = found.passage
-    legs = Lanes(
-        passage.legs_t,
+    pieces = Lanes(
+        passage.pieces_t,
         itinerary.charts,
-        passage.legs_q.T,
+        passage.pieces_q.T,
         itinerary.armed,
         itinerary.begins,
         pace_of(itinerary.begins),
@@ -204,7 +204,7 @@ def _cycle(
         map.base,
         map.expected if map.base is None else passage.t - map.anchor.t[0],
         anchor,
-        legs,
+        pieces,
         factors_across(route.map, itinerary, passage),
         found.distance,
         found.turns,

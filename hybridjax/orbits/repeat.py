@@ -21,7 +21,7 @@ from .._core.results import Result, update_result
 from .._core.vector_math.factorizations import solve_by_columns
 from ..engine.arrays import Array
 from ..engine.itinerary.bodies import Travelers
-from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
+from ..engine.itinerary.rows import PIECES, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..engine.unresolved import POLES, may_have_pulses
@@ -293,11 +293,11 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
 
 def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     """The beginning of Newton's method."""
-    lanes, d, K = q.shape[:-1], q.shape[-1], LEGS
+    lanes, d, K = q.shape[:-1], q.shape[-1], PIECES
     zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
-    legs = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
+    pieces = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
-    passage = Passage(zeros(), q, ends, *legs, zeros(d), zeros(), zeros(), inside)
+    passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
     unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
     return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
 
@@ -451,7 +451,7 @@ def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
         late = xp.abs(passage.t - (t + expected))
         return isolated & (late <= ROUNDING * expected)
     if not route.first.events:
-        apart = xp.abs(passage.legs_q - found.q[..., None, :]) / sizes
+        apart = xp.abs(passage.pieces_q - found.q[..., None, :]) / sizes
         return isolated & (apart.max(axis=(-2, -1)) > _APART)
     return isolated
 

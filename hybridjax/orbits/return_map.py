@@ -31,7 +31,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
 from ..engine.events import arm, await_schedules, belongs, enabled
-from ..engine.itinerary.rows import LEGS
+from ..engine.itinerary.rows import PIECES
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -95,7 +95,7 @@ class Turn(NamedTuple):
     end: Lanes
     jacobian: Float[Array, "d n"]
     """Derivative of the residual with respect to the state, and along the parameters if asked."""
-    legs: Lanes
+    pieces: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
     """Jacobians of the flow over the pieces; for an autonomous system on the states modulo the
@@ -269,20 +269,22 @@ class ReturnMap(eqx.Module):
                 True, new_input=False, tangents=True, at_once=varied is not None
             )
             travelled = travelled or (*self.travel(q, options), 0.0)
-            end, (legs, _, tapes), gap = travelled
+            end, (pieces, _, tapes), gap = travelled
             record = None
         else:
-            (end, (legs, factors, tapes, record)), gap = (
+            (end, (pieces, factors, tapes, record)), gap = (
                 self.travel(q, flow, record),
                 0.0,
             )
         (ends, levels), d = self.ends().split(), s.d
-        lanes, tape, ends = side_by_side((legs, tapes, ends))
+        lanes, tape, ends = side_by_side((pieces, tapes, ends))
         if on_host(q):
             many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
             by, at = tape_jacobian(many, lanes, ends, tape, varied is None)
             factors = (
-                by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
+                by[:, 1:, 1 : 1 + d]
+                if varied
+                else by[:, 1:].reshape(PIECES, *q.shape, d)
             )
         codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
         off, held = self.held(q, varied)
@@ -297,20 +299,20 @@ class ReturnMap(eqx.Module):
         if self.base is not None:
             f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
             factors = across(
-                f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors
+                f.reshape(PIECES, *q.shape), scale.reshape(PIECES, *q.shape), factors
             )
         distance = (
             xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
         )
         meetings = self._meetings(lanes, codes)
-        legs = jax.tree_util.tree_map(
-            lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs
+        pieces = jax.tree_util.tree_map(
+            lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), pieces
         )
         factors = xp.moveaxis(factors, 0, -3)
         return Turn(
             *end,
             jacobian,
-            legs,
+            pieces,
             factors,
             codes,
             distance,
@@ -383,8 +385,8 @@ class ReturnMap(eqx.Module):
     def _rests(self, q: Float[Array, " d"], turn: Turn) -> Bool[Array, ""]:
         """Test whether a turn stays where it begins, as at an equilibrium."""
         xp = namespace(q)
-        same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
-        apart = xp.abs(turn.legs.q - q[..., None]) / self.sizes[..., None]
+        same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
+        apart = xp.abs(turn.pieces.q - q[..., None]) / self.sizes[..., None]
         farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
@@ -395,7 +397,7 @@ class ReturnMap(eqx.Module):
         if not any(s.guards(a) for a in range(len(s.charts))):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
-        lanes = turn.legs
+        lanes = turn.pieces
         if shape:  # (turns of many systems: their pieces side by side)
             lanes = side_by_side(
                 jax.tree_util.tree_map(
@@ -417,7 +419,7 @@ class ReturnMap(eqx.Module):
         passed = here & ~lanes.armed & (value < -error)
         fine = here & (lanes.armed | (value > error))
         passed, fine = (
-            x.reshape(len(x), LEGS, *shape).any(axis=1)
+            x.reshape(len(x), PIECES, *shape).any(axis=1)
             for x in (passed & xp.stack(holds), fine)
         )
         # (An event that happens may leave the state beyond its guard.)
@@ -492,7 +494,7 @@ class ReturnMap(eqx.Module):
         """
         xp, ends = namespace(q), self.ends()
 
-        def leg(carry, end):
+        def follow_piece(carry, end):
             lanes, h, result = carry
             *end, piece = end
             time, index, event, limit = (xp.atleast_1d(x) for x in end)
@@ -501,7 +503,7 @@ class ReturnMap(eqx.Module):
             return (moved.lanes, moved.h, moved.result), extra
 
         lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
-        h = xp.atleast_1d(0.5 * self.expected / LEGS)
+        h = xp.atleast_1d(0.5 * self.expected / PIECES)
         if isinstance(flow, Options):
             u, begin = (
                 xp.zeros((self.structure.nu, len(h))),
@@ -512,7 +514,7 @@ class ReturnMap(eqx.Module):
             )
         else:
             rows = ends.time, ends.index, ends.event, ends.limit, record
-            (end, _, result), extra = scan(leg, (lanes, h, lanes.events), rows)
+            (end, _, result), extra = scan(follow_piece, (lanes, h, lanes.events), rows)
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
@@ -532,27 +534,27 @@ class ReturnMap(eqx.Module):
             self.expected,
             namespace(self.expected),
         )
-        k = xp.arange(1, LEGS + 1).reshape(LEGS, *[1] * expected.ndim)
+        k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
         if self.base is None:
-            return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+            return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
-        time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
+        time = xp.where(k < PIECES, t0 + free * expected * k / (PIECES - 1), np.inf)
         section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
-        last = k == LEGS
+        last = k == PIECES
         return dataclasses.replace(
             section,
             event=xp.where(last, section.event, -1).astype(np.int32),
             index=xp.where(last, section.index, -1).astype(np.int32),
         )
 
-    def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
+    def _meetings(self, pieces: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
         xp, shape = namespace(codes), codes.shape[:-2]
         if self.base is None:
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
             return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
-        level = self.watch(legs, to_section(until(legs.t), self.base)).value[-1]
-        level, events = (x.reshape(LEGS, *shape) for x in (level, legs.events))
+        level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
+        level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
         falls = (level[1:-1] > 0) & (level[2:] <= 0) & (events[1:-1] == events[2:])
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 

@@ -128,12 +128,12 @@ def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     return sizes
 
 
-def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
+def stiff_charts(s: Structure, pieces: Lanes, period: float) -> dict[str, float]:
     """The charts with explicit methods that are stiff on a cycle, each with the rate of its fastest
-    mode. `legs`: states at equal distances in time, of a turn in this period."""
+    mode. `pieces`: states at equal distances in time, of a turn in this period."""
     stiff = {}
-    step = period / len(np.ravel(legs.t))
-    for a, t, q in points(s, legs):
+    step = period / len(np.ravel(pieces.t))
+    for a, t, q in points(s, pieces):
         rates = fastest(s, a, t, q)
         if step * rates.sum() > STIFF and not is_implicit(s, a):
             stiff[s.names[a]] = float(rates.max())
@@ -171,9 +171,9 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     return max(times)
 
 
-def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def points(s: Structure, pieces: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Charts, times and states at the beginnings of the pieces of a turn, until it failed."""
-    t, chart, q = map(np.asarray, (legs.t, legs.chart, legs.q))
+    t, chart, q = map(np.asarray, (pieces.t, pieces.chart, pieces.q))
     for a in np.unique(chart):
         rows = (chart == a) & np.isfinite(q).all(axis=0)
         if rows.any():

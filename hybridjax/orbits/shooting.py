@@ -21,7 +21,7 @@ from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.attempt import deviation
 from ..engine.search.state import Stride
 from ..engine.target import Target, until
-from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
+from .return_map import CLOSED, PIECES, SINGULAR, Return, ReturnMap
 from .scale import has_implicit
 
 
@@ -67,7 +67,7 @@ def fixed_point(
     moves = recorded_moves(*turn)
     x = moves.q[:, 0] / sizes
     before = np.inf
-    while (moves.order == 0).sum() == LEGS:
+    while (moves.order == 0).sum() == PIECES:
         step, shift, h = _shift(map, moves, x, target)
         length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
         if not length <= 0.5 * before:
@@ -147,16 +147,18 @@ def _forwards(moves: Moves) -> Moves | None:
 def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
     states; None if it has other moves than expected."""
-    pieces = follow_moves(map, map.departure(q), map.ends(), expected)
-    if pieces is None or pieces[-1] > CLOSED:
+    followed = follow_moves(map, map.departure(q), map.ends(), expected)
+    if followed is None:
         return None
-    legs, moved, tape, gap = pieces
+    pieces, moved, tape, gap = followed
+    if gap > CLOSED:
+        return None
     end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
     residual = np.where(map.valid, end.q[:, 0], 0.0) - q - map.held(q)[0]
     residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
     period = end.t[0] - map.anchor.t[0]
     turn = Return(residual, period, np.asarray(moved.result[-1]), end)
-    return turn, jax.tree_util.tree_map(one_by_one, (legs, None, tape)), gap
+    return turn, jax.tree_util.tree_map(one_by_one, (pieces, None, tape)), gap
 
 
 def one_by_one(x: np.ndarray) -> np.ndarray:
@@ -184,12 +186,12 @@ def follow_moves(
     gap = _largest_gap(map, begin, lanes, moved.lanes)
     first = np.flatnonzero(np.diff(moves.lane, prepend=-1))
     last = np.append(first[1:], len(moves.lane)) - 1
-    legs = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
+    pieces = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
     moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
     # (Moves on the way to an end are lanes here, each to a time that is known.)
     on_the_way = (tape.code == ARRIVE_TIME) & (moves.code == MOVE)
     tape = tape._replace(code=np.where(on_the_way, MOVE, tape.code))
-    return legs, moved, regrouped(tape, moves.lane, legs), gap
+    return pieces, moved, regrouped(tape, moves.lane, pieces), gap
 
 
 def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:

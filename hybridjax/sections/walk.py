@@ -161,14 +161,14 @@ def walked(
     code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
     N = family.n_sections
     lanes = Lanes(
-        t=passage.legs_t,
+        t=passage.pieces_t,
         chart=jnp.asarray(walk.chart),
-        q=passage.legs_q.T,
+        q=passage.pieces_q.T,
         armed=jnp.asarray(walk.armed),
         events=jnp.asarray(walk.events),
         pace=pace_of(jnp.asarray(walk.events)),
     )
-    duration = jnp.diff(passage.legs_t, append=passage.t[None])
+    duration = jnp.diff(passage.pieces_t, append=passage.t[None])
     fields = bound, lanes, None, duration, jnp.full(N, code)
     placed = PlacedSections(cycle, family, *fields, *coordinates_on(map, bound, lanes))
     return placed, passage.factors

@@ -372,6 +372,8 @@ ATTRIBUTES = {
     "LimitCycle.prc": "`cycle.responses()` has the phase responses",
     "LimitCycle.phase_response": "`cycle.responses()` has the phase responses",
     "LimitCycle.jacobian": "`cycle.multipliers` has the eigenvalues of the return map's Jacobian",
+    "LimitCycle.legs": "`cycle.pieces` has the states at the beginnings of the cycle's pieces",
+    "LimitCycles.legs": "`cycles.pieces` has the states at the beginnings of the cycles' pieces",
     "LimitCycle.find": "`hj.find_limit_cycle(system)` finds one",
     "Plot.savefig": "`plot.save(path)` writes the figure, and `plot.figure` is that of matplotlib",
     "RationalFit.contains": "it has no covariance; `hj.fit_multipliers(htf, order)` has one",
