@@ -122,6 +122,20 @@ class Turn(NamedTuple):
         return tuple(self.codes[self.codes >= 0].tolist())
 
 
+class _Linear(NamedTuple):
+    """A turn with the Jacobians of its pieces, which stand on the first axis."""
+
+    end: Return
+    pieces: Lanes
+    factors: Float[Array, "K *S d d"]
+    tapes: Tape
+    record: Recorded | None = None
+    gap: Array | float = 0.0
+    """Largest gap between moves, if the turn was computed from many starts."""
+    by_parameter: Float[Array, " d"] | None = None
+    """Derivative of the end by the parameter of a `Varied` system."""
+
+
 class ReturnMap(eqx.Module):
     """The return map P of a system, with the data that select one of its fixed points.
 
@@ -250,76 +264,92 @@ class ReturnMap(eqx.Module):
         are derivatives, too, at the same phase of the clock (on the host). `travelled`: the turn,
         as by `travel`, and the largest gap in it (on the host).
         """
-        s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
+        xp = namespace(q)
+        if on_host(q):
+            linear = self._linear_on_host(q, varied, travelled)
+        else:
+            linear = self._linear_in_program(q, record)
+        end = linear.end
+        off, held = self.held(q, varied)
+        returned = monodromy(linear.factors)
+        if linear.by_parameter is not None:
+            returned = np.column_stack([returned, linear.by_parameter])
+        returned = xp.where(self.valid[..., None], returned, 0.0)
+        jacobian = returned - np.eye(*held.shape[-2:]) - held
+
+        lanes = side_by_side(linear.pieces)
+        factors = linear.factors
+        if self.base is not None:
+            f = self.slopes(lanes).T.reshape(PIECES, *q.shape)
+            scale = self.scale[lanes.chart].reshape(PIECES, *q.shape)
+            factors = across(f, scale, factors)
+
+        parts = (xp.abs(end.residual) + xp.abs(off)) / self.sizes
+        codes = self.each(xp.moveaxis(linear.tapes.code, -1, 0))
+
+        def pieces_last(x):
+            return self.each(xp.moveaxis(x, (0, -1), (-1, 0)))
+
+        return Turn(
+            *end,
+            jacobian=jacobian,
+            pieces=jax.tree_util.tree_map(pieces_last, linear.pieces),
+            factors=xp.moveaxis(factors, 0, -3),
+            codes=codes,
+            distance=xp.max(parts, axis=-1) + linear.gap,
+            meetings=self._meetings(lanes, codes),
+            record=linear.record,
+            tapes=linear.tapes,
+        )
+
+    def _linear_in_program(
+        self, q: Float[Array, " d"], record: Recorded | None
+    ) -> "_Linear":
+        """A turn whose pieces are linearized one after the other."""
+        s = self.structure
 
         def flow(lanes, target, h, result, piece):
             if piece is None:
                 jacobian, moved, tape = flow_jacobian(
-                    s, lanes, target, settings, h, result
+                    s, lanes, target, self.settings, h, result
                 )
             else:
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
             steps = tape._replace(before=None, after=None, chart=None)
-            return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
+            factor = self.each(jacobian[:, 1:])
+            return moved, (lanes, factor, tape, Recorded(moved, steps))
 
-        if on_host(q):  # (all pieces are linearized together)
+        end, (pieces, factors, tapes, record) = self.travel(q, flow, record)
+        return _Linear(end, pieces, factors, tapes, record)
+
+    def _linear_on_host(
+        self,
+        q: Float[np.ndarray, " d"],
+        varied: Varied | None,
+        travelled: tuple[Return, Any, Any] | None,
+    ) -> "_Linear":
+        """A turn whose pieces are all linearized together, after it."""
+        if travelled is None:
             options = Options(
                 True, new_input=False, tangents=True, at_once=varied is not None
             )
-            travelled = travelled or (*self.travel(q, options), 0.0)
-            end, (pieces, _, tapes), gap = travelled
-            record = None
-        else:
-            (end, (pieces, factors, tapes, record)), gap = (
-                self.travel(q, flow, record),
-                0.0,
-            )
-        (ends, levels), d = self.ends().split(), s.d
+            travelled = *self.travel(q, options), 0.0
+        end, (pieces, _, tapes), gap = travelled
+        ends, levels = self.ends().split()
         lanes, tape, ends = side_by_side((pieces, tapes, ends))
-        if on_host(q):
-            many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
-            by, at = tape_jacobian(many, lanes, ends, tape, varied is None)
-            factors = (
-                by[:, 1:, 1 : 1 + d]
-                if varied
-                else by[:, 1:].reshape(PIECES, *q.shape, d)
-            )
-        codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
-        off, held = self.held(q, varied)
-        returned = monodromy(factors)
-        if varied is not None:
-            returned = np.column_stack(
-                [returned, self._by_parameter(varied, by[:, 1:], at)]
-            )
-        jacobian = (
-            xp.where(valid[..., None], returned, 0.0) - np.eye(*held.shape[-2:]) - held
-        )
-        if self.base is not None:
-            f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
-            factors = across(
-                f.reshape(PIECES, *q.shape), scale.reshape(PIECES, *q.shape), factors
-            )
-        distance = (
-            xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
-        )
-        meetings = self._meetings(lanes, codes)
-        pieces = jax.tree_util.tree_map(
-            lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), pieces
-        )
-        factors = xp.moveaxis(factors, 0, -3)
-        return Turn(
-            *end,
-            jacobian,
-            pieces,
-            factors,
-            codes,
-            distance,
-            meetings,
-            record,
-            tapes,
-        )
+        ends = ends.with_levels(levels)
+        d = self.structure.d
+        if varied is None:
+            s = self._structure_of(lanes)
+            by, _ = tape_jacobian(s, lanes, ends, tape, True)
+            factors = by[:, 1:].reshape(PIECES, *q.shape, d)
+            return _Linear(end, pieces, factors, tapes, gap=gap)
+        by, at = tape_jacobian(varied, lanes, ends, tape, False)
+        by_parameter = self._by_parameter(varied, by[:, 1:], at)
+        factors = by[:, 1:, 1 : 1 + d]
+        return _Linear(end, pieces, factors, tapes, None, gap, by_parameter)
 
     def _by_parameter(
         self,
@@ -328,13 +358,11 @@ class ReturnMap(eqx.Module):
         ends: Float[np.ndarray, "n K"],
     ) -> Float[np.ndarray, " d"]:
         """Derivative of the end of a turn by a parameter, from those of its pieces by (t, q, u)."""
-        later, t0 = 0.0, self.anchor.t[0]
+        t0 = self.anchor.t[0]
+        later = 0.0
         if self.base is None:
-            later = (
-                kernels.by_parameter_of_period(varied)
-                * self.multiplicity
-                / self.expected
-            )
+            longer = kernels.by_parameter_of_period(varied) * self.multiplicity
+            later = longer / self.expected
         column = later * t0 * by[0, :, 0] + by[0, :, -1]
         for piece in by[1:]:
             column = piece[:, 1:-1] @ column + piece[:, -1]

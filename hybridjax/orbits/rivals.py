@@ -68,19 +68,22 @@ def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]
     `Tape.rival`), and a scheduled event that is due, but does not happen. Two scheduled events
     happen in the same order on all trajectories.
     """
-    codes, times, _, rivals = events
-    xp = namespace(times)
+    xp = namespace(events.times)
+    codes = events.codes
     happens = codes >= 0
-    times = xp.where(happens, times, 0.0)
+    times = xp.where(happens, events.times, 0.0)
     by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
-    close = happens[1:] & happens[:-1] & at_one_time(times[1:], times[:-1], period)
-    close = close & ~(by_clock[1:] & by_clock[:-1])
-    close = xp.concatenate([xp.zeros_like(happens[:1]), close])
-    before = xp.concatenate([xp.full_like(codes[:1], -1), codes[:-1]])
-    out = xp.where(close, before, xp.maximum(rivals, -1))
+
+    both_happen = happens[1:] & happens[:-1]
+    both_by_clock = by_clock[1:] & by_clock[:-1]
+    close = at_one_time(times[1:], times[:-1], period) & both_happen & ~both_by_clock
+    follows = xp.concatenate([xp.zeros_like(happens[:1]), close])
+    before = xp.concatenate([codes[:1], codes[:-1]])
+    out = xp.where(follows, before, xp.maximum(events.rivals, -1))
+
     for g in np.flatnonzero(s.clocks >= 0).tolist():
         missed = ~by_clock & is_due(s, g, codes, times, period)
-        out = xp.where((out < 0) & missed, np.int32(g), out)
+        out = xp.where(missed & (out < 0), np.int32(g), out)
     return xp.where(happens, out, -1)
 
 
