@@ -149,7 +149,7 @@ print("multipliers at the optimum:", best.multipliers)
 # height.
 
 # %%
-y, v = np.moveaxis(np.asarray(cycles.legs.q)[:, :2], 1, 0)
+y, v = np.moveaxis(np.asarray(cycles.pieces.q)[:, :2], 1, 0)
 y1, v1, h = (
     np.roll(y, -1, axis=1),
     np.roll(v, -1, axis=1),

@@ -141,7 +141,7 @@ def many(cycle, n):
         cycle.base,
         c.period,
         c.anchor,
-        c.legs,
+        c.pieces,
         c.factors,
         c.residual,
         c.iterations,

@@ -15,9 +15,11 @@ from .._core.executor import is_traced
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
 from .._core.showable import Showable
+from .._core.text import folded
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
+from ..identify.multiplier_estimate import shown_multipliers
 from ..identify.multipliers import StructuredFit
 from ..identify.weights import are_alike
 from .candidates import Candidates
@@ -279,7 +281,7 @@ class SequentialDesign(Showable, eqx.Module):
         else:
             rows = ["   cycles  standard errors"]
             rows += [f"  {n:>7}  {errors}" for n, errors in self._rows()]
-            rows.append(f"  {self.fit.show_multipliers()}")
+            rows.append(f"  {folded(shown_multipliers(self.fit))}")
             rows += [f"  {x}" for x in self._outlook().splitlines()]
         return "\n".join([f"SequentialDesign({self._state()})", *rows])
 

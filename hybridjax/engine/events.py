@@ -79,6 +79,11 @@ def await_schedules(
     return armed
 
 
+def falls_within(value: Array, rate: Array, time: Array) -> Array:
+    """Test whether watched functions are at zero, up to their change in a time, and fall."""
+    return (abs(value) <= time * abs(rate)) & (rate < 0)
+
+
 def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
     """Guards that are beyond zero at t, by more than rounding errors of times.
 
@@ -99,11 +104,9 @@ def rival_of(
     **Arguments:** `lanes`, `watched`: before the resets.
     """
     xp = namespace(fired)
-    value = watched.value[:-1]
-    rate = watched.rate[:-1]
     other = (np.arange(len(s.transitions))[:, None] != fired) & (fired >= 0)
     by_guard = (s.clocks < 0)[:, None]
-    falls = (xp.abs(value) <= TOGETHER * span * xp.abs(rate)) & (rate < 0)
+    falls = falls_within(watched.value[:-1], watched.rate[:-1], TOGETHER * span)
     due = lanes.armed & other & by_guard & falls
 
     def first_enabled():

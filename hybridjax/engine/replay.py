@@ -1,8 +1,8 @@
 """Derivatives of recorded flow: the moves on a tape, integrated again.
 
 The decisions of a search (step sizes, the order of events) are fixed here; only smooth arithmetic
-is left. The times of crossings follow from two Newton steps on the true guard, which is the
-saltation formula.
+is left. The times of crossings follow from two Newton steps on the true guard (`ChartFlow.locate`),
+which carry the derivatives that `saltation.py` writes out.
 
 - `replay` is a function of JAX's arrays with exact derivatives in forward and reverse mode.
 - `chain` multiplies the Jacobians of the moves on the host: of the Runge-Kutta step, of the
@@ -38,7 +38,9 @@ from .lanes import (
     needed,
     only,
 )
+from .linear_step import linear_step
 from .runge_kutta import take_step
+from .saltation import by_point, chained, delay_of_zero
 from .target import Target
 from .watch import ChartFlow, slopes
 
@@ -380,7 +382,7 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     h = np.where(moves.at_once, 0.0, moves.h)
     h = np.where(on_time, goal - moves.t, h)
     t = np.where(on_time, goal, moves.t + h)
-    expanded = _linear_step(s, a, moves.t, moves.q[:n], u, h)
+    expanded = linear_step(s, a, moves.t, moves.q[:n], u, h)
     expanded = np.array(np.moveaxis(expanded, -1, 0))
     q = expanded[:, :, 0].T
     field = expanded[:, :, 1].T
@@ -403,8 +405,7 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
 def _at_zeros(
     s: Structure, a: int, moves: Moves, target: Target, u, ends: _Ends
 ) -> _Ends:
-    """The ends moved to the zeros of the functions that end their moves. The delay of a zero is
-    that of the saltation formula (see `saltation.py`), here by time and state."""
+    """The ends moved to the zeros of the functions that end their moves."""
     n = s.dims[a]
     code = moves.code
     by_clock = np.isin(code, s.schedules(a))
@@ -423,22 +424,17 @@ def _at_zeros(
     t[lands] += zero.past
     q[:, lands] = zero.q
     at = t[lands], q[:, lands], u[:, lands]
-    by_field = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
-    field = by_field[:, :, :1]
-    f_t, f_q, f_u = _split(by_field, n)
+    expanded = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
+    field = expanded[:, :, :1]
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     row = np.argmax(np.array(flow.rows)[:, None] == crossed, axis=0)
-    gradient = watched[row, :, np.arange(len(lands))][:, None]
-    by_t, by_q, by_u = _split(gradient, n)
+    watched = watched[row, :, np.arange(len(lands))][:, None]
     # (Over the time past: nothing but rounding errors, with derivatives.)
     past = zero.past[:, None, None]
     before = ends.dq[lands]
     dt = ends.dt[lands]
-    moved = before + past * (f_t @ dt + f_q @ before)
-    moved[:, :, 1 + n :] += past * f_u
-    change = by_t @ dt + by_q @ moved
-    change[:, :, 1 + n :] += by_u
-    delay = -change / (by_t + by_q @ field)
+    moved = before + past * chained(by_point(expanded, n), dt, before)
+    delay = delay_of_zero(by_point(watched, n), field, dt, moved)
     all_dt = ends.dt.copy()
     all_dq = ends.dq.copy()
     all_dt[lands] = dt + delay
@@ -468,50 +464,10 @@ def _after_resets(
             place = np.argmax(np.array(kind)[:, None] == event[now], axis=0)
             member = Member(kind, place.astype(np.int32))
             reset = kernels.reset(s.at(now), member, ends.t[now], after, u[:, now])
-            by_t, by_q, by_u = _split(np.moveaxis(reset, -1, 0), n)
             after = reset[:, 0]
-            by_start = by_t @ ends.dt[now] + by_q @ by_start
-            by_start[:, :, 1 + n :] += by_u
+            by_reset = by_point(np.moveaxis(reset, -1, 0), n)
+            by_start = chained(by_reset, ends.dt[now], by_start)
         m = len(after)
         end[now, 1 : 1 + m] = after.T
         by[np.ix_(now, np.arange(1, 1 + m), columns)] = by_start
     return end, by
-
-
-def _linear_step(s: Structure, a: int, t, q, u, h):
-    """`kernels.linear_step`; of an explicit method, by derivatives of the field at its stages,
-    which needs no program."""
-    method = s.method(a)
-    if method.implicit or s.by_system:
-        return kernels.linear_step(s, a, t, q, u, h)
-    n, M = q.shape
-    m = 2 + n + s.nu  # by time, states, inputs and length of the step
-    stages = len(method.b) + 1  # the last one is at the end of the step
-    rates = np.zeros((stages, n, M), q.dtype)
-    by_rates = np.zeros((stages, M, n, m), q.dtype)
-    flat, by_flat = (x.reshape(stages, -1) for x in (rates, by_rates))  # (views)
-    straight = np.zeros((M, n, m))
-    straight[:, :, 1 : 1 + n] = np.eye(n)
-    weights = [row[:i] for i, row in enumerate(np.array(method.a))]
-    weights.append(np.array(method.b))
-    places = [*method.c, 1.0]
-    for i in range(stages):
-        slope = (weights[i] @ flat[:i]).reshape(n, M)
-        state = q + h * slope
-        by_slope = (weights[i] @ by_flat[:i]).reshape(M, n, m)
-        by_state = straight + h[:, None, None] * by_slope
-        by_state[:, :, -1] += slope.T
-        expanded = kernels.field(s, a, t + places[i] * h, state, u)
-        f_t, f_q, f_u = _split(np.moveaxis(expanded, -1, 0), n)
-        rates[i] = expanded[:, 0]
-        by_rates[i] = f_q @ by_state
-        by_rates[i, :, :, 0] += f_t[:, :, 0]
-        by_rates[i, :, :, 1 + n : -1] += f_u
-        by_rates[i, :, :, -1] += places[i] * f_t[:, :, 0]
-    values = np.stack([state.T, rates[-1].T], axis=2)
-    return np.moveaxis(np.concatenate([values, by_state], axis=2), 0, -1)
-
-
-def _split(expanded, n: int):
-    """Derivatives by t, q and u (see `kernels`), moves first."""
-    return expanded[:, :, 1:2], expanded[:, :, 2 : 2 + n], expanded[:, :, 2 + n :]

@@ -10,8 +10,8 @@ with the reset $R$ and the field $f^+$ after it (M. A. Aizerman and F. R. Gantma
 Mechanics and Applied Mathematics 11, 1958). Of a scheduled event, $h$ is the time that is left:
 its delay depends on inputs only.
 
-`itinerary/bodies.py` has this formula for columns that are carried along, and `replay.py` for
-deviations of both time and state.
+`replay.py` calls `delay_of_zero` and `chained` for deviations of both time and state. For columns
+that programs carry along an itinerary, `itinerary/bodies.py` has the formula by forward mode.
 """
 
 from typing import NamedTuple
@@ -22,6 +22,49 @@ from jaxtyping import Inexact
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from . import kernels
+
+
+class ByPoint(NamedTuple):
+    """Derivatives of a function of (t, q, u) at P points."""
+
+    by_t: Inexact[np.ndarray, "P k 1"]
+    by_q: Inexact[np.ndarray, "P k n"]
+    by_u: Inexact[np.ndarray, "P k nu"]
+
+
+def by_point(expanded: Inexact[np.ndarray, "P k columns"], n: int) -> ByPoint:
+    """The derivatives of `engine.kernels`, whose first column is the value, with points first."""
+    by_t = expanded[:, :, 1:2]
+    by_q = expanded[:, :, 2 : 2 + n]
+    by_u = expanded[:, :, 2 + n :]
+    return ByPoint(by_t, by_q, by_u)
+
+
+def chained(
+    by: ByPoint,
+    dt: Inexact[np.ndarray, "P 1 m"],
+    dq: Inexact[np.ndarray, "P n m"],
+) -> Inexact[np.ndarray, "P k m"]:
+    """Derivatives of a function of (t, q, u) by those of t and q with respect to m numbers, the
+    last of which are the inputs u."""
+    out = by.by_t @ dt + by.by_q @ dq
+    inputs = by.by_u.shape[2]
+    out[:, :, out.shape[2] - inputs :] += by.by_u
+    return out
+
+
+def delay_of_zero(
+    by: ByPoint,
+    field: Inexact[np.ndarray, "P n 1"],
+    dt: Inexact[np.ndarray, "P 1 m"],
+    dq: Inexact[np.ndarray, "P n m"],
+) -> Inexact[np.ndarray, "P 1 m"]:
+    """Derivatives of the time at which a function of (t, q, u) is zero along the field, where the
+    points before have these derivatives; NaN where its rate is zero."""
+    rate = by.by_t + by.by_q @ field
+    change = chained(by, dt, dq)
+    never = np.full_like(change, np.nan)
+    return np.divide(-change, rate, where=rate != 0, out=never)
 
 
 class Jump(NamedTuple):
@@ -69,32 +112,32 @@ def jump(
     b = s.chart_index(transition.target)
     n = s.dims[a]
     point = t, q.T, u
-    before = kernels.field(s, a, *point)[:, 0].T
     if isinstance(transition.guard, Scheduled):
         guard = kernels.due(s, g, *point)[0].T
     else:
         row = s.guards(a).index(g)
         first = np.zeros(1, np.int32)
         guard = kernels.watched(s, a, None, *point, first)[row].T
-    gradient = guard[:, 2 : 2 + n]
-    rate = guard[:, 1] + np.sum(gradient * before, axis=1)
-    never = np.full_like(rate, np.nan)
-    delay_by_level = np.divide(-1.0, rate, where=rate != 0, out=never)
+    before = kernels.field(s, a, *point)[:, 0].T
     reset = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
     after = reset[:, :, 0]
-    by_time = reset[:, :, 1]
-    by_state = reset[:, :, 2 : 2 + n]
     field_after = kernels.field(s, b, t, after.T, u)[:, 0].T
-    along = (by_state @ before[..., None])[..., 0]
+
+    field = before[:, :, None]
+    level = by_point(guard[:, None], n)
+    by = by_point(reset, n)
+    rate = (level.by_t + level.by_q @ field)[:, 0, 0]
+    never = np.full_like(rate, np.nan)
+    delay_by_level = np.divide(-1.0, rate, where=rate != 0, out=never)
     return Jump(
-        guard[:, 0],
-        rate,
-        gradient,
-        after,
-        by_state,
-        reset[:, :, 2 + n :],
-        along + by_time - field_after,
-        delay_by_level,
-        gradient * delay_by_level[:, None],
-        guard[:, 2 + n :] * delay_by_level[:, None],
+        level=guard[:, 0],
+        rate=rate,
+        gradient=level.by_q[:, 0],
+        after=after,
+        by_state=by.by_q,
+        by_input=by.by_u,
+        slip=(by.by_q @ field + by.by_t)[:, :, 0] - field_after,
+        delay_by_level=delay_by_level,
+        delay_by_state=level.by_q[:, 0] * delay_by_level[:, None],
+        delay_by_input=level.by_u[:, 0] * delay_by_level[:, None],
     )

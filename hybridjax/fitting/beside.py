@@ -203,7 +203,7 @@ def _model(problem: FitProblem, beside: Beside, x: Array, q: Array):
     cycle = first_order_cycle(route, known.return_map.at_phase_of(system), q)
     cycle = dataclasses.replace(
         cycle,
-        legs=cycle.legs._replace(q=jnp.full_like(cycle.legs.q, jnp.nan)),
+        pieces=cycle.pieces._replace(q=jnp.full_like(cycle.pieces.q, jnp.nan)),
         factors=jnp.full_like(cycle.factors, jnp.nan),
     )
     observations = problem.parameters.observed(problem.observations, values)

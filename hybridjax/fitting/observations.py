@@ -64,7 +64,7 @@ class AbstractObservation(eqx.Module):
 
         The method is called under JAX transformations and differentiated in forward mode, once. The
         parameters of `cycle.system`, `period`, `anchor`, and the results of `linearize` and
-        `place_sections` have derivatives with respect to the free parameters. `cycle.legs` and
+        `place_sections` have derivatives with respect to the free parameters. `cycle.pieces` and
         `cycle.factors` are NaN, because computing them would triple the compile time. Functions
         that need concrete values raise an error, such as `cycle.multipliers`. Linearize the cycle
         instead: `model = hj.linearize(cycle, sections)`, then `model.characteristic_polynomial()`

@@ -171,7 +171,7 @@ def candidate_cycle(
     """Return the cycle of a system near the `guess`, as `find_limit_cycle`, under a transformation;
     and its last turn outside of programs.
 
-    `factors` and `legs` are NaN: derivatives of a cycle's factors are second derivatives of the
+    `factors` and `pieces` are NaN: derivatives of a cycle's factors are second derivatives of the
     flow, and take two thirds of the time of compilation.
     """
     map, last = guess.return_map.at_phase_of(system), None
@@ -189,7 +189,7 @@ def candidate_cycle(
         numbers=arrays_of(system),
         period=period,
         anchor=anchor,
-        legs=guess.legs._replace(q=jnp.full_like(guess.legs.q, jnp.nan)),
+        pieces=guess.pieces._replace(q=jnp.full_like(guess.pieces.q, jnp.nan)),
         factors=jnp.full_like(guess.factors, jnp.nan),
         residual=turn.distance,
         iterations=steps,

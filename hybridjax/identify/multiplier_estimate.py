@@ -324,52 +324,8 @@ class MultiplierFit(Fit):
             tails.append(_tail(float(missed @ weights @ missed), equations, dof))
         return min(1.0, len(tails) * min(tails))
 
-    def contradicted_by(
-        self, others: Iterable[Callable[[], RoughFit]], level: float = 0.95
-    ) -> int | None:
-        """Return the order of the first other fit that contradicts this one; None if none does.
-
-        It does if a multiplier is outside of its confidence regions, and its nearest one outside of
-        those of this fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more
-        that are too low pass. Drift moves multipliers further: regions of 99.9 % notice it.)
-
-        **Arguments:** `others`: the fits; a `DefinitionError` means too few data.
-        """
-        for fit in others:
-            with suppress(DefinitionError):
-                coefficients, covariance = fit()
-                multipliers = multipliers_of(coefficients)
-                apart = np.abs(multipliers - self.multipliers[:, None])
-                moved = ~self.contains(multipliers[apart.argmin(axis=1)], level)
-                if not moved.any():
-                    continue
-                other = MultiplierEstimate(multipliers, coefficients, *covariance())
-                if (moved & ~other.contains(self.multipliers, level)).any():
-                    return len(coefficients)
-        return None
-
-    def undetermined(self) -> list[Finding]:
-        """Return a finding if the data do not determine the multipliers."""
-        if np.isfinite(self.covariance).all():
-            return []
-        text = "the data do not determine all multipliers, some may be spurious: fit fewer."
-        return [Finding("undetermined", text)]
-
-    def order_doubts(self, higher: Iterable[Callable[[], RoughFit]]) -> list[Finding]:
-        """Return a finding if the data do not determine the multipliers, or if fits of a higher
-        order contradict them."""
-        unknown = self.undetermined()
-        if unknown:
-            return unknown
-        order = self.contradicted_by(higher)
-        if order is None:
-            return []
-        # (No numbers: those of a few iterations may be far from those of a fit.)
-        text = f"`order` may be too low: order {order} gives other multipliers; compare both fits."
-        return [Finding("order", text)]
-
     def _summary(self) -> str:
-        parts = self._shown_multipliers(), self._shown_moduli(), self._about()
+        parts = shown_multipliers(self), self._shown_moduli(), self._about()
         about = "; ".join(filter(None, parts))
         return folded(f"{type(self).__name__}({about})")
 
@@ -386,20 +342,6 @@ class MultiplierFit(Fit):
     def _about(self) -> str:
         """The rest of a summary, after the multipliers."""
         return ""
-
-    def show_multipliers(self) -> str:
-        """Return the multipliers of a minimum and their standard errors, for a `repr`."""
-        return folded(self._shown_multipliers())
-
-    def _shown_multipliers(self) -> str:
-        if self.result != Result.OK:
-            reason = Result(self.result).message
-            return f"no multipliers: {reason} (`multipliers` holds its last step)"
-        shown = (
-            f"{_short(z)} ± {error:.1e}"
-            for z, error in zip(self.multipliers, self.standard_errors, strict=True)
-        )
-        return f"multipliers (± standard error) {', '.join(shown)}"
 
     def _shown_moduli(self) -> str:
         """Return the moduli and their intervals, of a pair of complex multipliers once."""
@@ -435,6 +377,18 @@ class MultiplierFit(Fit):
         return equations * dof / left * special.fdtri(equations, left, level)
 
 
+def shown_multipliers(fit: MultiplierFit) -> str:
+    """Return the multipliers of a minimum and their standard errors."""
+    if fit.result != Result.OK:
+        reason = Result(fit.result).message
+        return f"no multipliers: {reason} (`multipliers` holds its last step)"
+    shown = (
+        f"{_short(z)} ± {error:.1e}"
+        for z, error in zip(fit.multipliers, fit.standard_errors, strict=True)
+    )
+    return f"multipliers (± standard error) {', '.join(shown)}"
+
+
 def _tail(distance: float, equations: int, dof: float) -> float:
     """Return the probability of a larger squared distance from a true hypothesis."""
     from scipy import special  # (a fifth of a second)
@@ -465,3 +419,54 @@ class FitWithoutModel(MultiplierFit):
 
 class MultiplierEstimate(FitWithoutModel):
     """Multipliers and their covariance alone, such as a bound of what any estimate can reach."""
+
+
+def contradicted_by(
+    fit: MultiplierFit,
+    others: Iterable[Callable[[], RoughFit]],
+    level: float = 0.95,
+) -> int | None:
+    """Return the order of the first of other fits that contradicts a fit; None if none does.
+
+    It does if a multiplier is outside of its confidence regions, and its nearest one outside of
+    those of the fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more that
+    are too low pass. Drift moves multipliers further: regions of 99.9 % notice it.)
+
+    **Arguments:** `others`: the fits; a `DefinitionError` means too few data.
+    """
+    for make in others:
+        with suppress(DefinitionError):
+            coefficients, covariance = make()
+            multipliers = multipliers_of(coefficients)
+            apart = np.abs(multipliers - fit.multipliers[:, None])
+            moved = ~fit.contains(multipliers[apart.argmin(axis=1)], level)
+            if not moved.any():
+                continue
+            other = MultiplierEstimate(multipliers, coefficients, *covariance())
+            if (moved & ~other.contains(fit.multipliers, level)).any():
+                return len(coefficients)
+    return None
+
+
+def undetermined(fit: MultiplierFit) -> list[Finding]:
+    """Return a finding if the data do not determine the multipliers of a fit."""
+    if np.isfinite(fit.covariance).all():
+        return []
+    text = "the data do not determine all multipliers, some may be spurious: fit fewer."
+    return [Finding("undetermined", text)]
+
+
+def order_doubts(
+    fit: MultiplierFit, higher: Iterable[Callable[[], RoughFit]]
+) -> list[Finding]:
+    """Return a finding if the data do not determine the multipliers of a fit, or if fits of a
+    higher order contradict them."""
+    unknown = undetermined(fit)
+    if unknown:
+        return unknown
+    order = contradicted_by(fit, higher)
+    if order is None:
+        return []
+    # (No numbers: those of a few iterations may be far from those of a fit.)
+    text = f"`order` may be too low: order {order} gives other multipliers; compare both fits."
+    return [Finding("order", text)]

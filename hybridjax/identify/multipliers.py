@@ -26,6 +26,7 @@ from .fit import WithCost, not_converged
 from .multiplier_estimate import (
     FitWithoutModel,
     RoughFit,
+    order_doubts,
 )
 
 
@@ -201,7 +202,7 @@ def fit_multipliers(
 
     # One more multiplier, or a pair.
     higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]
-    doubts = surplus or fit.order_doubts(higher)
+    doubts = surplus or order_doubts(fit, higher)
     fit = dataclasses.replace(fit, findings=(*not_converged(result), *doubts))
     if check:
         warn_of(fit.findings, wrappers=2)

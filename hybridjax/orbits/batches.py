@@ -22,11 +22,11 @@ from ..engine.move import move
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import toward, until
 from ..systems.system import HybridSystem
-from .coincidence import together
-from .crossing import AtEvent, to_section
+from .crossing import to_section
 from .guess import require_similar
 from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn
+from .rivals import coincide, events_on
 from .shooting import excess, newton_steps, one_by_one
 
 
@@ -41,11 +41,13 @@ def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
 
 
 def _turn(map: ReturnMap):
-    """The anchor, the expected period, and one turn with its Jacobian, of a system, or of systems
-    side by side on the host."""
+    """The anchor, the expected period, one turn with its Jacobian, and whether events coincide on
+    it, of a system, or of systems side by side on the host."""
     turn = map.turn_with_jacobian(map.each(map.anchor.q.T))
+    assert turn.tapes is not None
+    together = coincide(map.structure, events_on(map, turn.tapes), turn.period)
     turn = turn._replace(record=None, tapes=None, end=_apart(map, turn.end))
-    return _apart(map, map.anchor), map.expected, turn
+    return _apart(map, map.anchor), map.expected, turn, together
 
 
 def _verdict(map: ReturnMap, turn: Turn):
@@ -203,7 +205,7 @@ class Tiles(NamedTuple):
 
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
-        anchor, period, turn, codes, coincide = self._turn(rows, anchor, period)
+        anchor, period, turn, codes, together = self._turn(rows, anchor, period)
         sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
         jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
         step = newton_steps(jacobian, turn.residual / sizes)
@@ -220,25 +222,17 @@ class Tiles(NamedTuple):
         anchor.q[other], anchor.chart[other] = turn.end.q[other], turn.end.chart[other]
         size[extra | other] = np.inf
         once = np.ones(len(rows), int)
-        return Rounds(anchor, size, period, turn, codes, coincide, -once, once)
+        return Rounds(anchor, size, period, turn, codes, together, -once, once)
 
     def _turn(self, rows, anchor: Lanes, period):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
 
         def events(turned):
-            anchor, expected, turn = jax.tree_util.tree_map(np.asarray, turned)
-            of_events = turn.codes, turn.times, turn.rivals
-            codes, times, rivals = (x.reshape(len(x), -1) for x in of_events)
-            at_event = isinstance(self.map.base, AtEvent)
-            begin = anchor.t[:, 0] if at_event else np.full(len(codes), -np.inf)
-            coincide = together(codes, times, rivals, begin, turn.period)
-            return (
-                anchor,
-                expected,
-                turn._replace(codes=None, times=None, rivals=None),
-                front(codes),
-                coincide,
+            anchor, expected, turn, together = jax.tree_util.tree_map(
+                np.asarray, turned
             )
+            codes = front(turn.codes.reshape(len(turn.codes), -1))
+            return anchor, expected, turn._replace(codes=None), codes, together
 
         return self._in_tiles(_turn, rows, anchor, period, then=events)
 
@@ -254,22 +248,18 @@ class Tiles(NamedTuple):
     ):
         """`function` of the return maps of some systems, and of further arguments, in calls of few
         sizes. (JAX compiles operations on numbers of systems for each size.)"""
-        arrays, static = eqx.partition(self.systems, eqx.is_array)
         map = self.map
 
         def run(k):
             left = len(rows) - k
             size = min(self.size, -(-left // WIDE) * WIDE)
             tile = np.arange(k, k + size) % len(rows)
-            systems = _pick(arrays, rows[tile])
             begin, expected, *further = _pick((anchor, period, *others), tile)
             if self.periods is not None:
                 expected = self.periods[rows[tile]]
             grown = expected / map.expected if map.base is None else np.ones(size)
             begin = begin._replace(t=map.anchor.t * grown[:, None])
-            last = jax.tree_util.tree_map(lambda x: np.moveaxis(x, 0, -1), systems)
-            split = (True,) * len(jax.tree_util.tree_leaves(last))
-            side = PerLane(eqx.combine(jax.device_put(last), static), split)
+            side = in_lanes(self.systems, rows[tile])
             begin = jax.tree_util.tree_map(
                 lambda x: np.moveaxis(x[..., 0], 0, -1), begin
             )
@@ -297,6 +287,16 @@ def tiles_of(
         of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
     return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
+
+
+def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
+    """Some of many systems, side by side."""
+    arrays, static = eqx.partition(systems, eqx.is_array)
+    last = jax.tree_util.tree_map(
+        lambda x: np.moveaxis(np.asarray(x)[rows], 0, -1), arrays
+    )
+    split = (True,) * len(jax.tree_util.tree_leaves(last))
+    return PerLane(eqx.combine(jax.device_put(last), static), split)
 
 
 def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:

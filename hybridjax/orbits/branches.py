@@ -26,7 +26,7 @@ from ..errors import DefinitionError
 from ..systems.system import Guess, copies_of, require_positive
 from .batches import front
 from .branch_ends import explained
-from .coincidence import SAME, coincident
+from .coincidence import SAME
 from .crossing import AtEvent
 from .curve import Curve, Point
 from .cycle import LimitCycle
@@ -35,6 +35,7 @@ from .guess import is_default
 from .limit_cycles import LimitCycles, examined
 from .newton import USUAL_STEPS
 from .return_map import SINGULAR
+from .rivals import coincident
 from .verdict import verdict
 
 
@@ -464,14 +465,14 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
 
     systems = [eqx.filter(curve.system_at(p.value), eqx.is_array) for p in points]
     systems = eqx.combine(jax.tree_util.tree_map(stack, *systems), cycle.system)
-    pairs = [(point.departure, point.turn) for point in points]
+    pairs = [(point.departure, point.turn._replace(tapes=None)) for point in points]
     anchor, turn = jax.tree_util.tree_map(stack, *pairs)
     cycles = LimitCycles(
         systems,
         cycle.base,
         turn.period,
         anchor,
-        turn.legs,
+        turn.pieces,
         turn.factors,
         turn.distance,
         np.array([p.steps for p in points]),
@@ -482,5 +483,9 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         cycle.multiplicity,
         copies_of(systems),
     )
-    together = [coincident(cycle.return_map, p.turn) is not None for p in points]
+    maps = [curve.map.at_phase_of(curve.system_at(p.value)) for p in points]
+    together = [
+        coincident(map, point.turn) is not None
+        for map, point in zip(maps, points, strict=True)
+    ]
     return examined(cycles, np.array(together))

@@ -24,9 +24,10 @@ from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import SAME_TIME, Scheduled
-from .coincidence import SAME, coincident, events_of
+from .coincidence import SAME
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
+from .rivals import coincident
 from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 from .verdict import verdict
 
@@ -138,7 +139,7 @@ def _check_output_period(cycle: LimitCycle, output: Output) -> None:
         problem = f"the {clocked[0]} depends on t"
         raise DefinitionError(_no_period(s.system, problem))
     scale = np.asarray(cycle.settings.scale)
-    for a, t, q in points(s, cycle.legs):
+    for a, t, q in points(s, cycle.pieces):
         if s.resolve_outputs(output).defined(a):
             sizes = np.append(float(cycle.period), scale[a, : len(q)])
             name, function = _output(s, a, output)
@@ -254,10 +255,10 @@ def check_found(cycle: LimitCycle) -> None:
     **Raises:** `DefinitionError` as `check_clock`, `check_claims` and `check_jumps`.
     """
     s = cycle.structure
-    legs = to_host(cycle.legs)
+    pieces = to_host(cycle.pieces)
     check_clock(s)
     check_claims(
-        s, legs.t, legs.chart, legs.q, cycle.settings.scale, float(cycle.period)
+        s, pieces.t, pieces.chart, pieces.q, cycle.settings.scale, float(cycle.period)
     )
     if int(cycle.result) in (Result.OK, Result.SINGULAR):
         check_jumps(cycle)
@@ -426,7 +427,7 @@ def _why_not_converged(cycle: LimitCycle, turn: Turn) -> str:
 def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -> str:
     """The place where steps shrank to nothing, or the mode that keeps them short."""
     if int(turn.result) == Result.STEP_COLLAPSE:
-        lanes = turn.legs
+        lanes = turn.pieces
         a = int(lanes.chart[0])
         path = simulate(
             cycle.system,
@@ -456,7 +457,7 @@ def rate_of_short_steps(s: Structure, turn: Turn, expected: float) -> float:
     if int(turn.result) != Result.STEP_LIMIT:
         return 0.0
     rate = 0.0
-    for a, times, states in points(s, turn.legs):
+    for a, times, states in points(s, turn.pieces):
         if not is_implicit(s, a):
             rate = max(rate, float(fastest(s, a, times, states).max()))
     return rate if rate * expected >= STIFF else 0.0
@@ -475,10 +476,10 @@ def _about_decisions(s: Structure) -> str:
 
 def _about_guards(s: Structure, turn: Turn, better: str) -> str:
     """The values of the guards, if none of them led to an event."""
-    if events_of(turn) or not s.transitions:
+    if turn.events or not s.transitions:
         return ""
     values: dict[int, list[float]] = {}
-    for a, t, q in points(s, turn.legs):
+    for a, t, q in points(s, turn.pieces):
         guards = s.guards(a)
         if not guards:
             continue

@@ -13,14 +13,14 @@ from typing import NamedTuple, cast
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from .._core.boundary.checked import checked
 from .._core.compilation import host_first
-from .._core.executor import Array, namespace, stop_gradient, to_host
+from .._core.executor import to_host
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.lanes import Tape
+from ..engine.events import falls_within
 from ..engine.saltation import jump
 from ..engine.settings import ROUNDING
 from ..engine.target import until
@@ -30,7 +30,8 @@ from ..systems.structure import Structure
 from ..systems.transition import TOGETHER, Scheduled
 from .crossing import AtEvent
 from .cycle import LimitCycle
-from .return_map import ReturnMap, Turn
+from .return_map import ReturnMap
+from .rivals import is_due
 
 
 # Two results of the flow are the same up to this relative difference: states and derivatives after
@@ -185,95 +186,16 @@ def commutes(cycle: LimitCycle) -> bool:
     return bool(groups) and all(group is None or group.commute for group in groups)
 
 
-def events_of(turn: Turn) -> list[tuple[int, float]]:
-    """The transitions of a turn by index, with their times."""
-    codes = np.ravel(np.asarray(turn.codes))
-    times = np.ravel(np.asarray(turn.times))
-    return [(int(g), float(t)) for g, t in zip(codes, times, strict=True) if g >= 0]
-
-
-def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
-    """Two transitions of a turn, by index, that are due at the same time; the turn may have passed
-    over one of them."""
-    s = map.structure
-    period = float(turn.period)
-    events = events_of(turn)
-    from_begin = events
-    if map.event >= 0:  # the turn begins with the event that ends it
-        begin = float(np.asarray(turn.legs.t)[0])
-        from_begin = [(map.event, begin), *events]
-    for (g, t), (other, later) in itertools.pairwise(from_begin):
-        # (Clocks tick in the same order for all neighbors.)
-        by_clock = s.clocks[g] >= 0 and s.clocks[other] >= 0
-        if later - t <= TOGETHER * period and not by_clock:
-            return g, other
-    codes = np.ravel(np.asarray(turn.codes))
-    rivals = np.ravel(np.asarray(turn.rivals))
-    for k in np.flatnonzero((codes >= 0) & (rivals >= 0)):
-        return int(codes[k]), int(rivals[k])
-    for g, t in events:
-        for other in _missed(s, [g], t, period):
-            return g, other
-    return None
-
-
-def meet(s: Structure, period: Array, tape: Tape) -> Bool[Array, ""]:
-    """Test whether two events of a turn coincide whose order may be another one beside it; also in
-    programs, where their orders are not compared."""
-    codes, times, at_once, rivals = (
-        stop_gradient(x.ravel()) for x in (tape.code, tape.t, tape.at_once, tape.rival)
-    )
-    xp = namespace(times)
-    times = xp.where(codes >= 0, times, xp.inf)
-    order = xp.argsort(times, stable=True)
-    codes = codes[order]
-    times = times[order]
-    at_once = at_once[order]
-    by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
-    close = times[1:] <= times[:-1] + TOGETHER * stop_gradient(period)
-    fixed = at_once[1:] | (by_clock[1:] & by_clock[:-1])
-    both_happen = (close & (codes[1:] >= 0) & ~fixed).any()
-    return both_happen | (rivals >= 0).any()
-
-
-def together(
-    codes: Int[np.ndarray, "S R"],
-    times: Float[np.ndarray, "S R"],
-    rivals: Int[np.ndarray, "S R"],
-    begin: Float[np.ndarray, " S"],
-    period: Float[np.ndarray, " S"],
-) -> Bool[np.ndarray, " S"]:
-    """The turns, among many, in which two events coincide, or an event and the one with which the
-    turn begins.
-
-    **Arguments:** `codes`, negative for no event, and `times`, of the events in order; `rivals`,
-    transitions that were due at these, too, negative for none; `begin`, times at which the turns
-    begin, minus infinity for one that begins with no event.
-    """
-    row, column = np.nonzero(codes >= 0)
-    time = times[row, column]
-    is_first = np.diff(row, prepend=-1) > 0
-    before = np.where(is_first, begin[row], np.roll(time, 1))
-    close = time - before <= TOGETHER * period[row]
-    out = np.asarray((rivals >= 0).any(axis=1))
-    out[row[close]] = True
-    return out
-
-
 def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]:
     """The scheduled events that are due together with a group that contains one of a guard."""
-    if all(isinstance(s.transitions[g].guard, Scheduled) for g in group):
+    if all(s.clocks[g] >= 0 for g in group):
         return set()
-    charts = set()
-    for g in group:
-        transition = s.transitions[g]
-        charts |= {s.chart_index(transition.source), s.chart_index(transition.target)}
     happened = {int(s.clocks[g]) for g in group}
+    codes, times = np.array(group), np.full(len(group), t)
     return {
         g
-        for a in charts
-        for g in s.schedules(a)
-        if _scheduled_at(s, g, t, TOGETHER * period) and s.clocks[g] not in happened
+        for g in np.flatnonzero(s.clocks >= 0).tolist()
+        if s.clocks[g] not in happened and is_due(s, g, codes, times, period).any()
     }
 
 
@@ -289,10 +211,10 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
     found = set()
     for g in s.guards(a):
         event = jump(s, g, times, states, u)
-        close = TOGETHER * period * np.abs(event.rate)
-        falls = event.level[0] > close[0] and event.rate[1] < 0
+        was_positive = event.level[0] > TOGETHER * period * abs(event.rate[0])
+        falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
         holds = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u).all()
-        if g not in events and falls and abs(event.level[1]) <= close[1] and holds:
+        if g not in events and was_positive and falls and holds:
             found.add(g)
     return found
 
@@ -337,7 +259,7 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
         saltation = event.saltation[0]
         if g in scheduled:
             saltation = event.by_state[0]
-        elif event.rate[0] >= 0 or abs(event.level[0]) > -due * event.rate[0]:
+        elif not falls_within(event.level[0], event.rate[0], due):
             continue
         b = s.chart_index(s.transitions[g].target)
         events = (*before.events, g)
@@ -358,7 +280,7 @@ def check_begin(map: ReturnMap) -> None:
     guards, rates = jax.device_get(_at_anchor(map))
     # (At the end of sliding the rate of the guard that began it is zero.)
     due = rates < -TOGETHER * np.abs(rates).max(initial=0.0)
-    due &= np.abs(guards) <= -TOGETHER * float(map.expected) * rates
+    due &= falls_within(guards, rates, TOGETHER * float(map.expected))
     if base is not None:
         # (Events that follow at once have been armed by the event that led to the anchor.)
         due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)

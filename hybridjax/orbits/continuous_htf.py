@@ -10,7 +10,7 @@ import functools as ft
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 
 from .._core.boundary.kinds import SignalNames
 from .._core.compilation import at_ease, one_program
@@ -115,19 +115,22 @@ def _interpolation(
     values there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s
     from 0 to 1.
     """
-    middle, half = (np.max(f) + np.min(f)) / 2, np.ptp(f) / 2
+    middle = (np.max(f) + np.min(f)) / 2
+    half = np.ptp(f) / 2
     n = int(np.pi * half + _EXTRA * np.cbrt(1 + np.pi * half))
     if n >= len(f) or not half:
         return f, f, np.eye(len(f))
-    k, chebyshev = np.arange(n), np.polynomial.chebyshev
+    k = np.arange(n)
     x = np.cos(np.pi * (k + 0.5) / n)
-    values = chebyshev.chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
-    coarse, mix = (
-        middle + half * x,
-        chebyshev.chebvander((f - middle) / half, n - 1) @ values,
-    )
+    coarse = middle + half * x
+    chebvander = np.polynomial.chebyshev.chebvander
+    coefficients = chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
+    mix = chebvander((f - middle) / half, n - 1) @ coefficients
+
+    def turn(x):
+        return np.exp(1j * np.pi * x)
+
     # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
-    turn = lambda x: np.exp(1j * np.pi * x)  # noqa: E731
     return f, coarse, mix * turn(coarse) * turn(-f)[:, None]
 
 
@@ -139,61 +142,94 @@ def _transfer(
     interpolation: tuple[Array, Array, Array],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
-    s, xp, h, period = map.structure, namespace(flow.q), flow.length, map.expected
-    z, (f, coarse, fine) = s.resolve_outputs(outputs), interpolation
-    values, by_state, by_input = linear_outputs(s, flow, z)
-    (P, K, d), nu, size, rows = (
-        flow.q.shape,
-        s.nu,
-        map.sizes,
-        len(harmonics) * len(z.names),
-    )
+    s = map.structure
+    xp = namespace(flow.q)
+    z = s.resolve_outputs(outputs)
+    f, coarse, fine = interpolation
+    d = flow.q.shape[2]
+    nu = s.nu
+    rows = len(harmonics) * len(z.names)
     whole = flow.monodromy(map.valid)
     if on_host(whole):
-        apart = np.abs(np.exp(2j * np.pi * f)[:, None] - np.linalg.eigvals(whole)).min(
-            axis=1
+        _require_no_pole(map, f, whole)
+
+    # The input's wave at the nodes of each piece, relative to its beginning. Columns are responses
+    # to inputs, then to states at phase 0.
+    phase = flow.length[:, None] * rule().nodes / map.expected
+    inside = xp.exp(phase[..., None] * (2j * np.pi * coarse))
+    begin, delay, end = flow.driven(inside)
+    H = _integrals(map, flow, z, harmonics, inside, begin, delay)
+
+    H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1)
+    at_f = (fine @ H.reshape(len(coarse), -1)).reshape(len(f), rows + d, -1)
+    H, end = xp.split(at_f, [rows], axis=1)
+
+    # The deviation at phase 0 is that one period later.
+    size = map.sizes
+    scaled = whole * size / size[:, None]
+    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * scaled
+    start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
+    H = H[..., :nu] + H[..., nu:] @ start
+    H = H.reshape(-1, len(harmonics), len(z.names), nu)
+    return xp.moveaxis(H, 0, 1) / map.expected
+
+
+def _require_no_pole(
+    map: ReturnMap,
+    f: Float[np.ndarray, " F"],
+    monodromy: Float[np.ndarray, "d d"],
+) -> None:
+    """**Raises:** `DefinitionError` for a frequency at which the HTF is infinite."""
+    turns = np.exp(2j * np.pi * f)
+    apart = np.abs(turns[:, None] - np.linalg.eigvals(monodromy)).min(axis=1)
+    if (apart < _POLE).any():
+        where = "every whole number" if map.base else "its multipliers of modulus 1"
+        raise DefinitionError(
+            f"f = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
+            f"lie at {where}: leave it out."
         )
-        if (apart < _POLE).any():
-            where = "every whole number" if map.base else "its multipliers of modulus 1"
-            raise DefinitionError(
-                f"f = {f[apart.argmin()]:.10g} cycles per period is a pole of the cycle, which "
-                f"lie at {where}: leave it out."
-            )
-    # Responses to inputs, and to states at phase 0, are columns.
-    inside = xp.exp(
-        (h[:, None] * rule().nodes / period)[..., None] * (2j * np.pi * coarse)
-    )
-    back, (begin, delay, end) = xp.conj(inside), flow.driven(inside)
+
+
+def _integrals(
+    map: ReturnMap,
+    flow: LinearFlow,
+    z: Outputs,
+    harmonics: tuple[int, ...],
+    inside: Inexact[Array, "P K f"],
+    begin: Inexact[Array, "P d c f"],
+    delay: Inexact[Array, "P c f"],
+) -> Complex[Array, "f rows c"]:
+    """Fourier integrals of outputs over a turn, by harmonic and output, for inputs that are waves,
+    and for the state at phase 0: c = nu + d columns.
+
+    **Arguments:** `inside`: waves within pieces; `begin`, `delay`: see `LinearFlow.driven`.
+    """
+    xp = namespace(flow.q)
+    P, K, d = flow.q.shape
+    nu = map.structure.nu
+    rows = len(harmonics) * len(z.names)
+    values, by_state, by_input = linear_outputs(map.structure, flow, z)
+    orders = np.asarray(harmonics)[:, None, None]
+    waves = xp.exp(-2j * np.pi * orders * flow.after(map) / map.expected)
+    weighted = waves * flow.length[:, None] * rule().weights
+    back = xp.conj(inside)
+
+    # By deviations where pieces begin.
+    free = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ flow.forward[0])
+    free = (free.reshape(P, -1, K) @ back).reshape(P, rows, d, -1)
+    free = free.transpose(3, 1, 0, 2).reshape(-1, rows, P * d)
+    of_begin = free @ xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
+
+    # By inputs within pieces.
     pushed = (by_state @ flow.pushed.reshape(P, K, d, -1)).reshape(*by_input.shape, K)
     pushed = pushed + by_input[..., None] * xp.eye(K)[:, None, None]
-    # Fourier integrals of outputs by deviations where pieces begin, and by inputs within them.
-    waves = xp.exp(
-        -2j * np.pi * np.asarray(harmonics)[:, None, None] * flow.after(map) / period
-    )
-    weighted = waves * h[:, None] * rule().weights
-    of_begin = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ flow.forward[0])
-    of_begin = of_begin.reshape(P, -1, K) @ back
-    of_begin = (
-        of_begin.reshape(P, rows, d, -1).transpose(3, 1, 0, 2).reshape(-1, rows, P * d)
-    )
-    H = of_begin @ xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
-    pushed = (pushed.reshape(P, -1, K) @ inside).reshape(P, K, -1, len(coarse))
-    pushed = weighted.reshape(-1, P * K) @ (pushed * back[:, :, None]).reshape(
-        P * K, -1
-    )
-    pushed = xp.pad(pushed.reshape(rows, nu, -1), [(0, 0), (0, d), (0, 0)])
+    pushed = (pushed.reshape(P, -1, K) @ inside).reshape(P, K, -1, inside.shape[2])
+    pushed = (pushed * back[:, :, None]).reshape(P * K, -1)
+    forced = (weighted.reshape(-1, P * K) @ pushed).reshape(rows, nu, -1)
+    forced = xp.pad(forced, [(0, 0), (0, d), (0, 0)])
+
     # Events whose time moves: the jump of the output at the moment of the event.
     jump = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
-    moved = (waves[:, None, :, -1] * jump.T).reshape(rows, P) @ delay.reshape(P, -1)
-    H = H + xp.moveaxis(pushed + moved.reshape(pushed.shape), -1, 0)
-    # The deviation at phase 0 is that one period later.
-    H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1).reshape(len(coarse), -1)
-    H, end = xp.split((fine @ H).reshape(len(f), rows + d, -1), [rows], axis=1)
-    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * (
-        whole * size / size[:, None]
-    )
-    start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
-    H = (H[..., :nu] + H[..., nu:] @ start).reshape(
-        -1, len(harmonics), len(z.names), nu
-    )
-    return xp.moveaxis(H, 0, 1) / period
+    jumps = (waves[:, None, :, -1] * jump.T).reshape(rows, P)
+    moved = (jumps @ delay.reshape(P, -1)).reshape(forced.shape)
+    return of_begin + xp.moveaxis(forced + moved, -1, 0)

@@ -56,7 +56,7 @@ class Point:
     @property
     def departure(self) -> Lanes:
         """The lane at which it begins."""
-        return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.legs)
+        return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.pieces)
 
     @property
     def value(self) -> float:
@@ -120,7 +120,7 @@ class Curve:
         self.value = float(parameter_of(cycle.system, parameter))
         self.least_range = SAME
         if not self.sequence:
-            first_ranges = self._ranges(to_host(cycle.legs))
+            first_ranges = self._ranges(to_host(cycle.pieces))
             self.least_range = max(SAME, _SHRUNK * float(np.max(first_ranges)))
 
     def system_at(self, value: float) -> HybridSystem:
@@ -181,17 +181,19 @@ class Curve:
         An event that moves across the phase at which the cycle begins changes the chart there, and
         is no obstacle to the cycle.
         """
-        legs = point.turn.legs
-        events = point.turn.times[point.turn.codes >= 0]
+        pieces = point.turn.pieces
+        tapes = point.turn.tapes
+        assert tapes is not None
+        events = tapes.t[tapes.code >= 0]
         if self.map.base is not None or not len(events):
             return None
-        k = far_from_events(legs.t, events, float(point.turn.period))
-        phase = legs.t[k : k + 1] / point.turn.period * float(self.map.expected)
-        anchor = point.anchor._replace(t=phase, chart=legs.chart[[k]])
+        k = far_from_events(pieces.t, events, float(point.turn.period))
+        phase = pieces.t[k : k + 1] / point.turn.period * float(self.map.expected)
+        anchor = point.anchor._replace(t=phase, chart=pieces.chart[[k]])
         if k == 0:
             return None
         forward = self._by_value() * np.sign(point.tangent[-1])
-        z = np.append(legs.q[:, k], point.value)
+        z = np.append(pieces.q[:, k], point.value)
         row = self._by_value(point.size)
         begin = anchor, point.period
         moved = self._correct(z, row, point.size, forward, begin)
@@ -241,12 +243,16 @@ class Curve:
         varied = Varied(self.system_at(z[-1]), self.parameter)
         with on_the_cpu(), at_ease():
             map = to_host(map.at_phase_of(varied.system))
-            return map.turn_with_jacobian(z[:-1], varied=varied)._replace(tapes=None)
+            turn = map.turn_with_jacobian(z[:-1], varied=varied)
+        assert turn.tapes is not None
+        # (Points keep what tells their events; states would fill the memory.)
+        tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
+        return turn._replace(tapes=tapes)
 
     def _failure(self, turn: Turn) -> Result | None:
         if int(turn.result) != Result.OK:
             return Result(int(turn.result))
-        sequence = _rotated(int(g) for g in np.ravel(turn.codes) if g >= 0)
+        sequence = _rotated(turn.events)
         if sorted(sequence) != sorted(self.sequence):
             return Result.GRAZING  # events come and go where a guard is touched
         if sequence != self.sequence or not np.all(np.isfinite(turn.residual)):
@@ -255,15 +261,15 @@ class Curve:
             return Result.EXTRA_TURNS
         return None
 
-    def _ranges(self, legs: Lanes) -> Float[np.ndarray, " d"]:
+    def _ranges(self, pieces: Lanes) -> Float[np.ndarray, " d"]:
         """The range of each state over the beginnings of pieces, in sizes of the states."""
         scale = np.asarray(self.map.scale)
-        return np.ptp(legs.q / scale[legs.chart].T, axis=1)
+        return np.ptp(pieces.q / scale[pieces.chart].T, axis=1)
 
     def _settled(self, point: Point) -> Point | Result:
         """The point with a tangent, and sizes by the range of each state on the cycle."""
         scale = np.asarray(self.map.scale)
-        ranges = self._ranges(point.turn.legs)
+        ranges = self._ranges(point.turn.pieces)
         if self.map.base is not None and np.max(ranges) <= self.least_range:
             return Result.EQUILIBRIUM
         sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)

@@ -80,7 +80,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
     - `period`: in the system's unit of time, until the cycle closes (see `multiplicity`).
     - `anchor`: the time, chart and state at which the cycle begins, on the section `base` (a clock
         section at `anchor.t` if `base` is `None`).
-    - `legs`: states at the beginnings of the K pieces into which the cycle is divided.
+    - `pieces`: states at the beginnings of the K pieces into which the cycle is divided.
     - `factors`: Jacobians of the flow over the pieces, padded with zeros. The valid block of
         `factors[n]` is [:dims[n+1], :dims[n]].
     - `residual`: largest distance between `anchor` and the end of one period, relative to the
@@ -99,7 +99,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
     base: Crossing | AtEvent | None
     period: Float[Array, ""]
     anchor: Lanes
-    legs: Lanes
+    pieces: Lanes
     factors: Float[Array, "K d d"]
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
@@ -171,7 +171,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
     def dims(self) -> Int[np.ndarray, " K"]:
         """Numbers of states at the beginnings of the pieces."""
         _require_values(self, "dims")
-        return np.array(self.structure.dims)[np.asarray(self.legs.chart)]
+        return np.array(self.structure.dims)[np.asarray(self.pieces.chart)]
 
     @property
     def multipliers(self) -> Complex[np.ndarray, " r"]:
@@ -211,7 +211,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
     def _scaled_factors(self) -> list[Matrix]:
         """The factors in sizes of the states, without padding."""
         dims = self.dims
-        scale = np.asarray(self.settings.scale)[np.asarray(self.legs.chart)]
+        scale = np.asarray(self.settings.scale)[np.asarray(self.pieces.chart)]
         after = np.roll(np.arange(len(dims)), -1)
         factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
         return [
@@ -469,7 +469,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
             "residual": f"{closes} after {int(self.iterations)} Newton steps",
             **self._checks(),
         }
-        stiff = stiff_charts(self.structure, to_host(self.legs), float(self.period))
+        stiff = stiff_charts(self.structure, to_host(self.pieces), float(self.period))
         if stiff:
             sentences = (
                 f"chart '{name}': a mode that decays in {1 / rate:.2g} limits the steps of an "
@@ -654,7 +654,7 @@ def derived_if_found(cycle: LimitCycle) -> LimitCycle:
     found = jnp.isin(cycle.result, jnp.array(_FOUND))
 
     def numbers(x: LimitCycle):
-        return x.period, x.anchor.q, x.legs.t, x.legs.q, x.factors
+        return x.period, x.anchor.q, x.pieces.t, x.pieces.q, x.factors
 
     derived = tuple(_derived_where(found, x) for x in numbers(cycle))
     return eqx.tree_at(numbers, cycle, derived)

@@ -26,7 +26,7 @@ from ..systems.solver import Radau
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
-from .coincidence import SAME, check_begin, coincident, commutes, events_of, meet
+from .coincidence import SAME, check_begin, commutes
 from .crossing import AtEvent, Crossing
 from .curve import away_from_events
 from .cycle import LimitCycle, derived_if_found
@@ -40,6 +40,7 @@ from .linear_flow import keep_turn, last_turn, remembering
 from .near import repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
+from .rivals import coincident, meet
 from .scale import (
     Sizes,
     given_sizes,
@@ -318,8 +319,9 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
     near = last_turn(known)
     solution = solve(map, True, True, near)
     # (Of events that coincide on the guess, too, its search has compared the orders.)
-    if near is None or not meet(map.structure, known.period, near[1]):
-        together = meet(map.structure, solution.turn.period, solution.turn.tapes)
+    if near is None or not meet(known.return_map, near[1], known.period):
+        assert solution.turn.tapes is not None
+        together = meet(map, solution.turn.tapes, solution.turn.period)
         code = update_result(solution.result, together, Result.SIMULTANEOUS)
         solution = solution._replace(result=code)
     cycle = derived_if_found(_cycle(map, solution, known.event_sequence))
@@ -385,7 +387,7 @@ def _found_later(
 def _sizes_hold(map: ReturnMap, cycle: LimitCycle) -> bool:
     """Test whether the sizes of states are those of a cycle, nearly."""
     rough = sizes_of(map.structure, map.scale)
-    own = sizes_on(map.structure, to_host(cycle.legs), float(cycle.period))
+    own = sizes_on(map.structure, to_host(cycle.pieces), float(cycle.period))
     return all(
         rough[name] <= _OFF * max(size, SAME * rough[name])
         for name, size in own.items()
@@ -446,8 +448,7 @@ def _judged(
 
 def kept(map: ReturnMap, solution: Solution) -> LimitCycle:
     """The cycle of a solution, which remembers its last turn."""
-    events = tuple(event for event, _ in events_of(solution.turn))
-    cycle = _cycle(map, solution, events)
+    cycle = _cycle(map, solution, solution.turn.events)
     keep_turn(cycle, solution.turn)
     return cycle
 
@@ -530,7 +531,7 @@ def _find_with_auto(
     """
     cycle = find_limit_cycle(integrated(system, Radau()), guess, **first, **each)
     explicit = dataclasses.replace(cycle, system=integrated(system, None))
-    stiff = stiff_charts(explicit.structure, to_host(cycle.legs), float(cycle.period))
+    stiff = stiff_charts(explicit.structure, to_host(cycle.pieces), float(cycle.period))
     if cycle.result != Result.OK or len(stiff) == len(cycle.system.charts()):
         return cycle
     fitting = integrated(system, dict.fromkeys(stiff, Radau()))
@@ -552,7 +553,7 @@ def _in_own_sizes(
     while solution.is_fixed_point:
         turn = solution.turn
         rough = sizes_of(s, map.scale)
-        own = sizes_on(s, turn.legs, float(turn.period))
+        own = sizes_on(s, turn.pieces, float(turn.period))
         # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
         # are, the rough sizes are those of a guess that is far too large.)
         moving = {name: x for name, x in own.items() if x > SAME * rough[name]}
@@ -569,7 +570,7 @@ def _in_own_sizes(
         if accurate:
             return fine, _with_distance_in(solution, map, fine)
         say("Newton's method, in the sizes of the cycle")
-        pieces = turn.legs, side_by_side(to_host(turn.tapes))
+        pieces = turn.pieces, side_by_side(to_host(turn.tapes))
         again = solve(fine, False, True, pieces)
         if again.is_fixed_point:
             map = fine
@@ -612,7 +613,7 @@ def _is_distant(map: ReturnMap, solution: Solution) -> bool:
         return False
     s = map.structure
     a = int(np.asarray(map.anchor.chart)[0])
-    own = sizes_on(s, solution.turn.legs, float(solution.turn.period))
+    own = sizes_on(s, solution.turn.pieces, float(solution.turn.period))
     guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
     names = s.charts[a].states
     return any(
@@ -631,7 +632,7 @@ def _cycle(
         map.base,
         period,
         solution.anchor,
-        turn.legs,
+        turn.pieces,
         turn.factors,
         turn.distance,
         solution.steps,

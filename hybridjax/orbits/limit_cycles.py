@@ -25,9 +25,9 @@ from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
 from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
-from .batches import Known, Rounds, Tiles, numbers_of, tiles_of
+from .batches import Known, Rounds, Tiles, in_lanes, numbers_of, tiles_of
 from .checks import check_found, check_periodic
-from .coincidence import commutes, together
+from .coincidence import commutes
 from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .find import kept
@@ -36,6 +36,7 @@ from .many import TILE, Many, Solver
 from .newton import search as newton
 from .repeat import has_route, leaves_of
 from .return_map import ReturnMap, turn_product
+from .rivals import coincide_on
 from .verdict import verdict
 
 
@@ -62,7 +63,7 @@ class LimitCycles(Showable, eqx.Module):
     **Fields**, with the systems on the first axis:
 
     - `systems`; `period` (S,), NaN where there is no cycle; `anchor`, the lanes at which they
-        begin; `legs`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
+        begin; `pieces`, `factors`: see `LimitCycle`; `residual`, `iterations`, `result` (S,).
     - `codes`: the events of one period, in order, filled up with negative numbers.
 
     `base`, `settings`, `conserved` and `multiplicity` are those of every cycle.
@@ -72,7 +73,7 @@ class LimitCycles(Showable, eqx.Module):
     base: Crossing | AtEvent | None
     period: Float[np.ndarray, " S"]
     anchor: Lanes
-    legs: Lanes
+    pieces: Lanes
     factors: Float[np.ndarray, "S K d d"]
     residual: Float[np.ndarray, " S"]
     iterations: Int[np.ndarray, " S"]
@@ -96,7 +97,7 @@ class LimitCycles(Showable, eqx.Module):
             self.base,
             pick(self.period),
             pick(self.anchor),
-            pick(self.legs),
+            pick(self.pieces),
             pick(self.factors),
             pick(self.residual),
             pick(self.iterations),
@@ -259,14 +260,14 @@ def solved(
     solver = Solver(many, tiles.map, search)
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
-    coincide = _coincide(cycles, solver)
+    together = _coincide(cycles, solver, tiles.map)
     if len(left := solver.left):
         near = _some_known(cycles) if known is None else known
         part = tiles_of(_some(systems, left), map, size, workers)
         rounds = part._replace(known=near).solve(len(left))
         cycles = _with_rows(cycles, left, _cycles(part, rounds))
-        coincide[left] = rounds.together
-    return examined(cycles, coincide, solver.found.path >= 0)
+        together[left] = rounds.together
+    return examined(cycles, together, solver.found.path >= 0)
 
 
 def _search(map: ReturnMap) -> ReturnMap | None:
@@ -294,7 +295,7 @@ def _some(systems: HybridSystem, rows) -> HybridSystem:
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
     """The cycles that were found on routes; NaN for the others."""
     found, s, S = solver.found, map.structure, len(solver.found.path)
-    G, K = len(s.transitions), found.legs_t.shape[1]
+    G, K = len(s.transitions), found.pieces_t.shape[1]
     chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
     armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
     for path, itinerary in enumerate(solver.itineraries):
@@ -307,15 +308,15 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         more[rows] = itinerary.events
         codes = _wider(codes, more)
     pace = np.array([0.0, np.inf, 0.0, 0.0])
-    legs = Lanes(
-        found.legs_t,
+    pieces = Lanes(
+        found.pieces_t,
         chart,
-        np.swapaxes(found.legs_q, 1, 2),
+        np.swapaxes(found.pieces_q, 1, 2),
         armed,
         events,
         np.tile(pace[:, None], (S, 1, K)),
     )
-    anchor = jax.tree_util.tree_map(lambda x: x[..., :1], legs)
+    anchor = jax.tree_util.tree_map(lambda x: x[..., :1], pieces)
     if map.event >= 0:
         anchor.armed[:, map.event] = False
     period = found.period if map.base is not None else solver.many.expected
@@ -325,7 +326,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         map.base,
         np.where(missing, np.nan, period),
         anchor._replace(q=found.q[..., None]),
-        legs,
+        pieces,
         found.factors,
         found.distance,
         found.turns,
@@ -345,20 +346,21 @@ def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
     return np.maximum(fill(codes), fill(more))
 
 
-def _coincide(cycles: LimitCycles, solver: Solver) -> Bool[np.ndarray, " S"]:
+def _coincide(
+    cycles: LimitCycles, solver: Solver, map: ReturnMap
+) -> Bool[np.ndarray, " S"]:
     """Whether events coincide, on cycles that were found on routes."""
-    found, out = solver.found, np.zeros(len(cycles), bool)
-    at_event = isinstance(cycles.base, AtEvent)
-    begin = cycles.anchor.t[:, 0] if at_event else np.full(len(out), -np.inf)
+    out = np.zeros(len(cycles), bool)
     for path, itinerary in enumerate(solver.itineraries):
-        rows = np.flatnonzero(found.path == path)
-        events = itinerary.events
-        if len(rows) and events:
-            times = solver.ends(path)[rows][:, : len(events)]
-            codes = np.tile(np.array(events), (len(rows), 1))
-            none = np.full(codes.shape, -1)
-            period = cycles.period[rows]
-            out[rows] = together(codes, times, none, begin[rows], period)
+        rows = np.flatnonzero(solver.found.path == path)
+        if not len(rows):
+            continue
+        some = dataclasses.replace(map, system=in_lanes(cycles.systems, rows))
+        begin = cycles.anchor.t[rows, 0]
+        end = begin + cycles.period[rows]
+        ends = solver.ends(path)[rows].T
+        together = coincide_on(some, itinerary.events, ends, begin, end)
+        out[rows] = together.any(axis=0)
     return out
 
 
@@ -390,7 +392,7 @@ def _with_rows(cycles: LimitCycles, rows, others: LimitCycles) -> LimitCycles:
     codes[rows] = -1
     more = np.full((len(cycles), others.codes.shape[1]), -1)
     more[rows] = others.codes
-    names = "period", "anchor", "legs", "factors", "residual", "iterations", "result"
+    names = "period", "anchor", "pieces", "factors", "residual", "iterations", "result"
     changed: Any = {
         name: jax.tree_util.tree_map(put, getattr(cycles, name), getattr(others, name))
         for name in names
@@ -410,7 +412,7 @@ def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         map.base,
         rounds.period,
         rounds.anchor,
-        turn.legs,
+        turn.pieces,
         turn.factors,
         turn.distance,
         rounds.steps,
@@ -425,18 +427,19 @@ def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 
 def examined(
     cycles: LimitCycles,
-    coincide: Bool[np.ndarray, " S"],
+    together: Bool[np.ndarray, " S"],
     walked: Bool[np.ndarray, " S"] | None = None,
 ) -> LimitCycles:
-    """The cycles, with the result `SIMULTANEOUS` if events `coincide` that do not commute, and with
+    """The cycles, with the result `SIMULTANEOUS` if events coincide that do not commute, and with
     those of their verdicts: of eight cycles and, if one of these has a fault, of all.
 
-    **Arguments:** `walked`: cycles that a second integration has checked already. Default: none.
+    **Arguments:** `together`: whether events coincide. `walked`: cycles that a second integration
+    has checked already. Default: none.
 
     **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
     """
     result = cycles.result.copy()
-    rows = np.flatnonzero(coincide & cycles.ok)
+    rows = np.flatnonzero(together & cycles.ok)
     few = rows[:: -(-len(rows) // _LOOKED_AT)] if len(rows) else rows
     if not all(commutes(cycles[i]) for i in few):
         result[[i for i in rows if not commutes(cycles[i])]] = Result.SIMULTANEOUS

@@ -214,26 +214,33 @@ class LinearFlow(eqx.Module):
         **Returns:** those where pieces begin (P, d, nu + d, f), the delays of the events at their
         ends (P, nu + d, f), and those at the end of the turn (d, nu + d, f).
         """
-        xp, jumps = namespace(self.q), self.jumps
+        xp = namespace(self.q)
+        jumps = self.jumps
         P, K, d = self.q.shape
-        nu, f = self.by_input.shape[3], waves.shape[2]
+        nu = self.by_input.shape[3]
+        f = waves.shape[2]
 
         def wide(x):
             """With columns of zeros for the deviations at the beginning of the turn."""
             return xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])
 
-        # Deviations at the ends of pieces, before and after their events.
+        # Deviations at the ends of pieces, before their events.
+        pushed_at_end = self.pushed[:, -1].reshape(P, -1, K)
+        arrived = (pushed_at_end @ waves).reshape(P, d, nu, f)
+
+        # The same after the events.
         last = waves[:, -1, None]
-        arrived = (self.pushed[:, -1].reshape(P, -1, K) @ waves).reshape(P, d, nu, f)
         jumped = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(P, d, nu, f)
-        kick = wide(jumped + jumps.by_input[..., None] * last[:, None])
+        jumped = jumped + jumps.by_input[..., None] * last[:, None]
+        kick = wide(jumped)
 
         def advance(x, piece):
             through, kick, back = piece
             after = (through @ x.reshape(d, -1)).reshape(x.shape) + kick
             return after * back, x
 
-        begin = xp.pad(xp.eye(d), [(0, 0), (nu, 0)])[..., None] + 0 * kick[0]
+        own = xp.pad(xp.eye(d), [(0, 0), (nu, 0)])
+        begin = own[..., None] + 0 * kick[0]
         through = xp.asarray(self.through, dtype=waves.dtype)
         end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
         by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
@@ -260,10 +267,10 @@ _hosted, _flows, _turns = Memory(), Memory(), Memory()
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
     """Keep the steps of a cycle's last turn, if the host took them: `last_turn` returns them."""
-    record = fixed((turn.legs, turn.tapes))
+    record = fixed((turn.pieces, turn.tapes))
     if turn.tapes is not None and not is_hidden(record):
-        legs, tapes = to_host(record)
-        _turns.recall(hosted(cycle), None, lambda: (legs, side_by_side(tapes)))
+        pieces, tapes = to_host(record)
+        _turns.recall(hosted(cycle), None, lambda: (pieces, side_by_side(tapes)))
 
 
 def remembering(cycle: Any, other: Any) -> Any:
@@ -363,19 +370,25 @@ def _pieces(
     begins = np.maximum.accumulate(np.where(after_event, k, 0))
     first = np.flatnonzero((k - begins) % most == 0)
     last = np.append(first[1:], len(k)) - 1
-    length, event = t[last + 1] - t[first], np.maximum(moves.code[last], -1)
-    # (Rounding divides no piece.)
+    length = t[last + 1] - t[first]
+    event = np.maximum(moves.code[last], -1)
+
+    # Each of these is divided into equal parts. (Rounding divides no piece.)
     count = np.ceil(np.real(length[:, 0]) / longest - 1e-9)
     count = np.maximum(count, 1).astype(int)
     whole = np.repeat(np.arange(len(first)), count)
     part = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
-    first, last, length = first[whole], last[whole], length[whole]
-    count, event = count[whole], event[whole]
-    share = (part[:, None] + rule().nodes) / count[:, None]
-    time = t[first][:, None] + share[..., None] * length[:, None]
-    is_last = part == count - 1
-    event = np.where(is_last, event, -1)
-    return _Pieces(first, last, time, length / count[:, None], event)
+    parts = count[whole]
+    share = (part[:, None] + rule().nodes) / parts[:, None]
+    time = t[first[whole]][:, None] + share[..., None] * length[whole][:, None]
+    is_last = part == parts - 1
+    return _Pieces(
+        first=first[whole],
+        last=last[whole],
+        time=time,
+        length=length[whole] / parts[:, None],
+        event=np.where(is_last, event[whole], -1),
+    )
 
 
 def _linear_flow(

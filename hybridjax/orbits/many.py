@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.compilation import identity, whole
 from .._core.execution import in_threads
 from .._core.executor import on_the_cpu
+from .._core.results import Result
 from .._core.vector_math import factorizations
-from ..engine.itinerary.rows import LEGS, Form, Itinerary
+from ..engine.itinerary.rows import PIECES, Itinerary
 from ..engine.itinerary.turn import Passage
 from .batches import nearest
 from .repeat import (
@@ -56,8 +57,8 @@ class Found(NamedTuple):
     """Number of the itinerary; negative for systems without a cycle."""
     q: Float[np.ndarray, "S d"]
     period: Float[np.ndarray, " S"]
-    legs_t: Float[np.ndarray, "S K"]
-    legs_q: Float[np.ndarray, "S K d"]
+    pieces_t: Float[np.ndarray, "S K"]
+    pieces_q: Float[np.ndarray, "S K d"]
     factors: Float[np.ndarray, "S K d d"]
     distance: Float[np.ndarray, " S"]
     turns: Int[np.ndarray, " S"]
@@ -81,20 +82,20 @@ class Many(NamedTuple):
         """Newton's method for some systems on a route, from states and ends of legs."""
         itinerary = route.finer if finer else route.first
         found: Corrected = self._in_tiles(_correct, route, itinerary, rows, q, ends)
-        judged = judge(route, found, self.t[rows], self.expected[rows])
-        converged, kept, fine = judged
-        good = np.flatnonzero(converged & kept & fine)
+        code = np.array(judge(route, found, self.t[rows], self.expected[rows]))
+        good = np.flatnonzero(code == Result.OK)
         if len(good):
             start = found.q[good], found.passage.ends[good]
             other = self._in_tiles(_travel, route, route.other, rows[good], *start)
-            kept[good] &= agrees(route, found.q[good], other)
-        return _Attempt(rows, found, converged, kept, fine)
+            differs = ~agrees(route, found.q[good], other)
+            code[good[differs]] = Result.NOT_VERIFIED
+        return _Attempt(rows, found, code)
 
     def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
         """A function of all lanes, in calls of one size."""
         plan = Plan.of(itinerary)
         map = on_device(route.map)
-        program = whole(function, (itinerary.form,), (map,), loops=True)
+        program = whole(function, (), (map,), loops=True)
 
         def run(k):
             own = np.arange(k, k + self.size) % len(rows)
@@ -119,23 +120,16 @@ class _Attempt(NamedTuple):
 
     rows: Int[np.ndarray, " n"]
     found: Corrected
-    converged: Bool[np.ndarray, " n"]
-    kept: Bool[np.ndarray, " n"]
-    """Whether the route was kept, and the second integration agrees."""
-    fine: Bool[np.ndarray, " n"]
-    """Whether the steps are fine enough."""
-
-    @property
-    def ok(self) -> Bool[np.ndarray, " n"]:
-        return self.converged & self.kept & self.fine
+    code: Int[np.ndarray, " n"]
+    """Those of `judge`, and of a second integration."""
 
 
-def _correct(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
-    return correct(Maps(map, *numbers), form, plan, q, ends)
+def _correct(map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
+    return correct(Maps(map, *numbers), plan, q, ends)
 
 
-def _travel(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
-    return travel(Maps(map, *numbers), form, plan, q, ends)
+def _travel(map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
+    return travel(Maps(map, *numbers), plan, q, ends)
 
 
 class Solver:
@@ -161,9 +155,9 @@ class Solver:
         self.pending = np.flatnonzero(self._finite)
         self._ends: dict[int, np.ndarray] = {}
         blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
-        legs = blank(LEGS), blank(LEGS, d), blank(LEGS, d, d)
+        pieces = blank(PIECES), blank(PIECES, d), blank(PIECES, d, d)
         none = np.full(S, -1)
-        self.found = Found(none, blank(d), blank(), *legs, blank(), none + 1)
+        self.found = Found(none, blank(d), blank(), *pieces, blank(), none + 1)
 
     def run(self) -> None:
         """Find cycles on the known routes, then on new ones."""
@@ -203,13 +197,13 @@ class Solver:
         for _ in range(_ROUNDS):
             attempt = many.attempt(route, rows, q, ends)
             self._keep(number, attempt)
-            coarse = attempt.converged & attempt.kept & ~attempt.fine
+            coarse = attempt.code == Result.STEP_LIMIT
             if coarse.any():
                 start = attempt.found.q[coarse], attempt.found.passage.ends[coarse]
                 again = many.attempt(route, rows[coarse], *start, finer=True)
                 self._keep(number, again, finer=True)
             # (What has converged, and left the route, needs another one.)
-            rows = rows[~attempt.converged]
+            rows = rows[attempt.code == Result.NOT_CONVERGED]
             known = np.flatnonzero(self.found.path // 2 == number)
             if not len(rows) or not len(known):
                 break
@@ -219,15 +213,15 @@ class Solver:
 
     def _keep(self, number: int, attempt: _Attempt, finer: bool = False) -> None:
         """Keep the cycles that an attempt has found."""
-        ok, route = np.flatnonzero(attempt.ok), self.routes[number]
+        ok, route = np.flatnonzero(attempt.code == Result.OK), self.routes[number]
         itinerary = route.finer if finer else route.first
         rows, found = attempt.rows[ok], attempt.found
         passage, out = found.passage, self.found
         out.path[rows] = 2 * number + finer
         out.q[rows] = found.q[ok]
         out.period[rows] = (passage.t - self.many.t[attempt.rows])[ok]
-        out.legs_t[rows] = passage.legs_t[ok]
-        out.legs_q[rows] = passage.legs_q[ok]
+        out.pieces_t[rows] = passage.pieces_t[ok]
+        out.pieces_q[rows] = passage.pieces_q[ok]
         factors = factors_across(route.map, itinerary, passage)
         out.factors[rows] = factors[ok]
         out.distance[rows] = found.distance[ok]

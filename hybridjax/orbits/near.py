@@ -5,6 +5,7 @@ derivatives. Outside of these, what leaves the route goes to the search.
 """
 
 import collections
+import dataclasses
 from typing import Any
 
 import jax
@@ -18,11 +19,10 @@ from .._core.jax_compat import outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
 from .._core.results import Result, update_result
-from ..engine.itinerary.rows import Form, Itinerary
+from ..engine.itinerary.rows import Itinerary
+from ..engine.itinerary.turn import Passage
 from ..engine.lanes import Lanes, pace_of
 from ..systems.system import copies_of
-from ..systems.transition import TOGETHER
-from .crossing import AtEvent
 from .cycle import LimitCycle, derived_if_found
 from .linear_flow import hosted, last_turn
 from .repeat import (
@@ -42,6 +42,7 @@ from .repeat import (
     travel,
 )
 from .return_map import ReturnMap
+from .rivals import coincide_on
 from .verdict import verdict
 
 
@@ -121,41 +122,26 @@ def _found(
     map: ReturnMap,
     reverse: bool = False,
 ) -> Corrected:
-    itinerary = route.finer  # (steps cannot be divided later)
-    count = None if reverse else jnp.asarray(itinerary.count)
-    plan = Plan(itinerary.rows, count, jnp.asarray(itinerary.last))
-    options: Any = dict(derivatives=derivatives)
-    return correct(maps_of(map), itinerary.form, plan, *begin, **options)
+    plan = Plan.of(route.finer)  # (steps cannot be divided later)
+    if reverse:
+        plan = dataclasses.replace(plan, count=None)
+    return correct(maps_of(map), plan, *begin, derivatives=derivatives)
 
 
 def _result(route: Route, map: ReturnMap, found: Corrected):
     """The code of a cycle."""
     still = jax.lax.stop_gradient
     t, expected = still(map.anchor.t[0]), still(map.expected)
-    converged, kept, fine = judge(route, still(found), t, expected)
-    result = jnp.zeros_like(found.turns, dtype=jnp.int32)
-    result = update_result(result, ~converged, Result.NOT_CONVERGED)
-    result = update_result(result, ~kept, Result.EVENT_ORDER)
-    result = update_result(result, ~fine, Result.STEP_LIMIT)
-    together = _coincide(route, found, expected)
+    result = judge(route, still(found), t, expected)
+    together = _coincide(route, map, still(found.passage))
     return update_result(result, together, Result.SIMULTANEOUS)
 
 
-def _coincide(route: Route, found: Corrected, expected):
-    """Whether two events come together that do not on the known cycle."""
-    s, events = route.map.structure, route.first.events
-    ends, known = found.passage.ends, jnp.asarray(route.first.ends)
-    together = jnp.asarray(False)
-    for k in range(1, len(events)):
-        if s.clocks[events[k]] >= 0 and s.clocks[events[k - 1]] >= 0:
-            continue  # (Of two that are scheduled, the order is known.)
-        were_apart = known[k] - known[k - 1] > TOGETHER * route.map.expected
-        meet = ends[k] - ends[k - 1] <= TOGETHER * expected
-        together = together | (were_apart & meet)
-    if isinstance(route.map.base, AtEvent) and len(events) > 1:
-        since_begin = ends[0] - found.passage.legs_t[0]
-        together = together | (since_begin <= TOGETHER * expected)
-    return together
+def _coincide(route: Route, map: ReturnMap, passage: Passage):
+    """Whether events coincide that do not on the known cycle."""
+    begin = passage.pieces_t[0]
+    together = coincide_on(map, route.first.events, passage.ends, begin, passage.t)
+    return (together & ~route.together).any()
 
 
 def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
@@ -174,27 +160,29 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
-            program = whole(_correct, (itinerary.form,), (arrays,), loops=True)
+            program = whole(_correct, (), (arrays,), loops=True)
             found = program(Plan.of(itinerary), *begin)
-            converged, kept, fine = judge(route, found, t, expected)
-            if fine or not (converged and kept):
+            code = judge(route, found, t, expected)
+            if code != Result.STEP_LIMIT:
                 break
             begin = [found.q, found.passage.ends]
-        if not (converged and kept and fine):
+        if code != Result.OK:
             return None
-        program = whole(_travel, (route.other.form,), (arrays,), loops=True)
+        program = whole(_travel, (), (arrays,), loops=True)
         other = program(Plan.of(route.other), found.q, found.passage.ends)
-    if not agrees(route, found.q, other) or _coincide(route, found, expected):
+    if not agrees(route, found.q, other):
+        return None
+    if _coincide(route, map, found.passage):
         return None
     return from_host(_cycle(itinerary, route, map, found, np.int32(Result.OK)))
 
 
-def _correct(form: Form, map: ReturnMap, plan: Plan, q, ends) -> Corrected:
-    return correct(maps_of(map), form, plan, q, ends)
+def _correct(map: ReturnMap, plan: Plan, q, ends) -> Corrected:
+    return correct(maps_of(map), plan, q, ends)
 
 
-def _travel(form: Form, map: ReturnMap, plan: Plan, q, ends):
-    return travel(maps_of(map), form, plan, q, ends)
+def _travel(map: ReturnMap, plan: Plan, q, ends) -> Passage:
+    return travel(maps_of(map), plan, q, ends)
 
 
 def _cycle(
@@ -202,10 +190,10 @@ def _cycle(
 ) -> LimitCycle:
     """The cycle that Newton's method has found on an itinerary of a route."""
     passage = found.passage
-    legs = Lanes(
-        passage.legs_t,
+    pieces = Lanes(
+        passage.pieces_t,
         itinerary.charts,
-        passage.legs_q.T,
+        passage.pieces_q.T,
         itinerary.armed,
         itinerary.begins,
         pace_of(itinerary.begins),
@@ -216,7 +204,7 @@ def _cycle(
         map.base,
         map.expected if map.base is None else passage.t - map.anchor.t[0],
         anchor,
-        legs,
+        pieces,
         factors_across(route.map, itinerary, passage),
         found.distance,
         found.turns,

@@ -133,7 +133,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
         longer, (ends.time - map.anchor.t) / map.expected
     )
     times = np.where(np.isfinite(ends.time), along, 0.0)
-    orbit = Variation(s, turn.legs, ends, side_by_side(turn.tapes), times, factors)
+    orbit = Variation(s, turn.pieces, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
@@ -142,18 +142,20 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
     moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
     if factors:
-        legs, by_factor = (
-            turn.legs,
+        pieces, by_factor = (
+            turn.pieces,
             orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)],
         )
         if map.base is not None:
             f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(
                 *by_factor.shape[:3]
             )
-            by_factor = across(f, map.scale[legs.chart][:, None], by_factor)
-        t_legs = np.moveaxis(tangents[orbit.first], 0, -1)
+            by_factor = across(f, map.scale[pieces.chart][:, None], by_factor)
+        t_pieces = np.moveaxis(tangents[orbit.first], 0, -1)
         moving = moving._replace(
-            legs=moving.legs._replace(t=t_legs[0], q=np.moveaxis(t_legs[1:], 1, 0)),
+            pieces=moving.pieces._replace(
+                t=t_pieces[0], q=np.moveaxis(t_pieces[1:], 1, 0)
+            ),
             factors=np.moveaxis(by_factor.imag / kernels.TINY, 1, 0),
         )
     t_anchor = None if by.anchor.t is None else begin[0][:, None]
@@ -221,7 +223,7 @@ def _by_rough_turns(
         x = newton = x + step
         if np.isfinite(x).all():
             x, moves = fixed_point(
-                rough_map, (turn.legs, side_by_side(turn.tapes)), newton
+                rough_map, (turn.pieces, side_by_side(turn.tapes)), newton
             )
         if x is not newton or not np.isfinite(x).all():
             break
@@ -256,7 +258,7 @@ def _newton(
         moves = None
         # (Later ones have not helped before.)
         if steps < FEW_STEPS:
-            x, moves = fixed_point(map, (turn.legs, side_by_side(turn.tapes)), x)
+            x, moves = fixed_point(map, (turn.pieces, side_by_side(turn.tapes)), x)
     return x * map.sizes, turn, np.asarray(steps)
 
 

@@ -17,10 +17,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.executor import namespace, on_host, svdvals, to_host
+from .._core.results import Result, update_result
 from .._core.vector_math.factorizations import solve_by_columns
 from ..engine.arrays import Array
 from ..engine.itinerary.bodies import Travelers
-from ..engine.itinerary.rows import LEGS, Form, Itinerary, Rows, recorded
+from ..engine.itinerary.rows import PIECES, Form, Itinerary, Rows, recorded
 from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..engine.unresolved import POLES, may_have_pulses
@@ -28,6 +29,7 @@ from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
+from .rivals import coincide_on
 from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
 
@@ -51,7 +53,7 @@ _OTHER = 0.83
 _APART, _ROUGH = 1e-6, 1e3
 # Largest last correction of an event's time, as a part of the period. Larger: an event that the
 # corrections have not reached passes. Smaller: rounding errors of times do not.
-LAST_CORRECTION = 1e-10
+_LAST_CORRECTION = 1e-10
 
 
 # Derivatives of a cycle: none; first ones, of the state at its beginning and of the period; all,
@@ -59,20 +61,43 @@ LAST_CORRECTION = 1e-10
 Derivatives: TypeAlias = Literal["none", "first", "all"]
 
 
-class Plan(NamedTuple):
-    """What a turn repeats: the arrays of an itinerary."""
+class Plan(eqx.Module):
+    """An itinerary as an argument of programs: what a trajectory repeats."""
 
+    form: Form = eqx.field(static=True)
     rows: Rows
-    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
-    """Of rows; None for all of them (see `follow`)."""
+    count: Int[Array, ""] | None
+    """Of rows that do something; None for a loop over all of them, which reverse mode needs."""
+    ends: Float[Array, " E"]
+    """Ends of legs, from the beginning of the recorded trajectory."""
     last: Int[Array, ""]
     """Number of the last leg."""
 
     @classmethod
     def of(cls, itinerary: Itinerary) -> "Plan":
         """That of a loop that ends with the last row."""
-        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
-        return cls(itinerary.rows, *counts)
+        return cls(
+            form=itinerary.form,
+            rows=itinerary.rows,
+            count=np.asarray(itinerary.count),
+            ends=itinerary.ends,
+            last=np.asarray(itinerary.last),
+        )
+
+    def code(self, passage: Passage, begin: Array, period: Array) -> Int[Array, "*L"]:
+        """The codes of trajectories that began at these times, on cycles with these periods:
+        whether they have kept the itinerary, with steps that are fine enough."""
+        xp = namespace(passage.t)
+        ends = passage.ends
+        durations = ends - xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        # (Rounding makes legs that last no time negative.)
+        forwards = durations >= -ROUNDING * period[..., None]
+        unused = np.arange(ends.shape[-1]) > self.last
+        kept = ~passage.left & (forwards | unused).all(axis=-1)
+        kept = kept & (passage.last <= _LAST_CORRECTION * period)
+        code = xp.zeros_like(passage.left, dtype=xp.int32)
+        code = update_result(code, ~kept, Result.EVENT_ORDER)
+        return update_result(code, ~(passage.error <= 1), Result.STEP_LIMIT)
 
 
 def on_device(tree: Any) -> Any:
@@ -90,6 +115,8 @@ class Route(NamedTuple):
     finer: Itinerary
     other: Itinerary
     """Of the second integration."""
+    together: Bool[np.ndarray, " E"]
+    """Which events of the known cycle have a rival (see `coincide_on`)."""
 
 
 def has_route(map: ReturnMap) -> bool:
@@ -117,7 +144,11 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     # (Steps of implicit methods differ much in length: joined ones have large errors.)
     density = _FINER if has_implicit(s) else _DENSITY
     densities = density, density * _FINER, density * _OTHER
-    return Route(map, *(recorded(s, pieces, levels, density) for density in densities))
+    first, finer, other = (recorded(s, pieces, levels, x) for x in densities)
+    begin = map.anchor.t[0]
+    ends = begin + first.ends
+    together = coincide_on(map, first.events, ends, begin, ends[first.last])
+    return Route(map, first, finer, other, together)
 
 
 class Corrected(NamedTuple):
@@ -188,7 +219,7 @@ def leaves_of(system: Any) -> tuple[Array, ...]:
     return tuple(jax.tree_util.tree_leaves(eqx.filter(system, eqx.is_array)))
 
 
-def turn(maps: Maps, form: Form, plan: Plan, q, ends, **options: Any):
+def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
     """One turn: its passage, and P(q) - q less the step back to conserved values.
 
     **Arguments:** `options`: of `follow`.
@@ -208,7 +239,7 @@ def turn(maps: Maps, form: Form, plan: Plan, q, ends, **options: Any):
         travelers,
         levels_of(maps.map),
         maps.map.settings,
-        form,
+        plan.form,
         plan.rows,
         plan.count,
         (maps.t, q),
@@ -234,7 +265,7 @@ def _newton(map: ReturnMap, factors, residual, q):
     return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
 
 
-def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
+def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
     # (Steps are judged relative to `RTOL`.)
     rtol = maps.map.settings.rtol
     assert rtol is not None
@@ -242,7 +273,7 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
 
     def again(carry):
         before, q, settled = carry
-        passage, residual = turn(maps, form, plan, q, before.passage.ends)
+        passage, residual = turn(maps, plan, q, before.passage.ends)
         steps = maps.each(_newton, passage.factors, residual, q)
         jacobian, step, excess, distance = steps
         found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
@@ -264,11 +295,11 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
 
 def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     """The beginning of Newton's method."""
-    lanes, d, K = q.shape[:-1], q.shape[-1], LEGS
+    lanes, d, K = q.shape[:-1], q.shape[-1], PIECES
     zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
-    legs = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
+    pieces = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
-    passage = Passage(zeros(), q, ends, *legs, zeros(d), zeros(), zeros(), inside)
+    passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
     unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
     return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
 
@@ -278,8 +309,8 @@ def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def _solved(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
-    return _corrected(maps, form, plan, q, ends)
+def _solved(maps: Maps, plan: Plan, q, ends) -> Corrected:
+    return _corrected(maps, plan, q, ends)
 
 
 @_solved.def_jvp
@@ -289,14 +320,14 @@ def _solved_jvp(primals, tangents):
     The derivative of a turn is taken twice, in a loop that is compiled once: first where q stands,
     for dP/dp, then where it moves.
     """
-    maps, form, plan, *_ = primals
+    maps, plan, *_ = primals
     by_maps = _without_settings(tangents[0])
     found = _solved(*primals)
     q, factors = found.q, found.passage.factors
     ends = jax.lax.stop_gradient(found.passage.ends)
 
     def around(maps, q):
-        return turn(maps, form, plan, q, ends)
+        return turn(maps, plan, q, ends)
 
     def along(by_q, _):
         _, (by_passage, moved) = eqx.filter_jvp(around, (maps, q), (by_maps, by_q))
@@ -317,30 +348,30 @@ def _without_settings(by_maps: Any) -> Any:
     )
 
 
-def _at_fixed_state(maps: Maps, by_maps: Any, form: Form, plan: Plan, q, ends):
+def _at_fixed_state(maps: Maps, by_maps: Any, plan: Plan, q, ends):
     """Derivatives of the time at the end of a turn from q, and of P(q) - q."""
     by_maps = _without_settings(by_maps)
 
     def end(maps):
-        passage, residual = turn(maps, form, plan, q, ends, columns=False)
+        passage, residual = turn(maps, plan, q, ends, columns=False)
         return passage.t, residual
 
     return eqx.filter_jvp(end, (maps,), (by_maps,))[1]
 
 
 @eqx.filter_custom_jvp
-def _root_and_period(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
-    return _corrected(maps, form, plan, q, ends)
+def _root_and_period(maps: Maps, plan: Plan, q, ends) -> Corrected:
+    return _corrected(maps, plan, q, ends)
 
 
 @_root_and_period.def_jvp
 def _root_and_period_jvp(primals, tangents):
     """First derivatives of the state, and of the time at the end of the turn, from the Jacobian
     that Newton's method has used."""
-    maps, form, plan, *_ = primals
+    maps, plan, *_ = primals
     found = _root_and_period(*primals)
     q, passage = found.q, found.passage
-    late, moved = _at_fixed_state(maps, tangents[0], form, plan, q, passage.ends)
+    late, moved = _at_fixed_state(maps, tangents[0], plan, q, passage.ends)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
     before = monodromy(passage.factors[:-1])
     late = late + passage.delay @ (before @ step)
@@ -350,7 +381,6 @@ def _root_and_period_jvp(primals, tangents):
 
 def correct(
     maps: Maps,
-    form: Form,
     plan: Plan,
     q,
     ends,
@@ -364,10 +394,10 @@ def correct(
     """
     still = jax.lax.stop_gradient
     if derivatives == "none":
-        return _corrected(maps, form, plan, q, ends)
+        return _corrected(maps, plan, q, ends)
     if derivatives == "first":
-        return _root_and_period(maps, form, plan, still(q), still(ends))
-    return _solved(maps, form, plan, still(q), still(ends))
+        return _root_and_period(maps, plan, still(q), still(ends))
+    return _solved(maps, plan, still(q), still(ends))
 
 
 def factors_across(
@@ -385,40 +415,47 @@ def factors_across(
     return xp.moveaxis(factors, 0, lanes)
 
 
-def travel(maps: Maps, form: Form, plan: Plan, q, ends) -> Passage:
+def travel(maps: Maps, plan: Plan, q, ends) -> Passage:
     """The second integration of turns: by another method, with other steps."""
     import diffrax
 
     # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
     implicit = has_implicit(maps.map.structure)
     solver = None if implicit else diffrax.Dopri8(scan_kind="lax")
-    return turn(maps, form, plan, q, ends, solver=solver, columns=False)[0]
+    return turn(maps, plan, q, ends, solver=solver, columns=False)[0]
 
 
-def judge(route: Route, found: Corrected, t, expected) -> tuple:
-    """Whether Newton's method converged, whether the route was kept, and whether its steps were
-    fine enough, of lanes with these times of the anchor and expected periods."""
+def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
+    """The codes of lanes with these times of the anchor and expected periods: whether Newton's
+    method converged, whether the route was kept, and whether its steps were fine enough."""
     passage, xp = found.passage, namespace(found.q)
     converged = xp.isfinite(found.excess) & (found.excess <= 1)
     converged = converged & (found.distance <= CLOSED)
-    ends = passage.ends[..., : route.first.last + 1]
-    durations = ends - xp.concatenate([t[..., None], ends[..., :-1]], axis=-1)
-    # (Rounding makes legs that last no time negative.)
-    forwards = durations >= -ROUNDING * expected[..., None]
-    kept = ~passage.left & forwards.all(axis=-1)
-    kept = kept & (passage.last <= LAST_CORRECTION * expected)
+    code = xp.zeros_like(found.turns, dtype=xp.int32)
+    code = update_result(code, ~converged, Result.NOT_CONVERGED)
+    code = update_result(
+        code, ~_is_alone(route, found, t, expected), Result.EVENT_ORDER
+    )
+    on_plan = Plan.of(route.first).code(passage, t, expected)
+    return xp.where(code == Result.OK, on_plan, code)
+
+
+def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
+    """Whether cycles are isolated, last as long as expected if a clock drives them, and are no
+    equilibria."""
+    passage, xp = found.passage, namespace(found.q)
     # (On a cycle that is not isolated, Newton's method ends anywhere.)
     sizes = route.map.sizes
     defect = found.jacobian * sizes / sizes[:, None]
-    kept = kept & (xp.min(svdvals(defect), axis=-1) >= SINGULAR)
+    isolated = xp.min(svdvals(defect), axis=-1) >= SINGULAR
     if route.map.base is None:
         # (The last event of a turn that ends with one may come later than the turn ends.)
         late = xp.abs(passage.t - (t + expected))
-        kept = kept & (late <= ROUNDING * expected)
-    elif not route.first.events:
-        apart = xp.abs(passage.legs_q - found.q[..., None, :]) / route.map.sizes
-        kept = kept & (apart.max(axis=(-2, -1)) > _APART)  # (it is no equilibrium)
-    return converged, kept, passage.error <= 1
+        return isolated & (late <= ROUNDING * expected)
+    if not route.first.events:
+        apart = xp.abs(passage.pieces_q - found.q[..., None, :]) / sizes
+        return isolated & (apart.max(axis=(-2, -1)) > _APART)
+    return isolated
 
 
 def agrees(route: Route, q, other: Passage) -> Bool[Array, "*L"]:

@@ -31,7 +31,7 @@ from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
 from ..engine.events import arm, await_schedules, belongs, enabled
-from ..engine.itinerary.rows import LEGS
+from ..engine.itinerary.rows import PIECES
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
 from ..engine.replay import projections
@@ -95,17 +95,13 @@ class Turn(NamedTuple):
     end: Lanes
     jacobian: Float[Array, "d n"]
     """Derivative of the residual with respect to the state, and along the parameters if asked."""
-    legs: Lanes
+    pieces: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
     """Jacobians of the flow over the pieces; for an autonomous system on the states modulo the
     direction of the flow."""
     codes: Int[Array, "K R"]
     """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
-    times: Float[Array, "K R"]
-    """Times of these events. (None in sweeps.)"""
-    rivals: Int[Array, "K R"]
-    """Transitions that were due at these events, too (see `Tape`). (None in sweeps.)"""
     distance: Float[Array, ""]
     """Largest part of the residual in sizes of the states."""
     meetings: Int[Array, ""]
@@ -119,6 +115,25 @@ class Turn(NamedTuple):
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
         """True if the turn ends at its beginning (also of many turns at once, on the host)."""
         return self.distance <= CLOSED
+
+    @property
+    def events(self) -> tuple[int, ...]:
+        """The events of a single turn on the host, by index of the transition."""
+        return tuple(self.codes[self.codes >= 0].tolist())
+
+
+class _Linear(NamedTuple):
+    """A turn with the Jacobians of its pieces, which stand on the first axis."""
+
+    end: Return
+    pieces: Lanes
+    factors: Float[Array, "K *S d d"]
+    tapes: Tape
+    record: Recorded | None = None
+    gap: Array | float = 0.0
+    """Largest gap between moves, if the turn was computed from many starts."""
+    by_parameter: Float[Array, " d"] | None = None
+    """Derivative of the end by the parameter of a `Varied` system."""
 
 
 class ReturnMap(eqx.Module):
@@ -249,78 +264,92 @@ class ReturnMap(eqx.Module):
         are derivatives, too, at the same phase of the clock (on the host). `travelled`: the turn,
         as by `travel`, and the largest gap in it (on the host).
         """
-        s, xp, settings, each = self.structure, namespace(q), self.settings, self.each
+        xp = namespace(q)
+        if on_host(q):
+            linear = self._linear_on_host(q, varied, travelled)
+        else:
+            linear = self._linear_in_program(q, record)
+        end = linear.end
+        off, held = self.held(q, varied)
+        returned = monodromy(linear.factors)
+        if linear.by_parameter is not None:
+            returned = np.column_stack([returned, linear.by_parameter])
+        returned = xp.where(self.valid[..., None], returned, 0.0)
+        jacobian = returned - np.eye(*held.shape[-2:]) - held
+
+        lanes = side_by_side(linear.pieces)
+        factors = linear.factors
+        if self.base is not None:
+            f = self.slopes(lanes).T.reshape(PIECES, *q.shape)
+            scale = self.scale[lanes.chart].reshape(PIECES, *q.shape)
+            factors = across(f, scale, factors)
+
+        parts = (xp.abs(end.residual) + xp.abs(off)) / self.sizes
+        codes = self.each(xp.moveaxis(linear.tapes.code, -1, 0))
+
+        def pieces_last(x):
+            return self.each(xp.moveaxis(x, (0, -1), (-1, 0)))
+
+        return Turn(
+            *end,
+            jacobian=jacobian,
+            pieces=jax.tree_util.tree_map(pieces_last, linear.pieces),
+            factors=xp.moveaxis(factors, 0, -3),
+            codes=codes,
+            distance=xp.max(parts, axis=-1) + linear.gap,
+            meetings=self._meetings(lanes, codes),
+            record=linear.record,
+            tapes=linear.tapes,
+        )
+
+    def _linear_in_program(
+        self, q: Float[Array, " d"], record: Recorded | None
+    ) -> "_Linear":
+        """A turn whose pieces are linearized one after the other."""
+        s = self.structure
 
         def flow(lanes, target, h, result, piece):
             if piece is None:
                 jacobian, moved, tape = flow_jacobian(
-                    s, lanes, target, settings, h, result
+                    s, lanes, target, self.settings, h, result
                 )
             else:
                 moved, tape = piece
                 jacobian, end = tape_jacobian(s, lanes, target, tape, of_states=True)
                 moved = moved._replace(lanes=moved.lanes._replace(t=end[0], q=end[1:]))
             steps = tape._replace(before=None, after=None, chart=None)
-            return moved, (lanes, each(jacobian[:, 1:]), tape, Recorded(moved, steps))
+            factor = self.each(jacobian[:, 1:])
+            return moved, (lanes, factor, tape, Recorded(moved, steps))
 
-        if on_host(q):  # (all pieces are linearized together)
+        end, (pieces, factors, tapes, record) = self.travel(q, flow, record)
+        return _Linear(end, pieces, factors, tapes, record)
+
+    def _linear_on_host(
+        self,
+        q: Float[np.ndarray, " d"],
+        varied: Varied | None,
+        travelled: tuple[Return, Any, Any] | None,
+    ) -> "_Linear":
+        """A turn whose pieces are all linearized together, after it."""
+        if travelled is None:
             options = Options(
                 True, new_input=False, tangents=True, at_once=varied is not None
             )
-            travelled = travelled or (*self.travel(q, options), 0.0)
-            end, (legs, _, tapes), gap = travelled
-            record = None
-        else:
-            (end, (legs, factors, tapes, record)), gap = (
-                self.travel(q, flow, record),
-                0.0,
-            )
-        (ends, levels), d = self.ends().split(), s.d
-        lanes, tape, ends = side_by_side((legs, tapes, ends))
-        if on_host(q):
-            many, ends = varied or self._structure_of(lanes), ends.with_levels(levels)
-            by, at = tape_jacobian(many, lanes, ends, tape, varied is None)
-            factors = (
-                by[:, 1:, 1 : 1 + d] if varied else by[:, 1:].reshape(LEGS, *q.shape, d)
-            )
-        codes, valid = each(xp.moveaxis(tapes.code, -1, 0)), self.valid
-        off, held = self.held(q, varied)
-        returned = monodromy(factors)
-        if varied is not None:
-            returned = np.column_stack(
-                [returned, self._by_parameter(varied, by[:, 1:], at)]
-            )
-        jacobian = (
-            xp.where(valid[..., None], returned, 0.0) - np.eye(*held.shape[-2:]) - held
-        )
-        if self.base is not None:
-            f, scale = self.slopes(lanes).T, self.scale[lanes.chart]
-            factors = across(
-                f.reshape(LEGS, *q.shape), scale.reshape(LEGS, *q.shape), factors
-            )
-        distance = (
-            xp.max((xp.abs(end.residual) + xp.abs(off)) / self.sizes, axis=-1) + gap
-        )
-        times = each(xp.moveaxis(tapes.t, -1, 0))
-        rivals = each(xp.moveaxis(tapes.rival, -1, 0))
-        meetings = self._meetings(lanes, codes)
-        legs = jax.tree_util.tree_map(
-            lambda x: each(xp.moveaxis(x, (0, -1), (-1, 0))), legs
-        )
-        factors = xp.moveaxis(factors, 0, -3)
-        return Turn(
-            *end,
-            jacobian,
-            legs,
-            factors,
-            codes,
-            times,
-            rivals,
-            distance,
-            meetings,
-            record,
-            tapes,
-        )
+            travelled = *self.travel(q, options), 0.0
+        end, (pieces, _, tapes), gap = travelled
+        ends, levels = self.ends().split()
+        lanes, tape, ends = side_by_side((pieces, tapes, ends))
+        ends = ends.with_levels(levels)
+        d = self.structure.d
+        if varied is None:
+            s = self._structure_of(lanes)
+            by, _ = tape_jacobian(s, lanes, ends, tape, True)
+            factors = by[:, 1:].reshape(PIECES, *q.shape, d)
+            return _Linear(end, pieces, factors, tapes, gap=gap)
+        by, at = tape_jacobian(varied, lanes, ends, tape, False)
+        by_parameter = self._by_parameter(varied, by[:, 1:], at)
+        factors = by[:, 1:, 1 : 1 + d]
+        return _Linear(end, pieces, factors, tapes, None, gap, by_parameter)
 
     def _by_parameter(
         self,
@@ -329,13 +358,11 @@ class ReturnMap(eqx.Module):
         ends: Float[np.ndarray, "n K"],
     ) -> Float[np.ndarray, " d"]:
         """Derivative of the end of a turn by a parameter, from those of its pieces by (t, q, u)."""
-        later, t0 = 0.0, self.anchor.t[0]
+        t0 = self.anchor.t[0]
+        later = 0.0
         if self.base is None:
-            later = (
-                kernels.by_parameter_of_period(varied)
-                * self.multiplicity
-                / self.expected
-            )
+            longer = kernels.by_parameter_of_period(varied) * self.multiplicity
+            later = longer / self.expected
         column = later * t0 * by[0, :, 0] + by[0, :, -1]
         for piece in by[1:]:
             column = piece[:, 1:-1] @ column + piece[:, -1]
@@ -386,8 +413,8 @@ class ReturnMap(eqx.Module):
     def _rests(self, q: Float[Array, " d"], turn: Turn) -> Bool[Array, ""]:
         """Test whether a turn stays where it begins, as at an equilibrium."""
         xp = namespace(q)
-        same = turn.legs.chart == self.each(self.anchor.chart)[..., None]
-        apart = xp.abs(turn.legs.q - q[..., None]) / self.sizes[..., None]
+        same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
+        apart = xp.abs(turn.pieces.q - q[..., None]) / self.sizes[..., None]
         farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
@@ -398,7 +425,7 @@ class ReturnMap(eqx.Module):
         if not any(s.guards(a) for a in range(len(s.charts))):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
-        lanes = turn.legs
+        lanes = turn.pieces
         if shape:  # (turns of many systems: their pieces side by side)
             lanes = side_by_side(
                 jax.tree_util.tree_map(
@@ -420,7 +447,7 @@ class ReturnMap(eqx.Module):
         passed = here & ~lanes.armed & (value < -error)
         fine = here & (lanes.armed | (value > error))
         passed, fine = (
-            x.reshape(len(x), LEGS, *shape).any(axis=1)
+            x.reshape(len(x), PIECES, *shape).any(axis=1)
             for x in (passed & xp.stack(holds), fine)
         )
         # (An event that happens may leave the state beyond its guard.)
@@ -495,7 +522,7 @@ class ReturnMap(eqx.Module):
         """
         xp, ends = namespace(q), self.ends()
 
-        def leg(carry, end):
+        def follow_piece(carry, end):
             lanes, h, result = carry
             *end, piece = end
             time, index, event, limit = (xp.atleast_1d(x) for x in end)
@@ -504,7 +531,7 @@ class ReturnMap(eqx.Module):
             return (moved.lanes, moved.h, moved.result), extra
 
         lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
-        h = xp.atleast_1d(0.5 * self.expected / LEGS)
+        h = xp.atleast_1d(0.5 * self.expected / PIECES)
         if isinstance(flow, Options):
             u, begin = (
                 xp.zeros((self.structure.nu, len(h))),
@@ -515,7 +542,7 @@ class ReturnMap(eqx.Module):
             )
         else:
             rows = ends.time, ends.index, ends.event, ends.limit, record
-            (end, _, result), extra = scan(leg, (lanes, h, lanes.events), rows)
+            (end, _, result), extra = scan(follow_piece, (lanes, h, lanes.events), rows)
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
@@ -535,27 +562,27 @@ class ReturnMap(eqx.Module):
             self.expected,
             namespace(self.expected),
         )
-        k = xp.arange(1, LEGS + 1).reshape(LEGS, *[1] * expected.ndim)
+        k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
         if self.base is None:
-            return toward(t0 + expected * k / LEGS, -1, t0 + 2 * expected)
+            return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
-        time = xp.where(k < LEGS, t0 + free * expected * k / (LEGS - 1), np.inf)
+        time = xp.where(k < PIECES, t0 + free * expected * k / (PIECES - 1), np.inf)
         section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
-        last = k == LEGS
+        last = k == PIECES
         return dataclasses.replace(
             section,
             event=xp.where(last, section.event, -1).astype(np.int32),
             index=xp.where(last, section.index, -1).astype(np.int32),
         )
 
-    def _meetings(self, legs: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
+    def _meetings(self, pieces: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
         xp, shape = namespace(codes), codes.shape[:-2]
         if self.base is None:
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
             return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
-        level = self.watch(legs, to_section(until(legs.t), self.base)).value[-1]
-        level, events = (x.reshape(LEGS, *shape) for x in (level, legs.events))
+        level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
+        level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
         falls = (level[1:-1] > 0) & (level[2:] <= 0) & (events[1:-1] == events[2:])
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 

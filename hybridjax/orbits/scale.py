@@ -128,12 +128,12 @@ def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     return sizes
 
 
-def stiff_charts(s: Structure, legs: Lanes, period: float) -> dict[str, float]:
+def stiff_charts(s: Structure, pieces: Lanes, period: float) -> dict[str, float]:
     """The charts with explicit methods that are stiff on a cycle, each with the rate of its fastest
-    mode. `legs`: states at equal distances in time, of a turn in this period."""
+    mode. `pieces`: states at equal distances in time, of a turn in this period."""
     stiff = {}
-    step = period / len(np.ravel(legs.t))
-    for a, t, q in points(s, legs):
+    step = period / len(np.ravel(pieces.t))
+    for a, t, q in points(s, pieces):
         rates = fastest(s, a, t, q)
         if step * rates.sum() > STIFF and not is_implicit(s, a):
             stiff[s.names[a]] = float(rates.max())
@@ -171,9 +171,9 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     return max(times)
 
 
-def points(s: Structure, legs: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def points(s: Structure, pieces: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Charts, times and states at the beginnings of the pieces of a turn, until it failed."""
-    t, chart, q = map(np.asarray, (legs.t, legs.chart, legs.q))
+    t, chart, q = map(np.asarray, (pieces.t, pieces.chart, pieces.q))
     for a in np.unique(chart):
         rows = (chart == a) & np.isfinite(q).all(axis=0)
         if rows.any():
@@ -210,31 +210,45 @@ def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
 
 
 def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
-    n = len(q)
-    eps = np.finfo(float).eps
-    # First no shift, then states (not all by the same part, which may cancel), then t.
-    shifts = np.zeros((n, 1 + 2 * len(_SHIFTS)))
-    shifts[:, 1 : len(_SHIFTS) + 1] = [np.roll(_SHIFTS, k) for k in range(n)]
-    moved = q[..., None] * (1 + eps * shifts[:, None])
-    later = t[:, None] * (1 + eps * np.append(np.zeros(len(_SHIFTS) + 1), _SHIFTS))
+    n, K = q.shape
+    times, states = _shifted(t, q)
     u = np.zeros((s.nu, 1))
-    rows = kernels.field(s, a, later.ravel(), moved.reshape(n, -1), u)
-    rows = rows.reshape(n, -1, *later.shape)
+    rows = kernels.field(s, a, times.ravel(), states.reshape(n, -1), u)
+    rows = rows.reshape(n, -1, K, times.shape[1])
     values = rows[:, 0]
-    by_time = rows[:, 1, :, :1]
+    by_time = rows[:, 1, :, 0]
     derivative = rows[:, 2 : 2 + n, :, 0]
     f = values[..., 0]
-    change = by_time[..., 0] + np.einsum("ijk,jk->ik", derivative, f)
-    smooth = np.einsum("ijk,jks->iks", derivative, moved - q[..., None])
-    smooth = smooth + by_time * (later - t[:, None])
+    change = by_time + np.einsum("ijk,jk->ik", derivative, f)
+
+    # The change of the field by the shifts, less that of a smooth field.
+    by_state = np.einsum("ijk,jks->iks", derivative, states - q[..., None])
+    smooth = by_state + by_time[..., None] * (times - t[:, None])
     off = np.abs(values - f[..., None] - smooth)
+    in_state, in_time = np.split(off, [1 + len(_SHIFTS)], axis=-1)
+
     # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
-    by_state, in_time = np.split(off, [len(_SHIFTS) + 1], axis=-1)
-    in_time = in_time - 2 * eps * np.abs(by_time * t[:, None])
+    in_time = in_time - 2 * np.finfo(float).eps * np.abs(by_time * t)[..., None]
     # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
-    earlier_and_later = [x.max(axis=-1) for x in np.split(in_time, 2, axis=-1)]
-    rounding = np.maximum(by_state.max(axis=-1), np.minimum(*earlier_and_later))
+    earlier, later = np.split(in_time, 2, axis=-1)
+    with_time = np.minimum(earlier.max(axis=-1), later.max(axis=-1))
+    rounding = np.maximum(in_state.max(axis=-1), with_time)
     return _Fields(f, change, derivative, rounding)
+
+
+def _shifted(t: Float[np.ndarray, " K"], q: Float[np.ndarray, "n K"]):
+    """Times (K, S) and states (n, K, S) without a shift, with shifted states, and with shifted
+    times."""
+    none = np.zeros(len(_SHIFTS))
+    of_time = np.concatenate([[0.0], none, _SHIFTS])
+    # (Not all states by the same part, which may cancel.)
+    of_state = [
+        np.concatenate([[0.0], np.roll(_SHIFTS, k), none]) for k in range(len(q))
+    ]
+    eps = np.finfo(float).eps
+    times = t[:, None] * (1 + eps * of_time)
+    states = q[..., None] * (1 + eps * np.array(of_state)[:, None])
+    return times, states
 
 
 def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:

@@ -7,6 +7,7 @@ Plitt, IFAC Proceedings 17, 1984.)
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,8 +19,9 @@ from ..engine.lanes import ARRIVE_TIME, MOVE, Lanes, Tape, regrouped, start_lane
 from ..engine.move import Options, move, stride
 from ..engine.replay import Moves, linear_moves, recorded_moves
 from ..engine.search.attempt import deviation
+from ..engine.search.state import Stride
 from ..engine.target import Target, until
-from .return_map import CLOSED, LEGS, SINGULAR, Return, ReturnMap
+from .return_map import CLOSED, PIECES, SINGULAR, Return, ReturnMap
 from .scale import has_implicit
 
 
@@ -60,28 +62,42 @@ def fixed_point(
 
     Guards are not watched here: `travel` tests whether the moves are still right.
     """
-    sizes, target = map.sizes, map.ends()
-    moves, last = recorded_moves(*turn), np.inf
+    sizes = map.sizes
+    target = map.ends()
+    moves = recorded_moves(*turn)
     x = moves.q[:, 0] / sizes
-    while True:
-        end, by = linear_moves(map.structure, moves, target)
-        by = by[:, :, : 1 + len(x)]  # by (t, q)
-        starts = np.concatenate([moves.t[None], moves.q]).T
-        gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
-        changes = _changes(by, gaps, map.anchor.t[0] - starts[0, 0])
-        step = _step_of(map, x, changes[-1, 1:])
-        shift = changes[:-1] @ np.append(step * sizes, 1.0)
-        ends_moved = end + (by @ shift[:, :, None])[:, :, 0]
-        h = (ends_moved - starts - shift)[:, 0]
+    before = np.inf
+    while (moves.order == 0).sum() == PIECES:
+        step, shift, h = _shift(map, moves, x, target)
         length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
-        whole = (moves.order == 0).sum() == LEGS
-        if not (length <= 0.5 * last and whole):
-            return otherwise, None
-        x, last, starts = x + step, length, starts + shift
-        moves = moves._replace(t=starts[:, 0], q=starts[:, 1:].T, h=h)
+        if not length <= 0.5 * before:
+            break
+        x = x + step
+        t = moves.t + shift[:, 0]
+        q = moves.q + shift[:, 1:].T
+        moves = moves._replace(t=t, q=q, h=h)
         # (The error after a step is about its square.)
         if length <= np.maximum(CLOSED, np.asarray(map.settings.rtol)):
             return x, _forwards(moves)
+        before = length
+    return otherwise, None
+
+
+def _shift(
+    map: ReturnMap, moves: Moves, x: Float[np.ndarray, " d"], target: Target
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
+    """The Newton step of the state at the anchor, in sizes, the changes of (t, q) where moves start
+    that close the gaps between moves, and the lengths of the moves after them."""
+    end, by = linear_moves(map.structure, moves, target)
+    by_point = by[:, :, : 1 + len(x)]
+    starts = np.concatenate([moves.t[None], moves.q]).T
+    gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
+    changes = _changes(by_point, gaps, map.anchor.t[0] - starts[0, 0])
+    step = _step_of(map, x, changes[-1, 1:])
+    shift = changes[:-1] @ np.append(step * map.sizes, 1.0)
+    end_after = end + (by_point @ shift[:, :, None])[:, :, 0]
+    h = (end_after - starts - shift)[:, 0]
+    return step, shift, h
 
 
 def _changes(
@@ -119,8 +135,10 @@ def _forwards(moves: Moves) -> Moves | None:
     back = np.flatnonzero(moves.h < 0)
     if (moves.order[back] == 0).any() or (moves.code[back - 1] != MOVE).any():
         return None
-    h, code = moves.h.copy(), moves.code.copy()
-    h[back - 1], code[back - 1] = h[back - 1] + h[back], code[back]
+    h = moves.h.copy()
+    code = moves.code.copy()
+    h[back - 1] += h[back]
+    code[back - 1] = code[back]
     kept = moves.h >= 0
     moves = Moves(*(x[..., kept] for x in moves._replace(h=h, code=code)))
     return moves if (moves.h >= 0).all() else None
@@ -129,16 +147,18 @@ def _forwards(moves: Moves) -> Moves | None:
 def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
     """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
     states; None if it has other moves than expected."""
-    pieces = follow_moves(map, map.departure(q), map.ends(), expected)
-    if pieces is None or pieces[-1] > CLOSED:
+    followed = follow_moves(map, map.departure(q), map.ends(), expected)
+    if followed is None:
         return None
-    legs, moved, tape, gap = pieces
+    pieces, moved, tape, gap = followed
+    if gap > CLOSED:
+        return None
     end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
     residual = np.where(map.valid, end.q[:, 0], 0.0) - q - map.held(q)[0]
     residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
     period = end.t[0] - map.anchor.t[0]
     turn = Return(residual, period, np.asarray(moved.result[-1]), end)
-    return turn, jax.tree_util.tree_map(one_by_one, (legs, None, tape)), gap
+    return turn, jax.tree_util.tree_map(one_by_one, (pieces, None, tape)), gap
 
 
 def one_by_one(x: np.ndarray) -> np.ndarray:
@@ -157,63 +177,104 @@ def follow_moves(
     **Returns:** by piece the lanes before, their ends, and the tape; and the largest gap between
     moves, in sizes of the states.
     """
-    s, moves, settings = map.structure, expected, map.settings
-    code, piece, later = moves.code, moves.lane, np.append(moves.t[1:], np.inf)
-    time = np.where(
-        code == ARRIVE_TIME, ends.time[piece], np.where(code == MOVE, later, np.inf)
-    )
-    timed = np.isfinite(time)
-    index, event = (
-        np.broadcast_to(x, ends.time.shape)[piece] for x in (ends.index, ends.event)
-    )
-    target = dataclasses.replace(
+    moves = expected
+    lanes = _starts(map, begin, moves)
+    followed = _searched(map, lanes, moves, _targets(moves, ends), ends)
+    if followed is None:
+        return None
+    lanes, moved, tape = followed
+    gap = _largest_gap(map, begin, lanes, moved.lanes)
+    first = np.flatnonzero(np.diff(moves.lane, prepend=-1))
+    last = np.append(first[1:], len(moves.lane)) - 1
+    pieces = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
+    moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
+    # (Moves on the way to an end are lanes here, each to a time that is known.)
+    on_the_way = (tape.code == ARRIVE_TIME) & (moves.code == MOVE)
+    tape = tape._replace(code=np.where(on_the_way, MOVE, tape.code))
+    return pieces, moved, regrouped(tape, moves.lane, pieces), gap
+
+
+def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:
+    """Lanes where moves start; the first one is that with which the turn begins."""
+    lanes = start_lanes(map.structure, moves.t, moves.chart.astype(np.int32), moves.q)
+    lanes = arm(map.structure, lanes, map.watch(lanes, until(lanes.t)), map.expected)
+    lanes.armed[:, :1] = begin.armed
+    happens = moves.code >= 0
+    events_until = np.cumsum(happens, dtype=np.int32)
+    return lanes._replace(events=begin.events + events_until - happens)
+
+
+def _targets(moves: Moves, ends: Target) -> Target:
+    """The targets of moves: a time where the next move starts, or an end of a piece."""
+    code = moves.code
+    piece = moves.lane
+    next_start = np.append(moves.t[1:], np.inf)
+    time = np.where(code == MOVE, next_start, np.inf)
+    time = np.where(code == ARRIVE_TIME, ends.time[piece], time)
+    after_time = np.nextafter(time, np.inf)
+    late = moves.t + 2 * moves.h
+    shape = ends.time.shape
+    event = np.broadcast_to(ends.event, shape)[piece]
+    return dataclasses.replace(
         ends,
         time=time,
-        index=index,
+        index=np.broadcast_to(ends.index, shape)[piece],
         event=np.where(code >= 0, code, event).astype(np.int32),
-        limit=np.where(timed, np.nextafter(time, np.inf), moves.t + 2 * moves.h),
+        limit=np.where(np.isfinite(time), after_time, late),
     )
-    lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
-    lanes = arm(s, lanes, map.watch(lanes, until(lanes.t)), map.expected)
-    lanes = lanes._replace(
-        events=begin.events + np.cumsum(code >= 0, dtype=np.int32) - (code >= 0)
-    )
-    lanes.armed[:, :1] = begin.armed
-    # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
-    h = np.where(
-        timed, np.where(moves.h > 0, 2 * moves.h, map.expected), 1.01 * moves.h
-    )
-    setout = stride(h)._replace(lead=0 * h)
-    if has_implicit(s):  # (a deviation goes on until a piece ends or an event happens)
-        along, (_, by) = deviation(s, lanes, settings), linear_moves(s, moves, ends)
-        for k in np.flatnonzero((np.diff(piece) == 0) & (code[:-1] < 0)):
-            along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
-        setout = setout._replace(along=along)
-    u, options = (
-        np.zeros((s.nu, len(code))),
-        Options(True, new_input=False, tangents=True),
-    )
+
+
+def _searched(
+    map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
+) -> tuple[Lanes, Any, Tape] | None:
+    """The lanes with the guards that are armed where they start, their ends, and the tape; None if
+    one fails, or does not end as the next one begins."""
+    s = map.structure
+    setout = _setout(map, lanes, moves, target, ends)
+    u = np.zeros((s.nu, len(moves.code)))
+    options = Options(True, new_input=False, tangents=True)
+    here = belongs(s, lanes.chart)[:-1, 1:]
+    # (Twice: guards that a move arms are armed where the next one starts.)
     for _ in range(2):
-        moved, tape = move(s, lanes, u, target, settings, setout, None, options)
-        end, in_chart = moved.lanes, belongs(s, lanes.chart)[:-1, 1:]
-        if same := (end.armed[:, :-1] == lanes.armed[:, 1:])[in_chart].all():
+        moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
+        end = moved.lanes
+        armed = (end.armed[:, :-1] == lanes.armed[:, 1:])[here].all()
+        if armed:
             break
         lanes.armed[:, 1:] = end.armed[:, :-1]
-    pairs = (end.chart, lanes.chart), (end.events, lanes.events)
-    same = same and all((ended[:-1] == begun[1:]).all() for ended, begun in pairs)
+    in_chart = (end.chart[:-1] == lanes.chart[1:]).all()
+    in_order = (end.events[:-1] == lanes.events[1:]).all()
+    ok = (moved.result == Result.OK).all()
+    if not (armed and in_chart and in_order and ok):
+        return None
+    assert tape is not None
+    return lanes, moved, tape
+
+
+def _setout(
+    map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
+) -> Stride:
+    """The first steps of moves."""
+    # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
+    to_time = np.where(moves.h > 0, 2 * moves.h, map.expected)
+    h = np.where(np.isfinite(target.time), to_time, 1.01 * moves.h)
+    setout = stride(h)._replace(lead=0 * h)
+    s = map.structure
+    if not has_implicit(s):
+        return setout
+    # (A deviation goes on until a piece ends or an event happens.)
+    along = deviation(s, lanes, map.settings)
+    _, by = linear_moves(s, moves, ends)
+    goes_on = (np.diff(moves.lane) == 0) & (moves.code[:-1] < 0)
+    for k in np.flatnonzero(goes_on):
+        along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+    return setout._replace(along=along)
+
+
+def _largest_gap(map: ReturnMap, begin: Lanes, lanes: Lanes, end: Lanes) -> float:
+    """The largest gap between the end of a move and the start of the next one, in sizes of the
+    states and in periods."""
     late = np.append(begin.t, end.t[:-1]) - lanes.t
     apart = np.column_stack([begin.q, end.q[:, :-1]]) - lanes.q
     sizes = np.maximum(map.scale[lanes.chart], np.abs(lanes.q.T))
-    gap = max(np.abs(late / map.expected).max(), np.abs(apart.T / sizes).max())
-    if not (same and (moved.result == Result.OK).all()):
-        return None
-    assert tape is not None
-    first = np.flatnonzero(np.diff(piece, prepend=-1))
-    last = np.append(first[1:], len(piece)) - 1
-    legs = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
-    moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
-    on_the_way = (tape.code == ARRIVE_TIME) & (code == MOVE)
-    tape = regrouped(
-        tape._replace(code=np.where(on_the_way, MOVE, tape.code)), piece, legs
-    )
-    return legs, moved, tape, gap
+    return max(np.abs(late / map.expected).max(), np.abs(apart.T / sizes).max())

@@ -51,7 +51,7 @@ def flow_along(
         return None
     chart = moves.chart[walk.key]
     ends = _ends_at_targets(map, walk, chart, code, begin.events)
-    legs = Lanes(
+    pieces = Lanes(
         *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
     )
     M = before.shape[1]
@@ -59,9 +59,9 @@ def flow_along(
     at_once = np.zeros(len(h), bool)
     rival = np.full(len(h), -1)
     rows = h, code, walk.t[1:], states, walk.q[:, 1:], chart[1:], at_once, rival
-    tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, legs)
+    tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
     none = np.zeros(len(event), np.int32)
-    flow = legs, Moved(ends, none, none, none), tape
+    flow = pieces, Moved(ends, none, none, none), tape
     last = Lanes(*(x[..., -1:] for x in ends))
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)
 

@@ -140,19 +140,30 @@ def _matrices(
 
 def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_matrices` on the host, and its derivatives."""
-    (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
+    cycle, family, outputs, turn = arguments
+    by_cycle, by_family, *_ = directions
     placed, s, jacobians = place_along(cycle, family, turn, by_cycle, by_family)
-    (N, P, n, _), lanes = jacobians.shape, placed.lanes
+    N, P, n, _ = jacobians.shape
+
+    def by_direction(x):
+        return x.reshape(N, P, *x.shape[1:])
+
     embed, select = placed.frames()
-    after = np.roll(select.reshape(N, P, *select.shape[1:]), -1, axis=0)
-    A = after @ jacobians[..., :n] @ embed.reshape(N, P, *embed.shape[1:])
-    values = lambda a, *point: kernels.outputs(s, a, outputs, *point)  # noqa: E731
+    after = np.roll(by_direction(select), -1, axis=0)
+    A = after @ jacobians[..., :n] @ by_direction(embed)
+    B = after @ jacobians[..., n:]
+
+    def values(a, *point):
+        return kernels.outputs(s, a, outputs, *point)
+
+    lanes = placed.lanes
     u = s.pushed(np.arange(N * P) % P)
     by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(outputs), u)
-    J = np.moveaxis(by[:, 1:], -1, 0)
-    C, D = (x.reshape(N, P, *x.shape[1:]) for x in (J[..., :n] @ embed, J[..., n:]))
-    values, columns = kernels.parted((A, after @ jacobians[..., n:], C, D))
-    return (*values, placed.dims[::P]), (*columns, None)
+    by_point = np.moveaxis(by[:, 1:], -1, 0)
+    C = by_direction(by_point[..., :n] @ embed)
+    D = by_direction(by_point[..., n:])
+    matrices, columns = kernels.parted((A, B, C, D))
+    return (*matrices, placed.dims[::P]), (*columns, None)
 
 
 _of_family = by_columns(_matrices, _matrices_along, of_flow)
@@ -163,11 +174,18 @@ def _output_jacobians(
     placed: PlacedSections, outputs: tuple[str | Output, ...]
 ) -> tuple[Float[Array, "N ny c"], Float[Array, "N ny nu"]]:
     """C and D, padded: derivatives of the outputs with respect to (t, q, u), at u = 0."""
-    s, lanes, items = placed.structure(), placed.lanes, tuple(outputs)
-    values = lambda a, *point: kernels.outputs(s, a, items, *point)  # noqa: E731
+    s = placed.structure()
+    lanes = placed.lanes
+    items = tuple(outputs)
+
+    def values(a, *point):
+        return kernels.outputs(s, a, items, *point)
+
     by = with_derivatives(s, values, lanes.chart, lanes.t, lanes.q, len(items))
-    J, n = namespace(by).moveaxis(by[:, 1:], -1, 0), 1 + s.d
-    return J[:, :, :n] @ placed.frames()[0], J[:, :, n:]
+    by_point = namespace(by).moveaxis(by[:, 1:], -1, 0)
+    n = 1 + s.d
+    embed, _ = placed.frames()
+    return by_point[:, :, :n] @ embed, by_point[:, :, n:]
 
 
 class _Departures(AbstractSections):

@@ -25,9 +25,9 @@ from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from ..engine import kernels
 from ..engine.cubic import interpolate
-from ..engine.lanes import IDLE, Lanes, for_each_chart, only, side_by_side
+from ..engine.lanes import IDLE, Lanes, Tape, for_each_chart, only, side_by_side
 from ..engine.move import Options, stride, through
-from ..engine.replay import Variation, recorded_moves
+from ..engine.replay import Moves, Variation, recorded_moves
 from ..engine.target import AbstractLevels, Target, toward
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
@@ -39,7 +39,7 @@ from ..orbits.linear_flow import beginning, last_turn, of_flow
 from ..orbits.return_map import PATIENCE, ReturnMap
 from ..orbits.scale import has_implicit
 from ..systems.structure import Structure
-from ..systems.transition import TOGETHER, Scheduled
+from ..systems.transition import Scheduled, at_one_time
 from . import families
 from .along import flow_along, levels_at
 from .families import AbstractSections, BoundSections, FamilyLike, Orbit, as_family
@@ -231,9 +231,8 @@ def _near_events(
         [*is_scheduled, True]
     )  # (the last one is for moves without an event)
     when = xp.where(ignored[xp.maximum(tape.code, -1)], xp.nan, tape.t)
-    late = TOGETHER * map.expected
-    at_start = (xp.abs(when - starts.t) <= late).any(axis=0)
-    at_end = (xp.abs(when - ends.t) <= late).any(axis=0)
+    at_start = at_one_time(when, starts.t, map.expected).any(axis=0)
+    at_end = at_one_time(when, ends.t, map.expected).any(axis=0)
     return xp.isfinite(bound.time) & (at_start | xp.roll(at_end, 1))
 
 
@@ -485,10 +484,10 @@ def _require_order(placed: PlacedSections) -> None:
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} {_AGAIN}{_remedy(placed, 0)}")
-    apart = np.abs(duration - period * np.rint(duration / period))
-    nearest = int(np.argmin(apart))
+    whole = period * np.rint(duration / period)
+    nearest = int(np.argmin(np.abs(duration - whole)))
     i, j = sorted((nearest, (nearest + 1) % N))
-    if i < j and apart[nearest] <= TOGETHER * period:
+    if i < j and at_one_time(duration[nearest], whole[nearest], period):
         raise ComputationError(
             f"{name(j)} coincides with section {i} on the cycle: leave one out."
         )
@@ -587,31 +586,45 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
 def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     """The number of crossings of each section (N,) by the cycle's steps, besides its own, the
     fastest rate of its level (N,), and the rate on the section (N,)."""
-    s, N = placed.structure(), placed.n_sections
-    lanes, tape = placed.lanes, placed.tape
-    assert tape is not None
-    still = np.zeros((s.nu, 1))
-    moves = recorded_moves(lanes, tape)
-    is_move = tape.code.T != IDLE
-    end = tape.before.transpose(2, 0, 1)[is_move].T
-    # The flow at several points of every step, by its cubic interpolant.
-    slope_at_start = slopes(s, moves.t, moves.chart, moves.q, still)
-    slope_at_end = slopes(s, moves.t + moves.h, moves.chart, end, still)
-    x = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
-    both = moves.q[:, None], end[:, None]
-    rates = slope_at_start[:, None], slope_at_end[:, None]
-    states = interpolate(x, moves.h, *both, *rates).reshape(s.d, -1)
-    times = (moves.t + moves.h * x).ravel()
-    value, rate = levels_at(s, levels, N, times, np.tile(moves.chart, len(x)), states)
-    level = value.reshape(N, len(x), -1)
+    s = placed.structure()
+    N = placed.n_sections
+    lanes = placed.lanes
+    assert placed.tape is not None
+    moves = recorded_moves(lanes, placed.tape)
+    value, rate = levels_at(s, levels, N, *_along_steps(s, moves, placed.tape))
+    level = value.reshape(N, -1, len(moves.t))
     falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (moves.h > 0)
+
     # Around the section itself, rounding decides the signs.
     begins_at = np.where(moves.order == 0, moves.lane, -1)
     is_itself = np.arange(N)[:, None] == begins_at
     falls[:, 0] &= ~is_itself
     falls[:, -1] &= ~np.roll(is_itself, -1, axis=1)
-    field = slopes(s, lanes.t, lanes.chart, lanes.q, still)
+
+    field = slopes(s, lanes.t, lanes.chart, lanes.q, np.zeros((s.nu, 1)))
     on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * field.T, axis=1)
     count = np.sum(falls, axis=(1, 2))
     fastest = np.max(np.nan_to_num(np.abs(rate)), axis=1)
     return count, fastest, on_section
+
+
+def _along_steps(s: Structure, moves: Moves, tape: Tape):
+    """Times, charts and states at several points of every step, by its cubic interpolant: first the
+    beginnings of all steps."""
+    still = np.zeros((s.nu, 1))
+    is_move = tape.code.T != IDLE
+    end = tape.before.transpose(2, 0, 1)[is_move].T
+    rate_at_start = slopes(s, moves.t, moves.chart, moves.q, still)
+    rate_at_end = slopes(s, moves.t + moves.h, moves.chart, end, still)
+    part = np.linspace(0.0, 1.0, _PARTS_OF_A_STEP + 1)[:, None]
+    states = interpolate(
+        part,
+        moves.h,
+        moves.q[:, None],
+        end[:, None],
+        rate_at_start[:, None],
+        rate_at_end[:, None],
+    )
+    times = moves.t + moves.h * part
+    charts = np.tile(moves.chart, len(part))
+    return times.ravel(), charts, states.reshape(s.d, -1)

@@ -141,20 +141,25 @@ class PlacedSections(Showable, eqx.Module):
         systems, and skipping `drop`. A move in coordinate j takes the dropped entry along the
         section: -normal_k / normal_drop.
         """
-        normal, drop = self.normal, self.drop[:, None]
-        xp, n, drops = namespace(normal), normal.shape[1], drop >= 0
+        normal = self.normal
+        drop = self.drop[:, None]
+        xp = namespace(normal)
+        n = normal.shape[1]
         k = np.arange(n)
+        unit = xp.eye(n)
+
         kept = (k != drop) & ((k > 0) | self.time_is_state[:, None])
         kept_first = xp.argsort(~kept, axis=1, stable=True)
         # One column more than a chart has states is never needed: (t, q) less the dropped entry.
-        select = xp.where(
-            (k < self.dims[:, None])[:, :, None], xp.eye(n)[kept_first], 0.0
-        )
-        slope = -normal / xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
-        along = xp.where(
-            (k == drop)[:, :, None] & drops[:, None], slope[:, None, :], 0.0
-        )
-        return (xp.eye(n) + along) @ xp.swapaxes(select, 1, 2), select
+        exists = k < self.dims[:, None]
+        select = xp.where(exists[:, :, None], unit[kept_first], 0.0)
+
+        drops = drop >= 0
+        of_dropped = xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
+        slope = -normal / of_dropped
+        is_dropped = (k == drop) & drops
+        along = xp.where(is_dropped[:, :, None], slope[:, None, :], 0.0)
+        return (unit + along) @ xp.swapaxes(select, 1, 2), select
 
     @property
     def flow_jacobians(self) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:

@@ -19,19 +19,18 @@ from .._core.executor import is_traced, on_the_cpu, to_host
 from .._core.jax_compat import is_tracer, outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
-from .._core.results import Result, update_result
+from .._core.results import Result
 from ..engine.arrays import Array
 from ..engine.itinerary.bodies import Travelers
-from ..engine.itinerary.rows import Form, Itinerary, Rows, recorded_walk
+from ..engine.itinerary.rows import recorded_walk
 from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, pace_of
 from ..engine.target import AbstractLevels
 from ..orbits.crossing import Crossing, ListLevels
 from ..orbits.cycle import LimitCycle
 from ..orbits.near import known_beside
-from ..orbits.repeat import LAST_CORRECTION, has_route, maps_of
+from ..orbits.repeat import Plan, has_route, maps_of
 from ..orbits.return_map import ReturnMap
-from ..orbits.scale import ROUNDING
 from .families import AbstractSections, BoundSections
 from .place import bind_at, coordinates_on, place_sections, recorded_flows
 from .placed import PlacedSections
@@ -45,31 +44,12 @@ _DENSITY = 2.0
 _PASSES = 2
 
 
-class Path(eqx.Module):
-    """A recorded trajectory that begins on a cycle."""
-
-    form: Form = eqx.field(static=True)
-    rows: Rows
-    count: Int[Array, ""]
-    """Of rows that do something."""
-    ends: Float[Array, " E"]
-    """Ends of legs, from the beginning."""
-    last: Int[Array, ""]
-    """Number of the last leg."""
-
-    @classmethod
-    def of(cls, itinerary: Itinerary) -> "Path":
-        counts = np.asarray(itinerary.count), np.asarray(itinerary.last)
-        rows, ends = itinerary.rows, itinerary.ends
-        return cls(itinerary.form, rows, counts[0], ends, counts[1])
-
-
 class Walk(eqx.Module):
     """From a cycle's beginning to each of its N sections, and to the first one again."""
 
-    lead: Path | None
+    lead: Plan | None
     """To the anchor of the family, if that is a `Crossing`."""
-    path: Path
+    path: Plan
     """From there."""
     period: Float[Array, ""]
     """Of the known cycle."""
@@ -132,8 +112,8 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     if np.isfinite(raw.time[0]):
         late = np.rint((placed.bound.time[0] - raw.time[0]) / placed.cycle.period)
     return Walk(
-        lead=None if before is None else Path.of(before),
-        path=Path.of(path),
+        lead=None if before is None else Plan.of(before),
+        path=Plan.of(path),
         period=np.asarray(placed.cycle.period),
         late=np.asarray(late),
         chart_at_anchor=begin.chart,
@@ -189,14 +169,14 @@ def walked(
     code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
     N = family.n_sections
     lanes = Lanes(
-        t=passage.legs_t,
+        t=passage.pieces_t,
         chart=jnp.asarray(walk.chart),
-        q=passage.legs_q.T,
+        q=passage.pieces_q.T,
         armed=jnp.asarray(walk.armed),
         events=jnp.asarray(walk.events),
         pace=pace_of(jnp.asarray(walk.events)),
     )
-    duration = jnp.diff(passage.legs_t, append=passage.t[None])
+    duration = jnp.diff(passage.pieces_t, append=passage.t[None])
     fields = bound, lanes, None, duration, jnp.full(N, code)
     placed = PlacedSections(cycle, family, *fields, *coordinates_on(map, bound, lanes))
     return placed, passage.factors
@@ -213,7 +193,7 @@ def _known_ends(map: ReturnMap, walk: Walk, bound: BoundSections) -> Float[Array
 def _followed(
     map: ReturnMap,
     walk: Walk,
-    path: Path,
+    path: Plan,
     levels: AbstractLevels | None,
     begin: tuple,
     known: Float[Array, " E"],
@@ -247,13 +227,6 @@ def _followed(
     return (by_jacobian(passage) if by_columns else passage)(everything)
 
 
-def _code(map: ReturnMap, path: Path, passage: Passage, begin) -> Int[Array, ""]:
-    """The code of a trajectory: whether it has kept the path, with steps that are fine enough."""
-    passage, begin = jax.lax.stop_gradient((passage, begin))
-    period = jax.lax.stop_gradient(map.expected)
-    durations = jnp.diff(passage.ends, prepend=begin[None])
-    used = jnp.arange(len(durations)) <= path.last
-    kept = ~passage.left & (~used | (durations >= -ROUNDING * period)).all()
-    kept = kept & (passage.last <= LAST_CORRECTION * period)
-    code = update_result(jnp.zeros((), jnp.int32), ~kept, Result.EVENT_ORDER)
-    return update_result(code, ~(passage.error <= 1), Result.STEP_LIMIT)
+def _code(map: ReturnMap, path: Plan, passage: Passage, begin) -> Int[Array, ""]:
+    """The code of a trajectory on a path of a walk."""
+    return path.code(*jax.lax.stop_gradient((passage, begin, map.expected)))

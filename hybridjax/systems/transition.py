@@ -23,6 +23,11 @@ Direction = Literal["falling", "rising"]
 TOGETHER = 1e-9
 
 
+def at_one_time(t: Array, other: Array, period: Array) -> Array:
+    """Test whether two times on a cycle are the same."""
+    return abs(t - other) <= TOGETHER * period
+
+
 # Times of a schedule are equal if they differ by less than this part of its period, and numbers of
 # steps if they differ by less than it; a target's level counts once it is above the change that its
 # rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an

@@ -151,7 +151,7 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
         q = map.anchor.q[:, 0]
         sizes = map.sizes
         turn = map.turn_with_jacobian(q)
-        recorded = (turn.legs, side_by_side(turn.tapes))
+        recorded = (turn.pieces, side_by_side(turn.tapes))
         x, expected = fixed_point(map, recorded, q / sizes)
         if name == "VerticalHopper":  # (moves arm later ones)
             monkeypatch.setattr(shooting, "arm", lambda s, lanes, *_: lanes)
@@ -167,16 +167,16 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     assert_array_equal(events_of(again), events_of(turn))
     s = map.structure
     sources = [s.chart_index(transition.source) for transition in s.transitions]
-    for legs in (again.legs, turn.legs):
-        of_other_charts = np.array(sources, int)[:, None] != legs.chart
-        legs.armed[of_other_charts] = False
-    assert_array_equal(again.legs.armed, turn.legs.armed)
-    assert_array_equal(again.legs.chart, turn.legs.chart)
-    assert_array_equal(again.legs.events, turn.legs.events)
+    for pieces in (again.pieces, turn.pieces):
+        of_other_charts = np.array(sources, int)[:, None] != pieces.chart
+        pieces.armed[of_other_charts] = False
+    assert_array_equal(again.pieces.armed, turn.pieces.armed)
+    assert_array_equal(again.pieces.chart, turn.pieces.chart)
+    assert_array_equal(again.pieces.events, turn.pieces.events)
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
-    scale = map.scale[turn.legs.chart].T
-    assert_allclose(again.legs.q / scale, turn.legs.q / scale, rtol=0, atol=1e-8)
+    scale = map.scale[turn.pieces.chart].T
+    assert_allclose(again.pieces.q / scale, turn.pieces.q / scale, rtol=0, atol=1e-8)
     assert_allclose(again.period, turn.period, rtol=3e-10)
     size = np.abs(turn.factors).max(axis=0)
     assert_allclose(again.factors / size, turn.factors / size, rtol=0, atol=1e-6)
@@ -236,7 +236,7 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
         map = to_host(hj.find_limit_cycle(grow, hj.Guess("x", (0.4,))).return_map)
         q = map.anchor.q[:, 0]
         turn = map.turn_with_jacobian(q)
-        recorded = (turn.legs, side_by_side(turn.tapes))
+        recorded = (turn.pieces, side_by_side(turn.tapes))
         x, moves = fixed_point(map, recorded, q / map.sizes)
         for gap, steps in ((8e-13, 1), (1e-9, 2)):
             end, _, taken = newton._newton(map, x + gap, moves, 0, 9)

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
-from hybridjax.identify.multiplier_estimate import MultiplierEstimate
+from hybridjax.identify.multiplier_estimate import MultiplierEstimate, contradicted_by
 from hybridjax.identify.series.fit import gradient_covariance
 from hybridjax.identify.series.linearization import (
     each_fit,
@@ -281,7 +281,7 @@ def test_how_far_another_fit_contradicts():
         [lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)
     ]
     doubts = [
-        fit.contradicted_by(x, level) is not None
+        contradicted_by(fit, x, level) is not None
         for x in others
         for level in (0.95, OF_DRIFT)
     ]

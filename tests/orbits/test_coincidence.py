@@ -1,6 +1,7 @@
 """Events that coincide: found on cycles, in sweeps, along branches, and with schedules."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -148,6 +149,90 @@ def test_an_event_that_coincides_with_a_schedule():
         hj.errors.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
     ):
         hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
+
+
+class Filled(hj.HybridSystem):
+    """x rises at the speed 1 from 0.2 at the time 0.3, until it is full or the clock ticks at 1."""
+
+    height: hj.Parameter = hj.parameter(0.8)
+
+    def charts(self):
+        return {
+            "up": Field(("x",), lambda t, q, u: (1.0,)),
+            "down": Field(("x",), lambda t, q, u: (-q[0],)),
+        }
+
+    def transitions(self):
+        tick = hj.systems.Scheduled(1.0)
+        start = hj.systems.Scheduled(1.0, offset=0.3)
+        return (
+            hj.Transition("full", "up", "down", lambda t, q, u: self.height - q[0]),
+            hj.Transition("tick", "up", "down", tick, reset=lambda t, q, u: (0.0,)),
+            hj.Transition("start", "down", "up", start, reset=lambda t, q, u: (0.2,)),
+        )
+
+    def period(self):
+        return 1.0
+
+
+class Clocks(hj.HybridSystem):
+    """x decays, and is changed by two clocks, which tick together once in a period."""
+
+    rate: hj.Parameter = hj.parameter(1.0)
+
+    def charts(self):
+        return {"a": Field(("x",), lambda t, q, u: (-self.rate * q[0],))}
+
+    def transitions(self):
+        third = hj.systems.Scheduled(1 / 3)
+        half = hj.systems.Scheduled(1 / 2)
+        return (
+            hj.Transition("add", "a", "a", third, reset=lambda t, q, u: (q[0] + 1,)),
+            hj.Transition("halve", "a", "a", half, reset=lambda t, q, u: (q[0] / 2,)),
+        )
+
+    def period(self):
+        return 1.0
+
+
+def results_of_all_searches(system, guess, value):
+    """The result for one value of the parameter of a class, by the way to find the cycle."""
+    known = hj.find_limit_cycle(system(), guess)
+
+    @jax.jit
+    def in_program(value):
+        return hj.find_limit_cycle(system(value), known, throw=False).result
+
+    def in_sweep(values):
+        systems = eqx.filter_vmap(system)(jnp.array(values))
+        return hj.orbits.find_limit_cycles(systems, known).result[0]
+
+    def repeated():
+        return hj.find_limit_cycle(system(value), known, throw=False).result
+
+    results = {
+        "single": hj.find_limit_cycle(system(value), guess, throw=False).result,
+        "repeated": [repeated() for _ in range(4)][-1],
+        "in a program": in_program(value),
+        "small sweep": in_sweep([value, 0.7]),
+        "large sweep": in_sweep([value, *np.linspace(0.6, 0.8, 260)]),
+    }
+    return {name: int(result) for name, result in results.items()}
+
+
+def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
+    """x would be full 1e-10 before the tick: beside the cycle, the clock may empty it instead."""
+    guess = hj.Guess("up", (0.4,), time=0.5)
+    found = results_of_all_searches(Filled, guess, 0.9 - 1e-10)
+    assert found == dict.fromkeys(found, int(hj.errors.Result.SIMULTANEOUS))
+    early = hj.find_limit_cycle(Filled(0.9 - 1e-7), guess)
+    assert early.event_sequence == (0, 2)
+
+
+def test_clocks_that_tick_together_are_accepted_by_all_searches():
+    guess = hj.Guess("a", (1.0,), time=0.9)
+    found = results_of_all_searches(Clocks, guess, 0.9)
+    assert found == dict.fromkeys(found, int(hj.errors.Result.OK))
 
 
 def test_two_schedules_for_one_time():

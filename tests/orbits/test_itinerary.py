@@ -196,7 +196,7 @@ def test_programs_of_many_systems_factorize_nothing(free):
     plan = Plan.of(route.first)
 
     def program(leaves, t, expected, q, ends):
-        return correct(Maps(map, leaves, t, expected), route.first.form, plan, q, ends)
+        return correct(Maps(map, leaves, t, expected), plan, q, ends)
 
     text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
     assert "while" in text

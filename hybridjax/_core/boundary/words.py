@@ -557,6 +557,9 @@ ATTRIBUTES = {
         ),
         "`hj.identify.fit_rational(model.htf(frequencies))` has zeros": "zeros",
     },
+    "LimitCycle LimitCycles": {
+        "`pieces` has the states at the beginnings of the cycle's pieces": "legs",
+    },
     "LimitCycle": {
         "`cycle.trajectory()` follows the cycle, and `hj.simulate(system, chart, state, "
         "duration)` another state": "simulate",

@@ -26,7 +26,7 @@ from ..target import AbstractLevels
 CORRECTIONS = 2
 # Pieces of one turn, in each of which columns begin anew. Fewer: strong contraction drowns in the
 # product of the steps of a piece. More: programs run longer.
-LEGS = 16
+PIECES = 16
 # Rows of a table are a multiple of this. More: empty rows take time. Fewer: itineraries of other
 # lengths compile again.
 _ROUND = 128
@@ -96,11 +96,11 @@ class Form(NamedTuple):
     """Largest number of watched functions of a chart."""
     sections: int = 0
     """Number of sections: a piece begins at each, with columns of the time, the state and the
-    inputs. 0 for a turn in `LEGS` pieces, with columns of the state."""
+    inputs. 0 for a turn in `PIECES` pieces, with columns of the state."""
 
     @property
     def pieces(self) -> int:
-        return self.sections or LEGS
+        return self.sections or PIECES
 
     @property
     def ways(self) -> tuple[Body, ...]:
@@ -174,7 +174,7 @@ class _Table:
         self.include([body])
         number = self.bodies.index(body)
         if piece is None:
-            piece = self.sections or LEGS
+            piece = self.sections or PIECES
         places = target, place, piece
         self.rows.append((number, leg, fraction, *places, onward, section, signs))
 
@@ -234,7 +234,7 @@ def recorded(
     """
     legs = _legs(s, levels, turn)
     nodes = [leg.nodes(density) for leg in legs]
-    while sum(len(x) - 1 for x in nodes) < LEGS:
+    while sum(len(x) - 1 for x in nodes) < PIECES:
         density *= 1.25
         nodes = [leg.nodes(density) for leg in legs]
     return _written(s, legs, nodes, _Table(), _pieces(nodes))
@@ -272,7 +272,7 @@ def _written(
     **Arguments:** `pieces`: leg and number of the node at which each piece begins; node -1 for one
     that begins with the leg, on a section.
     """
-    begun = _Begun(s, legs)
+    begun = _Pieces(s, legs)
     for k, (leg, times) in enumerate(zip(legs, nodes, strict=True)):
         begins = {j for j in range(-1, len(times)) if (k, j) in pieces}
         _rows_of_leg(s, table, k, leg, times, begun, begins)
@@ -298,7 +298,7 @@ def _written(
     )
 
 
-class _Begun:
+class _Pieces:
     """The pieces of an itinerary that have begun: their charts, the numbers of events before them,
     and the transitions that are armed."""
 
@@ -323,7 +323,7 @@ def _rows_of_leg(
     k: int,
     leg: _Leg,
     times: Float[np.ndarray, " 1+n"],
-    begun: _Begun,
+    begun: _Pieces,
     begins: set[int],
 ) -> None:
     """Add the rows of leg k until its end.
@@ -383,9 +383,9 @@ def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
     times = np.array([nodes[k][j] for k, j in places])
     whole = nodes[-1][-1] - nodes[0][0]
     chosen = [0]
-    for piece in range(1, LEGS):
-        first, last = chosen[-1] + 1, len(places) - (LEGS - piece)
-        goal = nodes[0][0] + piece * whole / LEGS
+    for piece in range(1, PIECES):
+        first, last = chosen[-1] + 1, len(places) - (PIECES - piece)
+        goal = nodes[0][0] + piece * whole / PIECES
         nearest = first + int(np.argmin(np.abs(times[first : last + 1] - goal)))
         chosen.append(nearest)
     return {places[k] for k in chosen}

@@ -34,8 +34,8 @@ class Passage(NamedTuple):
     """The time and the state at the end."""
     ends: Float[Array, " E"]
     """Ends of legs."""
-    legs_t: Float[Array, " K"]
-    legs_q: Float[Array, "K d"]
+    pieces_t: Float[Array, " K"]
+    pieces_q: Float[Array, "K d"]
     """Times and states at the beginnings of pieces."""
     rates: Float[Array, "K d"]
     """The field there."""

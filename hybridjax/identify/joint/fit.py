@@ -28,7 +28,12 @@ from ..denominator import Covariance, multipliers_of
 from ..descent import Spread
 from ..fit import WithCost, not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierFit, RoughFit
+from ..multiplier_estimate import (
+    MultiplierFit,
+    RoughFit,
+    contradicted_by,
+    undetermined,
+)
 from ..periodic import (
     LocalCoordinates,
     PeriodicModel,
@@ -432,10 +437,10 @@ def _doubts(
         covariance = Covariance(slow.covariance, slow.covariance_dof)
         return slow.coefficients, lambda: covariance
 
-    unknown = fit.undetermined()
+    unknown = undetermined(fit)
     if unknown:
         return unknown
-    if fit.contradicted_by([drifting], OF_DRIFT) is not None:
+    if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
     return residuals.about_misfit(outside.whole(), grid, error, how.innovations)
 
@@ -576,7 +581,7 @@ def _surplus(
 
     **Arguments:** `smaller`: a first model with these dimensions.
     """
-    unknown = fit.undetermined()
+    unknown = undetermined(fit)
     dims = [d - 1 for d in point.model.dims]
     if unknown or min(dims) < 1:
         return unknown

@@ -44,7 +44,13 @@ from ..denominator import (
 from ..descent import Coefficients
 from ..fit import not_converged
 from ..instrument import in_loop
-from ..multiplier_estimate import MultiplierFit, RoughFit
+from ..multiplier_estimate import (
+    MultiplierFit,
+    RoughFit,
+    contradicted_by,
+    order_doubts,
+    undetermined,
+)
 from ..multipliers import NoiseRatios, unsupported
 from ..realization import default_horizon, realized
 from ..variable_projection import amounts
@@ -298,7 +304,7 @@ def _fit_in_loop(
     fit = SeriesFit(**LoopEquations(plant, drive, order, extra_lags).fit(check))
     fewer = max(extra_lags - plant[0].n_sections, 0) if extra_lags else 0
     higher = [lambda: LoopEquations(plant, drive, order + 1, fewer).coefficients()]
-    return dataclasses.replace(fit, findings=tuple(fit.order_doubts(higher)))
+    return dataclasses.replace(fit, findings=tuple(order_doubts(fit, higher)))
 
 
 class _Weighted(NamedTuple):
@@ -352,7 +358,7 @@ def _fit_open_loop(
         higher = [
             partial(_of_order, order + k, records, fit, free_start) for k in (1, 2)
         ]
-        doubts = fit.order_doubts(higher)
+        doubts = order_doubts(fit, higher)
     return dataclasses.replace(fit, findings=(*fit.findings, *doubts, *answers))
 
 
@@ -374,10 +380,10 @@ def _about_drift(
         problem = _problem_like(fit, slow(), order, free_start)
         return _rough(problem, total_least_squares(late_outputs(problem, order)))
 
-    unknown = fit.undetermined()
+    unknown = undetermined(fit)
     if unknown:
         return unknown
-    if fit.contradicted_by([drifting], OF_DRIFT) is not None:
+    if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
     if not may_be_one.any() or may_be_one.all():

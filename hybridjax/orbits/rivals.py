@@ -1,0 +1,144 @@
+"""Events of a turn that happen at the same time.
+
+One rule serves searches, sweeps, programs and routes: `rivals_of`. Where it finds rivals outside of
+programs, `coincidence.commutes` compares the orders in which they may happen.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._core.executor import Array, namespace, on_host, stop_gradient, to_host
+from ..engine.lanes import Tape
+from ..systems.structure import Structure
+from ..systems.transition import Scheduled, at_one_time
+from .return_map import ReturnMap, Turn
+
+
+class Events(NamedTuple):
+    """The events of a turn in the order of their times; those of turns side by side have the turns
+    on the last axis."""
+
+    codes: Int[Array, "E *S"]
+    """Transitions, by index; negative for none, as after the last event."""
+    times: Float[Array, "E *S"]
+    at_once: Bool[Array, "E *S"]
+    rivals: Int[Array, "E *S"]
+    """Both as on the `Tape`."""
+
+
+def events_on(map: ReturnMap, tape: Tape) -> Events:
+    """The events on the tape of a turn, or of turns side by side, after the one with which the turn
+    begins."""
+    parts = tape.code, tape.t, tape.at_once, tape.rival
+    rows = Events(*(stop_gradient(x.reshape(-1, *map.expected.shape)) for x in parts))
+    if on_host(rows.codes):  # (most rows are moves without an event)
+        happens = (rows.codes.reshape(len(rows.codes), -1) >= 0).any(axis=1)
+        rows = Events(*(x[happens] for x in rows))
+    xp = namespace(rows.codes)
+    last = xp.where(rows.codes >= 0, rows.times, xp.inf)
+    order = xp.argsort(last, axis=0, stable=True)
+    return _after_beginning(
+        map,
+        Events(*(xp.take_along_axis(x, order, axis=0) for x in rows)),
+        map.each(map.anchor.t),
+    )
+
+
+def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
+    """The event with which a turn begins at these times, if it does, and those after it."""
+    if map.event < 0:
+        return events
+    xp = namespace(events.times)
+    first = map.event, begin, False, -1
+    return Events(
+        *(
+            xp.concatenate([xp.full_like(x[:1], value), x])
+            for x, value in zip(events, first, strict=True)
+        )
+    )
+
+
+def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]:
+    """For each event of turns, a transition that trajectories beside the turn may meet before it,
+    or in place of it; -1 for none.
+
+    These are the event before, if it happens at the same time, a guard that comes to zero, too (see
+    `Tape.rival`), and a scheduled event that is due, but does not happen. Two scheduled events
+    happen in the same order on all trajectories.
+    """
+    xp = namespace(events.times)
+    codes = events.codes
+    happens = codes >= 0
+    times = xp.where(happens, events.times, 0.0)
+    by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
+
+    both_happen = happens[1:] & happens[:-1]
+    both_by_clock = by_clock[1:] & by_clock[:-1]
+    close = at_one_time(times[1:], times[:-1], period) & both_happen & ~both_by_clock
+    follows = xp.concatenate([xp.zeros_like(happens[:1]), close])
+    before = xp.concatenate([codes[:1], codes[:-1]])
+    out = xp.where(follows, before, xp.maximum(events.rivals, -1))
+
+    for g in np.flatnonzero(s.clocks >= 0).tolist():
+        missed = ~by_clock & is_due(s, g, codes, times, period)
+        out = xp.where(missed & (out < 0), np.int32(g), out)
+    return xp.where(happens, out, -1)
+
+
+def is_due(s: Structure, g: int, codes, times, period) -> Bool[Array, "E *S"]:
+    """Test whether a scheduled event is due where other events leave its chart, or enter it."""
+    schedule = s.transitions[g].guard
+    assert isinstance(schedule, Scheduled)
+    source = s.transitions[g].source
+    touches = [source in (x.source, x.target) for x in s.transitions]
+    touches = np.array([*touches, False])  # (the last one is for no event)
+    xp = namespace(times)
+    within = xp.asarray(touches)[xp.maximum(codes, -1)]
+    return within & at_one_time(schedule.nearest(times), times, period)
+
+
+def coincide(s: Structure, events: Events, period: Array) -> Bool[Array, "*S"]:
+    """Test whether events of turns coincide, so that their order may be another one beside it."""
+    return (rivals_of(s, events, period) >= 0).any(axis=0)
+
+
+def coincide_on(
+    map: ReturnMap, sequence: tuple[int, ...], ends: Float[Array, "L *S"], begin, end
+) -> Bool[Array, "E *S"]:
+    """Test which events of turns have a rival that follow an itinerary with a sequence of events.
+
+    **Arguments:** `ends`: of legs, in the order of the events. `begin`, `end`: times of the turns.
+    """
+    xp = namespace(ends)
+    times = ends[: len(sequence)]
+    codes = np.array(sequence, np.int32).reshape(-1, *[1] * (times.ndim - 1))
+    codes = xp.broadcast_to(codes, times.shape)
+    no = xp.zeros_like(times, bool)
+    events = Events(codes, times, no, xp.full_like(codes, -1))
+    events = _after_beginning(map, events, begin)
+    return rivals_of(map.structure, events, end - begin) >= 0
+
+
+def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
+    """Two transitions of a turn, by index, that are due at the same time: the first one that
+    happens, and another one, which the turn may have passed over."""
+    # (JAX would compile a program for each operation.)
+    map, tapes, period = to_host((map, turn.tapes, turn.period))
+    events = events_on(map, tapes)
+    rivals = rivals_of(map.structure, events, period)
+    before = None
+    for code, rival in zip(events.codes.tolist(), rivals.tolist(), strict=True):
+        if rival >= 0:
+            return (rival, code) if rival == before else (code, rival)
+        before = code
+    return None
+
+
+def meet(map: ReturnMap, tape: Tape, period: Array) -> Bool[Array, ""]:
+    """Test whether two events of a turn coincide, in programs, where their orders are not compared:
+    an event at once follows the one before on all trajectories."""
+    events = events_on(map, tape)
+    rivals = rivals_of(map.structure, events, stop_gradient(period))
+    return ((rivals >= 0) & ~events.at_once).any()
