@@ -253,6 +253,8 @@ def _corrected(maps: Maps, form: Form, plan: Plan, q, ends) -> Corrected:
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
         closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
+        # (Where multipliers are zero, the state converges before the times of events do.)
+        closed = closed & (passage.last <= LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
 
     def going(carry):

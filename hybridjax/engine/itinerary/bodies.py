@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from ...systems.structure import Member, Structure
 from ...systems.transition import SAME_TIME, TOGETHER, Scheduled
 from ..arrays import Array
-from ..settings import Settings
+from ..settings import ROUNDING, Settings
 from ..target import AbstractLevels
 from . import steps
 from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Rows
@@ -53,6 +53,8 @@ class Flags(NamedTuple):
 
     before: "Watched"
     """Watched functions where the last row began, and since then."""
+    entry: "Entry"
+    """Guards of the chart that the last jump has entered, in the chart before."""
     error: Float[Array, ""]
     """Largest estimated error of a step so far, relative to what is allowed."""
     last: Float[Array, ""]
@@ -75,6 +77,21 @@ class Watched(NamedTuple):
         """Watched functions of which nothing is known."""
         far = jnp.full(width, jnp.inf)
         return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
+
+
+class Entry(NamedTuple):
+    """Guards of a chart that a jump enters, as far as the chart before has them, too."""
+
+    known: Bool[Array, " G"]
+    """Whether it has this guard: it is the same chart, or has one of the same value."""
+    armed: Bool[Array, " G"]
+    """Whether that guard was still to fall."""
+
+    @classmethod
+    def departure(cls, width: int) -> "Entry":
+        """That of the beginning of a trajectory: no guard is due there."""
+        nothing = jnp.zeros(width, bool)
+        return cls(known=~nothing, armed=nothing)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +137,7 @@ class Bodies:
         field = self._field(a, course.t, q)
         # (Corrections converge, so that the rate of their function needs no derivative.)
         now = self._watched(a, row, *_still((course.t, q, field)))
-        flags = self._noted(a, row, flags, now)
+        flags = self._noted(a, row, course, flags, now)
         course = self._begun(a, row, course, field)
         h = row.fraction * (course.ends[row.leg] - course.begin)
         if self._functions(a):
@@ -167,15 +184,20 @@ class Bodies:
         q, u = self._state(a, course), self._no_input
         field = self._field(a, course.t, q)
         now = self._watched(a, row, course.t, q, field)
-        flags = self._noted(a, row, flags, _still(now), same=body.at_once)
+        due = self._due(a, row, *_still((course, flags, now)))
+        flags = self._noted(a, row, course, flags, _still(now), same=body.at_once)
+        if body.at_once and not _is_scheduled(s, body.kind[0]):
+            flags = flags._replace(left=flags.left | ~due[self._fired(body, row)])
         delay, late = course.delay, jnp.zeros(())
-        if isinstance(s.transitions[body.kind[0]].guard, Scheduled):
+        if _is_scheduled(s, body.kind[0]):
             delay = jnp.zeros_like(delay)
         elif not body.at_once:
             late = _newton(now, row.target)
             delay = self._delay(a, row, course, q, now)
         has_rival = self._has_rival(row, *_still((course.begin, now)))
         t, q = course.t + late, q + field * late
+        is_disabled = ~s.enabled(member, *_still((t, q)), u)
+        entry = self._entry(a, b, row, *_still((now, due, t, q)))
         after = s.reset(member, t, q, u)
         onward = jnp.where(row.onward, self._field(b, t, after), 0.0)
 
@@ -191,9 +213,42 @@ class Bodies:
         y = jnp.zeros_like(course.y).at[:, : s.dims[b]].set(moved)
         moved = course._replace(t=t, y=y)
         unknown = Watched.unknown(_still(t), self.width)
-        left = flags.left | has_rival | self._has_tick(a, moved)
-        flags = flags._replace(before=unknown, left=left)
+        left = flags.left | has_rival | is_disabled | self._has_tick(a, moved)
+        flags = flags._replace(before=unknown, entry=entry, left=left)
         return self._arrived(row, moved, flags, late, delay)
+
+    def _fired(self, body: Body, row: Rows):
+        """The place of the guard of a jump among those of its chart."""
+        guards = self.s.guards(body.chart)
+        return jnp.array([guards.index(g) for g in body.kind])[row.place]
+
+    def _entry(
+        self, a: int, b: int, row: Rows, now: Watched, due, t, q: Float[Array, " n"]
+    ) -> Entry:
+        """The guards of chart b in chart a, from where a jump leads to b: with these values, and
+        those that were `due` besides."""
+        s = self.s
+        armed = (now.value > 0) | due
+        armed = armed & (jnp.arange(self.width) != row.target)
+        if a == b:
+            return Entry(jnp.ones(self.width, bool), armed)
+        none = Entry(jnp.zeros(self.width, bool), jnp.zeros(self.width, bool))
+        if s.dims[a] != s.dims[b] or not (s.guards(a) and s.guards(b)):
+            return none
+
+        def values(chart, q):
+            guards = self._values(chart, row, t, q, self._no_input)
+            return guards[: len(s.guards(chart))]
+
+        own = values(a, q)
+        others = values(b, q)
+        terms = jnp.abs(jax.jacfwd(values, 1)(b, q)) @ jnp.abs(q)
+        noise = ROUNDING * (terms + jnp.abs(others))
+        equal = jnp.abs(others[:, None] - own) <= noise[:, None]
+        more = (0, self.width - len(others))
+        known = jnp.pad(equal.any(axis=1), more)
+        was_armed = (equal & armed[: len(own)]).any(axis=1)
+        return Entry(known, jnp.pad(was_armed, more))
 
     def _level(self, body: Body, row: Rows, course: Course, flags: Flags):
         """The arrival on a level."""
@@ -201,7 +256,7 @@ class Bodies:
         n, q = self.s.dims[a], self._state(a, course)
         field = self._field(a, course.t, q)
         now = self._watched(a, row, course.t, q, field)
-        flags = self._noted(a, row, flags, _still(now))
+        flags = self._noted(a, row, course, flags, _still(now))
         late = _newton(now, row.target)
         delay = self._delay(a, row, course, q, now)
         arrived = jnp.outer(jnp.append(late, delay), field)
@@ -305,14 +360,37 @@ class Bodies:
         return jax.vmap(function)(*columns, *inputs)
 
     def _noted(
-        self, a: int, row: Rows, flags: Flags, now: Watched, same: bool = False
+        self,
+        a: int,
+        row: Rows,
+        course: Course,
+        flags: Flags,
+        now: Watched,
+        same: bool = False,
     ) -> Flags:
         """The flags at a row, where watched functions have these values; `same`: they must have the
         signs of the recorded trajectory."""
         if not self._functions(a):
             return flags._replace(before=now)
         left = flags.left | self._has_left(row, flags.before, now, same)
+        if not same:
+            due = self._due(a, row, *_still((course, flags, now)))
+            left = left | due.any()
         return flags._replace(before=now, left=left)
+
+    def _due(
+        self, a: int, row: Rows, course: Course, flags: Flags, now: Watched
+    ) -> Bool[Array, " G"]:
+        """The guards of chart a whose events happen at once where a jump has led there (see
+        `engine.events.rearm`): those beyond zero that fall and are new, or were still to fall."""
+        entry = flags.entry
+        begins = jnp.isinf(flags.before.value)
+        is_guard = jnp.arange(self.width) < len(self.s.guards(a))
+        falls = now.rate < 0
+        late = SAME_TIME * (course.ends[row.leg] - course.begin)
+        beyond = now.value < -late * jnp.abs(now.rate)
+        crossed = (falls & ~entry.known) | (entry.armed & (falls | beyond))
+        return begins & is_guard & (now.value < 0) & crossed & now.enabled
 
     def _has_left(
         self, row: Rows, before: Watched, now: Watched, same: bool
@@ -366,6 +444,10 @@ class Bodies:
             last = jnp.ceil((t - offset) / period - _SAME_TICK) - 1
             due = due | (last > before)
         return jax.lax.stop_gradient(due)
+
+
+def _is_scheduled(s: Structure, g: int) -> bool:
+    return isinstance(s.transitions[g].guard, Scheduled)
 
 
 def _still(tree: Any) -> Any:

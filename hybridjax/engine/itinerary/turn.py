@@ -13,7 +13,7 @@ from ..._core.loops import loop, pushed
 from ...systems.structure import Structure
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import Bodies, Course, Flags, Watched
+from .bodies import Bodies, Course, Entry, Flags, Watched
 from .rows import Body, Form, Rows
 from .steps import Solver, solver_of
 
@@ -264,7 +264,9 @@ def _departed(
     t = jax.lax.stop_gradient(t)
     zero = jnp.zeros_like(t)
     before = Watched.unknown(t, form.watched)
-    return course, Flags(before, error=zero, last=zero, left=jnp.asarray(False))
+    entry = Entry.departure(form.watched)
+    left = jnp.asarray(False)
+    return course, Flags(before, entry, error=zero, last=zero, left=left)
 
 
 class _Constants(NamedTuple):
