@@ -20,9 +20,9 @@ from .._core.execution import in_threads
 from .._core.executor import on_the_cpu
 from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import LEGS, Form, Itinerary
-from ..engine.itinerary.turn import Passage
 from .batches import nearest
 from .repeat import (
+    Check,
     Corrected,
     Maps,
     Plan,
@@ -86,13 +86,14 @@ class Many(NamedTuple):
         good = np.flatnonzero(converged & kept & fine)
         if len(good):
             start = found.q[good], found.passage.ends[good]
-            other = self._in_tiles(_travel, route, route.other, rows[good], *start)
-            kept[good] &= agrees(route, found.q[good], other)
+            check = self._in_tiles(_travel, route, route.other, rows[good], *start)
+            kept[good] &= agrees(route, found.q[good], check)
         return _Attempt(rows, found, converged, kept, fine)
 
     def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
         """A function of all lanes, in calls of one size."""
         plan = Plan.of(itinerary)
+        charts = itinerary.charts
         map = on_device(route.map)
         program = whole(function, (itinerary.form,), (map,), loops=True)
 
@@ -102,7 +103,7 @@ class Many(NamedTuple):
             leaves = tuple(x[lanes] for x in self.leaves)
             numbers = leaves, self.t[lanes], self.expected[lanes]
             with on_the_cpu():
-                result = program(numbers, plan, q[own], ends[own])
+                result = program(numbers, plan, charts, q[own], ends[own])
             left = min(self.size, len(rows) - k)
             return jax.tree_util.tree_map(lambda x: x[:left], result)
 
@@ -130,12 +131,14 @@ class _Attempt(NamedTuple):
         return self.converged & self.kept & self.fine
 
 
-def _correct(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
+def _correct(
+    form: Form, map: ReturnMap, numbers, plan: Plan, charts, q, ends
+) -> Corrected:
     return correct(Maps(map, *numbers), form, plan, q, ends)
 
 
-def _travel(form: Form, map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
-    return travel(Maps(map, *numbers), form, plan, q, ends)
+def _travel(form: Form, map: ReturnMap, numbers, plan: Plan, charts, q, ends) -> Check:
+    return travel(Maps(map, *numbers), form, plan, charts, q, ends)
 
 
 class Solver:

@@ -26,6 +26,7 @@ from .crossing import AtEvent
 from .cycle import LimitCycle, derived_if_found
 from .linear_flow import hosted, last_turn
 from .repeat import (
+    Check,
     Corrected,
     Derivatives,
     Plan,
@@ -38,6 +39,7 @@ from .repeat import (
     leaves_of,
     maps_of,
     on_device,
+    periodic,
     route_of,
     travel,
 )
@@ -138,7 +140,9 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
     result = update_result(result, ~kept, Result.EVENT_ORDER)
     result = update_result(result, ~fine, Result.STEP_LIMIT)
     together = _coincide(route, found, expected)
-    return update_result(result, together, Result.SIMULTANEOUS)
+    result = update_result(result, together, Result.SIMULTANEOUS)
+    repeats = periodic(maps_of(map), route.finer.charts, found.passage)
+    return update_result(result, ~repeats, Result.NOT_VERIFIED)
 
 
 def _coincide(route: Route, found: Corrected, expected):
@@ -183,8 +187,9 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
         if not (converged and kept and fine):
             return None
         program = whole(_travel, (route.other.form,), (arrays,), loops=True)
-        other = program(Plan.of(route.other), found.q, found.passage.ends)
-    if not agrees(route, found.q, other) or _coincide(route, found, expected):
+        plan = Plan.of(route.other)
+        check = program(plan, route.other.charts, found.q, found.passage.ends)
+    if not agrees(route, found.q, check) or _coincide(route, found, expected):
         return None
     return from_host(_cycle(itinerary, route, map, found, np.int32(Result.OK)))
 
@@ -193,8 +198,8 @@ def _correct(form: Form, map: ReturnMap, plan: Plan, q, ends) -> Corrected:
     return correct(maps_of(map), form, plan, q, ends)
 
 
-def _travel(form: Form, map: ReturnMap, plan: Plan, q, ends):
-    return travel(maps_of(map), form, plan, q, ends)
+def _travel(form: Form, map: ReturnMap, plan: Plan, charts, q, ends) -> Check:
+    return travel(maps_of(map), form, plan, charts, q, ends)
 
 
 def _cycle(

@@ -26,6 +26,7 @@ from ..engine.unresolved import POLES, may_have_pulses
 from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
+from .periodic import has_period
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
 from .scale import ROUNDING, has_implicit
 from .shooting import ATOL, RTOL
@@ -389,14 +390,37 @@ def factors_across(
     return xp.moveaxis(factors, 0, lanes)
 
 
-def travel(maps: Maps, form: Form, plan: Plan, q, ends) -> Passage:
+class Check(NamedTuple):
+    """The check of cycles that were found on an itinerary."""
+
+    passage: Passage
     """The second integration of turns: by another method, with other steps."""
+    periodic: Bool[Array, "*L"]
+    """Whether functions have the period of the clock; True without one."""
+
+
+def travel(maps: Maps, form: Form, plan: Plan, charts, q, ends) -> Check:
+    """Check cycles. `charts`: those of the pieces of the second integration."""
     import diffrax
 
     # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
     implicit = has_implicit(maps.map.structure)
     solver = None if implicit else diffrax.Dopri8(scan_kind="lax")
-    return turn(maps, form, plan, q, ends, solver=solver, columns=False)[0]
+    passage, _ = turn(maps, form, plan, q, ends, solver=solver, columns=False)
+    return Check(passage, periodic(maps, charts, passage))
+
+
+def periodic(maps: Maps, charts: Int[Array, " K"], passage: Passage):
+    """Whether the functions of clocked systems have the period of the clock, where the pieces of a
+    turn begin; True without one."""
+    if maps.map.base is not None:
+        return jnp.ones(maps.t.shape, bool)
+
+    def of_lane(map: ReturnMap, t, q):
+        period = map.expected / map.multiplicity
+        return has_period(map.structure, period, t, charts, q.T)
+
+    return maps.each(of_lane, passage.legs_t, passage.legs_q)
 
 
 def judge(route: Route, found: Corrected, t, expected) -> tuple:
@@ -425,9 +449,11 @@ def judge(route: Route, found: Corrected, t, expected) -> tuple:
     return converged, kept, passage.error <= 1
 
 
-def agrees(route: Route, q, other: Passage) -> Bool[Array, "*L"]:
-    """Whether a second integration from states q closes, and keeps the route."""
+def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
+    """Whether a second integration from states q closes, and keeps the route, and functions have
+    the period of the clock."""
     xp = namespace(q)
+    other = check.passage
     apart = xp.max(xp.abs(other.q - q) / route.map.sizes, axis=-1)
     same = xp.isfinite(apart) & (apart <= _APART)
-    return same & (other.error <= _ROUGH) & ~other.left
+    return same & check.periodic & (other.error <= _ROUGH) & ~other.left

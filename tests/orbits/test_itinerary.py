@@ -330,3 +330,37 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
     rise = -0.025 + np.sqrt(0.025**2 + 1.2)
     assert_allclose(above(0.05), (1 + rise, hj.errors.Result.OK))
     assert above(-0.05)[1] == hj.errors.Result.EVENT_ORDER
+
+
+class Detuned(Free):
+    def field(self, t, q, u):
+        x, v = q
+        s = self.system
+        return v, -x - s.damping * v + s.drive * jnp.cos((s.rate + s.detuned) * t)
+
+
+class Driven(Rebound):
+    """The drive may have a rate that is not that of the clock."""
+
+    detuned: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        return {"free": Detuned(self)}
+
+
+def test_a_drive_without_the_period_of_the_clock_is_refused_at_every_door(compiled):
+    known = hj.find_limit_cycle(Driven())
+    with pytest.raises(hj.errors.DefinitionError, match="does not have the period"):
+        hj.find_limit_cycle(Driven(detuned=0.01), known)
+    systems = eqx.filter_vmap(lambda x: Driven(detuned=x))(
+        jnp.where(jnp.arange(260) == 3, 0.01, 0.0)
+    )
+    with pytest.raises(hj.errors.DefinitionError, match="does not have the period"):
+        hj.orbits.find_limit_cycles(systems, known)
+
+    @jax.jit
+    def result(detuned):
+        return hj.find_limit_cycle(Driven(detuned=detuned), known).result
+
+    assert result(0.0) == hj.errors.Result.OK
+    assert result(0.01) == hj.errors.Result.NOT_VERIFIED
