@@ -364,3 +364,16 @@ def test_a_drive_without_the_period_of_the_clock_is_refused_at_every_door(compil
 
     assert result(0.0) == hj.errors.Result.OK
     assert result(0.01) == hj.errors.Result.NOT_VERIFIED
+
+
+def test_a_lane_without_a_cycle_has_no_derivative(free):
+    """In reverse mode. The others keep theirs: that of x(0) in closed form."""
+
+    def begin(drive):
+        return hj.find_limit_cycle(Rebound(drive=drive), free).anchor.q[0, 0]
+
+    drives = jnp.array([0.3, jnp.nan, 0.4])
+    values = jax.vmap(jax.grad(begin))(drives)
+    assert np.isnan(values[1])
+    expected = np.real(1 / (1 - 1.3**2 + 0.4j * 1.3))
+    assert_allclose(values[::2], [expected, expected], rtol=1e-8)
