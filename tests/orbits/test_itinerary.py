@@ -377,3 +377,51 @@ def test_a_lane_without_a_cycle_has_no_derivative(free):
     assert np.isnan(values[1])
     expected = np.real(1 / (1 - 1.3**2 + 0.4j * 1.3))
     assert_allclose(values[::2], [expected, expected], rtol=1e-8)
+
+
+class Decay(hj.Chart):
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return (-q[0],)
+
+
+class Doses(hj.HybridSystem):
+    """A dose of 1 in each period, unless there is more than `most` of it already."""
+
+    most: hj.Parameter = hj.parameter(2.0)
+
+    def charts(self):
+        return {"blood": Decay()}
+
+    def transitions(self):
+        def dose(t, q, u):
+            return (q[0] + 1,)
+
+        def is_little(t, q, u):
+            return q[0] < self.most
+
+        tick = hj.systems.Scheduled(1.0, 0.2)
+        return [
+            hj.Transition("dose", "blood", "blood", tick, reset=dose, enabled=is_little)
+        ]
+
+    def period(self):
+        return 1.0
+
+    def guess(self):
+        return hj.Guess("blood", (0.5,), time=0.0)
+
+
+def test_a_step_to_where_other_events_happen_ends_no_search_in_a_program():
+    """Before each dose 1 / (e - 1) is left. If that is too much for a dose, no cycle has the
+    period of the clock, and Newton's method steps from no dose to one and back."""
+    known = hj.find_limit_cycle(Doses())
+    left = 1 / (np.e - 1)
+
+    @jax.jit
+    def result(most):
+        return hj.find_limit_cycle(Doses(most=most), known).result
+
+    assert result(1.01 * left) == hj.errors.Result.OK
+    assert result(0.99 * left) == hj.errors.Result.NOT_CONVERGED
