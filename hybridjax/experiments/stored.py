@@ -29,6 +29,7 @@ from .._core.signal import Signal, unit_of
 from ..engine.settings import EXPERIMENT
 from ..errors import DefinitionError
 from ..linear.ldtp import LDTP, Gain
+from ..orbits.checks import default_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.limit_cycles import rough
 from ..sections.placed import SectionsLike
@@ -251,7 +252,7 @@ def run_experiments(
     `hj.experiments.add_noise`, `hj.estimate_htf`, `hj.fit_series`, `hj.validate`.
     """
     if outputs is None:
-        outputs = cycle.structure.states_everywhere()
+        outputs = default_outputs(cycle.structure)
     options = RunOptions(start, discard, process_noise, accuracy, execution, feedback)
     if store is not None:
         _check_storable(options)

@@ -23,6 +23,7 @@ from ..experiments.noise import add_noise
 from ..experiments.stored import run_experiments
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
+from ..orbits.checks import default_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
 from ..sections.linearization import linearize
@@ -129,7 +130,7 @@ def identify_model(
             "identify_model excites inputs, but the system has none: use `cycle.multipliers`."
         )
     placed = as_placed(cycle, sections)
-    names = cycle.structure.states_everywhere() if outputs is None else outputs
+    names = default_outputs(cycle.structure) if outputs is None else outputs
     say("linearization")
     model = linearize(cycle, placed, names)
     if design is None:

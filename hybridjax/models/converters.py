@@ -22,9 +22,9 @@ class BuckConverter(HybridSystem):
     input_units = ("V",)
     time_unit = "s"
 
-    R: Parameter = parameter(22.0, unit="ohm", doc="load")
-    C: Parameter = parameter(47e-6, unit="F", doc="capacitor")
-    L: Parameter = parameter(20e-3, unit="H", doc="coil")
+    R: Parameter = parameter(22.0, unit="ohm", positive=True, doc="load")
+    C: Parameter = parameter(47e-6, unit="F", positive=True, doc="capacitor")
+    L: Parameter = parameter(20e-3, unit="H", positive=True, doc="coil")
     Vin: Parameter = parameter(20.0, unit="V", doc="supply")
     Vref: Parameter = parameter(11.3, unit="V", doc="reference")
     gain: Parameter = parameter(8.4, doc="gain of the error amplifier")
@@ -92,11 +92,15 @@ class CukConverter(HybridSystem):
     time_unit = "s"
 
     E: Parameter = parameter(15.0, unit="V", doc="supply")
-    L1: Parameter = parameter(2e-3, unit="H", doc="coil at the supply")
-    L2: Parameter = parameter(2e-3, unit="H", doc="coil at the load")
-    C1: Parameter = parameter(20e-6, unit="F", doc="capacitor between the coils")
-    C2: Parameter = parameter(20e-6, unit="F", doc="capacitor at the load")
-    R: Parameter = parameter(10.0, unit="ohm", doc="load")
+    L1: Parameter = parameter(2e-3, unit="H", positive=True, doc="coil at the supply")
+    L2: Parameter = parameter(2e-3, unit="H", positive=True, doc="coil at the load")
+    C1: Parameter = parameter(
+        20e-6, unit="F", positive=True, doc="capacitor between the coils"
+    )
+    C2: Parameter = parameter(
+        20e-6, unit="F", positive=True, doc="capacitor at the load"
+    )
+    R: Parameter = parameter(10.0, unit="ohm", positive=True, doc="load")
     Iref: Parameter = parameter(2.0, unit="A", doc="reference for i1 + i2")
     T: Parameter = parameter(100e-6, unit="s", doc="period of the clock")
 

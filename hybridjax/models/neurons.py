@@ -57,7 +57,7 @@ class AdExNeuron(DrivenNeuron):
 
     input_units = ("pA",)
 
-    C: Parameter = parameter(281.0, unit="pF", doc="capacitance")
+    C: Parameter = parameter(281.0, unit="pF", positive=True, doc="capacitance")
     gL: Parameter = parameter(30.0, unit="nS", doc="leak")
     EL: Parameter = parameter(
         -70.6, unit="mV", doc="potential of the leak, and after a spike"

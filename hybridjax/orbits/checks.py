@@ -112,6 +112,20 @@ def check_claims(
             _compare(s, name, function, times.ravel(), states, sizes)
 
 
+def default_outputs(s: Structure) -> tuple[str, ...]:
+    """The states that all charts have.
+
+    **Raises:** `DefinitionError` for none.
+    """
+    names = tuple(s.states_everywhere())
+    if not names:
+        raise DefinitionError(
+            f"no state is in all charts of {type(s.system).__name__}, to be recorded by default: "
+            "give `outputs`, names of states or `hj.Output`s that exist at the sections."
+        )
+    return names
+
+
 def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     """Outputs of a cycle that are given to a call.
 

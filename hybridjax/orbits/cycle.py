@@ -656,19 +656,27 @@ def derived_if_found(cycle: LimitCycle) -> LimitCycle:
     def numbers(x: LimitCycle):
         return x.period, x.anchor.q, x.pieces.t, x.pieces.q, x.factors
 
-    derived = tuple(_derived_where(found, x) for x in numbers(cycle))
+    of_system = jax.tree_util.tree_leaves(
+        eqx.filter(cycle.system, eqx.is_inexact_array)
+    )
+    derived = _derived_where(found, numbers(cycle), tuple(of_system))
     return eqx.tree_at(numbers, cycle, derived)
 
 
 @jax.custom_jvp
-def _derived_where(found: Array, x: Array) -> Array:
-    return x
+def _derived_where(found: Array, numbers: tuple, of_system: tuple) -> tuple:
+    return numbers
 
 
 @_derived_where.defjvp
 def _derived_where_jvp(primals, tangents):
-    found, x = primals
-    return x, tangents[1] * jnp.where(found, 1.0, jnp.nan)
+    """Derivatives by all numbers of the system are NaN where there is no cycle. (A turn that fails
+    stops, so that reverse mode would take NaN of its end for zero at its beginning.)"""
+    found, numbers, _ = primals
+    _, by_numbers, by_system = tangents
+    factor = jnp.where(found, 1.0, jnp.nan)
+    spread = (factor - 1) * sum(jnp.sum(x) for x in by_system)
+    return numbers, tuple(x * factor + spread for x in by_numbers)
 
 
 def log_determinant(cycle: LimitCycle) -> float:

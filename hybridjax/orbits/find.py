@@ -39,6 +39,7 @@ from .guess import (
 from .linear_flow import keep_turn, last_turn, remembering
 from .near import repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
+from .periodic import has_period
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
 from .rivals import coincident, meet
 from .scale import (
@@ -323,6 +324,13 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
         assert solution.turn.tapes is not None
         together = meet(map, solution.turn.tapes, solution.turn.period)
         code = update_result(solution.result, together, Result.SIMULTANEOUS)
+        solution = solution._replace(result=code)
+    if map.base is None:
+        legs = solution.turn.legs
+        points = legs.t, legs.chart, legs.q
+        clock = map.expected / map.multiplicity
+        repeats = has_period(map.structure, clock, *points)
+        code = update_result(solution.result, ~repeats, Result.NOT_VERIFIED)
         solution = solution._replace(result=code)
     cycle = derived_if_found(_cycle(map, solution, known.event_sequence))
     keep_turn(cycle, solution.turn)

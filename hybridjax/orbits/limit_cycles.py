@@ -444,17 +444,21 @@ def examined(
     if not all(commutes(cycles[i]) for i in few):
         result[[i for i in rows if not commutes(cycles[i])]] = Result.SIMULTANEOUS
     good = np.flatnonzero(result == Result.OK)
-    if walked is not None:
-        good = good[~walked[good]]
-    places = np.linspace(0, len(good) - 1, min(len(good), _TESTED))
-    tested = good[np.unique(places.astype(int))]
-    for i in tested:
+    alone = good if walked is None else good[~walked[good]]
+    tested = _spread(alone)
+    for i in np.union1d(_spread(good), tested):
         check_found(cycles[i])
     if any(verdict(cycles[i]).refused for i in tested):
-        result[good] = [verdict(cycles[i]).result for i in good]
+        result[alone] = [verdict(cycles[i]).result for i in alone]
     found = np.isin(result, [Result.OK, Result.SINGULAR, Result.SIMULTANEOUS])
     period = np.where(found, cycles.period, np.nan)
     return dataclasses.replace(cycles, result=result, period=period)
+
+
+def _spread(rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+    """Eight of some rows, or all if they are fewer."""
+    places = np.linspace(0, len(rows) - 1, min(len(rows), _TESTED))
+    return rows[np.unique(places.astype(int))]
 
 
 def _stacked(systems) -> HybridSystem:

@@ -19,11 +19,10 @@ from .._core.compilation import identity, whole
 from .._core.execution import in_threads
 from .._core.executor import on_the_cpu
 from .._core.results import Result
-from .._core.vector_math import factorizations
 from ..engine.itinerary.rows import PIECES, Itinerary
-from ..engine.itinerary.turn import Passage
 from .batches import nearest
 from .repeat import (
+    Check,
     Corrected,
     Maps,
     Plan,
@@ -86,8 +85,8 @@ class Many(NamedTuple):
         good = np.flatnonzero(code == Result.OK)
         if len(good):
             start = found.q[good], found.passage.ends[good]
-            other = self._in_tiles(_travel, route, route.other, rows[good], *start)
-            differs = ~agrees(route, found.q[good], other)
+            check = self._in_tiles(_travel, route, route.other, rows[good], *start)
+            differs = ~agrees(route, found.q[good], check)
             code[good[differs]] = Result.NOT_VERIFIED
         return _Attempt(rows, found, code)
 
@@ -109,7 +108,7 @@ class Many(NamedTuple):
 
         tiles = range(0, len(rows), self.size)
         # (Two stacks of LAPACK at once may wait for each other for ever.)
-        alone = bool(map.conserved) or q.shape[1] > factorizations.MOST_ROWS
+        alone = bool(map.conserved)
         workers = 1 if alone else min(self.workers, len(tiles))
         parts = in_threads(run, tiles, workers)
         return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
@@ -128,7 +127,7 @@ def _correct(map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
     return correct(Maps(map, *numbers), plan, q, ends)
 
 
-def _travel(map: ReturnMap, numbers, plan: Plan, q, ends) -> Passage:
+def _travel(map: ReturnMap, numbers, plan: Plan, q, ends) -> Check:
     return travel(Maps(map, *numbers), plan, q, ends)
 
 

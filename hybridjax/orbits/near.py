@@ -26,6 +26,7 @@ from ..systems.system import copies_of
 from .cycle import LimitCycle, derived_if_found
 from .linear_flow import hosted, last_turn
 from .repeat import (
+    Check,
     Corrected,
     Derivatives,
     Plan,
@@ -38,6 +39,7 @@ from .repeat import (
     leaves_of,
     maps_of,
     on_device,
+    periodic,
     route_of,
     travel,
 )
@@ -134,7 +136,9 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
     t, expected = still(map.anchor.t[0]), still(map.expected)
     result = judge(route, still(found), t, expected)
     together = _coincide(route, map, still(found.passage))
-    return update_result(result, together, Result.SIMULTANEOUS)
+    result = update_result(result, together, Result.SIMULTANEOUS)
+    repeats = periodic(maps_of(map), route.finer.charts, still(found.passage))
+    return update_result(result, ~repeats, Result.NOT_VERIFIED)
 
 
 def _coincide(route: Route, map: ReturnMap, passage: Passage):
@@ -169,8 +173,8 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
         if code != Result.OK:
             return None
         program = whole(_travel, (), (arrays,), loops=True)
-        other = program(Plan.of(route.other), found.q, found.passage.ends)
-    if not agrees(route, found.q, other):
+        check = program(Plan.of(route.other), found.q, found.passage.ends)
+    if not agrees(route, found.q, check):
         return None
     if _coincide(route, map, found.passage):
         return None
@@ -181,7 +185,7 @@ def _correct(map: ReturnMap, plan: Plan, q, ends) -> Corrected:
     return correct(maps_of(map), plan, q, ends)
 
 
-def _travel(map: ReturnMap, plan: Plan, q, ends) -> Passage:
+def _travel(map: ReturnMap, plan: Plan, q, ends) -> Check:
     return travel(maps_of(map), plan, q, ends)
 
 

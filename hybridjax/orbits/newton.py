@@ -26,7 +26,7 @@ from ..engine.replay import Moves, Variation
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
-from .return_map import SINGULAR, Return, ReturnMap, Turn, across
+from .return_map import CLOSED, SINGULAR, Return, ReturnMap, Turn, across
 from .shooting import (
     ATOL,
     RTOL,
@@ -107,13 +107,20 @@ def _first_turn(map: ReturnMap) -> Return:
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
     q, turn, steps = root(map, MAX_STEPS, near)
-    if once_more and not on_host(
-        q
-    ):  # (where the host's last turn begins, a step is rounding)
+    if (
+        on_host(q) or not once_more
+    ):  # (the host's last turn begins at q but for rounding)
+        result = map.judge(q, turn)
+    else:
+        begin = turn.legs.q[:, 0]
         turn = map.turn_with_jacobian(q, record=turn.record)
-    return Solution(
-        map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
-    )
+        result = map.judge(q, turn)
+        # (Far from where a turn was recorded, other events happen than in its record.)
+        is_near = jnp.max(jnp.abs(q - begin) / map.sizes) <= CLOSED
+        is_fixed = (result == Result.OK) | (result == Result.SINGULAR)
+        strays = is_fixed & ~is_near
+        result = jnp.where(strays, jnp.int32(Result.NOT_CONVERGED), result)
+    return Solution(map.departure(q), turn._replace(record=None), steps, result)
 
 
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:

@@ -28,6 +28,7 @@ from ..engine.unresolved import POLES, may_have_pulses
 from ..linear.time_response import monodromy
 from ..systems.transition import Scheduled
 from .crossing import Crossing, ListLevels
+from .periodic import has_period
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
 from .rivals import coincide_on
 from .scale import ROUNDING, has_implicit
@@ -72,6 +73,8 @@ class Plan(eqx.Module):
     """Ends of legs, from the beginning of the recorded trajectory."""
     last: Int[Array, ""]
     """Number of the last leg."""
+    charts: Int[Array, " K"]
+    """Charts in which the pieces begin."""
 
     @classmethod
     def of(cls, itinerary: Itinerary) -> "Plan":
@@ -82,6 +85,7 @@ class Plan(eqx.Module):
             count=np.asarray(itinerary.count),
             ends=itinerary.ends,
             last=np.asarray(itinerary.last),
+            charts=itinerary.charts,
         )
 
     def code(self, passage: Passage, begin: Array, period: Array) -> Int[Array, "*L"]:
@@ -280,8 +284,8 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
         closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
-        # (The next turn begins its corrections where those of this one ended.)
-        closed = closed & (passage.last <= LAST_CORRECTION * maps.expected)
+        # (Where multipliers are zero, the state converges before the times of events do.)
+        closed = closed & (passage.last <= _LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
 
     def going(carry):
@@ -415,14 +419,37 @@ def factors_across(
     return xp.moveaxis(factors, 0, lanes)
 
 
-def travel(maps: Maps, plan: Plan, q, ends) -> Passage:
+class Check(NamedTuple):
+    """The check of cycles that were found on an itinerary."""
+
+    passage: Passage
     """The second integration of turns: by another method, with other steps."""
+    periodic: Bool[Array, "*L"]
+    """Whether functions have the period of the clock; True without one."""
+
+
+def travel(maps: Maps, plan: Plan, q, ends) -> Check:
+    """Check cycles by a second integration."""
     import diffrax
 
     # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
     implicit = has_implicit(maps.map.structure)
     solver = None if implicit else diffrax.Dopri8(scan_kind="lax")
-    return turn(maps, plan, q, ends, solver=solver, columns=False)[0]
+    passage, _ = turn(maps, plan, q, ends, solver=solver, columns=False)
+    return Check(passage, periodic(maps, plan.charts, passage))
+
+
+def periodic(maps: Maps, charts: Int[Array, " K"], passage: Passage):
+    """Whether the functions of clocked systems have the period of the clock, where the pieces of a
+    turn begin; True without one."""
+    if maps.map.base is not None:
+        return jnp.ones(maps.t.shape, bool)
+
+    def of_lane(map: ReturnMap, t, q):
+        period = map.expected / map.multiplicity
+        return has_period(map.structure, period, t, charts, q.T)
+
+    return maps.each(of_lane, passage.pieces_t, passage.pieces_q)
 
 
 def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
@@ -458,9 +485,11 @@ def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
     return isolated
 
 
-def agrees(route: Route, q, other: Passage) -> Bool[Array, "*L"]:
-    """Whether a second integration from states q closes, and keeps the route."""
+def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
+    """Whether a second integration from states q closes, and keeps the route, and functions have
+    the period of the clock."""
     xp = namespace(q)
+    other = check.passage
     apart = xp.max(xp.abs(other.q - q) / route.map.sizes, axis=-1)
     same = xp.isfinite(apart) & (apart <= _APART)
-    return same & (other.error <= _ROUGH) & ~other.left
+    return same & check.periodic & (other.error <= _ROUGH) & ~other.left

@@ -334,3 +334,49 @@ def test_no_event_is_missed_between_sections_a_period_apart():
     u = 1e-3 * np.random.default_rng(0).normal(size=(10, 20, 1))
     data = hj.run_experiments(cycle, hj.ClockPhase(1), u, ("a",), discard=0)
     assert data.ok.all(), data.summary()
+
+
+def test_charts_without_a_common_state_need_outputs():
+    class Charge(hj.Chart):
+        states = ("charge",)
+
+        def field(self, t, q, u):
+            return (1.0 + u[0],)
+
+    class Rest(hj.Chart):
+        states = ("heat",)
+
+        def field(self, t, q, u):
+            return (-q[0],)
+
+    class Flash(hj.HybridSystem):
+        def charts(self):
+            return {"charge": Charge(), "rest": Rest()}
+
+        def transitions(self):
+            def full(t, q, u):
+                return 1 - q[0]
+
+            def cold(t, q, u):
+                return q[0] - 0.1
+
+            def heated(t, q, u):
+                return (1.0,)
+
+            def empty(t, q, u):
+                return (0.0,)
+
+            return [
+                hj.Transition("flash", "charge", "rest", full, reset=heated),
+                hj.Transition("cool", "rest", "charge", cold, reset=empty),
+            ]
+
+        def guess(self):
+            return hj.Guess("charge", (0.5,))
+
+    cycle = hj.find_limit_cycle(Flash())
+    says = (
+        "no state is in all charts of Flash, to be recorded by default: give `outputs`"
+    )
+    with pytest.raises(hj.errors.DefinitionError, match=says):
+        hj.run_experiments(cycle, hj.AtEvent("cool"), np.zeros((1, 30, 1)))

@@ -1,5 +1,7 @@
 """Cycles that follow the itinerary of a known one: as the search finds them, or not at all."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -222,3 +224,204 @@ def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     begin = np.exp(-0.65) * (1 - np.exp(-0.35)) / (1 - np.exp(-1.0))
     error = abs(path.after[after, 0] - begin)
     assert error < 1e-10
+
+
+class Stop(Rebound):
+    """The stop throws back only what is fast enough, and lets the rest pass."""
+
+    least: hj.Parameter = hj.parameter(0.1)
+
+    def transitions(self):
+        (bounce,) = super().transitions()
+
+        def is_fast(t, q, u):
+            return q[1] > self.least
+
+        return [dataclasses.replace(bounce, enabled=is_fast)]
+
+
+def test_an_event_whose_predicate_fails_beside_the_known_cycle_is_noticed(compiled):
+    known = hj.find_limit_cycle(Stop(drive=2.0))
+    fastest = known.trajectory()("v")[1].max()
+
+    @jax.jit
+    def result(least):
+        return hj.find_limit_cycle(Stop(drive=2.0, least=least), known).result
+
+    assert result(0.2) == hj.errors.Result.OK
+    assert result(2 * fastest) == hj.errors.Result.EVENT_ORDER
+    passing = hj.find_limit_cycle(Stop(drive=2.0, least=2 * fastest), known)
+    assert passing.event_sequence == ()
+    _, _, states = passing.trajectory().dense(64)
+    assert_allclose(np.max(states[:, 0]), amplitude(2.0), rtol=1e-3)
+
+
+class Falling(hj.Chart):
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return (-1.0,)
+
+
+class Thrown(hj.Chart):
+    states = ("y", "v")
+    pull: float
+
+    def field(self, t, q, u):
+        return q[1], self.pull
+
+
+class Thrower(hj.HybridSystem):
+    """A weight falls to zero, and throws another one from y = -0.2, below the floor y = 0.
+
+    The event "floor" happens at once if this one moves down, otherwise when it comes back.
+    """
+
+    speed: hj.Parameter = hj.parameter(0.0)
+    pull: hj.Parameter = hj.parameter(-0.5)
+
+    def charts(self):
+        return {"falling": Falling(), "thrown": Thrown(self.pull)}
+
+    def transitions(self):
+        def height(t, q, u):
+            return q[0]
+
+        def depth_of_ceiling(t, q, u):
+            return 1 - q[0]
+
+        def throw(t, q, u):
+            return -0.2, self.speed
+
+        def begin(t, q, u):
+            return (1.0,)
+
+        return [
+            hj.Transition("throw", "falling", "thrown", height, reset=throw),
+            hj.Transition("floor", "thrown", "falling", height, reset=begin),
+            hj.Transition("top", "thrown", "falling", depth_of_ceiling, reset=begin),
+        ]
+
+    def guess(self):
+        return hj.Guess("falling", (0.9,))
+
+
+def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
+    """From one cycle to the other, in both directions, and with the pull upwards: there the weight
+    that begins upwards reaches the ceiling at y = 1, and the other one never does."""
+    down = hj.find_limit_cycle(Thrower(speed=-0.5))
+    up = hj.find_limit_cycle(Thrower(speed=0.1, pull=2.0))
+    assert_allclose(down.period, 1, rtol=1e-12)
+    # The height is reached at 0.1 t + t^2 = 1.2.
+    assert_allclose(up.period, 1 - 0.05 + np.sqrt(0.05**2 + 1.2), rtol=1e-9)
+
+    @jax.jit
+    def below(speed):
+        cycle = hj.find_limit_cycle(Thrower(speed=speed), down)
+        return cycle.period, cycle.result
+
+    @jax.jit
+    def above(speed):
+        cycle = hj.find_limit_cycle(Thrower(speed=speed, pull=2.0), up)
+        return cycle.period, cycle.result
+
+    assert_allclose(below(-0.4), (1, hj.errors.Result.OK))
+    assert below(1.0)[1] == hj.errors.Result.EVENT_ORDER
+    rise = -0.025 + np.sqrt(0.025**2 + 1.2)
+    assert_allclose(above(0.05), (1 + rise, hj.errors.Result.OK))
+    assert above(-0.05)[1] == hj.errors.Result.EVENT_ORDER
+
+
+class Detuned(Free):
+    def field(self, t, q, u):
+        x, v = q
+        s = self.system
+        return v, -x - s.damping * v + s.drive * jnp.cos((s.rate + s.detuned) * t)
+
+
+class Driven(Rebound):
+    """The drive may have a rate that is not that of the clock."""
+
+    detuned: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        return {"free": Detuned(self)}
+
+
+def test_a_drive_without_the_period_of_the_clock_is_refused_at_every_door(compiled):
+    known = hj.find_limit_cycle(Driven())
+    with pytest.raises(hj.errors.DefinitionError, match="does not have the period"):
+        hj.find_limit_cycle(Driven(detuned=0.01), known)
+    systems = eqx.filter_vmap(lambda x: Driven(detuned=x))(
+        jnp.where(jnp.arange(260) == 3, 0.01, 0.0)
+    )
+    with pytest.raises(hj.errors.DefinitionError, match="does not have the period"):
+        hj.orbits.find_limit_cycles(systems, known)
+
+    @jax.jit
+    def result(detuned):
+        return hj.find_limit_cycle(Driven(detuned=detuned), known).result
+
+    assert result(0.0) == hj.errors.Result.OK
+    assert result(0.01) == hj.errors.Result.NOT_VERIFIED
+
+
+def test_a_lane_without_a_cycle_has_no_derivative(free):
+    """In reverse mode. The others keep theirs: that of x(0) in closed form."""
+
+    def begin(drive):
+        return hj.find_limit_cycle(Rebound(drive=drive), free).anchor.q[0, 0]
+
+    drives = jnp.array([0.3, jnp.nan, 0.4])
+    values = jax.vmap(jax.grad(begin))(drives)
+    assert np.isnan(values[1])
+    expected = np.real(1 / (1 - 1.3**2 + 0.4j * 1.3))
+    assert_allclose(values[::2], [expected, expected], rtol=1e-8)
+
+
+class Decay(hj.Chart):
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return (-q[0],)
+
+
+class Doses(hj.HybridSystem):
+    """A dose of 1 in each period, unless there is more than `most` of it already."""
+
+    most: hj.Parameter = hj.parameter(2.0)
+
+    def charts(self):
+        return {"blood": Decay()}
+
+    def transitions(self):
+        def dose(t, q, u):
+            return (q[0] + 1,)
+
+        def is_little(t, q, u):
+            return q[0] < self.most
+
+        tick = hj.systems.Scheduled(1.0, 0.2)
+        return [
+            hj.Transition("dose", "blood", "blood", tick, reset=dose, enabled=is_little)
+        ]
+
+    def period(self):
+        return 1.0
+
+    def guess(self):
+        return hj.Guess("blood", (0.5,), time=0.0)
+
+
+def test_a_step_to_where_other_events_happen_ends_no_search_in_a_program():
+    """Before each dose 1 / (e - 1) is left. If that is too much for a dose, no cycle has the
+    period of the clock, and Newton's method steps from no dose to one and back."""
+    known = hj.find_limit_cycle(Doses())
+    left = 1 / (np.e - 1)
+
+    @jax.jit
+    def result(most):
+        return hj.find_limit_cycle(Doses(most=most), known).result
+
+    assert result(1.01 * left) == hj.errors.Result.OK
+    assert result(0.99 * left) == hj.errors.Result.NOT_CONVERGED

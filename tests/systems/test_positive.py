@@ -42,10 +42,10 @@ def test_masses_must_be_positive(mass):
     refused("must be positive|`M` must be", hj.continuation, cycle, "M", (2.0, mass))
 
 
-def test_masses_of_the_gallery_are_declared_positive():
+def test_masses_and_parts_of_circuits_of_the_gallery_are_declared_positive():
     for name in dir(hj.models):
         model = getattr(hj.models, name)
         fields = getattr(model, "__dataclass_fields__", {})
         for field in fields.values():
-            if field.metadata.get("unit") == "kg":
+            if field.metadata.get("unit") in ("kg", "ohm", "H", "F", "pF"):
                 assert field.metadata["positive"], (name, field.name)

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from ...systems.structure import Kind, Member, Structure
 from ...systems.transition import SAME_TIME, TOGETHER, Scheduled
 from ..arrays import Array
-from ..settings import Settings
+from ..settings import ROUNDING, Settings
 from ..target import AbstractLevels
 from . import steps
 from .motion import Alone, Motion, choose, chosen
@@ -65,6 +65,8 @@ class Flags(NamedTuple):
 
     before: "Watched"
     """Watched functions where the last row began, and since then."""
+    entry: "Entry"
+    """Guards of the chart that the last jump has entered, in the chart before."""
     error: Float[Array, ""]
     """Largest estimated error of a step so far, relative to what is allowed."""
     last: Float[Array, ""]
@@ -87,6 +89,37 @@ class Watched(NamedTuple):
         """Watched functions of which nothing is known."""
         far = jnp.full(width, jnp.inf)
         return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
+
+
+class Entry(NamedTuple):
+    """Guards of a chart that a jump enters, as far as the chart before has them, too."""
+
+    known: Bool[Array, " G"]
+    """Whether it has this guard: it is the same chart, or has one of the same value."""
+    armed: Bool[Array, " G"]
+    """Whether that guard was still to fall."""
+
+    @classmethod
+    def departure(cls, width: int) -> "Entry":
+        """That of the beginning of a trajectory: no guard is due there."""
+        nothing = jnp.zeros(width, bool)
+        return cls(known=~nothing, armed=nothing)
+
+    @classmethod
+    def unknown(cls, width: int) -> "Entry":
+        """That of a chart whose guards the chart before has not."""
+        nothing = jnp.zeros(width, bool)
+        return cls(known=nothing, armed=nothing)
+
+
+class Event(NamedTuple):
+    """What is noted of an event while it happens."""
+
+    due: Bool[Array, " G"]
+    """Guards whose events happen at once where the last jump has led."""
+    entry: Entry
+    disabled: Bool[Array, ""]
+    """Whether the event's predicate does not hold."""
 
 
 class Row(NamedTuple):
@@ -226,14 +259,15 @@ class Bodies:
         """A row that begins in a chart: a step, or the end of a leg."""
         course, now = self._in_chart(motion, row, self._observe, course)
         noted = self._lane(self._noted, row)
-        flags, _ = Alone(motion.constants).apply(noted, flags, now)
+        seen = _still(motion.values(course)), now
+        flags, due = Alone(motion.constants).apply(noted, flags, seen)
         does = {body.does for body in self.form.bodies}
         branches = []
         if STEP in does:
             branches.append(ft.partial(self._step, motion, row))
         if does & {JUMP, LEVEL}:
             branches.append(ft.partial(self._end, motion, row))
-        return chosen(row.ends_leg.astype(int), branches, course, flags, now)
+        return chosen(row.ends_leg.astype(int), branches, course, flags, (now, due))
 
     # Stages, and numbers of rows.
 
@@ -301,14 +335,46 @@ class Bodies:
                 enabled = enabled.at[place].set(s.enabled(g, t, q, u))
         return course, _still(Watched(t, value, rate, enabled))
 
-    def _noted(self, row: Row, s: Structure, _, flags: Flags, now: Watched):
-        """The flags at a row, where watched functions have these values."""
-        left = flags.left | _has_left(row, flags.before, now)
-        return flags._replace(before=now, left=left), None
+    def _noted(self, row: Row, s: Structure, _, flags: Flags, seen):
+        """The flags at a row, where watched functions have these values, and the guards that are
+        due there."""
+        course, now = seen
+        due = self._due(row, s, course, flags, now)
+        fired = self._fired(row, s)
+        surprise = due.any() & ~row.at_once
+        is_due = due[fired] if due.size else jnp.asarray(True)
+        late = row.at_once & ~row.scheduled & ~is_due
+        left = flags.left | surprise | late | _has_left(row, flags.before, now)
+        return flags._replace(before=now, left=left), due
+
+    def _due(
+        self, row: Row, s: Structure, course: Course, flags: Flags, now: Watched
+    ) -> Bool[Array, " G"]:
+        """The guards whose events happen at once where a jump has led (see `engine.events.rearm`):
+        those beyond zero that fall and are new, or were still to fall."""
+        guards = jnp.asarray([len(s.guards(a)) for a in self.form.charts])
+        is_guard = jnp.arange(self.form.watched) < guards[row.chart]
+        entry = flags.entry
+        begins = jnp.isinf(flags.before.value)
+        falls = now.rate < 0
+        late = SAME_TIME * (course.ends[row.leg] - course.begin)
+        beyond = now.value < -late * jnp.abs(now.rate)
+        crossed = (falls & ~entry.known) | (entry.armed & (falls | beyond))
+        return begins & is_guard & (now.value < 0) & crossed & now.enabled
+
+    def _fired(self, row: Row, s: Structure) -> Int[Array, ""]:
+        """The place of the guard of a jump among those of its chart."""
+        places = []
+        for kind in self.form.kinds:
+            guards = s.guards(s.chart_index(s.transitions[kind[0]].source))
+            places.append([guards.index(g) if g in guards else 0 for g in kind])
+        most = max(map(len, places), default=0)
+        table = [x + [0] * (most - len(x)) for x in places] + [[0] * most]
+        return jnp.asarray(table)[row.kind, row.place] if most else jnp.zeros((), int)
 
     # Steps.
 
-    def _step(self, motion: Motion, row: Row, course, flags: Flags, now: Watched):
+    def _step(self, motion: Motion, row: Row, course, flags: Flags, _):
         """A part of the leg, or a Newton step on a watched function."""
         course, _ = motion.apply(self._lane(self._departed, row), course, None)
         moving, error = self._advanced(motion, row, course)
@@ -399,8 +465,9 @@ class Bodies:
 
     # Ends of legs.
 
-    def _end(self, motion: Motion, row: Row, course, flags: Flags, now: Watched):
+    def _end(self, motion: Motion, row: Row, course, flags: Flags, seen):
         """The event, or the arrival on a level, with which a leg ends."""
+        now, due = seen
         course, _ = self._in_chart(motion, row, self._aimed, course)
         course, _ = motion.apply(self._lane(self._shifted), course, None)
         flags = self._without_tick(motion, row, course, flags)
@@ -408,9 +475,11 @@ class Bodies:
         stages = [self._lane(self._reset, kind, row) for kind in kinds]
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
-        course, _ = choose(motion, row.kind, stages, course)
+        disabled = jnp.zeros_like(flags.left)
+        event = Event(due, flags.entry, disabled)
+        course, (_, event) = choose(motion, row.kind, stages, course, (now, event))
         ended = self._lane(self._ended, row)
-        course, (flags, _) = motion.apply(ended, course, (flags, now))
+        course, (flags, *_) = motion.apply(ended, course, (flags, now, event))
         return course, flags
 
     def _aimed(self, a: int, row: Row, s: Structure, constants, course: Course, notes):
@@ -442,12 +511,18 @@ class Bodies:
         moved = jnp.outer(jnp.append(course.h, course.delay), course.rate)
         return course._replace(t=course.t + course.h, y=course.y + moved), notes
 
-    def _reset(self, kind: Kind, row: Row, s: Structure, _, course: Course, notes):
+    def _reset(
+        self, kind: Kind, row: Row, s: Structure, constants, course: Course, notes
+    ):
         """The state and its columns after a jump, at a fixed time again."""
         tr = s.transitions[kind[0]]
         a, b = s.chart_index(tr.source), s.chart_index(tr.target)
         member = Member(kind, row.place)
         t, q, u = course.t, _state(s, a, course), jnp.zeros(s.nu)
+        now, event = notes
+        entry = self._entry(a, b, row, s, constants, *_still((now, event.due, t, q)))
+        disabled = ~s.enabled(member, *_still((t, q)), u)
+        notes = now, event._replace(entry=entry, disabled=disabled)
 
         def reset(t, q, u):
             return s.reset(member, t, q, u)
@@ -464,15 +539,44 @@ class Bodies:
 
     def _ended(self, row: Row, s: Structure, _, course: Course, notes):
         """The course where a leg has ended, and the next one begins."""
-        flags, now = notes
+        flags, now, event = notes
         rival = row.is_jump & _has_rival(row, _still(course.begin), now)
         unknown = Watched.unknown(_still(course.t), self.form.watched)
         on_level = _leveled(row, flags).before
         select = ft.partial(jnp.where, row.is_jump)
         before = jax.tree_util.tree_map(select, unknown, on_level)
-        flags = flags._replace(before=before, left=flags.left | rival)
+        left = flags.left | rival | event.disabled
+        flags = flags._replace(before=before, entry=event.entry, left=left)
         course, flags = _arrived(row, course, flags, course.h)
-        return course, (flags, now)
+        return course, (flags, now, event)
+
+    def _entry(
+        self, a: int, b: int, row: Row, s: Structure, constants, now: Watched, due, t, q
+    ) -> Entry:
+        """The guards of chart b in chart a, from where a jump leads to b: with these values, and
+        those that were `due` besides."""
+        width = self.form.watched
+        armed = (now.value > 0) | due
+        armed = armed & (jnp.arange(width) != row.target)
+        if a == b:
+            return Entry(jnp.ones(width, bool), armed)
+        if s.dims[a] != s.dims[b] or not (s.guards(a) and s.guards(b)):
+            return Entry.unknown(width)
+
+        def values(chart, q):
+            u = jnp.zeros(s.nu)
+            watched = _values(s, chart, constants.levels, row, t, q, u)
+            return watched[: len(s.guards(chart))]
+
+        own = values(a, q)
+        others = values(b, q)
+        terms = jnp.abs(jax.jacfwd(values, 1)(b, q)) @ jnp.abs(q)
+        noise = ROUNDING * (terms + jnp.abs(others))
+        equal = jnp.abs(others[:, None] - own) <= noise[:, None]
+        more = (0, width - len(others))
+        known = jnp.pad(equal.any(axis=1), more)
+        was_armed = (equal & armed[: len(own)]).any(axis=1)
+        return Entry(known, jnp.pad(was_armed, more))
 
     def _each(self, function: Callable, *columns: Array) -> Array:
         """A function of each column, and of its inputs where there are any."""

@@ -14,6 +14,7 @@ from .bodies import (
     Bodies,
     Constants,
     Course,
+    Entry,
     Flags,
     Row,
     Travelers,
@@ -219,7 +220,9 @@ def _departed(
     t = jax.lax.stop_gradient(t)
     zero = jnp.zeros_like(t)
     before = Watched.unknown(t, form.watched)
-    return course, Flags(before, error=zero, last=zero, left=jnp.asarray(False))
+    entry = Entry.departure(form.watched)
+    left = jnp.asarray(False)
+    return course, Flags(before, entry, error=zero, last=zero, left=left)
 
 
 class _State(NamedTuple):

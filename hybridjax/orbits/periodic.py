@@ -1,0 +1,74 @@
+"""Whether the functions of a clocked system have the period of its clock, in programs."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..systems.structure import Structure
+from ..systems.transition import SAME_TIME, Scheduled
+from .scale import ROUNDING
+
+
+# The time at which functions are compared with those a period later, in parts of the period after
+# each point: fields that jump with a clock do not jump there.
+LATER = 0.0729
+# Largest difference, relative to the largest value at all points. Smaller: rounding errors of times
+# are taken for another period. Larger: functions of another period pass.
+_SAME = 1e-6
+
+
+def has_period(
+    s: Structure,
+    period: Float[Array, ""],
+    t: Float[Array, " K"],
+    chart: Int[Array, " K"],
+    q: Float[Array, "d K"],
+) -> Bool[Array, ""]:
+    """Test whether fields, guards, resets, predicates and schedules repeat after a period, at
+    points of a turn. (NaN is passed over.)"""
+    s, period, t, q = jax.lax.stop_gradient((s, period, t, q))
+    times = t + LATER * period
+    same = _schedules_fit(s, period)
+    for a in range(len(s.charts)):
+
+        def values(t, q, a=a):
+            return _values(s, a, t, q)
+
+        n = s.dims[a]
+        points = jax.vmap(lambda t, q, f=values: _with_rate(f, t, q))
+        now, rate = points(times, q[:n].T)
+        later, _ = points(times + period, q[:n].T)
+        here = (chart == a)[:, None]
+        size = jnp.max(jnp.where(here, jnp.abs(now), 0.0), axis=0)
+        rounding = ROUNDING * jnp.abs(rate) * (jnp.abs(times) + period)[:, None]
+        differs = jnp.abs(later - now) > _SAME * size + rounding
+        same = same & ~(here & differs).any()
+    return same
+
+
+def _values(s: Structure, a: int, t, q: Float[Array, " n"]) -> Float[Array, " v"]:
+    """The values of all functions of chart a that determine its motion."""
+    u = jnp.zeros(s.nu)
+    guards = s.guards(a)
+    parts = [s.field(a, t, q, u)]
+    parts += [s.guard(g, t, q, u) for g in guards]
+    for g in guards + s.schedules(a):
+        parts += [s.reset(g, t, q, u)]
+        if s.transitions[g].enabled is not None:
+            parts += [s.enabled(g, t, q, u)]
+    return jnp.concatenate([jnp.ravel(x).astype(float) for x in parts])
+
+
+def _with_rate(function, t, q) -> tuple[Array, Array]:
+    """Values and their derivatives by the time."""
+    return jax.jvp(lambda t: function(t, q), (t,), (jnp.ones_like(t),))
+
+
+def _schedules_fit(s: Structure, period: Float[Array, ""]) -> Bool[Array, ""]:
+    """Test whether the period of each schedule divides that of the clock."""
+    fit = jnp.asarray(True)
+    for transition in s.transitions:
+        if isinstance(transition.guard, Scheduled):
+            ratio = period / transition.guard.period
+            fit = fit & (jnp.abs(ratio - jnp.round(ratio)) < SAME_TIME * ratio)
+    return fit
