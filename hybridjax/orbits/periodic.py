@@ -26,7 +26,6 @@ def has_period(
 ) -> Bool[Array, ""]:
     """Test whether fields, guards, resets, predicates and schedules repeat after a period, at
     points of a turn. (NaN is passed over.)"""
-    s, period, t, q = jax.lax.stop_gradient((s, period, t, q))
     times = t + LATER * period
     same = _schedules_fit(s, period)
     for a in range(len(s.charts)):
