@@ -33,6 +33,7 @@ from .cycle import LimitCycle, derived_if_found
 from .guess import (
     after_rarest_event,
     is_default,
+    met_once,
     require_similar,
     return_map_near,
 )
@@ -77,6 +78,7 @@ _STRAYED = (
     Result.SECTION_MISSED,
     Result.STEP_LIMIT,
     Result.STEP_COLLAPSE,
+    Result.EXTRA_TURNS,
 )
 # The rough size of a state that does not move is made smaller this many times, if the guess was far
 # from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
@@ -383,6 +385,8 @@ def _found_later(
         try:
             later = _map_after(map, request.section, periods, request.given)
             solution = solve(later, False, True, None)
+            if request.section is None and not isinstance(map.base, AtEvent):
+                solution, later = _met_once(later, solution)
             cycle, turn = _judged(later, solution, request.given)
         except ComputationError as error:
             fault = f" From the guess the flow leads to no cycle either: {error}"
@@ -416,6 +420,8 @@ def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
             say("the same from a phase far from events")
             map = dataclasses.replace(map, anchor=distant.anchor)
             solution = search(map, patient)
+    if is_default(map.base):
+        solution, map = _met_once(map, solution)
     # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
     reach = float(solution.turn.period) * ENOUGH
     short = patient and int(solution.result) == Result.STEP_LIMIT
@@ -425,6 +431,22 @@ def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
         map = dataclasses.replace(map, settings=settings)
         solution = search(map)
     return solution, map
+
+
+def _met_once(map: ReturnMap, solution: Solution) -> tuple[Solution, ReturnMap]:
+    """A solution that closes, but meets a section that nobody has asked for more than once, on a
+    plane that it meets once; or the same solution."""
+    several = int(solution.result) == Result.EXTRA_TURNS
+    if not several or map.multiplicity > 1 or not solution.turn.closed:
+        return solution, map
+    once = met_once(map, solution.turn)
+    if once is None:
+        return solution, map
+    say("the same on a plane that the cycle meets once")
+    again = solve(once)
+    if not again.is_fixed_point:
+        return solution, map
+    return again._replace(steps=solution.steps), once
 
 
 def _judged(
@@ -439,16 +461,18 @@ def _judged(
     if coincident(map, solution.turn) and not commutes(cycle):
         return _with_result(cycle, Result.SIMULTANEOUS), solution.turn
     checked = verdict(cycle)
-    if checked.sooner is not None and map.base is not None and map.multiplicity == 1:
+    # (A cycle that runs four times around closes after half of its period, and again after half of
+    # that.)
+    while checked.sooner is not None and map.base is not None and map.multiplicity == 1:
         say("Newton's method, with the shorter period at which the cycle closes")
-        shorter = dataclasses.replace(
-            map, anchor=solution.anchor, expected=real(checked.sooner)
-        )
+        expected = real(checked.sooner)
+        shorter = dataclasses.replace(map, anchor=solution.anchor, expected=expected)
         again = solve(shorter)
-        if again.is_fixed_point:
-            solution = again._replace(steps=solution.steps)
-            cycle = kept(shorter, solution)
-            checked = verdict(cycle)
+        if not again.is_fixed_point or again.turn.period > 1.5 * checked.sooner:
+            break
+        solution = again._replace(steps=solution.steps)
+        cycle = kept(shorter, solution)
+        checked = verdict(cycle)
     if checked.refused:
         cycle = _with_result(cycle, checked.result)
     return cycle, solution.turn

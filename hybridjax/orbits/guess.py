@@ -15,18 +15,20 @@ from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.lanes import Lanes, lane_at
+from ..engine.lanes import IDLE, Lanes, lane_at, side_by_side
 from ..engine.move import Options, move
+from ..engine.replay import recorded_moves
 from ..engine.search.state import Moved
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import Target, toward, until
+from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
 from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
-from .return_map import ReturnMap
+from .return_map import ReturnMap, Turn
 from .scale import Sizes, fastest, scale_of, sizes_near, slow_time
 
 
@@ -36,7 +38,12 @@ _PATIENCE = 1000.0
 # A search that would be given up looks so often whether the states have become slower than they
 # were at the guess. Fewer: cycles are lost if the guess lies where they are fast. More: vain
 # searches last longer.
-_LOOKS = 4
+_LOOKS = 10
+# On a slow manifold, to which a fast mode has led, it waits this multiple of the time of motion
+# there, if that is longer, and until the next look at most this multiple of the time so far.
+# Smaller: slow manifolds are not left. Larger: vain searches last longer.
+_UNMOVED = 3.0
+_LOOKS_FURTHER = 2.0
 # Steps in which events are counted. More: memory. Fewer: rare events are missed.
 _RECORDED = 4096
 # A default section lies so much farther on than the event or the time at which a search for another
@@ -169,6 +176,18 @@ def _patience(map: ReturnMap, lanes: Lanes) -> float:
     return _PATIENCE * max(near.time, slow_time(s, t, near.points))
 
 
+def _time_of_motion(map: ReturnMap, lanes: Lanes) -> float:
+    """The time in which the first of the states at a lane changes by its own magnitude."""
+    s = map.structure
+    lane = to_host(lanes)
+    a = int(lane.chart[0])
+    q = lane.q[: s.dims[a]]
+    rates = kernels.field(s, a, lane.t, q, np.zeros((s.nu, 1)))[:, 0, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times = np.abs(q[:, 0] / rates)
+    return float(np.nanmin(times, initial=np.inf))
+
+
 def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     """Test whether a mode decays at a lane."""
     s = map.structure
@@ -279,7 +298,9 @@ def _next_crossing(
             break
         # (The states may have become slower than they were at the guess, or drift away.)
         lanes = moved.lanes
-        wait = _patience(map, lanes) - waited
+        _require_motion(map, lanes)
+        unmoved = min(_UNMOVED * _time_of_motion(map, lanes), _LOOKS_FURTHER * waited)
+        wait = max(_patience(map, lanes), unmoved) - waited
         if wait <= 0 or not _decays(map, lanes):
             break
     if _misses(moved):
@@ -315,6 +336,35 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     state = np.asarray(tape.after)[row, : s.dims[a], 0]
     name = s.transitions[g].name
     return Guess(s.names[a], state, time=float(tape.t[row, 0]), after=name)
+
+
+def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
+    """The map of a turn that closes, on a plane that it meets once; `None` if none is found. The
+    planes that are tried lie across the flow where the pieces of the turn begin."""
+    s = map.structure
+    tape = side_by_side(to_host(turn.tapes))
+    legs = to_host(turn.legs)
+    moves = recorded_moves(legs, tape)
+    lane, row = np.nonzero(tape.code.T != IDLE)
+    ends = tape.before[row, :, lane].T
+    f = slopes(s, legs.t, legs.chart, legs.q, np.zeros((s.nu, 1)))
+    (begins,) = np.nonzero(moves.order == 0)
+    for k in range(1, len(legs.t)):
+        a = int(legs.chart[k])
+        n = s.dims[a]
+        plane = _across(map, a, legs.q[:n, k], f[:n, k])
+        point = np.asarray(plane.signal.point)
+        normal = np.asarray(plane.signal.normal)
+        before = normal @ (moves.q[:n] - point[:, None])
+        after = normal @ (ends[:n] - point[:, None])
+        meets = (moves.chart == a) & (before <= 0) & (after >= 0)
+        # (It meets the plane where the piece begins, with the move before and that after.)
+        meets[begins[k] - 1 : begins[k] + 1] = False
+        if meets.any():
+            continue
+        anchor = jax.tree_util.tree_map(lambda x, k=k: x[..., k : k + 1], legs)
+        return dataclasses.replace(map, anchor=anchor, base=plane, expected=turn.period)
+    return None
 
 
 def _require_motion(map: ReturnMap, lanes: Lanes) -> None:

@@ -21,7 +21,7 @@ from .._core.host_derivatives import NotOnHostError, by_columns
 from .._core.progress import say
 from .._core.results import Result
 from ..engine import kernels
-from ..engine.lanes import Lanes, side_by_side
+from ..engine.lanes import IDLE, Lanes, side_by_side
 from ..engine.replay import Moves, Variation
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
@@ -51,6 +51,13 @@ MAX_STEPS = 32
 # Levenberg-Marquardt steps in which the residual falls by less than a tenth, where the search ends.
 # Fewer: slow searches are given up. More: searches where there is no cycle last longer.
 STALLED = 10
+# Steps of the flow, after which Levenberg-Marquardt steps end. Fewer: cycles with long turns
+# are lost. More: vain searches among fast oscillations last for minutes.
+_WORK = 40_000
+# The residual, in sizes, down to which Levenberg-Marquardt steps take rough turns. Larger: accurate
+# turns, four times as expensive, are taken where there is no cycle. Smaller: errors of rough turns
+# are taken for a residual that does not fall.
+_ROUGH = 1e-3
 
 
 class Solution(NamedTuple):
@@ -186,7 +193,7 @@ def solve(
 
 @on_the_host
 def _solve_damped(map: ReturnMap) -> Solution:
-    q, turn, steps = _damped(map, 2 * MAX_STEPS)
+    q, turn, steps = _damped(map)
     return Solution(
         map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)
     )
@@ -212,19 +219,32 @@ def _root_on_host(
     begin = map.anchor.q[:, 0] / map.sizes
     if near is not None:
         return _newton(map, *fixed_point(map, near, begin), 0, max_steps)
-    end = _newton(map, *_by_rough_turns(map, begin), max_steps)
-    return end if np.isfinite(end[0]).all() else _newton(map, begin, None, 0, max_steps)
+    x, moves, steps, turn = _by_rough_turns(map, begin)
+    end = x * map.sizes, turn, np.asarray(steps)
+    if np.isfinite(x).all():
+        end = _newton(map, x, moves, steps, max_steps)
+    if np.isfinite(end[0]).all():
+        return end
+    # (Accurate turns take at least as many steps.)
+    if int(end[1].result) == Result.STEP_LIMIT:
+        return end
+    return _newton(map, begin, None, 0, max_steps)
+
+
+def _rough(map: ReturnMap) -> ReturnMap:
+    """The map with errors of `TRANSIENT`."""
+    accuracy = np.array(TRANSIENT)
+    settings = Settings(accuracy, accuracy, map.settings.max_steps, map.scale)
+    return dataclasses.replace(map, settings=settings)
 
 
 def _by_rough_turns(
     map: ReturnMap, x: np.ndarray
-) -> tuple[np.ndarray, Moves | None, int]:
-    """Newton's method on turns with errors of `TRANSIENT`, until the moves of one have a fixed
-    point: that of these moves, divided at full accuracy, the moves, and the number of steps."""
-    rough = Settings(
-        np.array(TRANSIENT), np.array(TRANSIENT), map.settings.max_steps, map.scale
-    )
-    rough_map, moves = dataclasses.replace(map, settings=rough), None
+) -> tuple[np.ndarray, Moves | None, int, Turn]:
+    """Newton's method on rough turns, until the moves of one have a fixed point: that of these
+    moves, divided at full accuracy, the moves, the number of steps, and the last rough turn."""
+    rough_map = _rough(map)
+    moves = None
     for steps in range(1, FEW_STEPS + 1):  # noqa: B007
         turn, step = _step_from(rough_map, x)
         x = newton = x + step
@@ -238,7 +258,7 @@ def _by_rough_turns(
         map, map.departure(x * map.sizes), map.ends(), moves
     )
     x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
-    return x, moves, steps
+    return x, moves, steps, turn
 
 
 def _newton(
@@ -255,12 +275,11 @@ def _newton(
             np.asarray(map.settings.rtol) if travelled else 0.0
         )
         # (The first state need not be as accurate as a Newton step.)
-        done = (
-            excess(x[None], step[None])[0] < 1
-            and close
-            and (travelled or steps > first + 1)
-        )
-        if done or steps == max_steps or not np.isfinite(x).all():
+        small = excess(x[None], step[None])[0] < 1
+        done = small and close and (travelled or steps > first + 1)
+        # (At infinity a turn may not close, although all states there do nearly the same.)
+        stands = small and not travelled and steps > first + 1
+        if done or stands or steps == max_steps or not np.isfinite(x).all():
             break
         moves = None
         # (Later ones have not helped before.)
@@ -278,11 +297,41 @@ def _step_from(
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
-def _damped(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Levenberg-Marquardt steps on the host, with the constants of optimistix."""
-    sizes, least, damping, best = map.sizes, np.inf, 1.0, None
+class _Descent(NamedTuple):
+    """Where Levenberg-Marquardt steps have led, in sizes of the states."""
+
+    x: Float[np.ndarray, " d"]
+    turn: Turn
+    """The turn from there."""
+    residual: float
+    """Its size; infinite if no turn has closed."""
+    damping: float
+    """The square of the damping of the next step."""
+    steps: int
+
+
+def _damped(map: ReturnMap) -> tuple[np.ndarray, Turn, np.ndarray]:
+    """Levenberg-Marquardt steps from the anchor's state: on rough turns until one nearly closes,
+    and then on accurate ones."""
+    begin = map.anchor.q[:, 0] / map.sizes
+    damping = 1.0
+    rough = _descent(_rough(map), begin, damping, _ROUGH)
+    if rough.residual <= _ROUGH:
+        begin = rough.x
+        damping = rough.damping
+    # (Rough turns may fail where accurate ones do not.)
+    useful = rough.residual <= _ROUGH or not np.isfinite(rough.residual)
+    end = _descent(map, begin, damping, 0.0) if useful else rough
+    return end.x * map.sizes, end.turn, np.asarray(end.steps)
+
+
+def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _Descent:
+    """Levenberg-Marquardt steps on the host from a state, in sizes, with the constants of
+    optimistix. They end at a residual of `enough`."""
+    sizes, least, best = map.sizes, np.inf, None
     history: list[float] = []
-    x, step = map.anchor.q[:, 0] / sizes, 0.0
+    step = np.zeros_like(x)
+    work = 0
     for steps in itertools.count(1):
         turn = map.turn_with_jacobian((x + step) * sizes)
         residual = turn.residual / sizes
@@ -302,9 +351,13 @@ def _damped(map: ReturnMap, max_steps: int) -> tuple[np.ndarray, Turn, np.ndarra
         # (Short steps are at the end, or where none helps.)
         history.append(least)
         stalls = steps > STALLED and least > 0.9 * history[-1 - STALLED]
-        if excess(x[None], step[None])[0] < 1 or steps == max_steps or stalls:
+        short = excess(x[None], step[None])[0] < 1
+        work += int(np.sum(np.asarray(turn.tapes.code) != IDLE))
+        if least <= enough or short or stalls or work > _WORK:
             break
-    return x * sizes, best or turn, np.asarray(steps)
+        if steps == 2 * MAX_STEPS:
+            break
+    return _Descent(x, best or turn, least, damping, steps)
 
 
 @eqx.filter_custom_jvp

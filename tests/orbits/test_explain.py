@@ -83,7 +83,8 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     """Balls that know nothing of each other: twice the multipliers of one, also if the search puts
     both impacts at the same time to the last bit."""
     if not by_rough_turns:
-        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
+        no_turn = (None, 0, None)
+        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, *no_turn))
     cycle = hj.find_limit_cycle(Balls(), BALLS)
     (both,) = hj.orbits.simultaneous_events(cycle)
     assert both.commute
