@@ -328,8 +328,8 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
         code = update_result(solution.result, together, Result.SIMULTANEOUS)
         solution = solution._replace(result=code)
     if map.base is None:
-        legs = solution.turn.legs
-        points = legs.t, legs.chart, legs.q
+        pieces = solution.turn.pieces
+        points = pieces.t, pieces.chart, pieces.q
         clock = map.expected / map.multiplicity
         repeats = has_period(map.structure, clock, *points)
         code = update_result(solution.result, ~repeats, Result.NOT_VERIFIED)

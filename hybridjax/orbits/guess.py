@@ -343,16 +343,16 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
     planes that are tried lie across the flow where the pieces of the turn begin."""
     s = map.structure
     tape = side_by_side(to_host(turn.tapes))
-    legs = to_host(turn.legs)
-    moves = recorded_moves(legs, tape)
+    pieces = to_host(turn.pieces)
+    moves = recorded_moves(pieces, tape)
     lane, row = np.nonzero(tape.code.T != IDLE)
     ends = tape.before[row, :, lane].T
-    f = slopes(s, legs.t, legs.chart, legs.q, np.zeros((s.nu, 1)))
+    f = slopes(s, pieces.t, pieces.chart, pieces.q, np.zeros((s.nu, 1)))
     (begins,) = np.nonzero(moves.order == 0)
-    for k in range(1, len(legs.t)):
-        a = int(legs.chart[k])
+    for k in range(1, len(pieces.t)):
+        a = int(pieces.chart[k])
         n = s.dims[a]
-        plane = _across(map, a, legs.q[:n, k], f[:n, k])
+        plane = _across(map, a, pieces.q[:n, k], f[:n, k])
         point = np.asarray(plane.signal.point)
         normal = np.asarray(plane.signal.normal)
         before = normal @ (moves.q[:n] - point[:, None])
@@ -362,7 +362,7 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         meets[begins[k] - 1 : begins[k] + 1] = False
         if meets.any():
             continue
-        anchor = jax.tree_util.tree_map(lambda x, k=k: x[..., k : k + 1], legs)
+        anchor = jax.tree_util.tree_map(lambda x, k=k: x[..., k : k + 1], pieces)
         return dataclasses.replace(map, anchor=anchor, base=plane, expected=turn.period)
     return None
 

@@ -119,7 +119,7 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
     ):  # (the host's last turn begins at q but for rounding)
         result = map.judge(q, turn)
     else:
-        begin = turn.legs.q[:, 0]
+        begin = turn.pieces.q[:, 0]
         turn = map.turn_with_jacobian(q, record=turn.record)
         result = map.judge(q, turn)
         # (Far from where a turn was recorded, other events happen than in its record.)
