@@ -132,9 +132,7 @@ class WithCost:
 
     if TYPE_CHECKING:
         cost: float
-
-        @property
-        def dof(self) -> float: ...
+        dof: float
 
     @property
     def chi2_per_dof(self) -> float:

@@ -1,6 +1,7 @@
 """The beginning of a search for a limit cycle: from a guess to a state on the section."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -353,8 +354,8 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         a = int(pieces.chart[k])
         n = s.dims[a]
         plane = _across(map, a, pieces.q[:n, k], f[:n, k])
-        point = np.asarray(plane.signal.point)
-        normal = np.asarray(plane.signal.normal)
+        signal: Any = plane.signal
+        point, normal = np.asarray(signal.point), np.asarray(signal.normal)
         before = normal @ (moves.q[:n] - point[:, None])
         after = normal @ (ends[:n] - point[:, None])
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)

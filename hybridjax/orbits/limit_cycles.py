@@ -355,7 +355,8 @@ def _coincide(
         rows = np.flatnonzero(solver.found.path == path)
         if not len(rows):
             continue
-        some = dataclasses.replace(map, system=in_lanes(cycles.systems, rows))
+        systems: Any = in_lanes(cycles.systems, rows)
+        some = dataclasses.replace(map, system=systems)
         begin = cycles.anchor.t[rows, 0]
         end = begin + cycles.period[rows]
         ends = solver.ends(path)[rows].T

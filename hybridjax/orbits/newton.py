@@ -225,10 +225,9 @@ def _root_on_host(
         end = _newton(map, x, moves, steps, max_steps)
     if np.isfinite(end[0]).all():
         return end
-    # (Accurate turns take at least as many steps.)
-    if int(end[1].result) == Result.STEP_LIMIT:
-        return end
-    return _newton(map, begin, None, 0, max_steps)
+    # (Accurate turns take more steps: one tells how far they reach.)
+    vain = int(end[1].result) == Result.STEP_LIMIT
+    return _newton(map, begin, None, 0, 1 if vain else max_steps)
 
 
 def _rough(map: ReturnMap) -> ReturnMap:
@@ -352,12 +351,18 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
         history.append(least)
         stalls = steps > STALLED and least > 0.9 * history[-1 - STALLED]
         short = excess(x[None], step[None])[0] < 1
-        work += int(np.sum(np.asarray(turn.tapes.code) != IDLE))
+        work += _moves(turn)
         if least <= enough or short or stalls or work > _WORK:
             break
         if steps == 2 * MAX_STEPS:
             break
     return _Descent(x, best or turn, least, damping, steps)
+
+
+def _moves(turn: Turn) -> int:
+    """Number of moves that a turn has taken."""
+    assert turn.tapes is not None
+    return int(np.sum(np.asarray(turn.tapes.code) != IDLE))
 
 
 @eqx.filter_custom_jvp

@@ -35,8 +35,10 @@ def has_period(
 
         n = s.dims[a]
         points = jax.vmap(lambda t, q, f=values: _with_rate(f, t, q))
-        now, rate = points(times, q[:n].T)
-        later, _ = points(times + period, q[:n].T)
+        twice = jnp.concatenate([times, times + period])
+        both, rates = points(twice, jnp.tile(q[:n].T, (2, 1)))
+        now, later = jnp.split(both, 2)
+        rate, _ = jnp.split(rates, 2)
         here = (chart == a)[:, None]
         size = jnp.max(jnp.where(here, jnp.abs(now), 0.0), axis=0)
         rounding = ROUNDING * jnp.abs(rate) * (jnp.abs(times) + period)[:, None]

@@ -107,7 +107,8 @@ def test_full_duty_is_refused_by_name_from_any_guess(
     """Also where rounding puts the tick first, which sets the ramp back before the comparator
     trips: beside it, a later tick comes too late for that."""
     if not by_rough_turns:
-        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, None, 0))
+        no_turn = (None, 0, None)
+        monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, *no_turn))
     guess = hj.Guess(chart, (0.3, ramp), time=0.9)
     for duty in BESIDE_FULL:
         with pytest.raises(hj.errors.ComputationError, match="'trip'.* coincide"):

@@ -112,7 +112,7 @@ class Entry(NamedTuple):
         return cls(known=nothing, armed=nothing)
 
 
-class Event(NamedTuple):
+class EventNotes(NamedTuple):
     """What is noted of an event while it happens."""
 
     due: Bool[Array, " G"]
@@ -476,7 +476,7 @@ class Bodies:
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
         disabled = jnp.zeros_like(flags.left)
-        event = Event(due, flags.entry, disabled)
+        event = EventNotes(due, flags.entry, disabled)
         course, (_, event) = choose(motion, row.kind, stages, course, (now, event))
         ended = self._lane(self._ended, row)
         course, (flags, *_) = motion.apply(ended, course, (flags, now, event))
@@ -521,7 +521,8 @@ class Bodies:
         t, q, u = course.t, _state(s, a, course), jnp.zeros(s.nu)
         now, event = notes
         entry = self._entry(a, b, row, s, constants, *_still((now, event.due, t, q)))
-        disabled = ~s.enabled(member, *_still((t, q)), u)
+        at_event = _still((t, q))
+        disabled = ~s.enabled(member, at_event[0], at_event[1], u)
         notes = now, event._replace(entry=entry, disabled=disabled)
 
         def reset(t, q, u):

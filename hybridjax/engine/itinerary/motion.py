@@ -46,9 +46,10 @@ class InDirections(NamedTuple):
 
     def apply(self, stage: Stage, moving: Any, notes: Any) -> tuple[Any, Any]:
         """What moves, and the notes, after a stage."""
-        both = self.constants, self.by_constants
-        *moved, notes = pushed(stage, *both, *moving, notes)
-        return tuple(moved), notes
+        values, columns = moving
+        constants = self.constants, self.by_constants
+        values, columns, notes = pushed(stage, *constants, values, columns, notes)
+        return (values, columns), notes
 
     def part(self, moving: Any, name: str) -> Any:
         """A field of what moves."""
