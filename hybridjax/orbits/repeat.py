@@ -82,9 +82,9 @@ class Plan(eqx.Module):
         return cls(
             form=itinerary.form,
             rows=itinerary.rows,
-            count=np.asarray(itinerary.count),
+            count=_number(itinerary.count),
             ends=itinerary.ends,
-            last=np.asarray(itinerary.last),
+            last=_number(itinerary.last),
             charts=itinerary.charts,
         )
 
@@ -102,6 +102,11 @@ class Plan(eqx.Module):
         code = xp.zeros_like(passage.left, dtype=xp.int32)
         code = update_result(code, ~kept, Result.EVENT_ORDER)
         return update_result(code, ~(passage.error <= 1), Result.STEP_LIMIT)
+
+
+def _number(x: Any) -> Array:
+    """A number as an array, of which nothing is compiled; in programs it may be traced."""
+    return x if isinstance(x, jax.Array) else np.asarray(x)
 
 
 def on_device(tree: Any) -> Any:
