@@ -244,7 +244,7 @@ def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
     # (Without noise, a region is as small as rounding errors, which are not independent.)
     assert not fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.082})
     with pytest.raises(
-        hj.errors.DefinitionError, match="must have a value of 'input_delay'"
+        hj.errors.DefinitionError, match="lack 'input_delay'"
     ):
         fit.contains(hopper_cycle.system)
     with pytest.raises(hj.errors.DefinitionError, match="no data have a delay"):
