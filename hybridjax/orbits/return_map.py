@@ -118,8 +118,9 @@ class Turn(NamedTuple):
 
     @property
     def events(self) -> tuple[int, ...]:
-        """The events of a single turn on the host, by index of the transition."""
-        return tuple(self.codes[self.codes >= 0].tolist())
+        """The events of a single turn, whose values are known, by index of the transition."""
+        codes = np.asarray(self.codes)
+        return tuple(codes[codes >= 0].tolist())
 
 
 class _Linear(NamedTuple):
