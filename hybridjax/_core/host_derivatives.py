@@ -101,8 +101,7 @@ def _compiled_derivatives(compiled: Callable, arguments: tuple, tangents: tuple)
     try:
         return eqx.filter_jvp(compiled, arguments, tangents)
     except (AssertionError, ValueError) as error:
-        # (JAX raises the first without a text, the second for operations without a transpose.)
-        if isinstance(error, ValueError) and "reverse-mode" not in str(error):
+        if not jax_compat.lacks_transpose(error):
             raise
         raise DefinitionError(
             "second derivatives are available with forward mode inside: instead of `jax.hessian` "

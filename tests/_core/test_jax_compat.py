@@ -170,6 +170,16 @@ def test_calls_and_rules():
     assert jax_compat.is_hosted(only_equation(callback, 1.0))
 
 
+def test_loops_without_a_transpose():
+    def power(x):
+        return jax.lax.while_loop(lambda y: y < 10, lambda y: x * y, x)
+
+    with pytest.raises(ValueError) as caught:
+        jax.grad(power)(2.0)
+    assert jax_compat.lacks_transpose(caught.value)
+    assert not jax_compat.lacks_transpose(ValueError("of another kind"))
+
+
 def test_zeros_and_bits():
     product = only_equation(lambda x: 0.0 * x, 1.0)
     assert jax_compat.gives_zero(product, [True, False])
