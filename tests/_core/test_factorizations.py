@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from hybridjax._core.lanes import by_lane
-from hybridjax._core.vector_math.factorizations import solve_positive
+from hybridjax._core.vector_math.factorizations import solve_by_columns, solve_positive
 from hybridjax._core.vector_math.rewrite import vectorized
 
 
@@ -28,6 +28,7 @@ FUNCTIONS = {
     "inverse": (3, lambda A, b: jnp.linalg.inv(A) @ b),
     "cho_solve": (3, by_cholesky),
     "solve in a loop": (8, jnp.linalg.solve),
+    "solve by columns": (5, solve_by_columns),
 }
 
 

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from hybridjax._core.memo import Memory, remembered
+from hybridjax._core.memo import Memory, Recent, remembered
 
 
 class Box(eqx.Module):
@@ -58,3 +58,13 @@ def test_objects_that_come_and_go_in_threads():
         list(pool.map(work, range(0, 80_000, 10_000)))
     gc.collect()
     assert not memory._values
+
+
+def test_recent_values_are_those_of_their_objects_and_older_ones_are_dropped():
+    recent = Recent(2)
+    boxes = [Box(jnp.asarray(1.0)) for _ in range(3)]
+    for number, box in enumerate(boxes):
+        assert recent.get(box) is None
+        assert recent.keep(number, box) == number
+    assert [recent.get(box) for box in boxes] == [None, 1, 2]
+    assert recent.get(boxes[1], boxes[2]) is None

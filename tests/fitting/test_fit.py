@@ -243,9 +243,7 @@ def test_both_delays_come_back(hopper_cycle, hopper_htf, fitted):
     np.testing.assert_allclose(fit.values, (10.0, 0.037, 0.081), rtol=1e-8)
     # (Without noise, a region is as small as rounding errors, which are not independent.)
     assert not fit.contains({"k": 10.0, "input_delay": 0.037, "output_delay": 0.082})
-    with pytest.raises(
-        hj.errors.DefinitionError, match="lack 'input_delay'"
-    ):
+    with pytest.raises(hj.errors.DefinitionError, match="lack 'input_delay'"):
         fit.contains(hopper_cycle.system)
     with pytest.raises(hj.errors.DefinitionError, match="no data have a delay"):
         hj.fit_model(

@@ -4,7 +4,8 @@ XLA on CPU hands `jnp.linalg.solve` and its relatives to LAPACK, one matrix afte
 150 ns for 3 equations, where the operations themselves, for several lanes at once, take 9 (for 7
 equations 310 and 60; if the matrix is symmetric and positive, 4 and 16). Programs that call LAPACK
 may also wait for each other for ever if they run in several threads. The functions below do the
-same in additions, multiplications, divisions and selections: unrolled, but for LU factors.
+same in additions, multiplications, divisions and selections: unrolled, but for LU factors and
+`solve_by_columns`.
 `rewrite.vectorized` puts them into functions that were written with `jnp`. QR factorizations,
 eigenvalues, singular values and matrices of more than 12 rows are left to LAPACK.
 
@@ -109,8 +110,9 @@ def _eliminated(matrix, right):
 def solve_by_columns(
     matrix: Float[Array, "n n"], right: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """The same by a loop over columns, with the largest pivot of each: programs in which it runs
-    now and then compile sooner."""
+    """Return x in `matrix @ x = right`, by elimination with the largest pivot of each column, in a
+    loop over the columns. Programs in which it runs now and then compile sooner than with `solve`,
+    of which each operation is compiled."""
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
