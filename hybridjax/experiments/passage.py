@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.compilation import Program
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.itinerary.bodies import Watched, dips
+from ..engine.itinerary.flags import Watched, dips
 from ..engine.runge_kutta import looped_step
 from ..engine.settings import Settings, size
 from ..systems.solver import Method

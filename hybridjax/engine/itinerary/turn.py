@@ -10,21 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._core.loops import loop, pushed
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import (
-    Bodies,
-    Constants,
-    Course,
-    Entry,
-    Flags,
-    Row,
-    Travelers,
-    Watched,
-    read,
-    tabulated,
-)
+from .bodies import Bodies, Constants, Course, Travelers
+from .flags import Entry, Flags, Watched
 from .motion import Alone, InDirections
 from .rows import Form, Rows
 from .steps import Solver, solver_of
+from .table import Row, read, tabulated
 
 
 class Passage(NamedTuple):
