@@ -6,6 +6,9 @@ import weakref
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar, cast
 
+import equinox as eqx
+import jax
+
 
 Value = TypeVar("Value")
 
@@ -43,27 +46,23 @@ class Memory:
 
 
 class Recent:
-    """The last values that were computed for objects. They may refer to these, which are kept, too:
-    a `Memory` of such values would keep all of them for ever."""
+    """The last values that were computed for an object with others that are equal trees. Values may
+    refer to the object, which is kept with them: a `Memory` would keep all of them for ever.
+    Threads may share it."""
 
     def __init__(self, size: int):
-        self._size = size
-        self._kept: collections.OrderedDict[tuple[int, ...], tuple] = (
-            collections.OrderedDict()
-        )
+        self._kept: collections.deque[tuple] = collections.deque(maxlen=size)
 
-    def get(self, *owners: Any) -> Any:
-        """Return the value that is kept for these objects, or None."""
-        kept = self._kept.get(tuple(map(id, owners)))
-        return None if kept is None else kept[1]
+    def get(self, owner: Any, *others: Any) -> Any:
+        """Return the value that is kept for this object and equal others, or None."""
+        for known, kept, value in tuple(self._kept):
+            if known is owner and eqx.tree_equal(*jax.device_get((kept, others))):
+                return value
+        return None
 
-    def keep(self, value: Value, *owners: Any) -> Value:
-        """Keep a value for these objects, in place of another one, and return it."""
-        key = tuple(map(id, owners))
-        self._kept[key] = owners, value
-        self._kept.move_to_end(key)
-        while len(self._kept) > self._size:
-            self._kept.popitem(last=False)
+    def keep(self, value: Value, owner: Any, *others: Any) -> Value:
+        """Keep a value for this object and others, and return it."""
+        self._kept.appendleft((owner, others, value))
         return value
 
 

@@ -24,6 +24,7 @@ from ..orbits.near import first_order_cycle, route_near
 from ..orbits.repeat import Route, on_device
 from ..sections.families import AbstractSections
 from ..sections.walk import Walk, walk_of, walk_with
+from ..systems.system import HybridSystem
 from .observations import ObservedHTF, ObservedSeries
 from .problem import FitProblem, evaluate
 
@@ -55,6 +56,10 @@ class Beside(NamedTuple):
     """To the sections of each family in the observations."""
 
 
+Known = tuple[LimitCycle, Beside]
+"""A known cycle as it was found, and what is repeated, as arrays of JAX."""
+
+
 class Model:
     """Residuals and their Jacobian, by a program beside known cycles.
 
@@ -62,23 +67,24 @@ class Model:
     more of these; the program stays the same. Fits that begin from the same cycle share them.
     """
 
-    def __init__(self, problem: FitProblem, known: LimitCycle):
-        self._problem, self._known = problem, known
-        self._on_device = on_device(problem)
+    def __init__(self, problem: FitProblem, system: HybridSystem, known: LimitCycle):
+        """**Arguments:** `system`: that of the fit. Numbers that are not free are its own, also
+        where those of a known cycle differ."""
+        self._problem, self._system, self._known = problem, system, known
+        self._on_device = on_device((problem, system))
+        self._class = identity((on_device(known.return_map), self._on_device))
+        self._can_repeat = _can_repeat(problem)
         families = _families(problem.observations)
-        besides = _shared.get(known, *families)
-        if besides is None:
-            besides = _shared.keep([], known, *families)
-        self._besides: list[tuple[LimitCycle, Beside]] = besides
-        self._class = identity((on_device(known.return_map), problem))
+        shared: list[Known] | None = _shared.get(known, *families)
+        self._shared = _shared.keep([], known, *families) if shared is None else shared
+        # (Other threads may add to the shared ones.)
+        self._besides = list(self._shared)
 
     def __call__(
         self, problem: FitProblem, x: np.ndarray, guess: LimitCycle
     ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle]:
         """As `evaluate`."""
         _evaluations[self._class] += 1
-        if _evaluations[self._class] <= WORTH_COMPILING:
-            return evaluate(problem, x, guess)
         found = self._evaluated(x, guess)
         if found is None:
             found = self._with_another(x, guess)
@@ -90,39 +96,51 @@ class Model:
     @property
     def known(self) -> LimitCycle | None:
         """The cycle whose route the program has followed; None without a program."""
-        return self._besides[0][0] if self._besides else None
+        return self._besides[0][0] if self._has_program and self._besides else None
 
     def is_beside(self, x: np.ndarray, guess: LimitCycle) -> bool:
         """Test whether the cycle with the parameters at x is found without a search."""
         return self._evaluated(x, guess) is not None
 
+    @property
+    def _has_program(self) -> bool:
+        """Whether a program is worth its compilation, and its flags would tell all."""
+        return self._can_repeat and _evaluations[self._class] > WORTH_COMPILING
+
     def _with_another(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
         """The model by one known cycle more: the first, or one that a search finds at x."""
+        if not self._has_program:
+            return None
         cycle = self._cycle_at(x, guess) if self._besides else self._known
         if int(cycle.result) != Result.OK:
             return None
         beside = _beside(self._problem, cycle)
         if beside is None:
             return None
-        self._besides.insert(0, (cycle, on_device(beside)))
-        del self._besides[_MOST_KNOWN:]
+        known = cycle, on_device(beside)
+        self._besides = [known, *self._besides[: _MOST_KNOWN - 1]]
+        self._shared[:] = self._besides
         return self._evaluated(x, cycle)
 
     def _cycle_at(self, x: np.ndarray, guess: LimitCycle) -> LimitCycle:
         """The cycle with the parameters at x, converged or not, by a search."""
         parameters = self._problem.parameters
         values = parameters.decode(jnp.asarray(x))
-        system = parameters.insert(guess.system, values)
+        system = parameters.insert(self._system, values)
         return find_limit_cycle(system, guess, throw=False)
 
     def _evaluated(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
         """The model by a known cycle, which becomes the first to be tried; None if it leaves the
-        routes of all."""
-        for k, (_, beside) in enumerate(self._besides):
-            q = np.asarray(guess.anchor.q)[:, 0]
-            found = _run(self._on_device, np.asarray(x), q, beside)
+        routes of all, or without a program."""
+        if not self._has_program:
+            return None
+        problem, system = self._on_device
+        q = np.asarray(guess.anchor.q)[:, 0]
+        for known in self._besides:
+            found = _run(problem, system, known[1], np.asarray(x), q)
             if int(found.result) == Result.OK and np.isfinite(found.residuals).all():
-                self._besides.insert(0, self._besides.pop(k))
+                others = [other for other in self._besides if other is not known]
+                self._besides = [known, *others]
                 return found
         return None
 
@@ -137,21 +155,22 @@ class Evaluated(NamedTuple):
     result: Int[Array, ""]
 
 
+def _can_repeat(problem: FitProblem) -> bool:
+    """Test whether the observations need no search, and forward mode can take all directions."""
+    for observation in problem.observations:
+        if isinstance(observation, ObservedSeries):
+            return False
+        if isinstance(observation, ObservedHTF) and observation.delay is not None:
+            return False
+    return len(problem.parameters.names) <= _MOST_DIRECTIONS
+
+
 def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
-    """What a fit repeats; None where its flags would not tell all, or for observations that need
-    the search."""
-    observations = problem.observations
-    is_search = [
-        isinstance(o, ObservedSeries)
-        or (isinstance(o, ObservedHTF) and o.delay is not None)
-        for o in observations
-    ]
-    if any(is_search) or len(problem.parameters.names) > _MOST_DIRECTIONS:
-        return None
+    """What a fit repeats; None where its flags would not tell all."""
     route = route_near(known)
     if route is None:
         return None
-    walks = [walk_of(known, family) for family in _families(observations)]
+    walks = [walk_of(known, family) for family in _families(problem.observations)]
     if any(walk is None for walk in walks):
         return None
     walks = (dataclasses.replace(w, forwards=True) for w in walks if w is not None)
@@ -171,17 +190,23 @@ def _as_numbers(route: Route) -> Route:
 
 
 def _run(
-    problem: FitProblem, x: np.ndarray, q: np.ndarray, beside: Beside
+    problem: FitProblem,
+    system: HybridSystem,
+    beside: Beside,
+    x: np.ndarray,
+    q: np.ndarray,
 ) -> Evaluated:
     """Residuals and Jacobian at coordinates x, from a state q near the cycle's beginning."""
     with on_the_cpu():
-        program = whole(_evaluated, (), (problem, beside), loops=True)
+        program = whole(_evaluated, (), (problem, system, beside), loops=True)
         return program(x, q)
 
 
-def _evaluated(problem: FitProblem, beside: Beside, x: Array, q: Array) -> Evaluated:
+def _evaluated(
+    problem: FitProblem, system: HybridSystem, beside: Beside, x: Array, q: Array
+) -> Evaluated:
     def at(x):
-        cycle, observations = _model(problem, beside, x, q)
+        cycle, observations = _model(problem, system, beside, x, q)
         parts = [observation.residuals(cycle) for observation in observations]
         r = jnp.concatenate(parts)
         well = (cycle.result == Result.OK) & jnp.isfinite(r).all()
@@ -195,12 +220,14 @@ def _evaluated(problem: FitProblem, beside: Beside, x: Array, q: Array) -> Evalu
     return Evaluated(r, J, *rest)
 
 
-def _model(problem: FitProblem, beside: Beside, x: Array, q: Array):
-    """The cycle with parameters at x, and the observations of it."""
+def _model(
+    problem: FitProblem, system: HybridSystem, beside: Beside, x: Array, q: Array
+):
+    """The cycle of a system with parameters at x, and the observations of it."""
     known, route, walks = beside
     values = problem.parameters.decode(x)
-    system = problem.parameters.insert(known.system, values)
-    cycle = first_order_cycle(route, known.return_map.at_phase_of(system), q)
+    changed = problem.parameters.insert(system, values)
+    cycle = first_order_cycle(route, known.return_map.at_phase_of(changed), q)
     cycle = dataclasses.replace(
         cycle,
         pieces=cycle.pieces._replace(q=jnp.full_like(cycle.pieces.q, jnp.nan)),

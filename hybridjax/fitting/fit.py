@@ -49,6 +49,10 @@ _PERFECT = 1e-12
 # ones are not, and all guesses are tried.
 _LIKELY = 4.0
 
+# Cycles at the end of a fit are the same if their periods differ by less than this part. Larger:
+# another cycle is returned with the fit. Smaller: the search is repeated for rounding errors.
+_SAME_PERIOD = 1e-6
+
 _starts = Recent(8)
 """The limit cycles from which fits of systems without a guess have begun."""
 
@@ -112,7 +116,7 @@ def fit_model(
     rng = np.random.default_rng(seed)
     around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
     starts = np.concatenate([x0[None], x0 + around])
-    model = Model(problem, near)
+    model = Model(problem, system, near)
     ends: list[End] = []
     for start in counted(starts, "guesses", guesses):
         at_guess = not ends and near.system is system
@@ -298,7 +302,10 @@ def _summary(
         for end in ends
     )
     cycle = _cycle_at(problem, system, best.x, near)
-    if int(cycle.result) != Result.OK:
+    # (From afar, another cycle may be found.)
+    period = float(best.cycle.period)
+    is_same = abs(float(cycle.period) - period) <= _SAME_PERIOD * period
+    if int(cycle.result) != Result.OK or not is_same:
         cycle = _cycle_at(problem, system, best.x, best.cycle)
     values = decode(best.x)
     size = np.asarray(_sizes(jnp.asarray(values)))

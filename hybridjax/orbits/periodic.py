@@ -25,7 +25,7 @@ def has_period(
     q: Float[Array, "d K"],
 ) -> Bool[Array, ""]:
     """Test whether fields, guards, resets, predicates and schedules repeat after a period, at
-    points of a turn. (NaN is passed over.)"""
+    points of a turn. (A point at which a function is NaN is passed over.)"""
     times = t + LATER * period
     same = _schedules_fit(s, period)
     for a in range(len(s.charts)):
@@ -40,7 +40,8 @@ def has_period(
         now, later = jnp.split(both, 2)
         rate, _ = jnp.split(rates, 2)
         here = (chart == a)[:, None]
-        size = jnp.max(jnp.where(here, jnp.abs(now), 0.0), axis=0)
+        known = here & ~jnp.isnan(now)
+        size = jnp.max(jnp.where(known, jnp.abs(now), 0.0), axis=0)
         rounding = ROUNDING * jnp.abs(rate) * (jnp.abs(times) + period)[:, None]
         differs = jnp.abs(later - now) > _SAME * size + rounding
         same = same & ~(here & differs).any()

@@ -15,6 +15,7 @@ author meant, and multipliers of systems with more than `_MANY` states.
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -29,6 +30,7 @@ from ..errors import DefinitionError
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled
 from .linear_flow import hosted, last_turn
+from .periodic import has_period
 from .return_map import turn_product
 from .walk import ROUGH, Stretch, Walked, walk
 
@@ -58,6 +60,7 @@ _PRIMES = 2, 3, 5, 7
 _MANY = 24
 # The cause of the finding on a cycle that lies beyond a guard.
 BEYOND = "beyond a guard"
+LONG_CLOCK = "a long clock"
 
 
 class Verdict(NamedTuple):
@@ -97,7 +100,9 @@ class Verdict(NamedTuple):
         # (Smaller numbers are only rounding.)
         distance = np.maximum(self.distance, 1e-15)
         multipliers = np.maximum(self.multipliers, 1e-15)
-        text = f"second integration: closes to {distance:.1g}, events, shortest period"
+        text = f"second integration: closes to {distance:.1g}, events"
+        if all(finding.cause != LONG_CLOCK for finding in self.findings):
+            text += ", shortest period"
         if np.isnan(multipliers):
             return text
         return f"{text}, multipliers to {multipliers:.1g}"
@@ -174,6 +179,7 @@ def _verdict(cycle) -> Verdict:
     if accurate:
         findings += _departure(cycle, path)
         sooner = _closes_sooner(cycle, path)
+        findings += _long_clock(cycle, path)
     else:
         findings.append(_not_walked(path))
     if sooner is not None:
@@ -519,10 +525,37 @@ def _shorter(sooner: float, period: float) -> Finding:
 
 def _closes_sooner(cycle, path: _Path) -> float | None:
     """The time after which the cycle closes, if that is a part of its period."""
-    map = cycle.return_map
-    parts = [p for p in _PRIMES if map.base is not None or cycle.multiplicity % p == 0]
+    is_free = cycle.return_map.base is not None
+    parts = [p for p in _PRIMES if is_free or cycle.multiplicity % p == 0]
+    closing = _closing_parts(cycle, path, parts)
+    return float(cycle.period) / max(closing) if closing else None
+
+
+def _long_clock(cycle, path: _Path) -> list[Finding]:
+    """A doubt if a cycle closes after a part of the clock's period after which all functions of the
+    system repeat, too."""
+    is_clocked = cycle.return_map.base is None and cycle.multiplicity == 1
+    if not is_clocked or not np.ptp(path.begin, axis=1).any():
+        return []
+    pieces = cycle.pieces
+    for part in reversed(_closing_parts(cycle, path, list(_PRIMES))):
+        shorter = float(cycle.period) / part
+        where = pieces.t, pieces.chart, pieces.q
+        if has_period(cycle.structure, jnp.asarray(shorter), *map(jnp.asarray, where)):
+            text = (
+                f"the cycle closes after {shorter:.6g} already, and all functions of the system "
+                f"repeat then: its multipliers are those of {part} periods. If `period()` is to be "
+                f"the period of the clock, let it return {shorter:.6g}."
+            )
+            return [Finding(LONG_CLOCK, text)]
+    return []
+
+
+def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
+    """Those of `parts` for which the cycle closes after its period, divided by them."""
     if not parts:
-        return None
+        return []
+    map = cycle.return_map
     scale = np.asarray(map.scale)
     times = path.t[0] + float(cycle.period) / np.array(parts)
     moves = np.searchsorted(path.t, times) - 1
@@ -532,7 +565,7 @@ def _closes_sooner(cycle, path: _Path) -> float | None:
     reached = walk(map.structure, stretch, scale).q
     distance = np.abs(reached - path.begin[:, :1]) / scale[path.chart[0]][:, None]
     closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])
-    return min(times[closed] - path.t[0], default=None)
+    return [part for part, closes in zip(parts, closed, strict=True) if closes]
 
 
 def _apart(cycle, monodromy: Float[np.ndarray, "d d"]) -> float:

@@ -1,6 +1,5 @@
 """The position of the sections of a family on a limit cycle: located, and checked."""
 
-import collections
 import dataclasses
 from typing import Any, NamedTuple, cast
 
@@ -21,6 +20,7 @@ from .._core.executor import (
     to_host,
 )
 from .._core.host_derivatives import NotOnHostError, by_columns, require_program
+from .._core.memo import Recent
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from ..engine import kernels
@@ -55,7 +55,7 @@ _PARTS_OF_A_STEP = 16
 _LEAST_STEEPNESS = 1e-4
 
 # The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
-_recent: collections.deque[PlacedSections] = collections.deque(maxlen=4)
+_recent = Recent(4)
 
 
 @checked
@@ -91,31 +91,32 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     cycle.require_found()
     traced = is_traced((cycle, family))
     if not traced:
-        placed = _placed_before(cycle, family)
+        placed: PlacedSections | None = _recent.get(cycle, family)
         if placed is not None:
             return placed
     family.check(cycle.structure)
     if traced:
         require_program()
+        on_walk = _on_walk(cycle, family)
+        if on_walk is not None:
+            return on_walk
     # (Programs of `_place` are for one number of moves: none are given where they do not help.)
     turn = None if traced or has_implicit(cycle.structure) else last_turn(cycle)
     first, fields = _place(_patient(cycle), family, turn)
     placed = PlacedSections(cycle, family, *fields)
     if not traced:
         _check(placed, int(first))
-        _recent.append(placed)
+        _recent.keep(placed, cycle, family)
     return placed
 
 
-def _placed_before(
-    cycle: LimitCycle, family: AbstractSections
-) -> PlacedSections | None:
-    """The sections of this family on this cycle, if they were among the last that were placed."""
-    for placed in list(_recent):
-        families_of_both = jax.device_get((placed.family, family))
-        if placed.cycle is cycle and eqx.tree_equal(*families_of_both):
-            return placed
-    return None
+def _on_walk(cycle: LimitCycle, family: AbstractSections) -> PlacedSections | None:
+    """The sections of a traced cycle that was found beside a known one, on the walk of that; None
+    if there is none."""
+    from .walk import walk_beside, walked
+
+    walk = walk_beside(cycle, family)
+    return None if walk is None else walked(cycle, family, walk)[0]
 
 
 def _patient(cycle: LimitCycle) -> ReturnMap:
@@ -345,8 +346,19 @@ def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     return kernels.parted(jax.tree_util.tree_map(split, (lanes.t, y)))
 
 
-observed_at = by_columns(_observed, _observed_along, of_flow)
-"""Times (N,) at which a cycle crosses a family's sections, and outputs (N, ny) there."""
+_observed_by_columns = by_columns(_observed, _observed_along, of_flow)
+
+
+def observed_at(
+    cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], turn: Any
+) -> tuple[Array, Array | None]:
+    """Times (N,) at which a cycle crosses a family's sections, and outputs (N, ny) there."""
+    from .walk import walk_beside
+
+    arguments = cycle, family, outputs, turn
+    if is_traced(cycle) and walk_beside(cycle, family) is not None:
+        return _observed(*arguments)
+    return _observed_by_columns(*arguments)
 
 
 @quick_jit

@@ -18,7 +18,7 @@ from .._core.compilation import at_ease
 from .._core.executor import is_traced, on_the_cpu, to_host
 from .._core.jax_compat import is_tracer, outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
-from .._core.memo import Memory
+from .._core.memo import Memory, Recent
 from .._core.results import Result
 from ..engine.arrays import Array
 from ..engine.itinerary.bodies import Travelers
@@ -62,15 +62,14 @@ class Walk(eqx.Module):
     """Whether the anchor is section 0: then it is no arrival."""
     forwards: bool = eqx.field(static=True)
     """Whether only forward mode differentiates the walk."""
-    chart: Int[Array, " N"]
     armed: Bool[Array, "G N"]
     events: Int[Array, " N"]
-    """Charts, transitions that are armed, and numbers of events before, on the sections."""
+    """Transitions that are armed, and numbers of events before, on the sections."""
 
 
 _walks = Memory()
-_recorded = Memory()
-"""Each family, whose number stays its own for that reason, with its walk."""
+_recorded = Recent(8)
+"""Walks of known cycles, by family."""
 
 
 def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
@@ -79,9 +78,10 @@ def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 
     **Raises:** as `place_sections`.
     """
-    return _recorded.recall(cycle, id(family), lambda: (family, _walk(cycle, family)))[
-        1
-    ]
+    recorded: tuple[Walk | None] | None = _recorded.get(cycle, family)
+    if recorded is None:
+        recorded = _recorded.keep((_walk(cycle, family),), cycle, family)
+    return recorded[0]
 
 
 def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
@@ -120,7 +120,6 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
         arrivals=arrivals,
         begins_on_section=begins_on_section,
         forwards=False,
-        chart=path.charts,
         armed=path.armed,
         events=path.begins,
     )
@@ -170,7 +169,7 @@ def walked(
     N = family.n_sections
     lanes = Lanes(
         t=passage.pieces_t,
-        chart=jnp.asarray(walk.chart),
+        chart=jnp.asarray(walk.path.charts),
         q=passage.pieces_q.T,
         armed=jnp.asarray(walk.armed),
         events=jnp.asarray(walk.events),

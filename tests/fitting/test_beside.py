@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 import hybridjax as hj
 from hybridjax.fitting import beside
+from hybridjax.sections import walk
 
 from ..toys import Field
 
@@ -90,3 +91,50 @@ def test_later_fits_share_what_is_known_but_see_changes(monkeypatch):
     data = hj.fitting.ObservedCycle(at_jump, period=observed)
     changed = hj.fit_model(system, data, ["speed"]).values[0]
     assert changed == pytest.approx(0.95 / 2, rel=1e-8)
+
+
+class Falling(hj.HybridSystem):
+    """Falls at a rate to 1, and jumps to 2: the period is log(2) / (factor * speed)."""
+
+    factor: Float[Array, ""] = hj.parameter(2.0, doc="of the rate")
+    speed: Float[Array, ""] = hj.parameter(1.0, doc="of the fall")
+
+    def charts(self):
+        rate = self.factor * self.speed
+        return {"fall": Field(("x",), lambda t, q, u: (-rate * q[0],))}
+
+    def transitions(self):
+        jump = dict(guard=lambda t, q, u: q[0] - 1.0, reset=lambda t, q, u: (2.0,))
+        return (hj.Transition("jump", "fall", "fall", **jump),)
+
+    def guess(self):
+        return hj.Guess("fall", (1.5,))
+
+
+@pytest.mark.slow
+def test_numbers_that_are_not_free_are_those_of_the_fitted_system(monkeypatch):
+    """The guess is the cycle of a system with another fixed number: the program uses the fit's."""
+    monkeypatch.setattr(beside, "WORTH_COMPILING", 0)
+    near = hj.find_limit_cycle(Falling(factor=2.0))
+    observed = np.log(2) / (4.0 * 1.1)
+    data = hj.fitting.ObservedCycle([hj.AtEvent("jump")], period=observed)
+    fit = hj.fit_model(Falling(factor=4.0), data, ["speed"], guess=near)
+    assert fit.values[0] == pytest.approx(1.1, rel=1e-8)
+    assert float(fit.cycle.period) == pytest.approx(observed, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_families_of_the_same_sections_share_one_walk(monkeypatch):
+    """A fit's own copies of its sections are equal, and count as the same."""
+    monkeypatch.setattr(beside, "WORTH_COMPILING", 0)
+    known = hj.find_limit_cycle(Falling())
+    walks = []
+    record = walk._walk
+    monkeypatch.setattr(walk, "_walk", lambda *x: walks.append(x) or record(*x))
+    for speed in (1.0, 1.02, 0.97):
+        data = hj.fitting.ObservedCycle(
+            [hj.AtEvent("jump")], period=np.log(2) / (2.0 * speed)
+        )
+        fit = hj.fit_model(Falling(), data, ["speed"], guess=known)
+        assert fit.values[0] == pytest.approx(speed, rel=1e-8)
+    assert len(walks) == 1

@@ -13,6 +13,8 @@ import hybridjax as hj
 from hybridjax.orbits import batches, find, limit_cycles, near
 from hybridjax.orbits.repeat import Maps, Plan, correct, leaves_of, on_device
 
+from ..toys import Field
+
 
 class Free(hj.Chart):
     states = ("x", "v")
@@ -330,6 +332,40 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
     rise = -0.025 + np.sqrt(0.025**2 + 1.2)
     assert_allclose(above(0.05), (1 + rise, hj.errors.Result.OK))
     assert above(-0.05)[1] == hj.errors.Result.EVENT_ORDER
+
+
+class Marked(hj.HybridSystem):
+    """Falls from y = 2 to 1 at a rate, past two marks, which change nothing, and is lifted again."""
+
+    rate: hj.Parameter = hj.parameter(1.0)
+
+    def charts(self):
+        return {"on": Field(("y",), lambda t, q, u: (-self.rate * q[0],))}
+
+    def transitions(self):
+        def at(height):
+            return lambda t, q, u: q[0] - height
+
+        return [
+            hj.Transition("first mark", "on", "on", at(1.7)),
+            hj.Transition("second mark", "on", "on", at(1.3)),
+            hj.Transition("lift", "on", "on", at(1.0), reset=lambda t, q, u: (2.0,)),
+        ]
+
+    def guess(self):
+        return hj.Guess("on", (1.9,))
+
+
+def test_guards_that_have_fallen_in_the_same_chart_are_not_due_again():
+    """Beside a known cycle, a mark that is past is negative and falls, but its event is over."""
+    cycle = hj.find_limit_cycle(Marked())
+
+    @jax.jit
+    def beside(rate):
+        found = hj.find_limit_cycle(Marked(rate=rate), cycle)
+        return found.period, found.result
+
+    assert_allclose(beside(1.1), (np.log(2) / 1.1, hj.errors.Result.OK), rtol=1e-9)
 
 
 class Detuned(Free):

@@ -13,6 +13,8 @@ import hybridjax as hj
 from hybridjax._core.results import Result
 from hybridjax.errors import ComputationError
 
+from ..toys import Field
+
 
 class Charging(hj.Chart):
     """The capacitor of an RC circuit whose comparator has an output of +1 or -1."""
@@ -234,3 +236,28 @@ def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
             hj.errors.DefinitionError, match="the search for this cycle fail"
         ):
             getattr(cycles[1], name)
+
+
+class Driven(hj.HybridSystem):
+    """x' = -x / 10 + cos(t), with a clock that a slip may make too long."""
+
+    turns: int = eqx.field(static=True, default=1)
+
+    def charts(self):
+        return {"on": Field(("x",), lambda t, q, u: (jnp.cos(t) - 0.1 * q[0],))}
+
+    def period(self):
+        return 2 * np.pi * self.turns
+
+    def guess(self):
+        return hj.Guess("on", (0.5,))
+
+
+@pytest.mark.parametrize("turns", [1, 2, 6])
+def test_a_clock_that_is_too_long_is_a_doubt(turns):
+    """The multiplier of two periods is the square of that of one: the print says so."""
+    cycle = hj.find_limit_cycle(Driven(turns))
+    assert cycle.multipliers[0] == pytest.approx(np.exp(-0.2 * np.pi * turns), rel=1e-8)
+    causes = [finding.cause for finding in cycle.findings]
+    assert ("a long clock" in causes) == (turns > 1)
+    assert ("shortest period" in repr(cycle)) == (turns == 1)
