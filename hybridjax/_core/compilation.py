@@ -15,6 +15,7 @@ import hashlib
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
@@ -389,9 +390,18 @@ def whole(
 
     def call(*arguments):
         with uncollected():
-            return jax.tree_util.tree_map(np.asarray, program(arrays, *arguments))
+            if program not in _calls_lapack:
+                traced = program.trace(arrays, *arguments).jaxpr.jaxpr
+                _calls_lapack[program] = jax_compat.calls_lapack(traced)
+            with in_turn(_calls_lapack[program]):
+                result = program(arrays, *arguments)
+                return jax.tree_util.tree_map(np.asarray, result)
 
     return call
+
+
+_calls_lapack: weakref.WeakKeyDictionary[Any, bool] = weakref.WeakKeyDictionary()
+"""Programs that must run one at a time."""
 
 
 def _bound(

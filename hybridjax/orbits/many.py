@@ -107,10 +107,7 @@ class Many(NamedTuple):
             return jax.tree_util.tree_map(lambda x: x[:left], result)
 
         tiles = range(0, len(rows), self.size)
-        # (Two stacks of LAPACK at once may wait for each other for ever.)
-        alone = bool(map.conserved)
-        workers = 1 if alone else min(self.workers, len(tiles))
-        parts = in_threads(run, tiles, workers)
+        parts = in_threads(run, tiles, min(self.workers, len(tiles)))
         return jax.tree_util.tree_map(lambda *x: np.concatenate(x), *parts)
 
 

@@ -32,7 +32,7 @@ from ..orbits.near import known_beside
 from ..orbits.repeat import Plan, has_route, maps_of
 from ..orbits.return_map import ReturnMap
 from .families import AbstractSections, BoundSections
-from .place import bind_at, coordinates_on, place_sections, recorded_flows
+from .locate import bind_at, coordinates_on, place_on_host, recorded_flows
 from .placed import PlacedSections
 
 
@@ -88,7 +88,7 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     if family.points > 1 or not has_route(cycle.return_map):
         return None
     with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)
-        placed = to_host(place_sections(cycle, family))
+        placed = to_host(place_on_host(cycle, family))
         lead, flow = recorded_flows(placed)
         s, N = placed.cycle.structure, family.n_sections
         begins_on_section = lead is not None and family.at_anchor

@@ -335,7 +335,7 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
 
 
 class Marked(hj.HybridSystem):
-    """Falls from y = 2 to 1 at a rate, past two marks, which change nothing, and is lifted again."""
+    """Falls from y = 2 to 1 at a rate, past two marks without effect, and is lifted again."""
 
     rate: hj.Parameter = hj.parameter(1.0)
 

@@ -9,8 +9,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import hybridjax as hj
+from hybridjax._core.memo import Recent
 from hybridjax.engine.events import belongs
-from hybridjax.sections import place
+from hybridjax.sections import locate
 
 from ..conftest import APEX
 from ..engine.test_executors import slow_but
@@ -204,7 +205,7 @@ def test_outputs_of_any_kind_and_feedthrough(
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
-    monkeypatch.setattr("hybridjax.sections.place.PATIENCE", 3)
+    monkeypatch.setattr("hybridjax.sections.locate.PATIENCE", 3)
     settings = hj.orbits.Settings(1e-12, 1e-12, 3, hopper_cycle.settings.scale)
     with pytest.raises(
         hj.errors.ComputationError,
@@ -237,9 +238,9 @@ def families_of(cycle):
     return families
 
 
-def place_or_say(cycle, family):
+def place_or_say(cycle, family, monkeypatch):
     """The sections, or the message if there are none."""
-    place._recent.clear()
+    monkeypatch.setattr(locate, "_recent", Recent(1))
     try:
         return hj.sections.place_sections(cycle, family)
     except hj.errors.ComputationError as error:
@@ -257,7 +258,7 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
     cycle = hj.find_limit_cycle(system)
     structure = cycle.structure
     families = families_of(cycle)
-    flow_along = place.flow_along
+    flow_along = locate.flow_along
     used_the_turn = []
 
     def spy(*arguments):
@@ -265,10 +266,10 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         used_the_turn.append(flow is not None)
         return flow
 
-    monkeypatch.setattr(place, "flow_along", spy)
-    from_turn = [place_or_say(cycle, family) for family in families]
-    monkeypatch.setattr(place, "last_turn", lambda cycle: None)
-    from_flow = [place_or_say(cycle, family) for family in families]
+    monkeypatch.setattr(locate, "flow_along", spy)
+    from_turn = [place_or_say(cycle, family, monkeypatch) for family in families]
+    monkeypatch.setattr(locate, "last_turn", lambda cycle: None)
+    from_flow = [place_or_say(cycle, family, monkeypatch) for family in families]
 
     charts = range(len(structure.charts))
     if not any(structure.method(a).implicit for a in charts):
