@@ -33,6 +33,7 @@ from .io import load as load, save as save
 from .orbits.branches import continuation as continuation
 from .orbits.crossing import AtEvent as AtEvent, Crossing as Crossing
 from .orbits.find import find_limit_cycle as find_limit_cycle
+from .orbits.flow import flow as flow
 from .plot.explorer import explore as explore
 from .recordings.identification import identify_recording as identify_recording
 from .recordings.order import select_order as select_order

@@ -50,6 +50,15 @@ from .watch import ChartFlow, slopes
 _BLOCK = 16
 
 
+class Ways(NamedTuple):
+    """The rows of a tape, integrated again: where each of R moves of L lanes ends."""
+
+    t: Float[Array, "R L"]
+    before: Float[Array, "R d L"]
+    """The state before a reset."""
+    after: Float[Array, "R d L"]
+
+
 def replay(
     s: Structure,
     lanes: Lanes,
@@ -58,6 +67,22 @@ def replay(
     tape: Tape,
 ) -> tuple[Times, Padded]:
     """Times and states at the end of a recorded piece of flow, differentiable."""
+    end, _ = _replayed(s, lanes, u, target, tape, keeps=False)
+    return end
+
+
+def replayed_ways(
+    s: Structure, lanes: Lanes, u: Inputs, target: Target, tape: Tape
+) -> Ways:
+    """Times and states at the ends of all moves of a recorded piece of flow, differentiable."""
+    _, ways = _replayed(s, lanes, u, target, tape, keeps=True)
+    return Ways(*(x[: len(tape.h)] for x in ways))
+
+
+def _replayed(
+    s: Structure, lanes: Lanes, u: Inputs, target: Target, tape: Tape, keeps: bool
+) -> tuple[tuple[Times, Padded], Any]:
+    """The end of a recorded piece of flow, and if it `keeps` them, the ends of all moves."""
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     scheduled = jnp.array([*is_scheduled, False])
 
@@ -74,20 +99,30 @@ def replay(
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
             t, q = _advance(s, begin, code != IDLE, u, target, h1, which)
-            q, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
-            return t, q, chart
+            after, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
+            return (t, after, chart), kept(t, q, after)
 
-        moves = (code != IDLE).any()
-        return jax.lax.cond(moves, move, lambda carry: carry, carry), None
+        def stay(carry):
+            t, q, _ = carry
+            return carry, kept(t, q, q)
+
+        return jax.lax.cond((code != IDLE).any(), move, stay, carry)
+
+    def kept(*ends):
+        return ends if keeps else None
 
     @ft.partial(jax.checkpoint, prevent_cse=False)
     def block(carry, rows):
         def follow(carry):
-            return jax.lax.scan(row, carry, rows)[0]
+            return jax.lax.scan(row, carry, rows)
+
+        def stay(carry):
+            t, q, _ = carry
+            repeated = (jnp.broadcast_to(x, (_BLOCK, *x.shape)) for x in (t, q, q))
+            return carry, kept(*repeated)
 
         _, code, _ = rows
-        moves = (code != IDLE).any()
-        return jax.lax.cond(moves, follow, lambda carry: carry, carry), None
+        return jax.lax.cond((code != IDLE).any(), follow, stay, carry)
 
     # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
     # mode keeps no more of a block than where it starts.
@@ -97,8 +132,9 @@ def replay(
     at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
     code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
     begin = lanes.t, lanes.q, lanes.chart
-    (t, q, _), _ = jax.lax.scan(block, begin, (h, code, at_once))
-    return t, q
+    (t, q, _), ways = jax.lax.scan(block, begin, (h, code, at_once))
+    in_rows = jax.tree_util.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ways)
+    return (t, q), in_rows
 
 
 def _advance(

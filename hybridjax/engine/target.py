@@ -53,6 +53,8 @@ class Target(eqx.Module):
     levels: AbstractLevels | PerLane | None
     missed: Result = eqx.field(static=True)
     """The code of a lane that does not arrive."""
+    count: Int[Array, " #L"] | None = None
+    """End right after so many events; None for no such end."""
 
     def split(self) -> tuple["Target", AbstractLevels | PerLane | None]:
         """The part that belongs to lanes, and the level functions, which all of them share."""

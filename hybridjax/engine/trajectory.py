@@ -30,7 +30,7 @@ from .cubic import interpolate
 from .lanes import IDLE, Lanes, Tape, lane_at
 from .move import Options, move
 from .settings import SIMULATION, Settings
-from .target import until
+from .target import Target, until
 from .unresolved import passed_over
 from .watch import slopes
 
@@ -268,41 +268,59 @@ def simulate(
     system = settings.system(system)
     check_system(system)
     check_symmetry(system)
-    constant = _constant_input(system, input)
+    constant = constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     check_schedules(s)
     start, length = _start_of(chart, state, duration, time)
     begin = lane_at(s, start.chart, start.state, start.time, "`state`")
-    lanes = begin
     settings = settings.filled(SIMULATION)
-    u = constant[:, None]
-    end = lanes.t + float(length)
-    tapes = []
-    steps = 0
-    h = None
-    result = Result.STEP_LIMIT
-    while result == Result.STEP_LIMIT and steps < max_steps:
-        moved, tape = _piece(s, lanes, u, end, settings, h)
-        tapes.append(tape)
-        lanes = moved.lanes
-        h = moved.h
-        steps = steps + settings.max_steps
-        result = Result(int(np.asarray(moved.result)[0]))
-    path = recorded(s, begin, tapes, u, result)
-    path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
-    warn_of(path.findings)
-    passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
-    if passed is not None:
-        path = path.until(passed, Result.GUARD_PASSED)
-    pulse = passed_over(path, constant, settings)
-    if pulse is not None:
-        path = path.until(pulse[0], Result.PULSE_PASSED)
+    target = until(begin.t + float(length))
+    path, _ = integrate(s, begin, constant[:, None], target, settings, max_steps)
     if throw and path.result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}': "
             f"{path.result.message}. `throw=False` returns it up to there."
         )
     return path
+
+
+def integrate(
+    s: Structure,
+    begin: Lanes,
+    u: Float[np.ndarray, "nu 1"],
+    target: Target,
+    settings: Settings,
+    max_steps: int,
+    new_input: bool = True,
+) -> tuple[Trajectory, Lanes]:
+    """Integrate one trajectory to its target on the host, and check it. It ends where a check
+    fails, with the reason as its `result`.
+
+    **Returns:** the trajectory, and the lane at its end.
+    """
+    lanes = begin
+    tapes = []
+    steps = 0
+    h = None
+    result = Result.STEP_LIMIT
+    while result == Result.STEP_LIMIT and steps < max_steps:
+        moved, tape = _piece(s, lanes, u, target, settings, h, new_input or steps > 0)
+        tapes.append(tape)
+        lanes = moved.lanes
+        h = moved.h
+        steps = steps + settings.max_steps
+        result = Result(int(np.asarray(moved.result)[0]))
+    path = recorded(s, begin, tapes, u, result)
+    if new_input:
+        path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
+    warn_of(path.findings)
+    passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
+    if passed is not None:
+        path = path.until(passed, Result.GUARD_PASSED)
+    pulse = passed_over(path, u[:, 0], settings)
+    if pulse is not None:
+        path = path.until(pulse[0], Result.PULSE_PASSED)
+    return path, lanes
 
 
 def _start_of(
@@ -361,7 +379,7 @@ def recorded(
     )
 
 
-def _constant_input(system: HybridSystem, input) -> np.ndarray:
+def constant_input(system: HybridSystem, input) -> np.ndarray:
     """The constant part of an input of the right shape; zero for a function of time."""
     names = system.inputs
     nu = len(names)
@@ -442,5 +460,6 @@ def _guards_at(s: Structure, a: int, t, q, u):
 
 
 @host_first
-def _piece(s, lanes, u, end, settings, h):
-    return move(s, lanes, u, until(end), settings, h, options=Options(tape=True))
+def _piece(s, lanes, u, target, settings, h, new_input: bool):
+    options = Options(tape=True, new_input=new_input)
+    return move(s, lanes, u, target, settings, h, options=options)

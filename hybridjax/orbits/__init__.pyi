@@ -10,6 +10,7 @@ from .coincidence import (
     simultaneous_events as simultaneous_events,
 )
 from .cycle import LimitCycle as LimitCycle
+from .flow import Flow as Flow
 from .fluctuations import Fluctuations as Fluctuations
 from .limit_cycles import (
     LimitCycles as LimitCycles,

@@ -92,6 +92,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     level = lands & (aim.which == G)
     on_time = verdict.plain & aim.last & ~by_clock
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
+    if target.count is not None:
+        arrived = arrived | ((fired >= 0) & (lanes.events + 1 >= target.count))
     after, watched, aimed, zeno, slow = _after(state, aim, new, verdict, fired, t, task)
     h, stuck = _next_step(state, aim, new, verdict, fired, task)
     # Failures; the first one counts.

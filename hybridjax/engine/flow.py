@@ -1,0 +1,139 @@
+"""Flow of many lanes to their targets with the events on the way, differentiable."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .._core.lanes import lane_jvp
+from .._core.results import Result
+from ..systems.structure import Structure
+from .arrays import Array, Inputs
+from .lanes import Lanes, Tape, fixed
+from .move import _search, stride
+from .replay import Ways, replayed_ways
+from .search.search import initial_step
+from .search.state import Moved, Options
+from .settings import Settings
+from .target import Target
+
+
+class Events(NamedTuple):
+    """The first E events of L lanes. What has not happened has the transition -1 and NaN."""
+
+    transition: Int[Array, "E L"]
+    t: Float[Array, "E L"]
+    before: Float[Array, "E d L"]
+    """The state before the reset."""
+    after: Float[Array, "E d L"]
+
+
+class Passage(NamedTuple):
+    """Lanes at their targets, and the events on the way."""
+
+    moved: Moved
+    events: Events
+    rival: Bool[Array, " L"]
+    """Whether another guard is at its zero, too, where an event happens (see `Tape.rival`)."""
+
+
+def pass_through(
+    s: Structure,
+    lanes: Lanes,
+    u: Inputs,
+    target: Target,
+    settings: Settings,
+    most_events: int,
+    new_input: bool,
+) -> Passage:
+    """Flow every lane to its target under a constant input, as `move` does.
+
+    Times and states of the end and of the events have exact derivatives of first and second order
+    with respect to all floating-point arrays: states, times, inputs, parameters, the target.
+    """
+    # (Without sizes of the states, steps are only as short as their own errors ask for.)
+    options = Options(
+        tape=True, new_input=new_input, tangents=settings.scale is not None
+    )
+    return _passed(s, lanes, u, target, settings, options, most_events)
+
+
+@eqx.filter_custom_jvp
+def _passed(s, lanes, u, target, settings, options, most_events) -> Passage:
+    moved, tape = _recorded(s, lanes, u, target, settings, options)
+    ways = Ways(tape.t, tape.before, tape.after)
+    return _passage(moved, tape, _events(tape, ways, most_events))
+
+
+@_passed.def_jvp
+def _passed_jvp(primals, tangents):
+    s, lanes, u, target, settings, options, most_events = primals
+    still = fixed((s, lanes, u, target))
+    moved, tape = _recorded(*still, settings, options)
+    target, levels = target.split()
+
+    def repeat(by_lane, common):
+        t, q, u, time = by_lane
+        s, levels = common
+        begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
+        end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
+        ways = replayed_ways(s, begin, u, end, tape)
+        events = _events(tape, ways, most_events)
+        return ways.t[-1], ways.after[-1], *events[1:]
+
+    t_s, t_lanes, t_u, t_target, *_ = tangents
+    point = lanes.t, lanes.q, u, target.time
+    t_point = t_lanes.t, t_lanes.q, t_u, t_target.time
+    common = (s, levels), (t_s, t_target.levels)
+    ends, t_ends = lane_jvp(repeat, (point, t_point), common)
+
+    def put(passage, ends):
+        def places(x):
+            return (x.moved.lanes.t, x.moved.lanes.q, *x.events[1:])
+
+        return eqx.tree_at(places, passage, ends, is_leaf=lambda x: x is None)
+
+    events = _events(tape, Ways(tape.t, tape.before, tape.after), most_events)
+    out = put(_passage(moved, tape, events), ends)
+    none = jax.tree_util.tree_map(lambda _: None, out)
+    return out, put(none, t_ends)
+
+
+def _recorded(s, lanes, u, target, settings, options) -> tuple[Moved, Tape]:
+    first = initial_step(s, lanes, u, target.limit - lanes.t, settings)
+    result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
+    setout = fixed(stride(first))
+    recorded = _search(s, lanes, u, target, setout, result, settings, options)
+    assert recorded.tape is not None
+    return recorded.moved, recorded.tape
+
+
+def _events(tape: Tape, ways: Ways, most: int) -> Events:
+    """The first events on a tape, with times and states from the ends of its moves."""
+    happened = tape.code >= 0
+    count = jnp.cumsum(happened, axis=0)
+    number = np.arange(1, most + 1)[:, None]
+    # The row in which the count reaches each number.
+    row = jnp.argmax(count[None] >= number[:, None], axis=1)
+    exists = count[-1] >= number
+
+    def times(x):
+        return jnp.take_along_axis(x, row, axis=0)
+
+    def states(x):
+        return jnp.take_along_axis(x, row[:, None], axis=0)
+
+    return Events(
+        jnp.where(exists, times(tape.code), -1),
+        jnp.where(exists, times(ways.t), jnp.nan),
+        jnp.where(exists[:, None], states(ways.before), jnp.nan),
+        jnp.where(exists[:, None], states(ways.after), jnp.nan),
+    )
+
+
+def _passage(moved: Moved, tape: Tape, events: Events) -> Passage:
+    rival = ((tape.code >= 0) & (tape.rival >= 0)).any(axis=0)
+    return Passage(moved, events, rival)

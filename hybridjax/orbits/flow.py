@@ -1,0 +1,465 @@
+"""The flow from any state through any events, differentiable."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
+from .._core.boundary.values import Reals
+from .._core.compilation import quick_jit
+from .._core.executor import Array, is_traced, namespace
+from .._core.findings import Finding, print_findings
+from .._core.meaning import current
+from .._core.precision import require_x64
+from .._core.results import Result, update_result
+from .._core.showable import Showable
+from .._core.text import folded, number, signal_values
+from ..engine.flow import Events, Passage, pass_through
+from ..engine.lanes import Lanes, lane_at, start_lanes
+from ..engine.settings import Settings
+from ..engine.target import Target, toward, until as until_time
+from ..engine.trajectory import Event, Trajectory, constant_input, integrate
+from ..errors import ComputationError, DefinitionError
+from ..systems.check import check_schedules, check_system
+from ..systems.quotient import check_symmetry
+from ..systems.structure import Structure
+from ..systems.system import Driven, Guess, HybridSystem
+from .crossing import AtEvent, Crossing, to_section
+
+
+# Error of a step relative to the sizes of states. Larger: derivatives, which are those of the
+# steps, are less accurate than values. Smaller: rounding is all that steps could still avoid.
+_ACCURACY = 1e-12
+
+
+@checked_methods
+class Flow(Showable, eqx.Module):
+    """The end of a flow, and the events on the way; of many flows with an axis more in front.
+
+    States are padded with zeros to the largest chart's dimension d, unless the chart at the end is
+    known while JAX traces the flow: it is if all charts have as many states, and after an event.
+    What is not known is NaN: all of a flow that failed, and events that did not happen.
+
+    **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end. `result`:
+    a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and
+    indices of their transitions (-1 for none). `before`, `after` (E, d): the states before and
+    after their resets. `count`: number of all events. `trajectory`: steps and dense states, of a
+    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start.
+    """
+
+    t: Float[Array, "*L"]
+    state: Float[Array, "*L n"]
+    chart: Int[Array, "*L"]
+    result: Int[Array, "*L"]
+    event_times: Float[Array, "*L E"]
+    event_index: Int[Array, "*L E"]
+    before: Float[Array, "*L E d"]
+    after: Float[Array, "*L E d"]
+    count: Int[Array, "*L"]
+    trajectory: Trajectory | None
+    structure: Structure
+    lanes: Lanes
+    """Where it ended."""
+    request: "_Request"
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return () if self.trajectory is None else self.trajectory.findings
+
+    @property
+    def events(self) -> list[Event]:
+        """The events in order of time, of a single flow that JAX does not trace.
+
+        **Raises:** `DefinitionError` for other flows.
+        """
+        if self.trajectory is None:
+            raise DefinitionError(
+                "`events` lists those of a single flow outside of `jax.jit`: read `event_times`, "
+                "`event_index`, `before` and `after` here."
+            )
+        return self.trajectory.events
+
+    @property
+    def system(self) -> HybridSystem:
+        return self.structure.system
+
+    def at(
+        self, times: Annotated[Numbers, Reals("K")]
+    ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
+        """Charts and states, padded to d numbers, at some times, as accurate as the flow itself and
+        differentiable like it. They are NaN at times before its start and after its end.
+
+        **Arguments:** `times` (K,).
+
+        **Returns:** `charts` (K,), their indices, and `states` (K, d).
+        """
+        require_x64(self)
+        request = self.request
+        charts, states = _at(request, jnp.asarray(times), self.t)
+        return charts, states
+
+    def __repr__(self):
+        name = type(self.system).__name__
+        if is_traced(self.t) or np.ndim(self.t):
+            shape = "traced" if is_traced(self.t) else f"of {len(self.t)} starts"
+            failed = ""
+            if not is_traced(self.result):
+                failed = f", {int(np.sum(np.asarray(self.result) != 0))} failed"
+            return folded(f"Flow({name}, {shape}{failed})")
+        end = number(float(self.t), unit=self.system.time_unit)
+        chart = self.structure.names[int(self.chart)]
+        states = self.structure.by_name(int(self.chart), np.asarray(self.state))
+        count = int(self.count)
+        many = "1 event" if count == 1 else f"{count} events"
+        text = folded(
+            f"Flow({name}: to t = {end} in {chart}, {signal_values(states, states.values())}; "
+            f"{many}: {Result(int(self.result)).message})"
+        )
+        return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
+
+
+class _Request(eqx.Module):
+    """What was asked for, with L lanes where they begin."""
+
+    system: HybridSystem
+    lanes: Lanes
+    u: Float[Array, "nu #L"]
+    target: Target
+    settings: Settings
+    most_events: int = eqx.field(static=True)
+    new_input: bool = eqx.field(static=True)
+    many: bool = eqx.field(static=True)
+    """Whether the result has an axis of lanes."""
+    ends_in: int | None = eqx.field(static=True)
+    """Chart at the end, if it is known."""
+
+
+@checked
+def flow(
+    system: HybridSystem,
+    start: Guess | Flow,
+    until: Scalar | str | AtEvent | Crossing | None = None,
+    *,
+    events: Count | None = None,
+    within: Duration | None = None,
+    input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
+    settings: Settings | None = None,
+    max_events: Count = 16,
+    max_steps: StepCount = 1024,
+    throw: bool = True,
+) -> Flow:
+    """Integrate from any state, through any events, to a time, an event or a section.
+
+    The result has exact derivatives of first and second order, in forward and reverse mode, with
+    respect to the state and the time at the start, parameters, a constant input, the time of the
+    end and the value of a `Crossing`. It works inside of `jax.jit`, `jax.vmap` and `jax.grad`. At
+    an event the derivative is that by the saltation matrix, which holds while neighbors meet the
+    same events in the same order.
+
+    **Arguments:**
+
+    - `system`: a `HybridSystem`.
+    - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
+      that ended there. A `Guess` with states (L, n) starts L flows.
+    - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
+      `Crossing`: at its level. `events`: right after so many events, in place of `until`.
+    - `within`: the longest duration. It is needed for ends that are no times.
+    - `input`: a constant input (nu,), or a function of time that returns one. Default: 0; after a
+      `Flow`, its input.
+    - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
+    - `max_events`: number of events of which times and states are kept. Default: 16.
+    - `max_steps`: largest number of steps. Default: 1024.
+    - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
+      transformations, `result` has the reason, and times and states are NaN.
+
+    **Returns:** a `Flow`: `t`, `state` and `chart` at the end; `event_times`, `event_index`,
+    `before` and `after` of the first `max_events` events; `result`; and `at(times)`.
+
+    **Raises:** `DefinitionError` for bad arguments; `ComputationError` if the end is not reached,
+    for grazing, Zeno, blow-up and the limit on steps, if `throw`.
+
+    **Example:**
+
+    ```python
+    start = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
+    landing = hj.flow(hopper, start, "touchdown", within=5.0)
+    print(landing.t, landing.state)
+
+    def height(k):
+        return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
+
+    print(jax.grad(height)(10.0))
+    ```
+
+    **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `jax.grad`, `jax.vmap`.
+    """
+    require_x64(system, start, settings)
+    settings = Settings() if settings is None else settings
+    system = settings.system(system)
+    settings = settings.filled(_ACCURACY)
+    settings = Settings(settings.rtol, settings.atol, max_steps, settings.scale)
+    check_system(system)
+    check_symmetry(system)
+    constant = constant_input(system, input)
+    if callable(input):
+        system = current(Driven(system, input))
+    s = Structure(system)
+    check_schedules(s)
+    if isinstance(start, Flow):
+        lanes, many = start.lanes, start.request.many
+        if input is None:
+            constant = start.request.u
+    else:
+        lanes, many = _lanes_of(s, start)
+    u = constant if np.ndim(constant) == 2 else constant[:, None]
+    target, ends_in = _target_of(s, lanes, until, events, within)
+    request = _Request(
+        system=system,
+        lanes=lanes,
+        u=u,
+        target=target,
+        settings=settings,
+        most_events=max_events,
+        new_input=not isinstance(start, Flow) or input is not None,
+        many=many,
+        ends_in=ends_in,
+    )
+    if many or is_traced(request):
+        found = _flows(request)
+    else:
+        found = _on_host(request, s)
+    if throw and not is_traced(found.result):
+        _require_ends(found)
+    return found
+
+
+def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:
+    """Lanes at the start, and whether they are many.
+
+    **Raises:** `DefinitionError` for a chart or a number of states that the system does not have.
+    """
+    a = s.chart_index(start.chart)
+    q = start.state
+    many = q.ndim == 2
+    if not many and not is_traced(start):
+        return lane_at(s, start.chart, q, start.time, "`start`"), False
+    if q.shape[-1] != s.dims[a]:
+        raise DefinitionError(
+            f"`start` must give values for the {s.dims[a]} states "
+            f"{', '.join(s.charts[a].states)} of chart '{start.chart}'; got an array of shape "
+            f"{q.shape}."
+        )
+    states = jnp.atleast_2d(q).T
+    states = jnp.pad(states, ((0, s.d - len(states)), (0, 0)))
+    L = states.shape[1]
+    t = jnp.broadcast_to(start.time, L)
+    lanes = start_lanes(s, t, jnp.full(L, a, jnp.int32), states)
+    return jax.tree_util.tree_map(jnp.asarray, lanes), many
+
+
+def _target_of(
+    s: Structure, lanes: Lanes, until: Any, events: int | None, within: Any
+) -> tuple[Target, int | None]:
+    """The end of a flow, and its chart, if it is known.
+
+    **Raises:** `DefinitionError` for an end that does not exist, or lies before the start, and for
+    one that needs a longest duration.
+    """
+    if (until is None) == (events is None):
+        raise DefinitionError(
+            "flow needs one end: `until`, a time, the name of an event or a `hj.Crossing`; or "
+            "`events`, a number of events. For example `hj.flow(system, start, 3.0)`, or "
+            '`hj.flow(system, start, "impact", within=10.0)`.'
+        )
+    xp = namespace(lanes.t)
+    at_time = not isinstance(until, str | AtEvent | Crossing) and until is not None
+    if at_time:
+        if within is not None:
+            raise DefinitionError(
+                "`within` is for ends that are no times: the flow until a time takes as long as it "
+                "takes."
+            )
+        time = xp.broadcast_to(xp.asarray(until, float), lanes.t.shape)
+        if not is_traced(time, lanes.t) and np.any(np.asarray(time) < lanes.t):
+            raise DefinitionError(
+                f"the flow ends at t = {float(np.min(time)):.9g}, before its start at t = "
+                f"{float(np.max(lanes.t)):.9g}: give a later `until`."
+            )
+        return until_time(time), _only_chart(s)
+    if within is None:
+        raise DefinitionError(
+            "flow to an event or a section needs the longest duration to wait for it: "
+            "`within=10.0`, in the system's unit of time."
+        )
+    never = xp.full(lanes.t.shape, np.inf)
+    limit = lanes.t + within
+    if events is not None:
+        target = toward(never, -1, limit)
+        count = xp.full(lanes.t.shape, events, xp.int32)
+        return dataclasses.replace(target, count=count), _only_chart(s)
+    if isinstance(until, Crossing):
+        until.check(s)
+        return to_section(toward(never, -1, limit), until), _only_chart(s, until)
+    name = until.name if isinstance(until, AtEvent) else until
+    g = s.transition_index(name)
+    return toward(never, g, limit), s.chart_index(s.transitions[g].target)
+
+
+def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
+    """A chart with as many states as the one at the end has, if that is known."""
+    charts = range(len(s.charts))
+    if section is not None:
+        charts = [a for a in charts if section.in_chart(s, a)]
+    dims = {s.dims[a] for a in charts}
+    return next(iter(charts)) if len(dims) == 1 else None
+
+
+def _flows(request: _Request) -> Flow:
+    """The flows of all lanes as one program."""
+    passage = _program(request)
+    return _result(request, passage, None)
+
+
+@quick_jit
+def _program(request: _Request) -> Passage:
+    s = Structure(request.system)
+    lanes = jax.tree_util.tree_map(jnp.asarray, request.lanes)
+    lanes = lanes._replace(events=lanes.events * 0)
+    target = jax.tree_util.tree_map(jnp.asarray, request.target)
+    passage = pass_through(
+        s,
+        lanes,
+        jnp.asarray(request.u),
+        target,
+        request.settings,
+        request.most_events,
+        request.new_input,
+    )
+    moved = passage.moved
+    early = jnp.isfinite(target.time) & (target.time < lanes.t)
+    result = update_result(moved.result, early, Result.BAD_INPUT)
+    return passage._replace(moved=moved._replace(result=result))
+
+
+def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flow:
+    """The result of lanes at their ends."""
+    s = Structure(request.system)
+    moved = passage.moved
+    xp = namespace(moved.lanes.t)
+    arrived = moved.result == Result.OK
+    # (A factor makes derivatives NaN, too.)
+    keep = xp.where(arrived, 1.0, xp.nan)
+    n = s.d if request.ends_in is None else s.dims[request.ends_in]
+    events = passage.events
+
+    def of_lanes(x):
+        x = xp.moveaxis(x, -1, 0)
+        return x if request.many else x[0]
+
+    return Flow(
+        t=of_lanes(keep * moved.lanes.t),
+        state=of_lanes(keep * moved.lanes.q[:n]),
+        chart=of_lanes(moved.lanes.chart),
+        result=of_lanes(moved.result),
+        event_times=of_lanes(events.t),
+        event_index=of_lanes(events.transition),
+        before=of_lanes(events.before),
+        after=of_lanes(events.after),
+        count=of_lanes(moved.lanes.events),
+        trajectory=path,
+        structure=s,
+        lanes=moved.lanes,
+        request=request,
+    )
+
+
+def _on_host(request: _Request, s: Structure) -> Flow:
+    """A single flow, without a program, and checked."""
+    lanes = request.lanes._replace(events=request.lanes.events * 0)
+    settings = request.settings
+    path, end = integrate(
+        s,
+        lanes,
+        np.asarray(request.u),
+        request.target,
+        settings,
+        settings.max_steps,
+        request.new_input,
+    )
+    a = int(path.chart[-1])
+    request = dataclasses.replace(request, ends_in=a)
+    code = np.array([path.result], np.int32)
+    rows = np.flatnonzero(path.event >= 0)
+    end = end._replace(events=np.array([len(rows)], np.int32))
+    rows = rows[: request.most_events]
+
+    def padded(x, empty):
+        more = request.most_events - len(rows)
+        widths = [(0, more)] + [(0, 0)] * (x.ndim - 1)
+        return np.pad(x[rows], widths, constant_values=empty)[..., None]
+
+    events = Events(
+        padded(path.event, -1),
+        padded(path.t, np.nan),
+        padded(path.before, np.nan),
+        padded(path.after, np.nan),
+    )
+    h = np.zeros(1)
+    passage = Passage(_moved(end, h, code), events, np.zeros(1, bool))
+    return _result(request, passage, path)
+
+
+def _moved(lanes: Lanes, h, code):
+    from ..engine.search.state import Moved
+
+    return Moved(lanes, h, h, code)
+
+
+def _require_ends(found: Flow) -> None:
+    """**Raises:** `ComputationError` for the first flow that did not reach its end."""
+    codes = np.atleast_1d(np.asarray(found.result))
+    failed = np.flatnonzero(codes != Result.OK)
+    if not len(failed):
+        return
+    k = int(failed[0])
+    message = Result(int(codes[k])).message
+    if found.request.many:
+        raise ComputationError(
+            f"{len(failed)} of {len(codes)} flows did not reach their end, first start {k}: "
+            f"{message}. `throw=False` returns the others."
+        )
+    lanes = found.lanes
+    raise ComputationError(
+        f"the flow stopped at t = {float(lanes.t[0]):.6g} in chart "
+        f"'{found.structure.names[int(lanes.chart[0])]}': {message}. `throw=False` returns it."
+    )
+
+
+def _at(request: _Request, times: Float[Array, " K"], end: Float[Array, "*L"]):
+    """Charts and states of all lanes at these times."""
+    K = len(times)
+    L = len(request.lanes.t)
+
+    def each(x):
+        return jnp.repeat(jnp.asarray(x), K, axis=-1)
+
+    lanes = jax.tree_util.tree_map(each, request.lanes)
+    u = each(request.u) if request.u.shape[-1] > 1 else request.u
+    ends = jnp.tile(times, L)
+    target = until_time(ends)
+    every = dataclasses.replace(
+        request, lanes=lanes, u=u, target=target, most_events=1, many=True
+    )
+    passage = _program(every)
+    moved = passage.moved
+    known = (moved.result == Result.OK) & (ends <= each(jnp.atleast_1d(end)))
+    q = jnp.where(known, 1.0, jnp.nan) * moved.lanes.q
+    shape = (L, K) if request.many else (K,)
+    return moved.lanes.chart.reshape(shape), q.T.reshape(*shape, -1)
