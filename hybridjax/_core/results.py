@@ -39,7 +39,7 @@ class Result(enum.IntEnum):
     )
     SIMULTANEOUS = (
         13,
-        "two events coincide on the cycle: trajectories near it may meet them in either order",
+        "two events coincide: trajectories nearby may meet them in either order",
     )
     STEP_COLLAPSE = (
         14,

@@ -29,6 +29,14 @@ class Events(NamedTuple):
     before: Float[Array, "E d L"]
     """The state before the reset."""
     after: Float[Array, "E d L"]
+    at_once: Bool[Array, "E L"]
+    rival: Int[Array, "E L"]
+    """Both as on the `Tape`."""
+
+    @property
+    def smooth(self) -> tuple:
+        """Times, and states before and after: those that have derivatives."""
+        return self.t, self.before, self.after
 
 
 class Passage(NamedTuple):
@@ -36,8 +44,6 @@ class Passage(NamedTuple):
 
     moved: Moved
     events: Events
-    rival: Bool[Array, " L"]
-    """Whether another guard is at its zero, too, where an event happens (see `Tape.rival`)."""
 
 
 def pass_through(
@@ -65,7 +71,7 @@ def pass_through(
 def _passed(s, lanes, u, target, settings, options, most_events) -> Passage:
     moved, tape = _recorded(s, lanes, u, target, settings, options)
     ways = Ways(tape.t, tape.before, tape.after)
-    return _passage(moved, tape, _events(tape, ways, most_events))
+    return Passage(moved, _events(tape, ways, most_events))
 
 
 @_passed.def_jvp
@@ -82,7 +88,7 @@ def _passed_jvp(primals, tangents):
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
         ways = replayed_ways(s, begin, u, end, tape)
         events = _events(tape, ways, most_events)
-        return ways.t[-1], ways.after[-1], *events[1:]
+        return ways.t[-1], ways.after[-1], *events.smooth
 
     t_s, t_lanes, t_u, t_target, *_ = tangents
     point = lanes.t, lanes.q, u, target.time
@@ -92,12 +98,12 @@ def _passed_jvp(primals, tangents):
 
     def put(passage, ends):
         def places(x):
-            return (x.moved.lanes.t, x.moved.lanes.q, *x.events[1:])
+            return (x.moved.lanes.t, x.moved.lanes.q, *x.events.smooth)
 
         return eqx.tree_at(places, passage, ends, is_leaf=lambda x: x is None)
 
     events = _events(tape, Ways(tape.t, tape.before, tape.after), most_events)
-    out = put(_passage(moved, tape, events), ends)
+    out = put(Passage(moved, events), ends)
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, put(none, t_ends)
 
@@ -131,9 +137,6 @@ def _events(tape: Tape, ways: Ways, most: int) -> Events:
         jnp.where(exists, times(ways.t), jnp.nan),
         jnp.where(exists[:, None], states(ways.before), jnp.nan),
         jnp.where(exists[:, None], states(ways.after), jnp.nan),
+        exists & times(tape.at_once),
+        jnp.where(exists, times(tape.rival), -1),
     )
-
-
-def _passage(moved: Moved, tape: Tape, events: Events) -> Passage:
-    rival = ((tape.code >= 0) & (tape.rival >= 0)).any(axis=0)
-    return Passage(moved, events, rival)

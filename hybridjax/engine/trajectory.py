@@ -399,28 +399,54 @@ def constant_input(system: HybridSystem, input) -> np.ndarray:
 
 
 def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
-    """Guards that have, at the start, the sign that they have after their event."""
-    a = int(begin.chart[0])
+    """Doubts about a start at which guards are beyond zero, or at zero and fall."""
+    for g, value, is_due in guards_reached(s, begin, u):
+        transition = s.transitions[g]
+        name = transition.name
+        if is_due:
+            text = (
+                f"the start lies on the guard of '{name}', and goes beyond it: this event does not "
+                "happen there. Start a little before it, or after its reset."
+            )
+            yield Finding("on a guard", text)
+            continue
+        text = (
+            f"the start lies beyond the guard of '{name}' (its value is "
+            f"{transition.sign * value:.3g}; the event happens where it is "
+            f"{transition.direction} through zero), so that this event cannot happen before the "
+            "guard has come back."
+        )
+        yield Finding("beyond a guard", text)
+
+
+def guards_reached(
+    s: Structure, lane: Lanes, u: np.ndarray
+) -> Iterator[tuple[int, float, bool]]:
+    """The transitions of a lane whose guards are beyond zero, or at zero and fall: they have, or get
+    at once, the sign that they have after their event.
+
+    **Returns:** for each its index, the value of its guard, and whether it is at zero.
+    """
+    a = int(lane.chart[0])
     guards = s.guards(a)
     n = s.dims[a]
     if not guards:
         return
-    q = begin.q[:n]
+    q = lane.q[:n]
     first = np.zeros(1, np.int32)
-    rows = kernels.watched(s, a, None, begin.t, q, u, first)[..., 0]
-    point = np.append(begin.t, q)
+    rows = kernels.watched(s, a, None, lane.t, q, u, first)[..., 0]
+    point = np.append(lane.t, q)
+    flow = np.append(1.0, kernels.field(s, a, lane.t, q, u)[:, 0, 0])
     for g, row in zip(guards, rows, strict=True):
-        transition = s.transitions[g]
-        noise = _SAME * np.abs(row[1 : 2 + n] * point).sum()
-        holds = kernels.enabled(s, s.member(g), begin.t, q, u).all()
-        if row[0] < -noise and holds:
-            text = (
-                f"the start lies beyond the guard of '{transition.name}' (its value is "
-                f"{transition.sign * row[0]:.3g}; the event happens where it is "
-                f"{transition.direction} through zero), so that this event cannot happen before "
-                "the guard has come back."
-            )
-            yield Finding("beyond a guard", text)
+        if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
+            continue
+        slope = row[1 : 2 + n]
+        noise = _SAME * np.abs(slope * point).sum()
+        falls = slope @ flow < -_SAME * np.abs(slope * flow).sum()
+        if row[0] < -noise:
+            yield g, float(row[0]), False
+        elif row[0] <= noise and falls:
+            yield g, float(row[0]), True
 
 
 def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:

@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import host_first
@@ -101,16 +101,31 @@ def _groups(cycle: LimitCycle) -> list[SimultaneousEvents | None]:
     path = cycle.trajectory(1.01)
     period = float(cycle.period)
     rows = np.flatnonzero(path.event >= 0)
+    since_begin = path.t[rows] - path.t[0]
+    in_turn = since_begin > TOGETHER * period
+    in_turn &= since_begin <= (1 + TOGETHER) * period
+    scale = np.asarray(cycle.settings.scale)
+    return groups_on(path, rows[in_turn], period, scale)
+
+
+def groups_on(
+    path: Trajectory,
+    rows: Int[np.ndarray, " E"],
+    period: float,
+    scale: Float[np.ndarray, "A d"],
+) -> list[SimultaneousEvents | None]:
+    """The groups of events in these rows of a path that happen at the same time, for times that are
+    compared in parts of a `period`; `None` for one whose order is the same for all neighbors.
+
+    **Arguments:** `scale`: sizes of the states by chart.
+    """
     times = path.t[rows]
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
     groups: list[SimultaneousEvents | None] = []
     for first, after in itertools.pairwise([*starts, len(rows)]):
-        since_begin = float(times[first]) - path.t[0]
-        if not TOGETHER * period < since_begin <= (1 + TOGETHER) * period:
-            continue
         group = rows[first:after].tolist()
         events = path.event[group].tolist()
-        missed = _missed(cycle.structure, events, float(times[first]), period)
+        missed = _missed(path.structure, events, float(times[first]), period)
         missed |= _rivals(path, group[0], events, period)
         if len({*events, *missed}) < 2:
             continue
@@ -119,24 +134,26 @@ def _groups(cycle: LimitCycle) -> list[SimultaneousEvents | None]:
         if in_order and not missed:
             groups.append(None)
         else:
-            groups.append(_coincidence(cycle, path, group[0]))
+            groups.append(_coincidence(path, group[0], period, scale))
     return groups
 
 
-def _coincidence(cycle: LimitCycle, path: Trajectory, k: int) -> SimultaneousEvents:
+def _coincidence(
+    path: Trajectory, k: int, period: float, scale: Float[np.ndarray, "A d"]
+) -> SimultaneousEvents:
     """The group of events of which event k of a path is the first."""
-    s = cycle.structure
+    s = path.structure
     t = float(path.t[k])
     a = int(path.chart[k - 1])
     n = s.dims[a]
     before = _Order((), a, path.before[k, :n], np.eye(n))
-    due = 10 * TOGETHER * float(cycle.period)
+    due = 10 * TOGETHER * period
     orders = list(_orders(s, t, before, due))
     names = tuple(
         tuple(s.transitions[g].name for g in order.events) for order in orders
     )
     derivatives = tuple(order.derivative for order in orders)
-    commute = _commute(np.asarray(cycle.settings.scale), a, orders)
+    commute = _commute(scale, a, orders)
     return SimultaneousEvents(t, names, derivatives, commute)
 
 
@@ -183,7 +200,12 @@ def commutes(cycle: LimitCycle) -> bool:
     """True if the orders of all events that coincide on a cycle commute, or are the same for all
     of its neighbors; False if no events do."""
     groups = _groups(cycle)
-    return bool(groups) and all(group is None or group.commute for group in groups)
+    return bool(groups) and all_commute(groups)
+
+
+def all_commute(groups: list[SimultaneousEvents | None]) -> bool:
+    """True if the orders of all groups commute, or are the same for all neighbors."""
+    return all(group is None or group.commute for group in groups)
 
 
 def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]:

@@ -1,21 +1,21 @@
 """The flow from any state through any events, differentiable."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import quick_jit
 from .._core.executor import Array, is_traced, namespace
-from .._core.findings import Finding, print_findings
+from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
@@ -23,14 +23,24 @@ from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
 from ..engine.flow import Events, Passage, pass_through
 from ..engine.lanes import Lanes, lane_at, start_lanes
+from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until as until_time
-from ..engine.trajectory import Event, Trajectory, constant_input, integrate
+from ..engine.trajectory import (
+    Event,
+    Trajectory,
+    constant_input,
+    guards_reached,
+    integrate,
+)
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
+from ..systems.transition import SAME_TIME
+from . import rivals
+from .coincidence import all_commute, groups_on
 from .crossing import AtEvent, Crossing, to_section
 
 
@@ -342,10 +352,35 @@ def _program(request: _Request) -> Passage:
         request.most_events,
         request.new_input,
     )
-    moved = passage.moved
+    moved, events = passage
     early = jnp.isfinite(target.time) & (target.time < lanes.t)
     result = update_result(moved.result, early, Result.BAD_INPUT)
+    result = update_result(
+        result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
+    )
     return passage._replace(moved=moved._replace(result=result))
+
+
+def _coincide(
+    s: Structure, lanes: Lanes, target: Target, events: Events
+) -> Bool[Array, " L"]:
+    """Test whether two events of a lane coincide, in programs, where their orders are not compared:
+    an event at once follows the one before on all trajectories."""
+    of_turn = rivals.Events(events.transition, events.t, events.at_once, events.rival)
+    span = jax.lax.stop_gradient(target.limit - lanes.t)
+    found = rivals.rivals_of(s, jax.lax.stop_gradient(of_turn), span) >= 0
+    return (found & ~events.at_once).any(axis=0)
+
+
+def _orders_differ(path: Trajectory, span: float) -> bool:
+    """Test whether events of a path coincide that lead elsewhere in another order."""
+    s = path.structure
+    rows = np.flatnonzero(path.event >= 0)
+    scale = np.ones((len(s.dims), s.d))
+    for a in np.unique(path.chart).tolist():
+        size = np.abs(path.after[path.chart == a]).max(axis=0)
+        scale[a] = np.where(size > 0, size, 1.0)
+    return not all_commute(groups_on(path, rows, span, scale))
 
 
 def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flow:
@@ -393,6 +428,13 @@ def _on_host(request: _Request, s: Structure) -> Flow:
         settings.max_steps,
         request.new_input,
     )
+    span = float(request.target.limit[0] - lanes.t[0])
+    if path.result == Result.OK and _orders_differ(path, span):
+        path = dataclasses.replace(path, result=Result.SIMULTANEOUS)
+    if np.isfinite(request.target.time[0]):
+        doubts = tuple(_ends_at_an_event(path, s, end, np.asarray(request.u), span))
+        warn_of(doubts)
+        path = dataclasses.replace(path, findings=path.findings + doubts)
     a = int(path.chart[-1])
     request = dataclasses.replace(request, ends_in=a)
     code = np.array([path.result], np.int32)
@@ -410,16 +452,29 @@ def _on_host(request: _Request, s: Structure) -> Flow:
         padded(path.t, np.nan),
         padded(path.before, np.nan),
         padded(path.after, np.nan),
+        padded(path.event < 0, False),
+        padded(path.event * 0 - 1, -1),
     )
-    h = np.zeros(1)
-    passage = Passage(_moved(end, h, code), events, np.zeros(1, bool))
+    nothing = np.zeros(1)
+    passage = Passage(Moved(end, nothing, nothing, code), events)
     return _result(request, passage, path)
 
 
-def _moved(lanes: Lanes, h, code):
-    from ..engine.search.state import Moved
-
-    return Moved(lanes, h, h, code)
+def _ends_at_an_event(
+    path: Trajectory, s: Structure, end: Lanes, u: np.ndarray, span: float
+) -> Iterator[Finding]:
+    """A doubt about a flow to a time at which an event happens, too, but for rounding."""
+    found = [g for g, _, is_due in guards_reached(s, end, u) if is_due]
+    rows = np.flatnonzero(path.event >= 0)
+    at_end = rows[path.t[-1] - path.t[rows] <= SAME_TIME * span]
+    found += path.event[at_end].tolist()
+    for g in dict.fromkeys(found):
+        name = s.transitions[g].name
+        text = (
+            f"the flow ends at the time of '{name}', up to rounding, which decides whether this "
+            "event happens. End a little sooner or later, or at the event."
+        )
+        yield Finding("ends at an event", text)
 
 
 def _require_ends(found: Flow) -> None:
@@ -436,6 +491,11 @@ def _require_ends(found: Flow) -> None:
             f"{message}. `throw=False` returns the others."
         )
     lanes = found.lanes
+    if codes[k] == Result.SIMULTANEOUS:
+        raise ComputationError(
+            f"{message}, and its derivatives depend on the order. `throw=False` returns the "
+            "events."
+        )
     raise ComputationError(
         f"the flow stopped at t = {float(lanes.t[0]):.6g} in chart "
         f"'{found.structure.names[int(lanes.chart[0])]}': {message}. `throw=False` returns it."

@@ -20,11 +20,12 @@ from .._core.boundary.containers import Names
 from .._core.boundary.kinds import (
     NewNames,
     NewOptionalNames,
+    Numbers,
     PositiveScalar,
     Scalar,
-    Vector,
 )
 from .._core.boundary.leads import missing_attribute
+from .._core.boundary.values import Reals
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
 from .._core.pieces.description import digest_of, marked
@@ -206,7 +207,8 @@ class Guess(eqx.Module):
     """Where the search for a limit cycle starts: a chart's name, a state there, and a time.
 
     `after` names the event that has just led to this state. For an autonomous system, the return
-    map is then taken right after this event, unless a section is given.
+    map is then taken right after this event, unless a section is given. For `hj.flow`, where it is
+    the start, there may be many states (L, n).
 
     **Example:**
 
@@ -219,18 +221,23 @@ class Guess(eqx.Module):
     """
 
     chart: str = eqx.field(static=True)
-    state: Float[Array, " n"]
+    state: Float[Array, "*L n"]
     time: Float[Array, ""]
     after: str | None = eqx.field(static=True, default=None)
 
     def __init__(
         self,
         chart: str,
-        state: Vector,
+        state: Annotated[Numbers, Reals()],
         time: Scalar = 0.0,
         *,
         after: str | None = None,
     ):
+        if np.ndim(state) not in (1, 2):
+            raise DefinitionError(
+                f"Guess: `state` must be of shape (n,), or (L, n) for `hj.flow`, not of shape "
+                f"{np.shape(state)}."
+            )
         self.chart = chart
         self.state = real(state)
         self.time = real(time)

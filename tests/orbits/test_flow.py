@@ -1,0 +1,212 @@
+"""Flows from any state: ends, events, codes, and derivatives against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import hybridjax as hj
+from hybridjax.errors import ComputationError, DefinitionError, Result
+
+
+def ball(**numbers):
+    """A bouncing ball."""
+
+    def fall(t, q, u, p):
+        return q[1], -p.g
+
+    def height(t, q, u, p):
+        return q[0]
+
+    def bounce(t, q, u, p):
+        return q[0], -p.e * q[1]
+
+    own = {"g": 9.81, "e": 0.7}
+    events = [("bounce", height, bounce)]
+    names = ("y", "v")
+    system = hj.HybridSystem.from_functions(names, fall, events, own, inputs=())
+    return system.replace(**numbers)
+
+
+DROP = hj.Guess("main", (1.0, 0.0))
+FIRST = np.sqrt(2 / 9.81)
+SECOND = FIRST * (1 + 2 * 0.7)
+
+
+def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
+    until = hj.flow(ball(), DROP, 1.0)
+    left = 1.0 - FIRST
+    speed = 0.7 * 9.81 * FIRST
+    state = speed * left - 9.81 * left**2 / 2, speed - 9.81 * left
+    assert_allclose(until.state, state, rtol=1e-12)
+    assert [x.name for x in until.events] == ["bounce"]
+
+    bounce = hj.flow(ball(), DROP, "bounce", within=3.0)
+    assert_allclose(bounce.t, FIRST, rtol=1e-13)
+    assert_allclose(bounce.state, (0.0, speed), atol=1e-12)
+
+    second = hj.flow(ball(), DROP, events=2, within=3.0)
+    assert_allclose(second.event_times[:2], (FIRST, SECOND), rtol=1e-12)
+    assert second.count == 2
+    assert np.isnan(second.event_times[2:]).all()
+
+    apex = hj.flow(ball(), DROP, hj.Crossing("v", "falling"), within=3.0)
+    assert_allclose(apex.t, FIRST * 1.7, rtol=1e-12)
+    assert_allclose(apex.state[0], 0.49, rtol=1e-12)
+
+    # One goes on where the other has ended.
+    third = hj.flow(ball(), second, "bounce", within=3.0)
+    assert_allclose(third.t, FIRST * (1 + 1.4 + 0.98), rtol=1e-12)
+    assert third.count == 1
+
+
+def test_states_at_times_between():
+    times = np.array([0.2, FIRST + 0.1, 1.0])
+    charts, states = hj.flow(ball(), DROP, 1.0).at(times)
+    since = times - np.where(times > FIRST, FIRST, 0.0)
+    speed = np.where(times > FIRST, 0.7 * 9.81 * FIRST, 0.0)
+    begin = np.where(times > FIRST, 0.0, 1.0)
+    assert_allclose(
+        states[:, 0], begin + speed * since - 9.81 * since**2 / 2, rtol=1e-12
+    )
+    assert np.isnan(hj.flow(ball(), DROP, 1.0).at([1.1])[1]).all()
+
+
+def third_bounce(height, g, e):
+    start = hj.Guess("main", jnp.stack([height, 0.0]))
+    found = hj.flow(ball(g=g, e=e), start, events=3, within=9.0)
+    return jnp.stack([found.t, found.before[2, 1], found.event_times[1]])
+
+
+def third_bounce_exactly(height, g, e):
+    first = jnp.sqrt(2 * height / g)
+    speed = -(e**2) * jnp.sqrt(2 * height * g)
+    return jnp.stack([first * (1 + 2 * e + 2 * e**2), speed, first * (1 + 2 * e)])
+
+
+def test_derivatives_through_events_are_those_of_the_closed_form():
+    point = 1.0, 9.81, 0.7
+    every = 0, 1, 2
+
+    def orders(function):
+        forward = jax.jacfwd(function, every)
+        reverse = jax.jacrev(function, every)
+        second = jax.jacfwd(reverse, every)
+        return function(*point), forward(*point), reverse(*point), second(*point)
+
+    own = jax.jit(lambda: orders(third_bounce))()
+    true = orders(third_bounce_exactly)
+    leaves = jax.tree_util.tree_leaves
+    for x, y in zip(leaves(own), leaves(true), strict=True):
+        assert_allclose(x, y, rtol=1e-11, atol=1e-11)
+
+
+def test_many_flows_one_of_which_fails():
+    """A ball that comes to rest before the end has NaN, and the others are untouched."""
+    states = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
+    found = hj.flow(ball(), hj.Guess("main", states), 0.9, throw=False)
+    assert found.result.tolist() == [Result.OK, Result.ZENO, Result.OK]
+    assert np.isnan(found.state[1]).all()
+    for k in (0, 2):
+        alone = hj.flow(ball(), hj.Guess("main", states[k]), 0.9)
+        assert_allclose(found.state[k], alone.state, rtol=1e-11)
+        assert_allclose(found.event_times[k], alone.event_times, rtol=1e-11)
+    with pytest.raises(ComputationError, match="1 of 3 flows .* start 1: events accum"):
+        hj.flow(ball(), hj.Guess("main", states), 0.9)
+
+    def height(x):
+        return hj.flow(ball(), hj.Guess("main", x), 0.9).state[0]
+
+    slopes = jax.vmap(jax.grad(height))(states)
+    assert np.isnan(slopes[1]).all()
+    by_one = jax.grad(height)(states[0])
+    assert_allclose(slopes[0], by_one, rtol=1e-11)
+
+
+class Pair(hj.HybridSystem):
+    """Two balls, of which each may push the other as it bounces."""
+
+    inputs = ()
+    push: hj.Parameter = hj.parameter(0.0)
+
+    def charts(self):
+        class Air(hj.Chart):
+            states = ("y", "v", "z", "w")
+
+            def field(self, t, q, u):
+                return q[1], -1.0, q[3], -1.0
+
+        return {"air": Air()}
+
+    def transitions(self):
+        def left(t, q, u):
+            return q[0], -0.5 * q[1], q[2], q[3] + self.push * q[1]
+
+        def right(t, q, u):
+            return q[0], q[1] + self.push * q[3], q[2], -0.5 * q[3]
+
+        return [
+            hj.Transition("left", "air", "air", lambda t, q, u: q[0], reset=left),
+            hj.Transition("right", "air", "air", lambda t, q, u: q[2], reset=right),
+        ]
+
+
+def test_events_that_coincide():
+    """They have a derivative if their orders lead to the same, and are refused otherwise."""
+    together = hj.Guess("air", (1.0, 0.0, 1.0, 0.0))
+    found = hj.flow(Pair(), together, 2.0)
+    assert_allclose(found.state[:2], found.state[2:], rtol=1e-12)
+    with pytest.raises(ComputationError, match="coincide.* depend on the order"):
+        hj.flow(Pair(push=0.3), together, 2.0)
+    # (Programs do not compare the orders.)
+    program = jax.jit(lambda x: hj.flow(Pair(), hj.Guess("air", x), 2.0))
+    assert program(together.state).result == Result.SIMULTANEOUS
+    apart = program(jnp.array([1.0, 0.0, 1.1, 0.0]))
+    assert apart.result == Result.OK
+
+
+def test_events_at_the_start_and_at_the_end():
+    """Findings say that rounding decides whether they happen, and that they do not."""
+    for end in (FIRST, FIRST * (1 - 1e-15), FIRST * (1 + 1e-15)):
+        ends = hj.flow(ball(), DROP, end)
+        assert [x.cause for x in ends.findings] == ["ends at an event"]
+    assert hj.flow(ball(), DROP, FIRST * 0.999).findings == ()
+    rolls = hj.flow(ball(), hj.Guess("main", (0.0, -1.0)), 1.0)
+    assert [x.cause for x in rolls.findings] == ["on a guard"]
+    assert hj.flow(ball(), hj.Guess("main", (0.0, 1.0)), 0.1).findings == ()
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: hj.flow(ball(), DROP), "one end: `until`"),
+        (lambda: hj.flow(ball(), DROP, 1.0, events=2), "one end: `until`"),
+        (lambda: hj.flow(ball(), DROP, "bounce"), "longest duration .* `within=10.0`"),
+        (lambda: hj.flow(ball(), DROP, 1.0, within=2.0), "`within` is for ends that"),
+        (
+            lambda: hj.flow(ball(), DROP, -1.0),
+            "ends at t = -1, before its start at t = 0",
+        ),
+        (lambda: hj.flow(ball(), DROP, "bonce", within=1.0), "no event 'bonce'"),
+        (lambda: hj.flow(ball(), hj.Guess("air", (1.0,)), 1.0), "no chart 'air'"),
+        (
+            lambda: hj.flow(ball(), hj.Guess("main", (1.0,)), 1.0),
+            "2 states y, v of chart",
+        ),
+        (
+            lambda: hj.flow(ball(), hj.Guess("main", jnp.ones((3, 1))), 1.0),
+            r"2 states y, v of chart .* shape \(3, 1\)",
+        ),
+        (lambda: hj.flow(ball(), (1.0, 0.0), 1.0), "`start` must be a Guess or a Flow"),
+    ],
+)
+def test_bad_arguments(call, message):
+    with pytest.raises(DefinitionError, match=message):
+        call()
+
+
+def test_a_section_that_is_not_reached():
+    high = hj.Crossing("y", "rising", 3.0)
+    with pytest.raises(ComputationError, match="was not crossed within the time"):
+        hj.flow(ball(), DROP, high, within=1.0)
