@@ -420,10 +420,10 @@ def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Findin
 
 
 def guards_reached(
-    s: Structure, lane: Lanes, u: np.ndarray
+    s: Structure, lane: Lanes, u: np.ndarray, instant: float = 0.0
 ) -> Iterator[tuple[int, float, bool]]:
-    """The transitions of a lane whose guards are beyond zero, or at zero and fall: they have, or get
-    at once, the sign that they have after their event.
+    """The transitions of a lane whose guards are beyond zero, or fall to zero within an `instant`:
+    they have, or get at once, the sign that they have after their event.
 
     **Returns:** for each its index, the value of its guard, and whether it is at zero.
     """
@@ -442,10 +442,11 @@ def guards_reached(
             continue
         slope = row[1 : 2 + n]
         noise = _SAME * np.abs(slope * point).sum()
-        falls = slope @ flow < -_SAME * np.abs(slope * flow).sum()
+        rate = slope @ flow
+        falls = rate < -_SAME * np.abs(slope * flow).sum()
         if row[0] < -noise:
             yield g, float(row[0]), False
-        elif row[0] <= noise and falls:
+        elif falls and row[0] <= noise - instant * rate:
             yield g, float(row[0]), True
 
 

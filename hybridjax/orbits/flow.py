@@ -464,9 +464,10 @@ def _ends_at_an_event(
     path: Trajectory, s: Structure, end: Lanes, u: np.ndarray, span: float
 ) -> Iterator[Finding]:
     """A doubt about a flow to a time at which an event happens, too, but for rounding."""
-    found = [g for g, _, is_due in guards_reached(s, end, u) if is_due]
+    instant = SAME_TIME * span
+    found = [g for g, _, is_due in guards_reached(s, end, u, instant) if is_due]
     rows = np.flatnonzero(path.event >= 0)
-    at_end = rows[path.t[-1] - path.t[rows] <= SAME_TIME * span]
+    at_end = rows[path.t[-1] - path.t[rows] <= instant]
     found += path.event[at_end].tolist()
     for g in dict.fromkeys(found):
         name = s.transitions[g].name
