@@ -261,7 +261,7 @@ def simulate(
     ```
 
     **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `hj.find_limit_cycle`,
-    `hj.plot.animate`.
+    `hj.plot.animate`; `hj.flow`, which has derivatives.
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings
