@@ -13,3 +13,4 @@ from .observations import (
     ObservedSeries as ObservedSeries,
 )
 from .stability import spectral_radius as spectral_radius
+from .transients import ObservedTrajectory as ObservedTrajectory

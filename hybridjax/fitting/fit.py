@@ -19,6 +19,7 @@ from ..orbits.curve import away_from_events
 from ..orbits.cycle import LimitCycle, what_changed
 from ..orbits.find import find_limit_cycle
 from ..orbits.guess import require_similar
+from ..systems.check import check_system
 from ..systems.quotient import check_symmetry
 from ..systems.system import Guess, HybridSystem
 from .beside import Model
@@ -29,10 +30,11 @@ from .problem import (
     FitProblem,
     Free,
     Parameters,
+    TransientProblem,
     descend,
-    evaluate,
     free_parameters,
 )
+from .transients import ObservedTrajectory
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -79,7 +81,8 @@ def fit_model(
 
     - `system`: its parameters are the first guess.
     - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them; or a
-        subclass of `AbstractObservation` for data of another type.
+        subclass of `AbstractObservation` for data of another type. One or several
+        `ObservedTrajectory` need no limit cycle.
     - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
         (infinite where there are none; `None` in place of both keeps the sign). Names may have
         dots. "input_delay" and "output_delay" are those of all `ObservedHTF` with a delay.
@@ -110,12 +113,13 @@ def fit_model(
     **Before:** `hj.estimate_htf`, with `hj.fitting.ObservedHTF`; `hj.fitting.identifiability`.
     **After:** `hj.validate`, `hj.linearize`, `hj.save`.
     """
+    transient = _transients(system, data, free)
+    if transient is not None:
+        return _fit_transients(transient, guesses, seed)
     problem, near = _prepare(system, data, free, guess)
     parameters = problem.parameters
     x0 = np.asarray(parameters.encode(parameters.read(system, problem.observations)))
-    rng = np.random.default_rng(seed)
-    around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
-    starts = np.concatenate([x0[None], x0 + around])
+    starts = _starts_around(x0, guesses, seed)
     model = Model(problem, system, near)
     ends: list[End] = []
     for start in counted(starts, "guesses", guesses):
@@ -136,6 +140,45 @@ def fit_model(
             f"({why}): give another system, or more `guesses`."
         )
     return _summary(problem, system, ends, best, model.known or best.cycle)
+
+
+def _starts_around(
+    x0: Float[np.ndarray, " p"], guesses: int, seed: int
+) -> Float[np.ndarray, "guesses p"]:
+    """Coordinates from which fits begin: the first ones, and random ones around them."""
+    rng = np.random.default_rng(seed)
+    around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
+    return np.concatenate([x0[None], x0 + around])
+
+
+def _fit_transients(problem: TransientProblem, guesses: int, seed: int) -> ModelFit:
+    """Fit parameters to trajectories.
+
+    **Raises:** `ComputationError` if no guess has flows with all measurements.
+    """
+    parameters = problem.parameters
+    values = parameters.read(problem.system, problem.observations)
+    x0 = np.asarray(parameters.encode(values))
+
+    def model(problem, x, guess):
+        return problem.evaluated(x, guess)
+
+    ends: list[End] = []
+    for start in counted(_starts_around(x0, guesses, seed), "guesses", guesses):
+        x, r, J, _, steps, converged = descend(problem, start, None, model)
+        result = Result.OK if converged else Result.NOT_CONVERGED
+        cost = float(r @ r) if np.isfinite(J).all() else np.inf
+        ends.append(End(start, x, cost, r, J, None, steps, int(result)))
+        if ends[-1].explains(problem.weighted):
+            break
+    best = min(ends, key=lambda end: end.cost)
+    if not np.isfinite(best.cost):
+        raise ComputationError(
+            f"none of {guesses} guesses has trajectories with all measurements: one ends sooner or "
+            "lacks a measured event. Compare `hj.flow` from the start of each with its data, and "
+            "begin with other parameters."
+        )
+    return _of_end(problem, ends, best, None)
 
 
 @checked
@@ -166,16 +209,18 @@ def identifiability(
     **Before:** `hj.fitting.ObservedHTF`, `hj.fitting.ObservedSeries` or `hj.fitting.ObservedCycle`.
     **After:** `hj.fit_model`.
     """
-    problem, near = _prepare(system, data, free, guess)
+    cycle = None
+    problem: FitProblem | None = _transients(system, data, free)
+    if problem is None:
+        problem, near = _prepare(system, data, free, guess)
+        with searching("as `guess`"):
+            cycle = find_limit_cycle(system, near)
     parameters = problem.parameters
-    with searching("as `guess`"):
-        cycle = find_limit_cycle(system, near)
     x = parameters.encode(parameters.read(system, problem.observations))
-    residuals, jacobian, _ = evaluate(problem, x, cycle)
+    residuals, jacobian, _ = problem.evaluated(x, cycle)
     if not np.isfinite(residuals).all():
         raise ComputationError(
-            "the system has a limit cycle, but predicts NaN or infinity for these data: change its "
-            "parameters."
+            "the system predicts NaN or infinity for these data: change its parameters."
         )
     return diagnose(parameters.names, _relative(parameters, x, jacobian))
 
@@ -194,9 +239,34 @@ def _prepare(
     for name in {*parameters.names} - {*DELAYS}:
         check_symmetry(near.system, near.structure.sizes(near.settings.scale), name)
     prepared = tuple(observation.prepare(near) for observation in observations)
-    if len({bool(observation.weighted) for observation in prepared}) > 1:
-        raise DefinitionError("give standard deviations of all data, or of none.")
+    _require_same_weighting(prepared)
     return FitProblem(parameters, prepared), near
+
+
+def _transients(
+    system: HybridSystem, data: Data, free: Free
+) -> TransientProblem | None:
+    """Return the problem of a fit to trajectories; None if the data are of limit cycles."""
+    observations = [data] if isinstance(data, AbstractObservation) else [*data]
+    of_trajectories = [x for x in observations if isinstance(x, ObservedTrajectory)]
+    if not of_trajectories:
+        return None
+    if len(of_trajectories) < len(observations):
+        raise DefinitionError(
+            "trajectories and limit cycles cannot be fitted together: fit each alone, and compare "
+            "both by `fit.compare(other)`."
+        )
+    check_system(system)
+    for observation in of_trajectories:
+        observation.prepare_for(system)
+    _require_same_weighting(observations)
+    parameters = free_parameters(system, free, observations)
+    return TransientProblem(parameters, tuple(observations), system)
+
+
+def _require_same_weighting(observations: Sequence[AbstractObservation]) -> None:
+    if len({bool(observation.weighted) for observation in observations}) > 1:
+        raise DefinitionError("give standard deviations of all data, or of none.")
 
 
 def _known_cycle(system: HybridSystem, guess: Guess | LimitCycle | None) -> LimitCycle:
@@ -243,8 +313,8 @@ class End(NamedTuple):
     residuals: Float[np.ndarray, " r"]
     jacobian: Float[np.ndarray, "r p"]
     """Their derivatives by the coordinates."""
-    cycle: LimitCycle
-    """A guess for the cycle of the fit."""
+    cycle: LimitCycle | None
+    """A guess for the cycle of the fit; None for trajectories."""
     steps: int
     result: int
 
@@ -288,8 +358,22 @@ def _summary(
     system: HybridSystem,
     ends: list[End],
     best: End,
-    near: LimitCycle,
+    near: LimitCycle | None,
 ) -> ModelFit:
+    assert best.cycle is not None and near is not None
+    cycle = _cycle_at(problem, system, best.x, near)
+    # (From afar, another cycle may be found.)
+    period = float(best.cycle.period)
+    is_same = abs(float(cycle.period) - period) <= _SAME_PERIOD * period
+    if int(cycle.result) != Result.OK or not is_same:
+        cycle = _cycle_at(problem, system, best.x, best.cycle)
+    return _of_end(problem, ends, best, cycle)
+
+
+def _of_end(
+    problem: FitProblem, ends: list[End], best: End, cycle: LimitCycle | None
+) -> ModelFit:
+    """The fit with the best of all ends; `cycle`: None for trajectories."""
     parameters = problem.parameters
 
     def decode(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
@@ -301,13 +385,12 @@ def _summary(
         )
         for end in ends
     )
-    cycle = _cycle_at(problem, system, best.x, near)
-    # (From afar, another cycle may be found.)
-    period = float(best.cycle.period)
-    is_same = abs(float(cycle.period) - period) <= _SAME_PERIOD * period
-    if int(cycle.result) != Result.OK or not is_same:
-        cycle = _cycle_at(problem, system, best.x, best.cycle)
     values = decode(best.x)
+    if cycle is not None:
+        fitted = cycle.system
+    else:
+        assert isinstance(problem, TransientProblem)
+        fitted = parameters.insert(problem.system, jnp.asarray(values))
     size = np.asarray(_sizes(jnp.asarray(values)))
     sensitivity = _relative(parameters, jnp.asarray(best.x), best.jacobian)
     identified = diagnose(parameters.names, sensitivity)
@@ -316,7 +399,7 @@ def _summary(
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
     root = left[:, :rank] / singular[:rank] * size[:, None]
     return ModelFit(
-        system=cycle.system,
+        system=fitted,
         cycle=cycle,
         names=parameters.names,
         values=values,

@@ -25,7 +25,7 @@ from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
 from ..sections.linearization import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
-from .problem import DELAYS, FitProblem, evaluate
+from .problem import DELAYS, FitProblem, of_system
 
 
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
@@ -389,7 +389,7 @@ class ModelFit(ParameterFit):
     **Fields** beside those of every `Fit` (`noise` is None):
 
     - `system`, and `model`: with the fitted parameters. `cycle`: its limit cycle, which has the
-        `multipliers`.
+        `multipliers`; None for a fit to trajectories (`ObservedTrajectory`), which has none.
     - `names`, `values` (p,): the free parameters.
     - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
         of their standard deviations (estimated from the residuals where the data have none); zero
@@ -407,7 +407,7 @@ class ModelFit(ParameterFit):
     """
 
     system: HybridSystem
-    cycle: LimitCycle
+    cycle: LimitCycle | None
     names: tuple[str, ...] = eqx.field(static=True)
     values: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
@@ -421,7 +421,7 @@ class ModelFit(ParameterFit):
 
     @property
     def multipliers(self) -> Complex[np.ndarray, " d"]:
-        return self.cycle.multipliers
+        return np.zeros(0, complex) if self.cycle is None else self.cycle.multipliers
 
     @property
     def model(self) -> HybridSystem:
@@ -440,9 +440,12 @@ class ModelFit(ParameterFit):
     def units(self) -> tuple[str, ...]:
         units = []
         for name in self.names:
-            is_delay = name in DELAYS
-            unit = unit_of_parameter(self.system, name) if not is_delay else ""
-            units.append(self.system.time_unit if is_delay else unit)
+            unit = ""
+            if name in DELAYS:
+                unit = self.system.time_unit
+            elif of_system(name):
+                unit = unit_of_parameter(self.system, name)
+            units.append(unit)
         return tuple(units)
 
     @property
@@ -469,6 +472,8 @@ class ModelFit(ParameterFit):
         **Raises:** `DefinitionError` if there is none.
         """
         for observation in self.problem.observations:
+            if self.cycle is None:
+                break
             family = getattr(observation, "sections", None)
             if not isinstance(family, AbstractSections):
                 continue
@@ -510,10 +515,10 @@ class ModelFit(ParameterFit):
         standard errors.
         """
         values = jnp.array(self._values_of(true))
-        self.cycle.require_current()
-        r, *_ = evaluate(
-            self.problem, self.problem.parameters.encode(values), self.cycle
-        )
+        if self.cycle is not None:
+            self.cycle.require_current()
+        x = self.problem.parameters.encode(values)
+        r, *_ = self.problem.evaluated(x, self.cycle)
         unit = self.problem.unit(self.cost, self.dof)
         if np.isnan(unit):
             raise DefinitionError(

@@ -25,6 +25,7 @@ from ..orbits.return_map import Turn
 from ..systems.system import HybridSystem, arrays_of
 from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation, ObservedHTF
+from .transients import ObservedTrajectory
 
 
 # The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
@@ -48,6 +49,8 @@ _DAMPING, _FACTOR = 3e-3, 4.0
 
 # Names of the entries of `ObservedHTF.delay` among the free parameters.
 DELAYS = "input_delay", "output_delay"
+# Between the name of a state and the number of the trajectory that starts there.
+AT_START = " at start "
 
 Observations = Sequence[AbstractObservation]
 Bounds = Annotated[Numbers, Reals("2", infinite=True)]
@@ -81,7 +84,7 @@ class Parameters(eqx.Module):
         """Return the system with other values."""
         named = zip(self.names, values, strict=True)
         return with_parameters(
-            system, {name: x for name, x in named if name not in DELAYS}
+            system, {name: x for name, x in named if of_system(name)}
         )
 
     def observed(
@@ -122,7 +125,17 @@ class Parameters(eqx.Module):
         return *finite, [low & high, low, high]
 
 
+def of_system(name: str) -> bool:
+    """Test whether a free parameter is one of the system."""
+    return name not in DELAYS and AT_START not in name
+
+
 def _value(system: HybridSystem, observations: Observations, name: str) -> Array:
+    if AT_START in name:
+        state, _, number = name.partition(AT_START)
+        trajectory = observations[int(number) - 1]
+        assert isinstance(trajectory, ObservedTrajectory)
+        return trajectory.start_values(system)[state]
     if name not in DELAYS:
         return parameter_of(system, name)
     delays = [
@@ -150,10 +163,18 @@ def free_parameters(
         raise DefinitionError(
             f"`free` must name one parameter or more, each once, not {names}."
         )
+    names += tuple(
+        f"{state}{AT_START}{k}"
+        for k, observation in enumerate(observations, 1)
+        if isinstance(observation, ObservedTrajectory)
+        for state in observation.unknown
+    )
     rows = []
     for name in names:
         value = float(_value(system, observations, name))
-        bounds = free[name] if isinstance(free, Mapping) else None
+        bounds = free.get(name) if isinstance(free, Mapping) else None
+        if AT_START in name:
+            bounds = -jnp.inf, jnp.inf
         if bounds is None:  # it keeps its sign
             bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
         if not bounds[0] < value < bounds[1]:
@@ -224,6 +245,13 @@ class FitProblem(eqx.Module):
             ** 2
         )
 
+    def evaluated(
+        self, x: Float[Array | np.ndarray, " p"], guess: LimitCycle | None
+    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], Any]:
+        """Return residuals and Jacobian at x, and a guess for parameters near x."""
+        assert guess is not None
+        return evaluate(self, x, guess)
+
     def residuals(
         self, x: Float[Array, " p"], guess: LimitCycle
     ) -> tuple[Array, tuple]:
@@ -236,6 +264,42 @@ class FitProblem(eqx.Module):
         observations = self.parameters.observed(self.observations, values)
         parts = [observation.residuals(cycle) for observation in observations]
         return _joined(parts, cycle.result), (cycle.anchor, cycle.period, turn)
+
+
+class TransientProblem(FitProblem):
+    """The same for trajectories, which need no limit cycle."""
+
+    system: HybridSystem
+
+    def of_values(self, x: Float[Array, " p"]) -> Float[Array, " r"]:
+        """Return the residuals (r,), infinite where a flow lacks a measurement."""
+        values = self.parameters.decode(x)
+        system = self.parameters.insert(self.system, values)
+        named = dict(zip(self.parameters.names, values, strict=True))
+        parts = []
+        for k, observation in enumerate(self.observations, 1):
+            assert isinstance(observation, ObservedTrajectory)
+            start = {
+                state: named[f"{state}{AT_START}{k}"] for state in observation.unknown
+            }
+            parts.append(observation.with_start(system, start).of_system(system))
+        return _joined(parts, Result.OK)
+
+    def evaluated(
+        self, x: Float[Array | np.ndarray, " p"], guess: LimitCycle | None
+    ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], Any]:
+        r, J = jax.device_get(_transient(self, jnp.asarray(x)))
+        return r, J, None
+
+
+@quick_jit
+def _transient(problem: TransientProblem, x: Float[Array, " p"]) -> tuple[Array, Array]:
+    """Residuals and their Jacobian, all columns in one pass."""
+
+    def push(direction):
+        return jax.jvp(problem.of_values, (x,), (direction,))
+
+    return jax.vmap(push, out_axes=(None, -1))(np.eye(len(x)))
 
 
 @jax.jit
@@ -280,10 +344,10 @@ def evaluate(
 def descend(
     problem: FitProblem,
     x: Float[np.ndarray, " p"],
-    guess: LimitCycle,
+    guess: LimitCycle | None,
     evaluate: Callable = evaluate,
 ) -> tuple[
-    Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle, int, bool
+    Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle | None, int, bool
 ]:
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
     Jacobian, a guess for their cycle, number of evaluations, and whether it has converged. Other

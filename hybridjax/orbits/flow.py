@@ -110,10 +110,15 @@ class Flow(Showable, eqx.Module):
 
         **Returns:** `charts` (K,), their indices, and `states` (K, d).
         """
+        lanes = self.lanes_at(times)
+        K = len(times)
+        shape = (len(self.request.lanes.t), K) if self.request.many else (K,)
+        return lanes.chart.reshape(shape), lanes.q.T.reshape(*shape, -1)
+
+    def lanes_at(self, times: Annotated[Numbers, Reals("K")]) -> Lanes:
+        """The lanes at some times, of each start one after the other; as in `at`."""
         require_x64(self)
-        request = self.request
-        charts, states = _at(request, jnp.asarray(times), self.t)
-        return charts, states
+        return _at(self.request, jnp.asarray(times), self.t)
 
     def __repr__(self):
         name = type(self.system).__name__
@@ -503,8 +508,8 @@ def _require_ends(found: Flow) -> None:
     )
 
 
-def _at(request: _Request, times: Float[Array, " K"], end: Float[Array, "*L"]):
-    """Charts and states of all lanes at these times."""
+def _at(request: _Request, times: Float[Array, " K"], end: Float[Array, "*L"]) -> Lanes:
+    """All lanes at these times; their states are NaN after the end."""
     K = len(times)
     L = len(request.lanes.t)
 
@@ -518,9 +523,8 @@ def _at(request: _Request, times: Float[Array, " K"], end: Float[Array, "*L"]):
     every = dataclasses.replace(
         request, lanes=lanes, u=u, target=target, most_events=1, many=True
     )
-    passage = _program(every)
-    moved = passage.moved
+    moved = _program(every).moved
     known = (moved.result == Result.OK) & (ends <= each(jnp.atleast_1d(end)))
-    q = jnp.where(known, 1.0, jnp.nan) * moved.lanes.q
-    shape = (L, K) if request.many else (K,)
-    return moved.lanes.chart.reshape(shape), q.T.reshape(*shape, -1)
+    return moved.lanes._replace(
+        t=ends, q=jnp.where(known, 1.0, jnp.nan) * moved.lanes.q
+    )

@@ -1,0 +1,254 @@
+"""Recorded trajectories that are no cycles: drops, first steps, transients."""
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._core.arguments import Numbers, require_axes
+from .._core.boundary.checked import checked
+from .._core.boundary.kinds import OptionalNames
+from .._core.boundary.values import Reals
+from .._core.text import fields
+from ..engine.settings import Settings
+from ..errors import DefinitionError
+from ..orbits.flow import Flow, flow
+from ..sections.placed import observe
+from ..systems.structure import Structure
+from ..systems.system import Guess, HybridSystem
+from .observations import AbstractObservation, Deviations
+
+
+# The flow goes on after the last measurement for this part of the time until then. Larger: events
+# are passed that nobody has measured. Smaller: a measured event that comes later is missed, and a
+# fit does not come from there.
+_AFTER = 0.2
+# Events of which times are kept, besides as many as were measured. Fewer: a measured event that
+# others come before is missed. More: programs take longer.
+_MORE_EVENTS = 32
+
+
+@checked
+class ObservedTrajectory(AbstractObservation):
+    """A recorded trajectory from any state: outputs at times, and times of events.
+
+    Fits of it need no limit cycle. Residuals are in units of the standard deviations where these
+    are given, otherwise relative to the rms of each output, and for times of events to the mean of
+    the intervals between them.
+
+    **Example:**
+
+    ```python
+    drop = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
+    observed = hj.fitting.ObservedTrajectory(
+        drop, (0.1, 0.2, 0.3), "yM", [[2.03], [1.99], [1.88]], std=0.01, unknown="vM"
+    )
+    ```
+
+    **After:** `hj.fit_model`, `hj.fitting.identifiability`.
+    """
+
+    start: Guess
+    unknown: tuple[str, ...] = eqx.field(static=True)
+    times: Float[Array, " K"]
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    values: Float[Array, "K ny"]
+    known: tuple[int, ...] = eqx.field(static=True)
+    """Places of the values that are no NaN."""
+    scale: Float[Array, " ny"]
+    events: tuple[str, ...] = eqx.field(static=True)
+    event_times: tuple[Float[Array, " E"], ...]
+    event_scale: Float[Array, ""]
+    input: Any
+    settings: Settings | None
+    weighted: Bool[Array, ""]
+
+    def __init__(
+        self,
+        start: Guess,
+        times: Annotated[Numbers, Reals("K")] | None = None,
+        outputs: OptionalNames = (),
+        values: Annotated[Numbers, Reals("K outputs", missing=True)] | None = None,
+        *,
+        std: Deviations | None = None,
+        events: Mapping[str, Any] | None = None,
+        events_std: Deviations | None = None,
+        unknown: OptionalNames = (),
+        input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
+        settings: Settings | None = None,
+    ):
+        """**Arguments:**
+
+        - `start`: chart, state and time at which the flow begins.
+        - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing.
+        - `std`: their standard deviation, one number or one for each output.
+        - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
+          `events_std`: their standard deviation.
+        - `unknown`: names of states at the start that are fitted, too, from those of `start`.
+        - `input`, `settings`: as in `hj.flow`.
+
+        **Raises:** `DefinitionError` without any measurement, for shapes that do not fit, times
+        that do not increase or come before the start, and standard deviations that are not given
+        for all.
+        """
+        self.start = start
+        self.unknown = tuple(unknown)
+        self.input = input
+        self.settings = settings
+        self.outputs = tuple(outputs)
+        if (values is None) != (not self.outputs) or (values is None) != (
+            times is None
+        ):
+            raise DefinitionError(
+                "ObservedTrajectory: give `times`, `outputs` and `values` together."
+            )
+        if values is None and not events:
+            raise DefinitionError(
+                "ObservedTrajectory: give samples (`times`, `outputs`, `values`) or `events`."
+            )
+        own_times = np.zeros(0) if times is None else np.asarray(times, float)
+        samples = np.zeros((0, 0)) if values is None else np.asarray(values, float)
+        axes = {"times": len(own_times), "outputs": len(self.outputs)}
+        require_axes("`values`", samples, axes)
+        missing = np.isnan(samples)
+        self.known = tuple(np.flatnonzero(~missing).tolist())
+        self.times = jnp.asarray(own_times)
+        self.values = jnp.asarray(np.where(missing, 0.0, samples))
+        self.events = tuple(events or ())
+        lists = [np.atleast_1d(np.asarray(x, float)) for x in (events or {}).values()]
+        self.event_times = tuple(jnp.asarray(x) for x in lists)
+        _require_times(start, own_times, *lists)
+        self.scale = _sizes("values", std, samples)
+        self.event_scale = _event_size(events_std, lists, start)
+        given = {std is not None for _ in own_times[:1]} | {
+            events_std is not None for _ in lists[:1]
+        }
+        if len(given) > 1:
+            raise DefinitionError(
+                "give standard deviations of the samples and of the events, or of neither."
+            )
+        self.weighted = jnp.asarray(given.pop())
+
+    __repr__ = fields
+
+    def residuals(self, cycle: Any) -> Float[Array, " r"]:
+        """Return the prediction minus the measurement, weighted, of the system of a "cycle"."""
+        return self.of_system(cycle.system)
+
+    def of_system(self, system: HybridSystem) -> Float[Array, " r"]:
+        """Return the prediction of a system minus the measurement, weighted; NaN where its flow
+        ends sooner, or lacks a measured event."""
+        found = self._flow(system)
+        parts = []
+        if self.outputs:
+            error = (self._outputs_of(found) - self.values) / self.scale
+            parts.append(error.ravel()[np.array(self.known, int)])
+        s = found.structure
+        for name, measured in zip(self.events, self.event_times, strict=True):
+            is_own = found.event_index == s.transition_index(name)
+            number = jnp.cumsum(is_own)
+            row = jnp.argmax(
+                number == jnp.arange(1, len(measured) + 1)[:, None], axis=1
+            )
+            exists = number[-1] >= jnp.arange(1, len(measured) + 1)
+            time = jnp.where(exists, found.event_times[row], jnp.nan)
+            parts.append((time - measured) / self.event_scale)
+        return jnp.concatenate(parts)
+
+    def _flow(self, system: HybridSystem) -> Flow:
+        """The flow until a little after the last measurement."""
+        end = jnp.max(jnp.concatenate([self.times, *self.event_times]))
+        if self.events:
+            end = end + _AFTER * (end - self.start.time)
+        count = sum(len(x) for x in self.event_times)
+        return flow(
+            system,
+            self.start,
+            end,
+            input=self.input,
+            settings=self.settings,
+            max_events=count + _MORE_EVENTS,
+            throw=False,
+        )
+
+    def _outputs_of(self, found: Flow) -> Float[Array, "K ny"]:
+        s = found.structure
+        lanes = found.lanes_at(self.times)
+        u = jnp.broadcast_to(found.request.u, (s.nu, len(self.times)))
+        return observe(s, s.resolve_outputs(self.outputs), lanes, u).T
+
+    def prepare_for(self, system: HybridSystem) -> None:
+        """**Raises:** `DefinitionError` for names that the system does not have."""
+        s = Structure(system)
+        s.resolve_outputs(self.outputs)
+        for name in self.events:
+            s.transition_index(name)
+        states = s.charts[s.chart_index(self.start.chart)].states
+        for name in self.unknown:
+            if name not in states:
+                raise DefinitionError(
+                    f"`unknown` names '{name}', which is no state of chart '{self.start.chart}': "
+                    f"its states are {', '.join(states)}."
+                )
+
+    def start_values(self, system: HybridSystem) -> dict[str, Any]:
+        """The states at the start that are unknown, by name."""
+        s = Structure(system)
+        states = s.charts[s.chart_index(self.start.chart)].states
+        return {name: self.start.state[states.index(name)] for name in self.unknown}
+
+    def with_start(
+        self, system: HybridSystem, values: dict[str, Any]
+    ) -> "ObservedTrajectory":
+        """The observation from a start with other states."""
+        s = Structure(system)
+        states = s.charts[s.chart_index(self.start.chart)].states
+        state = jnp.asarray(self.start.state)
+        for name, value in values.items():
+            state = state.at[states.index(name)].set(value)
+        return eqx.tree_at(lambda o: o.start.state, self, state)
+
+
+def _require_times(start: Guess, *lists: np.ndarray) -> None:
+    """**Raises:** `DefinitionError` for times that do not increase, or come before the start."""
+    for times in lists:
+        if len(times) and not (np.diff(times, prepend=float(start.time) - 1) > 0).all():
+            raise DefinitionError("times of a trajectory must increase.")
+        if len(times) and times[0] < float(start.time):
+            raise DefinitionError(
+                f"a time, {times[0]:.6g}, comes before the start at {float(start.time):.6g}."
+            )
+
+
+def _sizes(
+    name: str, std: Any, samples: Float[np.ndarray, "K ny"]
+) -> Float[Array, " ny"]:
+    """Standard deviations of each output, or its rms.
+
+    **Raises:** `DefinitionError` for an output that is zero throughout, without one.
+    """
+    ny = samples.shape[1]
+    if std is not None:
+        return jnp.broadcast_to(jnp.asarray(std, float), (ny,))
+    if not ny:
+        return jnp.ones(0)
+    size = np.sqrt(np.nanmean(samples**2, axis=0))
+    if not (size > 0).all():
+        raise DefinitionError(
+            f"`{name}` of an output are zero throughout, or all missing: leave it out, or give "
+            "its standard deviation."
+        )
+    return jnp.asarray(size)
+
+
+def _event_size(std: Any, lists: list[np.ndarray], start: Guess) -> Float[Array, ""]:
+    if std is not None:
+        return jnp.asarray(std, float)
+    if not lists:
+        return jnp.ones(())
+    begin = float(start.time)
+    intervals = [(x[-1] - begin) / len(x) for x in lists]
+    return jnp.asarray(np.mean(intervals) or 1.0)

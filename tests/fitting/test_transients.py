@@ -1,0 +1,128 @@
+"""Fits to trajectories that are no cycles: drops of a ball with drag."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+import hybridjax as hj
+from hybridjax.errors import ComputationError, DefinitionError
+
+
+def ball(**numbers):
+    def fall(t, q, u, p):
+        return q[1], -p.g - p.drag * jnp.abs(q[1]) * q[1]
+
+    def bounce(t, q, u, p):
+        return q[0], -p.e * q[1]
+
+    own = {"g": 9.81, "e": 0.7, "drag": 0.05}
+    events = [("bounce", lambda t, q, u, p: q[0], bounce)]
+    system = hj.HybridSystem.from_functions(("y", "v"), fall, events, own, inputs=())
+    return system.replace(**numbers)
+
+
+TIMES = np.arange(1, 60) / 50
+TRUE = {"e": 0.78, "drag": 0.12}
+
+
+def drop(height):
+    """Heights at TIMES and times of two bounces, by scipy."""
+
+    def fall(t, q):
+        return q[1], -9.81 - TRUE["drag"] * abs(q[1]) * q[1]
+
+    def ground(t, q):
+        return q[0]
+
+    ground.terminal = True
+    ground.direction = -1
+    t, q, heights, bounces = 0.0, np.array([height, 0.0]), [], []
+    while t < TIMES[-1]:
+        options = dict(rtol=1e-12, atol=1e-14, method="DOP853", dense_output=True)
+        found = solve_ivp(fall, (t, 1.5), q, events=ground, **options)
+        own = TIMES[(TIMES > t) & (TIMES <= found.t[-1])]
+        heights.append(found.sol(own)[0])
+        t = found.t[-1]
+        q = np.array([0.0, -TRUE["e"] * found.y[1, -1]])
+        bounces.append(t)
+    return np.concatenate(heights), bounces[:2]
+
+
+def observed(height, seed=None, **options):
+    y, bounces = drop(height)
+    y = y[:, None].copy()
+    if seed is not None:
+        y += 0.003 * np.random.default_rng(seed).normal(size=y.shape)
+        options["std"] = 0.003
+    y[7] = np.nan  # (a frame without the ball)
+    begin = hj.Guess("main", (height + 0.02, 0.1))
+    options.setdefault("unknown", ("y", "v"))
+    return hj.fitting.ObservedTrajectory(begin, TIMES, "y", y, **options)
+
+
+def test_parameters_and_starts_of_two_drops_are_those_of_scipy():
+    data = [observed(1.0), observed(1.5)]
+    fit = hj.fit_model(ball(), data, ("e", "drag"))
+    assert fit.names[2:] == (
+        "y at start 1",
+        "v at start 1",
+        "y at start 2",
+        "v at start 2",
+    )
+    assert_allclose(fit.values, (*TRUE.values(), 1.0, 0.0, 1.5, 0.0), atol=1e-6)
+    assert len(fit.residuals) == 2 * (len(TIMES) - 1)
+    assert fit.cycle is None
+    assert_allclose(float(fit.system.e), TRUE["e"], atol=1e-6)
+
+
+def test_times_of_events_alone_identify_the_restitution():
+    _, bounces = drop(1.0)
+    begin = hj.Guess("main", (1.0, 0.0))
+    data = hj.fitting.ObservedTrajectory(begin, events={"bounce": bounces})
+    fit = hj.fit_model(ball(drag=TRUE["drag"]), data, "e")
+    assert_allclose(fit.values, TRUE["e"], atol=1e-7)
+    seen = hj.fitting.identifiability(ball(), data, ("e", "drag", "g"))
+    assert seen.rank == 2
+
+
+@pytest.mark.slow
+def test_standard_errors_are_those_of_many_draws():
+    errors = []
+    for seed in range(60):
+        fit = hj.fit_model(ball(), observed(1.0, seed), ("e", "drag"))
+        size = fit.standard_errors[:2]
+        errors.append((fit.values[:2] - tuple(TRUE.values())) / size)
+    spread = np.std(errors, axis=0)
+    assert (0.75 < spread).all() and (spread < 1.3).all()
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda d: d(hj.Guess("main", (1.0, 0.0))), "give samples"),
+        (lambda d: d(hj.Guess("main", (1.0, 0.0)), TIMES), "together"),
+        (
+            lambda d: d(hj.Guess("main", (1.0, 0.0)), [0.2, 0.1], "y", [[1.0], [1.0]]),
+            "must increase",
+        ),
+        (
+            lambda d: d(hj.Guess("main", (1.0, 0.0), 0.5), [0.2], "y", [[1.0]]),
+            "0.2, comes before the start at 0.5",
+        ),
+    ],
+)
+def test_bad_measurements(call, message):
+    with pytest.raises(DefinitionError, match=message):
+        call(hj.fitting.ObservedTrajectory)
+
+
+def test_bad_fits():
+    with pytest.raises(DefinitionError, match="`unknown` names 'x', which is no state"):
+        hj.fit_model(ball(), observed(1.0, unknown="x"), "e")
+    late = hj.fitting.ObservedTrajectory(
+        hj.Guess("main", (1.0, 0.0)), events={"bounce": (0.01, 0.02, 0.03)}
+    )
+    with pytest.raises(ComputationError, match="lacks a measured event"):
+        hj.fit_model(ball(), late, "e")
