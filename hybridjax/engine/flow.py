@@ -12,13 +12,13 @@ from .._core.lanes import lane_jvp
 from .._core.results import Result
 from ..systems.structure import Structure
 from .arrays import Array, Inputs
-from .lanes import Lanes, Tape, fixed
+from .lanes import ARRIVE_TIME, IDLE, Lanes, Tape, blank_tape, fixed, pace_of
 from .move import _search, stride
-from .replay import Ways, replayed_ways
+from .replay import Ways, replay, replayed_ways
 from .search.search import initial_step
 from .search.state import Moved, Options
 from .settings import Settings
-from .target import Target
+from .target import Target, until
 
 
 class Events(NamedTuple):
@@ -39,11 +39,19 @@ class Events(NamedTuple):
         return self.t, self.before, self.after
 
 
+class Samples(NamedTuple):
+    """Charts and states of L lanes at K times of each; NaN before the start and after the end."""
+
+    chart: Int[Array, "K L"]
+    q: Float[Array, "K d L"]
+
+
 class Passage(NamedTuple):
-    """Lanes at their targets, and the events on the way."""
+    """Lanes at their targets, the events on the way, and samples of it."""
 
     moved: Moved
     events: Events
+    samples: Samples
 
 
 def pass_through(
@@ -54,58 +62,113 @@ def pass_through(
     settings: Settings,
     most_events: int,
     new_input: bool,
+    times: Float[Array, "K L"],
 ) -> Passage:
     """Flow every lane to its target under a constant input, as `move` does.
 
-    Times and states of the end and of the events have exact derivatives of first and second order
-    with respect to all floating-point arrays: states, times, inputs, parameters, the target.
+    Times and states of the end, of the events and at the `times` have exact derivatives of first
+    and second order with respect to all floating-point arrays: states, times, inputs, parameters,
+    the target.
     """
     # (Without sizes of the states, steps are only as short as their own errors ask for.)
     options = Options(
         tape=True, new_input=new_input, tangents=settings.scale is not None
     )
-    return _passed(s, lanes, u, target, settings, options, most_events)
+    return _passed(s, lanes, u, target, times, settings, options, most_events)
 
 
 @eqx.filter_custom_jvp
-def _passed(s, lanes, u, target, settings, options, most_events) -> Passage:
+def _passed(s, lanes, u, target, times, settings, options, most_events) -> Passage:
     moved, tape = _recorded(s, lanes, u, target, settings, options)
     ways = Ways(tape.t, tape.before, tape.after)
-    return Passage(moved, _events(tape, ways, most_events))
+    samples = _samples(s, lanes, u, tape, ways, times)
+    return Passage(moved, _events(tape, ways, most_events), samples)
 
 
 @_passed.def_jvp
 def _passed_jvp(primals, tangents):
-    s, lanes, u, target, settings, options, most_events = primals
+    s, lanes, u, target, times, settings, options, most_events = primals
     still = fixed((s, lanes, u, target))
     moved, tape = _recorded(*still, settings, options)
     target, levels = target.split()
 
     def repeat(by_lane, common):
-        t, q, u, time = by_lane
+        t, q, u, time, times = by_lane
         s, levels = common
         begin = eqx.tree_at(lambda x: (x.t, x.q), lanes, (t, q))
         end = eqx.tree_at(lambda x: x.time, target, time).with_levels(levels)
         ways = replayed_ways(s, begin, u, end, tape)
         events = _events(tape, ways, most_events)
-        return ways.t[-1], ways.after[-1], *events.smooth
+        samples = _samples(s, begin, u, tape, ways, times)
+        return ways.t[-1], ways.after[-1], *events.smooth, samples.q
 
-    t_s, t_lanes, t_u, t_target, *_ = tangents
-    point = lanes.t, lanes.q, u, target.time
-    t_point = t_lanes.t, t_lanes.q, t_u, t_target.time
+    t_s, t_lanes, t_u, t_target, t_times, *_ = tangents
+    point = lanes.t, lanes.q, u, target.time, times
+    t_point = t_lanes.t, t_lanes.q, t_u, t_target.time, t_times
     common = (s, levels), (t_s, t_target.levels)
     ends, t_ends = lane_jvp(repeat, (point, t_point), common)
 
     def put(passage, ends):
         def places(x):
-            return (x.moved.lanes.t, x.moved.lanes.q, *x.events.smooth)
+            return x.moved.lanes.t, x.moved.lanes.q, *x.events.smooth, x.samples.q
 
         return eqx.tree_at(places, passage, ends, is_leaf=lambda x: x is None)
 
-    events = _events(tape, Ways(tape.t, tape.before, tape.after), most_events)
-    out = put(Passage(moved, events), ends)
+    ways = Ways(tape.t, tape.before, tape.after)
+    chart = jnp.zeros(times.shape, jnp.int32)
+    if len(times):
+        chart = _before(lanes, tape, ways, times).chart.reshape(times.shape)
+    samples = Samples(chart, ends[-1])
+    out = put(Passage(moved, _events(tape, ways, most_events), samples), ends)
     none = jax.tree_util.tree_map(lambda _: None, out)
     return out, put(none, t_ends)
+
+
+def _samples(
+    s: Structure,
+    lanes: Lanes,
+    u: Inputs,
+    tape: Tape,
+    ways: Ways,
+    times: Float[Array, "K L"],
+) -> Samples:
+    """The states at some times, by a step from the end of the last move before each."""
+    K, L = times.shape
+    if not K:
+        return Samples(jnp.zeros((0, L), jnp.int32), jnp.zeros((0, s.d, L)))
+    begin = _before(lanes, tape, ways, times)
+    every = times.ravel()
+    row = blank_tape(1, begin)
+    row = row._replace(code=jnp.full((1, K * L), ARRIVE_TIME, jnp.int32))
+    inputs = u if u.shape[-1] == 1 else jnp.tile(u, (1, K))
+    _, q = replay(s, begin, inputs, until(every), row)
+    last = jnp.max(jnp.where(tape.code != IDLE, tape.t, -jnp.inf), axis=0)
+    within = (times >= lanes.t) & (times <= jnp.maximum(last, lanes.t))
+    q = jnp.moveaxis(q.reshape(-1, K, L), 1, 0)
+    q = jnp.where(within[:, None], q, jnp.nan)
+    return Samples(begin.chart.reshape(K, L), q)
+
+
+def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) -> Lanes:
+    """The lanes where the moves begin within which the times lie, K of each one after the other."""
+    rows = jnp.arange(len(tape.code))[:, None]
+    is_move = tape.code != IDLE
+    # (The last move that ends before each time; -1 for none.)
+    ended = is_move & (tape.t <= jax.lax.stop_gradient(times)[:, None])
+    row = jnp.max(jnp.where(ended, rows, -1), axis=1)
+    first = row < 0
+    place = jnp.maximum(row, 0)
+
+    def chosen(start, ends):
+        return jnp.where(first, start, jnp.take_along_axis(ends, place, axis=0)).ravel()
+
+    states = jnp.take_along_axis(ways.after, place[:, None], axis=0)
+    q = jnp.where(first[:, None], lanes.q, states)
+    K, d, L = q.shape
+    t, chart = chosen(lanes.t, ways.t), chosen(lanes.chart, tape.chart)
+    q = jnp.moveaxis(q, 0, 1).reshape(d, K * L)
+    armed = jnp.tile(lanes.armed, (1, K))
+    return Lanes(t, chart, q, armed, chart * 0, pace_of(chart * 0))
 
 
 def _recorded(s, lanes, u, target, settings, options) -> tuple[Moved, Tape]:

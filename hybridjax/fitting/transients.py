@@ -13,9 +13,11 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames
 from .._core.boundary.values import Reals
 from .._core.text import fields
+from ..engine.flow import Samples
+from ..engine.lanes import Lanes, pace_of
 from ..engine.settings import Settings
 from ..errors import DefinitionError
-from ..orbits.flow import Flow, flow
+from ..orbits.flow import MOST_STEPS, Flow, requested, sampled
 from ..sections.placed import observe
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
@@ -141,10 +143,10 @@ class ObservedTrajectory(AbstractObservation):
     def of_system(self, system: HybridSystem) -> Float[Array, " r"]:
         """Return the prediction of a system minus the measurement, weighted; NaN where its flow
         ends sooner, or lacks a measured event."""
-        found = self._flow(system)
+        found, samples = sampled(self._request(system), self.times)
         parts = []
         if self.outputs:
-            error = (self._outputs_of(found) - self.values) / self.scale
+            error = (self._outputs_of(found, samples) - self.values) / self.scale
             parts.append(error.ravel()[np.array(self.known, int)])
         s = found.structure
         for name, measured in zip(self.events, self.event_times, strict=True):
@@ -158,26 +160,33 @@ class ObservedTrajectory(AbstractObservation):
             parts.append((time - measured) / self.event_scale)
         return jnp.concatenate(parts)
 
-    def _flow(self, system: HybridSystem) -> Flow:
+    def _request(self, system: HybridSystem) -> Any:
         """The flow until a little after the last measurement."""
         end = jnp.max(jnp.concatenate([self.times, *self.event_times]))
         if self.events:
             end = end + _AFTER * (end - self.start.time)
         count = sum(len(x) for x in self.event_times)
-        return flow(
+        most = count + _MORE_EVENTS
+        return requested(
             system,
             self.start,
             end,
-            input=self.input,
-            settings=self.settings,
-            max_events=count + _MORE_EVENTS,
-            throw=False,
+            None,
+            None,
+            self.input,
+            self.settings,
+            most,
+            MOST_STEPS,
         )
 
-    def _outputs_of(self, found: Flow) -> Float[Array, "K ny"]:
+    def _outputs_of(self, found: Flow, samples: Samples) -> Float[Array, "K ny"]:
         s = found.structure
-        lanes = found.lanes_at(self.times)
-        u = jnp.broadcast_to(found.request.u, (s.nu, len(self.times)))
+        K = len(self.times)
+        chart = samples.chart[:, 0]
+        pace = pace_of(chart * 0)
+        armed = jnp.zeros((len(s.transitions), K), bool)
+        lanes = Lanes(self.times, chart, samples.q[..., 0].T, armed, chart * 0, pace)
+        u = jnp.broadcast_to(found.request.u, (s.nu, K))
         return observe(s, s.resolve_outputs(self.outputs), lanes, u).T
 
     def prepare_for(self, system: HybridSystem) -> None:

@@ -21,7 +21,7 @@ from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
-from ..engine.flow import Events, Passage, pass_through
+from ..engine.flow import Events, Passage, Samples, pass_through
 from ..engine.lanes import Lanes, lane_at, start_lanes
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
@@ -47,6 +47,9 @@ from .crossing import AtEvent, Crossing, to_section
 # Error of a step relative to the sizes of states. Larger: derivatives, which are those of the
 # steps, are less accurate than values. Smaller: rounding is all that steps could still avoid.
 _ACCURACY = 1e-12
+# Steps of a flow, accepted or rejected. Fewer: more flows end early. More: programs keep longer
+# records.
+MOST_STEPS = 1024
 
 
 @checked_methods
@@ -110,15 +113,11 @@ class Flow(Showable, eqx.Module):
 
         **Returns:** `charts` (K,), their indices, and `states` (K, d).
         """
-        lanes = self.lanes_at(times)
-        K = len(times)
-        shape = (len(self.request.lanes.t), K) if self.request.many else (K,)
-        return lanes.chart.reshape(shape), lanes.q.T.reshape(*shape, -1)
-
-    def lanes_at(self, times: Annotated[Numbers, Reals("K")]) -> Lanes:
-        """The lanes at some times, of each start one after the other; as in `at`."""
         require_x64(self)
-        return _at(self.request, jnp.asarray(times), self.t)
+        samples = _program(self.request, jnp.asarray(times)).samples
+        chart = jnp.moveaxis(samples.chart, -1, 0)
+        q = jnp.moveaxis(samples.q, -1, 0)
+        return (chart, q) if self.request.many else (chart[0], q[0])
 
     def __repr__(self):
         name = type(self.system).__name__
@@ -167,7 +166,7 @@ def flow(
     input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
     settings: Settings | None = None,
     max_events: Count = 16,
-    max_steps: StepCount = 1024,
+    max_steps: StepCount = MOST_STEPS,
     throw: bool = True,
 ) -> Flow:
     """Integrate from any state, through any events, to a time, an event or a section.
@@ -215,6 +214,33 @@ def flow(
 
     **Before:** a model, `hj.models` or `hj.HybridSystem`. **After:** `jax.grad`, `jax.vmap`.
     """
+    request = requested(
+        system, start, until, events, within, input, settings, max_events, max_steps
+    )
+    if request.many or is_traced(request):
+        found = _flows(request)
+    else:
+        found = _on_host(request)
+    if throw and not is_traced(found.result):
+        _require_ends(found)
+    return found
+
+
+def requested(
+    system: HybridSystem,
+    start: Guess | Flow,
+    until: Any,
+    events: int | None,
+    within: Any,
+    input: Any,
+    settings: Settings | None,
+    max_events: int,
+    max_steps: int,
+) -> _Request:
+    """What is asked for.
+
+    **Raises:** `DefinitionError` as `flow`.
+    """
     require_x64(system, start, settings)
     settings = Settings() if settings is None else settings
     system = settings.system(system)
@@ -235,7 +261,7 @@ def flow(
         lanes, many = _lanes_of(s, start)
     u = constant if np.ndim(constant) == 2 else constant[:, None]
     target, ends_in = _target_of(s, lanes, until, events, within)
-    request = _Request(
+    return _Request(
         system=system,
         lanes=lanes,
         u=u,
@@ -246,13 +272,6 @@ def flow(
         many=many,
         ends_in=ends_in,
     )
-    if many or is_traced(request):
-        found = _flows(request)
-    else:
-        found = _on_host(request, s)
-    if throw and not is_traced(found.result):
-        _require_ends(found)
-    return found
 
 
 def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:
@@ -338,16 +357,22 @@ def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
 
 def _flows(request: _Request) -> Flow:
     """The flows of all lanes as one program."""
-    passage = _program(request)
-    return _result(request, passage, None)
+    return _result(request, _program(request), None)
+
+
+def sampled(request: _Request, times: Float[Array, " K"]) -> tuple[Flow, Samples]:
+    """A flow as a program, and samples of it."""
+    passage = _program(request, times)
+    return _result(request, passage, None), passage.samples
 
 
 @quick_jit
-def _program(request: _Request) -> Passage:
+def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Passage:
+    """The flow of all lanes, with samples at some times."""
     s = Structure(request.system)
-    lanes = jax.tree_util.tree_map(jnp.asarray, request.lanes)
+    lanes, target = jax.tree_util.tree_map(jnp.asarray, (request.lanes, request.target))
     lanes = lanes._replace(events=lanes.events * 0)
-    target = jax.tree_util.tree_map(jnp.asarray, request.target)
+    times = jnp.zeros(0) if times is None else times
     passage = pass_through(
         s,
         lanes,
@@ -356,8 +381,9 @@ def _program(request: _Request) -> Passage:
         request.settings,
         request.most_events,
         request.new_input,
+        jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
     )
-    moved, events = passage
+    moved, events, _ = passage
     early = jnp.isfinite(target.time) & (target.time < lanes.t)
     result = update_result(moved.result, early, Result.BAD_INPUT)
     result = update_result(
@@ -420,8 +446,9 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
     )
 
 
-def _on_host(request: _Request, s: Structure) -> Flow:
+def _on_host(request: _Request) -> Flow:
     """A single flow, without a program, and checked."""
+    s = Structure(request.system)
     lanes = request.lanes._replace(events=request.lanes.events * 0)
     settings = request.settings
     path, end = integrate(
@@ -461,7 +488,8 @@ def _on_host(request: _Request, s: Structure) -> Flow:
         padded(path.event * 0 - 1, -1),
     )
     nothing = np.zeros(1)
-    passage = Passage(Moved(end, nothing, nothing, code), events)
+    none = Samples(np.zeros((0, 1), np.int32), np.zeros((0, s.d, 1)))
+    passage = Passage(Moved(end, nothing, nothing, code), events, none)
     return _result(request, passage, path)
 
 
@@ -505,26 +533,4 @@ def _require_ends(found: Flow) -> None:
     raise ComputationError(
         f"the flow stopped at t = {float(lanes.t[0]):.6g} in chart "
         f"'{found.structure.names[int(lanes.chart[0])]}': {message}. `throw=False` returns it."
-    )
-
-
-def _at(request: _Request, times: Float[Array, " K"], end: Float[Array, "*L"]) -> Lanes:
-    """All lanes at these times; their states are NaN after the end."""
-    K = len(times)
-    L = len(request.lanes.t)
-
-    def each(x):
-        return jnp.repeat(jnp.asarray(x), K, axis=-1)
-
-    lanes = jax.tree_util.tree_map(each, request.lanes)
-    u = each(request.u) if request.u.shape[-1] > 1 else request.u
-    ends = jnp.tile(times, L)
-    target = until_time(ends)
-    every = dataclasses.replace(
-        request, lanes=lanes, u=u, target=target, most_events=1, many=True
-    )
-    moved = _program(every).moved
-    known = (moved.result == Result.OK) & (ends <= each(jnp.atleast_1d(end)))
-    return moved.lanes._replace(
-        t=ends, q=jnp.where(known, 1.0, jnp.nan) * moved.lanes.q
     )
