@@ -44,6 +44,7 @@ GIVEN = UNCHECKED["made by this package"] | {
     "ComputationError",
     "Design",
     "FileFormatError",
+    "Flow",
     "FindingWarning",
     "LDTP",
     "PrecisionError",

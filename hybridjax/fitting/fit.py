@@ -34,7 +34,7 @@ from .problem import (
     descend,
     free_parameters,
 )
-from .transients import ObservedTrajectory
+from .transients import ObservedTrajectory, require_names
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -258,7 +258,7 @@ def _transients(
         )
     check_system(system)
     for observation in of_trajectories:
-        observation.prepare_for(system)
+        require_names(observation, system)
     _require_same_weighting(observations)
     parameters = free_parameters(system, free, observations)
     return TransientProblem(parameters, tuple(observations), system)

@@ -25,7 +25,7 @@ from ..orbits.return_map import Turn
 from ..systems.system import HybridSystem, arrays_of
 from ..systems.varied import parameter_of, with_parameters
 from .observations import AbstractObservation, ObservedHTF
-from .transients import ObservedTrajectory
+from .transients import ObservedTrajectory, residuals_of, start_value, with_start
 
 
 # The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
@@ -135,7 +135,7 @@ def _value(system: HybridSystem, observations: Observations, name: str) -> Array
         state, _, number = name.partition(AT_START)
         trajectory = observations[int(number) - 1]
         assert isinstance(trajectory, ObservedTrajectory)
-        return trajectory.start_values(system)[state]
+        return start_value(trajectory, system, state)
     if name not in DELAYS:
         return parameter_of(system, name)
     delays = [
@@ -167,7 +167,7 @@ def free_parameters(
         f"{state}{AT_START}{k}"
         for k, observation in enumerate(observations, 1)
         if isinstance(observation, ObservedTrajectory)
-        for state in observation.unknown
+        for state in observation.unknown_states
     )
     rows = []
     for name in names:
@@ -280,9 +280,11 @@ class TransientProblem(FitProblem):
         for k, observation in enumerate(self.observations, 1):
             assert isinstance(observation, ObservedTrajectory)
             start = {
-                state: named[f"{state}{AT_START}{k}"] for state in observation.unknown
+                state: named[f"{state}{AT_START}{k}"]
+                for state in observation.unknown_states
             }
-            parts.append(observation.with_start(system, start).of_system(system))
+            moved = with_start(observation, system, start)
+            parts.append(residuals_of(moved, system))
         return _joined(parts, Result.OK)
 
     def evaluated(

@@ -17,6 +17,7 @@ from ..engine.flow import Samples
 from ..engine.lanes import Lanes, pace_of
 from ..engine.settings import Settings
 from ..errors import DefinitionError
+from ..orbits.cycle import LimitCycle
 from ..orbits.flow import MOST_STEPS, Flow, requested, sampled
 from ..sections.placed import observe
 from ..systems.structure import Structure
@@ -46,7 +47,7 @@ class ObservedTrajectory(AbstractObservation):
     ```python
     drop = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
     observed = hj.fitting.ObservedTrajectory(
-        drop, (0.1, 0.2, 0.3), "yM", [[2.03], [1.99], [1.88]], std=0.01, unknown="vM"
+        drop, (0.1, 0.2, 0.3), "yM", [[2.03], [1.99], [1.88]], std=0.01, unknown_states="vM"
     )
     ```
 
@@ -54,7 +55,7 @@ class ObservedTrajectory(AbstractObservation):
     """
 
     start: Guess
-    unknown: tuple[str, ...] = eqx.field(static=True)
+    unknown_states: tuple[str, ...] = eqx.field(static=True)
     times: Float[Array, " K"]
     outputs: tuple[str, ...] = eqx.field(static=True)
     values: Float[Array, "K ny"]
@@ -78,7 +79,7 @@ class ObservedTrajectory(AbstractObservation):
         std: Deviations | None = None,
         events: Mapping[str, Any] | None = None,
         events_std: Deviations | None = None,
-        unknown: OptionalNames = (),
+        unknown_states: OptionalNames = (),
         input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
         settings: Settings | None = None,
     ):
@@ -89,7 +90,7 @@ class ObservedTrajectory(AbstractObservation):
         - `std`: their standard deviation, one number or one for each output.
         - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
           `events_std`: their standard deviation.
-        - `unknown`: names of states at the start that are fitted, too, from those of `start`.
+        - `unknown_states`: names of states at the start that are fitted, too; `start` has guesses.
         - `input`, `settings`: as in `hj.flow`.
 
         **Raises:** `DefinitionError` without any measurement, for shapes that do not fit, times
@@ -97,7 +98,7 @@ class ObservedTrajectory(AbstractObservation):
         for all.
         """
         self.start = start
-        self.unknown = tuple(unknown)
+        self.unknown_states = tuple(unknown_states)
         self.input = input
         self.settings = settings
         self.outputs = tuple(outputs)
@@ -136,89 +137,107 @@ class ObservedTrajectory(AbstractObservation):
 
     __repr__ = fields
 
-    def residuals(self, cycle: Any) -> Float[Array, " r"]:
-        """Return the prediction minus the measurement, weighted, of the system of a "cycle"."""
-        return self.of_system(cycle.system)
+    def residuals(self, cycle: LimitCycle) -> Float[Array, " r"]:
+        """Return the prediction minus the measurement, weighted, of the system of a cycle; NaN
+        where its flow ends sooner, or lacks a measured event."""
+        return residuals_of(self, cycle.system)
 
-    def of_system(self, system: HybridSystem) -> Float[Array, " r"]:
-        """Return the prediction of a system minus the measurement, weighted; NaN where its flow
-        ends sooner, or lacks a measured event."""
-        found, samples = sampled(self._request(system), self.times)
-        parts = []
-        if self.outputs:
-            error = (self._outputs_of(found, samples) - self.values) / self.scale
-            parts.append(error.ravel()[np.array(self.known, int)])
-        s = found.structure
-        for name, measured in zip(self.events, self.event_times, strict=True):
-            is_own = found.event_index == s.transition_index(name)
-            number = jnp.cumsum(is_own)
-            row = jnp.argmax(
-                number == jnp.arange(1, len(measured) + 1)[:, None], axis=1
+
+def residuals_of(
+    observation: ObservedTrajectory, system: HybridSystem
+) -> Float[Array, " r"]:
+    """The prediction of a system minus the measurement, weighted; NaN where its flow ends sooner,
+    or lacks a measured event."""
+    found, samples = sampled(_request(observation, system), observation.times)
+    parts = []
+    if observation.outputs:
+        values = _outputs(observation, found, samples)
+        error = (values - observation.values) / observation.scale
+        parts.append(error.ravel()[np.array(observation.known, int)])
+    s = found.structure
+    measurements = zip(observation.events, observation.event_times, strict=True)
+    for name, measured in measurements:
+        is_own = found.event_index == s.transition_index(name)
+        count = jnp.cumsum(is_own)
+        number = jnp.arange(1, len(measured) + 1)
+        row = jnp.argmax(count == number[:, None], axis=1)
+        time = jnp.where(count[-1] >= number, found.event_times[row], jnp.nan)
+        parts.append((time - measured) / observation.event_scale)
+    return jnp.concatenate(parts)
+
+
+def _request(observation: ObservedTrajectory, system: HybridSystem) -> Any:
+    """The flow until a little after the last measurement."""
+    times = observation.times, *observation.event_times
+    end = jnp.max(jnp.concatenate(times))
+    if observation.events:
+        end = end + _AFTER * (end - observation.start.time)
+    count = sum(len(x) for x in observation.event_times)
+    return requested(
+        system,
+        observation.start,
+        until=end,
+        events=None,
+        within=None,
+        input=observation.input,
+        settings=observation.settings,
+        max_events=count + _MORE_EVENTS,
+        max_steps=MOST_STEPS,
+    )
+
+
+def _outputs(
+    observation: ObservedTrajectory, found: Flow, samples: Samples
+) -> Float[Array, "K ny"]:
+    s = found.structure
+    K = len(observation.times)
+    chart = samples.chart[:, 0]
+    pace = pace_of(chart * 0)
+    armed = jnp.zeros((len(s.transitions), K), bool)
+    q = samples.q[..., 0].T
+    lanes = Lanes(observation.times, chart, q, armed, chart * 0, pace)
+    u = jnp.broadcast_to(found.request.u, (s.nu, K))
+    return observe(s, s.resolve_outputs(observation.outputs), lanes, u).T
+
+
+def require_names(observation: ObservedTrajectory, system: HybridSystem) -> None:
+    """**Raises:** `DefinitionError` for names that the system does not have."""
+    s = Structure(system)
+    s.resolve_outputs(observation.outputs)
+    for name in observation.events:
+        s.transition_index(name)
+    states = _states(observation, system)
+    for name in observation.unknown_states:
+        if name not in states:
+            raise DefinitionError(
+                f"`unknown_states` has '{name}', which is no state of chart "
+                f"'{observation.start.chart}': its states are {', '.join(states)}."
             )
-            exists = number[-1] >= jnp.arange(1, len(measured) + 1)
-            time = jnp.where(exists, found.event_times[row], jnp.nan)
-            parts.append((time - measured) / self.event_scale)
-        return jnp.concatenate(parts)
 
-    def _request(self, system: HybridSystem) -> Any:
-        """The flow until a little after the last measurement."""
-        end = jnp.max(jnp.concatenate([self.times, *self.event_times]))
-        if self.events:
-            end = end + _AFTER * (end - self.start.time)
-        count = sum(len(x) for x in self.event_times)
-        most = count + _MORE_EVENTS
-        return requested(
-            system,
-            self.start,
-            end,
-            None,
-            None,
-            self.input,
-            self.settings,
-            most,
-            MOST_STEPS,
-        )
 
-    def _outputs_of(self, found: Flow, samples: Samples) -> Float[Array, "K ny"]:
-        s = found.structure
-        K = len(self.times)
-        chart = samples.chart[:, 0]
-        pace = pace_of(chart * 0)
-        armed = jnp.zeros((len(s.transitions), K), bool)
-        lanes = Lanes(self.times, chart, samples.q[..., 0].T, armed, chart * 0, pace)
-        u = jnp.broadcast_to(found.request.u, (s.nu, K))
-        return observe(s, s.resolve_outputs(self.outputs), lanes, u).T
+def _states(observation: ObservedTrajectory, system: HybridSystem) -> tuple[str, ...]:
+    """Names of the states at the start."""
+    s = Structure(system)
+    return s.charts[s.chart_index(observation.start.chart)].states
 
-    def prepare_for(self, system: HybridSystem) -> None:
-        """**Raises:** `DefinitionError` for names that the system does not have."""
-        s = Structure(system)
-        s.resolve_outputs(self.outputs)
-        for name in self.events:
-            s.transition_index(name)
-        states = s.charts[s.chart_index(self.start.chart)].states
-        for name in self.unknown:
-            if name not in states:
-                raise DefinitionError(
-                    f"`unknown` names '{name}', which is no state of chart '{self.start.chart}': "
-                    f"its states are {', '.join(states)}."
-                )
 
-    def start_values(self, system: HybridSystem) -> dict[str, Any]:
-        """The states at the start that are unknown, by name."""
-        s = Structure(system)
-        states = s.charts[s.chart_index(self.start.chart)].states
-        return {name: self.start.state[states.index(name)] for name in self.unknown}
+def start_value(
+    observation: ObservedTrajectory, system: HybridSystem, state: str
+) -> Array:
+    """The guess of an unknown state at the start."""
+    place = _states(observation, system).index(state)
+    return jnp.asarray(observation.start.state)[place]
 
-    def with_start(
-        self, system: HybridSystem, values: dict[str, Any]
-    ) -> "ObservedTrajectory":
-        """The observation from a start with other states."""
-        s = Structure(system)
-        states = s.charts[s.chart_index(self.start.chart)].states
-        state = jnp.asarray(self.start.state)
-        for name, value in values.items():
-            state = state.at[states.index(name)].set(value)
-        return eqx.tree_at(lambda o: o.start.state, self, state)
+
+def with_start(
+    observation: ObservedTrajectory, system: HybridSystem, values: dict[str, Any]
+) -> ObservedTrajectory:
+    """The observation from a start with other states."""
+    names = _states(observation, system)
+    state = jnp.asarray(observation.start.state)
+    for name, value in values.items():
+        state = state.at[names.index(name)].set(value)
+    return eqx.tree_at(lambda o: o.start.state, observation, state)
 
 
 def _require_times(start: Guess, *lists: np.ndarray) -> None:

@@ -58,7 +58,7 @@ def observed(height, seed=None, **options):
         options["std"] = 0.003
     y[7] = np.nan  # (a frame without the ball)
     begin = hj.Guess("main", (height + 0.02, 0.1))
-    options.setdefault("unknown", ("y", "v"))
+    options.setdefault("unknown_states", ("y", "v"))
     return hj.fitting.ObservedTrajectory(begin, TIMES, "y", y, **options)
 
 
@@ -119,8 +119,10 @@ def test_bad_measurements(call, message):
 
 
 def test_bad_fits():
-    with pytest.raises(DefinitionError, match="`unknown` names 'x', which is no state"):
-        hj.fit_model(ball(), observed(1.0, unknown="x"), "e")
+    with pytest.raises(
+        DefinitionError, match="`unknown_states` has 'x', which is no state"
+    ):
+        hj.fit_model(ball(), observed(1.0, unknown_states="x"), "e")
     late = hj.fitting.ObservedTrajectory(
         hj.Guess("main", (1.0, 0.0)), events={"bounce": (0.01, 0.02, 0.03)}
     )

@@ -50,6 +50,10 @@ def systems(t):
     yield hj.orbits.Settings, dict(rtol=1e-09, atol=1e-09)
     begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
     yield hj.simulate, dict(system=t.system) | begin
+    guess = hj.Guess("plane", (1.0, 0.0))
+    yield hj.flow, dict(system=t.system, start=guess, until=0.1, max_events=2)
+    samples = dict(times=(0.1, 0.2), outputs="x", values=[[1.0], [2.0]], std=0.1)
+    yield hj.fitting.ObservedTrajectory, dict(start=guess) | samples
 
 
 def sections(t):

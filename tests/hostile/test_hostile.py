@@ -48,7 +48,14 @@ CALLED_BY_THE_ENGINE = {
 }
 SLOW_TO_MAKE = {"ModelFit", "StoredExperiments", "SubjectStudy"}
 # Results of methods of results, whose tests call them.
-FURTHER_RESULTS = {"Coupling", "Explorer", "Fluctuations", "Responses", "Trajectory"}
+FURTHER_RESULTS = {
+    "Coupling",
+    "Explorer",
+    "Flow",
+    "Fluctuations",
+    "Responses",
+    "Trajectory",
+}
 
 
 def printed(*command):
