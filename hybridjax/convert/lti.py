@@ -162,7 +162,7 @@ class HarmonicStateSpace(NamedTuple):
         rates = 2j * np.pi * np.asarray(frequencies).reshape(-1, 1, 1) / period
         resolvent = rates * np.eye(len(self.A)) - self.A
         H = self.C @ np.linalg.solve(resolvent, B[None]) + D
-        return H.reshape(len(rates), M, -1, D.shape[-1])
+        return H.reshape(len(rates), M, len(self.C) // M, D.shape[-1])
 
 
 # Orders that are tried, and frequencies of the comparison, in cycles per period. More:

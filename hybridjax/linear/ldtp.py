@@ -429,6 +429,11 @@ class LDTP(WithMultipliers, eqx.Module):
 
     def _response(self, u, x0, first_section):
         u = self._input(u)
+        if u.ndim > 2:
+            raise DefinitionError(
+                f"`u` must be one record of shape (n, {u.shape[-1]}), not of shape {u.shape}: use "
+                "`jax.vmap` for several."
+            )
         x0 = self._state(x0, first_section)
         sections = (first_section + np.arange(len(u))) % self.n_sections
         return time_response.response(self.matrices, u, x0, sections)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import signal
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
@@ -92,6 +93,7 @@ class SectionData(Showable, eqx.Module):
     @checked
     def of_inputs(self, names: Sequence[str]) -> "SectionData":
         """Return the data with some of the inputs only."""
+        require_among("input", names, self.inputs)
         columns = [self.inputs.index(name) for name in names]
         inputs = tuple(self.inputs[k] for k in columns)
         of_inputs = [self.spikes[k] for k in columns]

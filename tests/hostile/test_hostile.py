@@ -32,6 +32,7 @@ CALLED_BY_THE_ENGINE = {
     "Motion",
     "MuJoCoPlant",
     "ObservedSeries",
+    "ObservedTrajectory",
     "PaddleJuggler",
     "PlacedSections",
     "Plan",
