@@ -50,6 +50,9 @@ _ACCURACY = 1e-12
 # Steps of a flow, accepted or rejected. Fewer: more flows end early. More: programs keep longer
 # records.
 MOST_STEPS = 1024
+# Lanes of a program that JAX does not trace. More: records of many steps take gigabytes. Fewer:
+# more calls.
+_PART = 1024
 
 
 @checked_methods
@@ -356,8 +359,33 @@ def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
 
 
 def _flows(request: _Request) -> Flow:
-    """The flows of all lanes as one program."""
-    return _result(request, _program(request), None)
+    """The flows of all lanes by one program, which gets many lanes part by part."""
+    L = len(request.lanes.t)
+    if is_traced(request) or L <= _PART:
+        return _result(request, _program(request), None)
+    parts = []
+    for first in range(0, L, _PART):
+        # (The last part is filled up, so that no other program is compiled.)
+        lanes = np.minimum(np.arange(first, first + _PART), L - 1)
+        passage = _program(_some(request, lanes))
+        left = min(_PART, L - first)
+        parts.append(jax.tree_util.tree_map(lambda x, n=left: x[..., :n], passage))
+    joined = jax.tree_util.tree_map(lambda *x: jnp.concatenate(x, axis=-1), *parts)
+    return _result(request, joined, None)
+
+
+def _some(request: _Request, lanes: Int[np.ndarray, " L"]) -> _Request:
+    """What is asked for of some lanes. (Arrays of one entry are for all lanes.)"""
+
+    def of(x):
+        return x[..., lanes] if x.shape[-1] > 1 else x
+
+    target, levels = request.target.split()
+    own = request.lanes, request.u, target
+    some, u, target = jax.tree_util.tree_map(of, own)
+    return dataclasses.replace(
+        request, lanes=some, u=u, target=target.with_levels(levels)
+    )
 
 
 def sampled(request: _Request, times: Float[Array, " K"]) -> tuple[Flow, Samples]:
