@@ -195,6 +195,30 @@ data.nlargest(3)                                        -> result.to_pandas()
 est.plot().set_rasterization_zorder(1)                  -> plot.axes[0, 0]
 hj.findLimitCycle(hopper)                               -> hj.find_limit_cycle
 fit.Multiplier                                          -> `multipliers`
+hj.find_cycle(hopper)                                   -> use `hj.find_limit_cycle(system)`
+hj.find_limit_cycle(hj.models.VerticalHopper)           -> `VerticalHopper()`
+hj.continuation(cycle, "k")                             -> hj.continuation(cycle, 'k', (0.1, 0.5))
+hj.continuation(cycle, "k", 9.0)                        -> (low, high)
+hj.continuation(cycle, stifness=(8, 9))                 -> it has `cycle`
+hj.continuation(cycle, retentio=(0.1, 0.9))             -> hj.continuation(cycle, 'retention'
+hj.linearize(cycle, "yM")                               -> hj.Crossing('yM', 'falling')
+hj.linearize(cycle)                                     -> hj.Crossing('yM', 'falling')
+hj.identify_recording(rec, "yM", inputs="u", outputs="yM") -> hj.Crossing('yM', 'falling')
+cycle.state.yM                                          -> `['yM']`
+cycle.trajectory.t                                      -> `trajectory().t`
+traj["yM"]                                              -> t, yM = trajectory('yM')
+hopper.replace(stiffness=3)                             -> use `k`
+hj.models.VerticalHopper(retentoin=3)                   -> use `retention`
+hj.parameter(1.0, bounds=(0, 1))                        -> positive=True
+hj.explore(hopper, parameters="k")                      -> hj.explore(system, 'k')
+hj.Chart(("y", "v"), lambda t, q, u: q)                 -> def field(self, t, q, u)
+hj.HybridSystem()                                       -> hj.HybridSystem.from_functions
+hj.Guess("flight", {"yM": 2.0})                         -> in the order of the chart's states
+setattr(hopper, "k", 9.0)                               -> system.replace(k=9.0)
+setattr(hopper, "stiffness", 9.0)                       -> use `k`
+setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)
+setattr(fit, "covariance", 0)                           -> hj.fit_multipliers(htf, order)
+setattr(data, "u", 0)                                   -> hj.run_experiments
 """
 
 
@@ -266,6 +290,60 @@ def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
     with pytest.raises(AttributeError, match="use `k`"):
         Broken().K  # noqa: B018
     assert not hasattr(Broken(), "__jax_array__")
+
+
+def test_public_objects_do_not_change():
+    """The error of who sets an attribute leads on, where that of equinox does not."""
+    written_by_users = "Chart", "Abstract", "Drawing"
+    parts_of_results = "Finding", "Trial"
+    for place, thing in all_members():
+        name = place.rpartition(".")[2]
+        if isinstance(thing, type) and issubclass(thing, eqx.Module):
+            raw = thing.__setattr__ is eqx.Module.__setattr__
+            assert not raw or name.startswith(written_by_users + parts_of_results)
+
+
+def test_a_method_without_its_call_says_how_it_is_called(names):
+    cycle = names["cycle"]
+    text = repr(cycle.trajectory)
+    assert text == "<method of a LimitCycle: call it, as in `.trajectory(periods=1.0)`>"
+    assert cycle.trajectory.__doc__.startswith("The orbit from")
+    assert list(inspect.signature(cycle.trajectory).parameters) == ["periods"]
+    # (As equinox binds methods: JAX takes them as arguments.)
+    responses = jax.jit(lambda method: method.__self__.period)(cycle.trajectory)
+    assert responses == cycle.period
+
+
+OSCILLATOR = hj.HybridSystem.from_functions(
+    ("x", "v"),
+    lambda t, q, u, p: (q[1], -p.damping * q[1] - q[0]),
+    parameters={"damping": 1.0},
+)
+
+
+def test_the_place_of_rest_prints_no_rounding():
+    with pytest.raises(hj.errors.ComputationError, match="x 0, v 0, where nothing"):
+        hj.find_limit_cycle(OSCILLATOR, hj.Guess("main", (1.0, 0.0)))
+
+
+def test_an_error_in_a_field_has_the_hint_that_fits():
+    def error_of(field):
+        system = hj.HybridSystem.from_functions(("x",), field, (), {"damping": 1.0})
+        with pytest.raises(hj.errors.DefinitionError) as caught:
+            hj.simulate(system, hj.Guess("main", (1.0,)), 1.0)
+        return str(caught.value)
+
+    misspelt = error_of(lambda t, q, u, p: -p.dampin * q[0])
+    assert misspelt.endswith("A System has no `dampin`: use `damping`.")
+    assert "write `p.k`" in error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    assert "write `y, v = q`" in error_of(lambda t, q, u, p: -q["x"])
+    assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
+
+
+def test_settings_print_their_accuracy():
+    assert "default rtol and atol of each call" in repr(hj.orbits.Settings())
+    assert "default atol of each call" in repr(hj.orbits.Settings(rtol=1e-9))
+    assert "default" not in repr(hj.orbits.Settings(rtol=1e-9, atol=1e-9))
 
 
 FITS = "fit", "ser", "ldtp", "phys"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from .boundary.leads import missing_attribute
+from .boundary.members import fixed_attribute, missing_attribute
 from .findings import Finding
 
 
@@ -25,6 +25,7 @@ class Showable:
     else:
         findings = ()
         __getattr__ = missing_attribute
+        __setattr__ = fixed_attribute
 
     def plot(self, *args: Any, **options: Any) -> Any:
         """Draw what one would ask for first.

@@ -179,6 +179,14 @@ def table(summary: dict) -> str:
         found = "confirmed" if item["holds"] else "differs"
         rows.append(f"  {found:9}  {item['claim']}")
         rows.append(f"             {item['measured']}")
+    if not all(item["holds"] for item in summary["observations"]):
+        rows += [
+            "",
+            "'differs': the numbers that are computed here contradict this statement of the paper. "
+            "The",
+            "multipliers above do not depend on it: they are checked against the Jacobian of the "
+            "return map.",
+        ]
     return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s.", ""])
 
 

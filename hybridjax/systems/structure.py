@@ -148,6 +148,13 @@ class ByName(dict):
     def __missing__(self, name: str):
         raise KeyError(f"there is no '{name}'; names are {', '.join(self)}")
 
+    def __getattr__(self, name: str):
+        if name in self:
+            raise AttributeError(f"names stand in brackets here: write `['{name}']`.")
+        raise AttributeError(
+            f"there is no `{name}`; names are {', '.join(self)}, as in `['{next(iter(self))}']`."
+        )
+
 
 _kinds = Memory()
 _all_clocks = Memory()

@@ -24,7 +24,7 @@ from .._core.boundary.kinds import (
     Scalar,
     Vector,
 )
-from .._core.boundary.leads import missing_attribute
+from .._core.boundary.members import fixed_attribute, missing_attribute
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
 from .._core.pieces.description import digest_of, marked
@@ -317,6 +317,12 @@ class HybridSystem(Definition):
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)
+        if cls.__abstractmethods__:
+            raise DefinitionError(
+                f"{cls.__name__} is a base class without `charts`: `hj.models` has systems, and "
+                "`hj.HybridSystem.from_functions(states, field, events)` or a class with `def "
+                "charts(self)` makes one."
+            )
         return super().__new__(cls)
 
     @abc.abstractmethod
@@ -436,6 +442,7 @@ class HybridSystem(Definition):
         return dataclasses.replace(self, **parameters)
 
     __getattr__ = missing_attribute
+    __setattr__ = fixed_attribute
 
     def __repr__(self):
         rows = []

@@ -6,14 +6,12 @@ read only where an error is raised.
 
 import dataclasses
 import difflib
-import inspect
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from ..exceptions import HybridJaxError
 from ..public import about_word, place_of
 from . import words
-from .values import Kind, with_article
+from .values import Kind, show, with_article
 
 
 MAKERS = {
@@ -134,8 +132,9 @@ stands for those derived from it."""
 OBJECTS = {
     "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
     "fit_series.LDTP": "are the model and the data in the wrong order?",
-    "continuation.int": "pass `(low, high)`",
-    "continuation.float": "pass `(low, high)`",
+    "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "Guess.dict": "pass the values in the order of the chart's states",
     "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
     "multisine.AbstractSections": "pass `sections.n_sections`",
     "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
@@ -205,6 +204,15 @@ def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
     return IN_NAMESPACES.get(namespace, f"`dir(hj.{namespace})` lists its names")
 
 
+def other_than(package: str, name: str) -> str | None:
+    """Return what a name of one namespace most often means in the package itself; None if it means
+    the name of the namespace."""
+    is_class = name[0].isupper()
+    if package != "hybridjax" or is_class:
+        return None
+    return words.lead_of(words.NAMES, [""], name)
+
+
 def _leads_of_name(
     namespace: str, name: str, places: Mapping[str, str]
 ) -> Iterator[str | None]:
@@ -233,33 +241,6 @@ def about_called(package: str) -> str:
     return f"`hj.{name}` is a module: {lead}."
 
 
-class UnknownAttribute(HybridJaxError, AttributeError):
-    """An attribute that an object has not. The sentence is composed when it is read: JAX asks for
-    many attributes that are not there."""
-
-    def __init__(self, cls: type, name: str):
-        # (With a `name` Python would suggest one again.)
-        super().__init__(name="")
-        self._of = cls, name
-
-    def __str__(self) -> str:
-        return about_attribute(*self._of)
-
-    def __reduce__(self) -> Any:
-        # (Processes hand on the sentence: the class may not exist elsewhere.)
-        return AttributeError, (str(self),)
-
-
-def missing_attribute(self: Any, name: str) -> Any:
-    """`__getattr__` of public classes: an error that leads on."""
-    if name.startswith("_"):
-        raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
-    if inspect.getattr_static(type(self), name, None) is not None:
-        # A property raised an AttributeError, which Python hides: it is raised again.
-        return object.__getattribute__(self, name)
-    raise UnknownAttribute(type(self), name)
-
-
 def about_attribute(cls: type, name: str) -> str:
     """Return the sentence about an attribute that a class has not."""
     earlier = about_word(cls.__name__, name)
@@ -268,6 +249,24 @@ def about_attribute(cls: type, name: str) -> str:
     head = f"{with_article(cls.__name__)} has no `{name}`"
     head = head[0].upper() + head[1:]
     return f"{head}{_meant_attribute(cls, name)}."
+
+
+def about_setting(thing: Any, name: str, value: Any) -> str:
+    """Return the sentence about an attribute that a user sets."""
+    cls = type(thing)
+    kind = with_article(cls.__name__)
+    head = f"{kind[0].upper()}{kind[1:]} does not change"
+    if name not in attributes_of(cls):
+        return f"{head}, and has no `{name}`{_meant_attribute(cls, name)}."
+    if _is_system(thing):
+        new = show(value) if isinstance(value, int | float | str) else "..."
+        return (
+            f"{head}: `system.replace({name}={new})` returns one with another `{name}`."
+        )
+    for base in cls.__mro__:
+        if base.__name__ in MAKERS:
+            return f"{head}: {MAKERS[base.__name__]}."
+    return f"{head}: functions return new ones."
 
 
 def _meant_attribute(cls: type, name: str) -> str:
@@ -303,6 +302,22 @@ def _use(name: str | None) -> str | None:
     return None if name is None else f"use `{name}`"
 
 
+def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
+    """Return the sentence about a parameter that a class has not."""
+    alike = (
+        _synonym(name, known),
+        _spelled_alike(name, known, _SLIP),
+        _documented(cls, name),
+        _spelled_alike(name, known, _ALIKE),
+    )
+    meant = next((x for x in alike if x is not None), None)
+    lead = "" if meant is None else f": use `{meant}`"
+    return (
+        f"{cls.__name__}: there is no parameter '{name}'; parameters are "
+        f"{', '.join(known) or 'none'}{lead}."
+    )
+
+
 def _documented(cls: type, name: str) -> str | None:
     """Return the parameter of a system whose description has this word."""
     if dataclasses.is_dataclass(cls):
@@ -333,6 +348,9 @@ def attributes_of(cls: type) -> list[str]:
 
 
 NEEDS = {
+    "continuation.range": "(low, high), as in `hj.continuation(cycle, 'k', (0.1, 0.5))`, with the "
+    "value of the cycle's system between them",
+    "sweep.values": "values by name, as in `hj.sweep(system, {'k': [0.1, 0.5]})`",
     "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
     "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
@@ -348,13 +366,55 @@ NEEDS = {
 """What a missing argument is, of any function or of one."""
 
 
-def about_missing(function: str, name: str, kind: Kind | None) -> str:
-    """Return the sentence about an argument that a function needs."""
+def about_missing(
+    function: str, name: str, kind: Kind | None, given: Sequence[Any]
+) -> str:
+    """Return the sentence about an argument that a function needs.
+
+    **Arguments:** `given`: the arguments before it.
+    """
     lead = NEEDS.get(f"{function.rpartition('.')[2]}.{name}", NEEDS.get(name))
     if lead is not None:
-        return f"{function} needs `{name}`: {lead}."
+        return f"{function} needs `{name}`: {_in_names_of(given, lead)}."
     about = "" if kind is None else f" ({kind.allowed})"
-    return f"{function} needs `{name}`{about}{about_object(function, kind, None)}."
+    made = about_object(function, kind, None, given)
+    return f"{function} needs `{name}`{about}{made}."
+
+
+def _in_names_of(given: Sequence[Any], sentence: str) -> str:
+    """Return a sentence on a signal 'y' and a parameter 'k' with names of what was given."""
+    named = [x for x in given if isinstance(x, str)]
+    for thing in given:
+        for letter, names in (("'y'", _signals(thing)), ("'k'", _parameters(thing))):
+            if names:
+                meant = [name for name in named if name in names] or names
+                sentence = sentence.replace(letter, f"'{meant[0]}'")
+    return sentence
+
+
+def _is_system(thing: Any) -> bool:
+    return hasattr(type(thing), "charts") and hasattr(type(thing), "transitions")
+
+
+def _signals(thing: Any) -> list[str]:
+    """Return the names of the states of a system, or of the signals of a recording."""
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        signals = getattr(thing, "signals", ())
+        return list(signals) if isinstance(signals, tuple) else []
+    try:
+        charts = system.charts().values()
+        return [str(name) for chart in charts for name in chart.states]
+    except Exception:  # (An error in a user's charts has its own sentence elsewhere.)
+        return []
+
+
+def _parameters(thing: Any) -> list[str]:
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        return []
+    fields = dataclasses.fields(system)
+    return [x.name for x in fields if x.repr and not x.metadata.get("static")]
 
 
 def about_keyword(
@@ -388,10 +448,11 @@ def _leads_of_argument(
     own = [function]
     for word in (name, *words.synonyms(name)):
         yield words.lead_of(words.KEYWORDS, own, word)
-    system = getattr(first, "system", first)
-    if hasattr(type(system), "charts") and name in attributes_of(type(system)):
-        yield words.lead_of(words.KEYWORDS, own, "parameter")
-        yield f"`system.replace({name}=...)` returns a system with another `{name}`"
+    parameter = _parameter_like(name, _parameters(first))
+    if parameter is not None:
+        about = words.lead_of(words.KEYWORDS, own, "parameter")
+        yield about and about.replace("'k'", f"'{parameter}'")
+        yield f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
@@ -401,6 +462,10 @@ def _leads_of_argument(
         yield _use(words.with_part(part, parameters))
         yield words.lead_of(words.KEYWORDS, owners, part)
     yield _use(_spelled_alike(name, parameters, _ALIKE))
+
+
+def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
+    return name if name in parameters else _spelled_alike(name, parameters, _SLIP)
 
 
 def _synonym(name: str, among: Collection[str]) -> str | None:
@@ -416,14 +481,25 @@ def _spelled_alike(name: str, among: Collection[str], likeness: float) -> str | 
     return alike[0] if alike else None
 
 
-def about_object(function: str, kind: Kind | None, value: Any) -> str:
+def about_object(
+    function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
+) -> str:
     """Return the call that makes what a function needs instead of a value, or the part of it that
-    is needed, as the rest of a sentence; "" if none is known."""
+    is needed, as the rest of a sentence; "" if none is known.
+
+    **Arguments:** `given`: all arguments, whose names the call has.
+    """
+    return _in_names_of(given, _about_object(function, kind, value))
+
+
+def _about_object(function: str, kind: Kind | None, value: Any) -> str:
     for base in type(value).__mro__:
         lead = OBJECTS.get(f"{function}.{base.__name__}")
         if lead is not None:
             return f": {lead}"
     wanted = list(classes_in(kind))
+    if isinstance(value, type) and issubclass(value, tuple(wanted)):
+        return f": make one, as `{value.__name__}()`"
     for cls in wanted:
         part = _part(value, cls)
         if part is not None:

@@ -268,7 +268,7 @@ KEYWORDS = {
         "the period follows from the clock or the search; `max_period` bounds it": (
             "period"
         ),
-        "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=1000)`": "settings",
+        "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=20_000)`": "settings",
     },
     "simulate": {
         "events are transitions of the system, as in `hj.HybridSystem.from_functions(states, "
@@ -349,6 +349,16 @@ KEYWORDS = {
     "optimal_design": {
         "`plan.cycles_for(standard_error)` returns the number of cycles for an accuracy": (
             "cycles strides n_cycles budget accuracy standard_error"
+        ),
+    },
+    "parameter": {
+        "`positive=True` keeps it positive, and there are no other bounds": (
+            "bounds limits constraints range min max lower upper low high"
+        ),
+    },
+    "explore": {
+        "pass names: `hj.explore(system, 'k')`, with `ranges={'k': (low, high)}`": (
+            "parameter parameters"
         ),
     },
     "continuation": {
@@ -738,7 +748,7 @@ ATTRIBUTES = {
 NAMES = {
     "": {
         "use `hj.plot.bode(htf)`": (
-            "bode bode_plot nyquist plot_bode nyquist_plot freqz singular_values_plot"
+            "bode_plot nyquist plot_bode nyquist_plot freqz singular_values_plot"
         ),
         "use `fit.compare(other)`": "compare",
         "use `hj.Recording(time, signals, units=...)`": "create_info",
@@ -747,8 +757,8 @@ NAMES = {
             "mean_squared_error compare_models evaluate"
         ),
         "use `hj.find_limit_cycle(system)`": (
-            "cycle periodic_orbit shooting periodic orbit limitcycle steady_state find_orbit "
-            "bvp solve_bvp collocation"
+            "find_cycle cycle periodic_orbit shooting periodic orbit limitcycle steady_state "
+            "find_orbit bvp solve_bvp collocation"
         ),
         "use `hj.testing.simulate_recording(cycle, inputs, outputs, rate)`": (
             "datasets synthetic fake_data example_data"
@@ -786,7 +796,7 @@ NAMES = {
         ),
         "use `hj.linearize(cycle, sections)`": "monodromy linearization jacobian",
         "use `hj.experiments.add_noise(data, std=...)`": (
-            "noise add_noise measurement_noise awgn"
+            "noise measurement_noise awgn"
         ),
         "use `hj.sections.section_map(cycle, sections, i, j)`, or `cycle.return_map()`": (
             "poincare_map return_map poincare stroboscopic"
@@ -905,7 +915,7 @@ NAMES = {
         "use `cycle.plot(x, y)`": (
             "phase_portrait phase_plane portrait phaseplot streamplot phase_plot"
         ),
-        "use `hj.plot.animate(cycle)`": "animation movie video animate",
+        "use `hj.plot.animate(cycle)`": "animation movie video",
         "`result.to_pandas()` returns a table of pandas": (
             "to_pandas to_csv to_dataframe dataframe_of table export"
         ),
