@@ -214,8 +214,8 @@ _COMPARE = "`fit.compare(other)` tests the difference from another fit or a trut
 KEYWORDS = {
     "": {
         _HELD_OUT: (
-            "cv kfold n_splits test_size train_size split holdout validation_split test_data "
-            "train"
+            "cv kfold n_splits test_size train_size split holdout held_out validation_split "
+            "test_data train"
         ),
         "responses are computed from whole periods, without windows; `discard` of "
         "`hj.run_experiments` leaves out the first cycles, and `drift` of "
@@ -240,10 +240,20 @@ KEYWORDS = {
             "copy inplace copy_x"
         ),
     },
-    "bode htf": {
-        "`plot.axes` are Axes of matplotlib, such as `plot.axes[0, 0].set_xscale('log')`": (
-            "db deg degrees log logscale margins phase magnitude omega_limits range"
+    "bode": {
+        "`unit='Hz'` with `period=cycle` draws frequencies in Hz": "hz rad",
+        "`log=True` draws decibels over a logarithmic axis": "db decibel logscale",
+        "phases are in degrees": "deg degrees",
+        "limits are those of matplotlib: `plot.axes[0, 0].set_xlim(low, high)`": (
+            "omega_limits range xlim freq_range"
         ),
+        "an HTF has its frequencies: `model.htf(frequencies)`": (
+            "omega w freq frequencies"
+        ),
+        _CONTROL: "margins",
+    },
+    "htf": {
+        "`hj.plot.bode(htf, log=True)` draws decibels": "db decibel log logscale phase",
     },
     "plot": {
         "`ax` takes an `Axes` of matplotlib, and `plot.axes[0, 0]` can be changed afterwards": (
@@ -798,9 +808,8 @@ NAMES = {
         "use `hj.experiments.add_noise(data, std=...)`": (
             "noise measurement_noise awgn"
         ),
-        "use `hj.sections.section_map(cycle, sections, i, j)`, or `cycle.return_map()`": (
-            "poincare_map return_map poincare stroboscopic"
-        ),
+        "use `hj.sections.section_map(cycle, sections, i, j)`; `hj.plot.return_map(cycle)` draws "
+        "one": "poincare_map poincare stroboscopic cobweb",
         "use `model.multipliers`": "pole poles",
         "use `cycle.responses()`": (
             "prc phase_response_curve isochron isochrons ipr adjoint"
@@ -967,6 +976,9 @@ NAMES = {
         ),
         "use `hj.plot.branch(branch)`": "bifurcation bifurcation_diagram continuation",
         "use `hj.plot.animate(cycle)`": "animation movie",
+        "use `hj.plot.return_map(cycle)`": (
+            "cobweb poincare poincare_map poincare_section first_return stroboscopic"
+        ),
         "use `plot.show()`": "show",
     },
 }
