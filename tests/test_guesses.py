@@ -17,6 +17,11 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax._core.boundary import leads, words
+from hybridjax._core.boundary.guesses.attributes import ATTRIBUTES
+from hybridjax._core.boundary.guesses.functions import CALLED, IN_NAMESPACES, NAMES
+from hybridjax._core.boundary.guesses.keywords import KEYWORDS, NEEDS
+from hybridjax._core.boundary.guesses.objects import MAKERS, OBJECTS, STEPS
+from hybridjax._core.boundary.guesses.synonyms import ALIKE, WORDS
 from hybridjax._core.showable import Showable, WithMultipliers
 
 from .conftest import APEX, OUTPUTS
@@ -243,35 +248,132 @@ def test_the_error_of_a_guess_leads_on(names, line):
     assert "\n" not in text
 
 
+PLACES = {place.rpartition(".")[2]: thing for place, thing in all_members()}
+# Objects as the sentences call them, by the classes that they may be of.
+VARIABLES = {
+    "branch": "Branch",
+    "cycle": "LimitCycle",
+    "data": "ExperimentData SectionData",
+    "design": "Design",
+    "fit": "SeriesFit StructuredFit LDTPFit ModelFit ParameterEstimate RationalFit",
+    "htf": "HTF",
+    "model": "LDTP HTF",
+    "other": "SeriesFit",
+    "plan": "OptimalDesign",
+    "plot": "Plot",
+    "recording": "Recording",
+    "sections": "ClockPhase",
+    "selection": "OrderSelection",
+    "system": "HybridSystem",
+    "trajectory": "Trajectory",
+    "validation": "Validation",
+}
+# (`result` is a result of any kind.)
+VARIABLES["result"] = "Identification LimitCycle SectionData ExperimentData HTF"
+
+
+def sentences():
+    """All sentences of the tables."""
+    for table in (ATTRIBUTES, KEYWORDS, NAMES):
+        for owned in table.values():
+            yield from owned
+    for flat in (MAKERS, STEPS, OBJECTS, NEEDS, CALLED, IN_NAMESPACES):
+        yield from flat.values()
+
+
+def thing_at(path):
+    thing = types.SimpleNamespace(hj=hj)
+    for name in path.split("."):
+        thing = getattr(thing, name)
+    return thing
+
+
 def test_errors_name_calls_that_exist():
-    tables = inspect.getsource(leads) + inspect.getsource(words)
-    for path in re.findall(r"hj(?:\.\w+)+", tables):
-        thing = types.SimpleNamespace(hj=hj)
-        for name in path.split("."):
-            thing = getattr(thing, name)
+    for sentence in sentences():
+        for path in re.findall(r"hj(?:\.\w+)+", sentence):
+            assert thing_at(path) is not None
+
+
+def test_errors_name_attributes_that_exist():
+    for sentence in sentences():
+        for owner, name in re.findall(r"(?<![\w.'(/])(\w+)\.(\w+)", sentence):
+            classes = [PLACES[x] for x in VARIABLES.get(owner, "").split()]
+            attributes = {x for cls in classes for x in leads.attributes_of(cls)}
+            assert not classes or name in attributes, sentence
+
+
+def test_errors_name_arguments_that_exist():
+    for sentence in sentences():
+        for path, given in re.findall(r"(hj(?:\.\w+)+)\(([^()]*)\)", sentence):
+            known = inspect.signature(thing_at(path))
+            named = set(re.findall(r"(\w+)=", given))
+            assert named <= known.parameters.keys(), sentence
 
 
 def test_tables_of_words_have_owners_that_exist():
-    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
     classes = {
-        base.__name__ for x in places.values() for base in getattr(x, "__mro__", ())
+        base.__name__ for x in PLACES.values() for base in getattr(x, "__mro__", ())
     }
-    for owners in words.ATTRIBUTES:
+    for owners in ATTRIBUTES:
         assert set(owners.split()) <= classes
-    for owners in words.KEYWORDS:
-        assert set(owners.split()) <= {*places, *hj.__all__}
-    for namespace in words.NAMES:
+    for owners in KEYWORDS:
+        assert set(owners.split()) <= {*PLACES, *hj.__all__}
+    for namespace in NAMES:
         assert namespace == "" or namespace in hj.__all__
+
+
+@pytest.mark.parametrize("table", [ATTRIBUTES, KEYWORDS, NAMES])
+def test_a_word_leads_to_one_sentence_of_an_owner(table):
+    """Nobody sees the second one."""
+    found = {}
+    for owners, owned in table.items():
+        for owner in owners.split() or [""]:
+            for sentence, row in owned.items():
+                for word in row.split():
+                    first = found.setdefault((owner, words._plain(word)), word)
+                    assert first is word, (owner, first, word, sentence)
 
 
 def test_words_that_lead_on_are_no_names():
     """Else nobody sees the sentence."""
-    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
-    for owners, sentences in words.ATTRIBUTES.items():
-        for owner in set(owners.split()) & places.keys():
-            names = leads.attributes_of(places[owner])
-            known = {name for row in sentences.values() for name in row.split()}
+    for owners, owned in ATTRIBUTES.items():
+        for owner in set(owners.split()) & PLACES.keys():
+            names = leads.attributes_of(PLACES[owner])
+            known = {name for row in owned.values() for name in row.split()}
             assert not known & set(names), owner
+    # (These two are parts of names: `identify_walk`, `load_walk`.)
+    parts = {"identify", "load"}
+    for namespace, owned in NAMES.items():
+        names = getattr(hj, namespace).__all__ if namespace else hj.__all__
+        known = {name for row in owned.values() for name in row.split()}
+        assert not (known - parts) & set(names), namespace
+
+
+def test_words_stand_for_words_of_this_package():
+    known = set()
+    for thing in PLACES.values():
+        if isinstance(thing, type):
+            known |= set(leads.attributes_of(thing))
+            things = [
+                thing,
+                *(
+                    getattr(thing, x)
+                    for x in leads.attributes_of(thing)
+                    if hasattr(thing, x)
+                ),
+            ]
+        else:
+            things = [thing]
+        for callable_thing in filter(callable, things):
+            try:
+                known |= inspect.signature(callable_thing).parameters.keys()
+            except ValueError:  # (a class of C)
+                continue
+    for word, meant in WORDS.items():
+        assert set(meant) <= known, word
+    assert ALIKE.keys() <= WORDS.keys() | known
+    twice = [x for row in ALIKE.values() for x in row.split()]
+    assert len(twice) == len(set(twice))
 
 
 def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():

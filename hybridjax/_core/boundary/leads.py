@@ -1,7 +1,7 @@
-"""Which call, argument or attribute does what a wrong call means: tables that errors look up.
+"""Which call, argument or attribute does what a wrong call means: the sentences of errors.
 
-Users guess with the words of other libraries, and give an object of an earlier step. The tables are
-read only where an error is raised.
+Users guess with the words of other libraries, and give an object of an earlier step. The tables in
+`guesses` are read only where an error is raised.
 """
 
 import dataclasses
@@ -11,173 +11,12 @@ from typing import Any
 
 from ..public import about_word, place_of
 from . import words
+from .guesses.attributes import ATTRIBUTES
+from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
+from .guesses.keywords import KEYWORDS, NEEDS
+from .guesses.objects import MAKERS, OBJECTS, STEPS
 from .values import Kind, show, with_article
 
-
-MAKERS = {
-    "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "
-    "sections",
-    "Branch": "`hj.continuation(cycle, parameter, (low, high))` makes one",
-    "Crossing": "`hj.Crossing('y', 'falling')` makes one",
-    "Design": "`hj.multisine(n_sections)` makes one",
-    "ExperimentData": "`hj.run_experiments(cycle, sections, design, outputs)` makes one",
-    "Guess": "`hj.Guess(chart, state)` makes one",
-    "HTF": "`hj.estimate_htf(data)` or `model.htf(frequencies)` makes one",
-    "HybridSystem": "`hj.models` has ready ones, and subclasses of `hj.HybridSystem` are others",
-    "HasMultipliers": "limit cycles, models and fits have them",
-    "HasRecords": "`hj.run_experiments(cycle, sections, design, outputs)` makes data, and "
-    "`hj.identify_recording` those of a recording",
-    "LDTP": "`hj.linearize(cycle, sections)` or `hj.fit_ldtp(data, ...)` makes one",
-    "LimitCycle": "`hj.find_limit_cycle(system)` makes one",
-    "LimitCycles": "`hj.orbits.find_limit_cycles(systems)` makes one",
-    "Fit": "`hj.fit_multipliers(htf, order)` or `hj.fit_series(data, order)` makes one",
-    "MultiplierFit": "`hj.fit_multipliers(htf, order)` makes one",
-    "OptimalDesign": "`hj.optimal_design(model)` makes one",
-    "Phase": "`hj.recordings.estimate_phase(recording, sections)` makes one",
-    "Plant": "`hj.plants` has ready ones",
-    "RationalFit": "`hj.identify.fit_rational(htf)` makes one",
-    "SectionSeries": "`data.records` has them",
-    "Recording": "`hj.read_recording(path)`, or `hj.Recording(time, signals)` of arrays, makes one",
-    "SectionData": "`hj.identify_recording(recording, ...).data` or "
-    "`hj.recordings.sample_sections(...)` is one",
-    "SeriesFit": "`hj.fit_series(data, order)` makes one",
-    "Settings": "`hj.orbits.Settings(rtol=1e-9)` makes one",
-    "StructuredFit": "`hj.fit_multipliers(htf, order)` makes one",
-    "Validation": "`hj.validate(model, data)` makes one",
-}
-"""For each type, the call that makes an object of it."""
-
-STEPS = {
-    (
-        "Phase",
-        "ClockPhase",
-    ): "recordings have no clock; its ticks are events: "
-    "`hj.Recording(time, signals, events={'tick': times})`, then `hj.AtEvent('tick')`",
-    (
-        "Phase",
-        "AbstractSections",
-    ): "`hj.Crossing('y', 'falling')` of a signal 'y', with `n_sections=8`, divides cycles by time",
-    (
-        "Crossing",
-        "str",
-    ): "`hj.Crossing('y', 'falling')` of a signal 'y', or `hj.AtEvent('strike')` of an event, is "
-    "one",
-    ("HTF", "ExperimentData"): "`hj.estimate_htf(data)` makes one of data",
-    (
-        "HTF",
-        "Identification",
-    ): "`result.fit` is a fit, and `hj.fit_series(result.data, order)` makes another",
-    ("HasRecords", "Identification"): "pass its `data`",
-    (
-        "ExperimentData",
-        "SectionData",
-    ): "`hj.fit_series(data, order)` fits data at sections",
-    ("HTF", "SectionData"): "`hj.fit_series(data, order)` fits data at sections",
-    ("HTF", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
-    ("HTF", "LDTP"): "`model.htf(frequencies)` makes one of a model",
-    (
-        "HTF",
-        "LimitCycle",
-    ): "`hj.linearize(cycle, sections).htf(frequencies)` makes one of a cycle",
-    ("HTF", "Fit"): "`fit.htf(frequencies)` makes one of a fit",
-    ("LDTP", "LimitCycle"): "`hj.linearize(cycle, sections)` makes one of a cycle",
-    (
-        "LDTP",
-        "HybridSystem",
-    ): "`hj.linearize(hj.find_limit_cycle(system), sections)` makes one of a system",
-    ("LDTP", "HTF"): "`hj.fit_ldtp(htf, ...)` makes one of an HTF",
-    (
-        "ExperimentData",
-        "HTF",
-    ): "it takes the data: `hj.fit_multipliers(htf, order)` takes an HTF",
-    (
-        "ExperimentData",
-        "Recording",
-    ): "`hj.identify_recording(recording, ...)` takes recordings",
-    (
-        "ExperimentData",
-        "LDTP",
-    ): "`hj.experiments.simulate_experiments(model, design)` makes data of a model",
-    (
-        "HasRecords",
-        "HTF",
-    ): "it takes the data; `hj.fit_multipliers(htf, order)` takes an HTF",
-    (
-        "HasRecords",
-        "Recording",
-    ): "`hj.identify_recording(recording, ...)` takes recordings",
-    (
-        "HasRecords",
-        "LimitCycle",
-    ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
-    ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
-    ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
-    ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
-    (
-        "LimitCycle",
-        "LDTP",
-    ): "it needs the cycle that was linearized: `hj.find_limit_cycle(system)`",
-    (
-        "AbstractObservation",
-        "HTF",
-    ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
-    (
-        "AbstractObservation",
-        "ExperimentData",
-    ): "`hj.fitting.ObservedSeries(data, sections)` makes one of data",
-}
-"""For a type that is needed, and one that was given, the step between them. A given type also
-stands for those derived from it."""
-
-OBJECTS = {
-    "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
-    "fit_series.LDTP": "are the model and the data in the wrong order?",
-    "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
-    "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
-    "Guess.dict": "pass the values in the order of the chart's states",
-    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
-    "multisine.AbstractSections": "pass `sections.n_sections`",
-    "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
-    "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
-    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
-    "save.Showable": "`hj.save('name.npz', result)` takes the name first",
-    "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
-    "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
-    "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
-    "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
-    "save.HybridSystem": "a system is code: keep the script that makes it",
-    "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
-    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
-    "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
-    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
-    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
-    "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
-    "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
-}
-"""For a function, and the type of the object that it was given, what to do. A given type also
-stands for those derived from it."""
-
-IN_NAMESPACES = {
-    "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
-    "other fields are arrays",
-    "hybridjax": "`dir(hj)` lists its names, and those of the page of each namespace, such as "
-    "`hj.recordings`, are one level below",
-    "plot": "`result.plot()` draws a result, and `dir(hj.plot)` lists all figures",
-}
-"""Where a name is none of a namespace's, and close to no other one; `dir` in the others."""
-
-CALLED = {
-    "identify": "`hj.fit_multipliers(htf, order)`, `hj.fit_series(data, order)` and "
-    "`hj.identify_recording(recording, ...)` identify",
-    "plot": "`result.plot()` draws a result, and `hj.plot.bode(htf)` an HTF",
-    "fitting": "`hj.fit_model(system, observations, parameters)` fits",
-    "experiments": "`hj.run_experiments(cycle, sections, design, outputs)` runs some",
-    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
-    "linear": "`hj.linearize(cycle, sections)` linearizes",
-    "convert": "`result.to_pandas()` and `hj.convert.to_xarray(result)` convert",
-    "models": "`hj.models.VerticalHopper()` is one",
-}
-"""What does what a call of a namespace means."""
 
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
 # is longer than a line.
@@ -210,7 +49,7 @@ def other_than(package: str, name: str) -> str | None:
     is_class = name[0].isupper()
     if package != "hybridjax" or is_class:
         return None
-    return words.lead_of(words.NAMES, [""], name)
+    return words.lead_of(NAMES, [""], name)
 
 
 def _leads_of_name(
@@ -222,13 +61,13 @@ def _leads_of_name(
         return None if meant is None else f"did you mean {places[meant]}?"
 
     own = "" if namespace == "hybridjax" else namespace
-    yield words.lead_of(words.NAMES, [own], name)
+    yield words.lead_of(NAMES, [own], name)
     yield place(words.same_word(name, places))
-    yield words.lead_of(words.NAMES, [""], name)
+    yield words.lead_of(NAMES, [""], name)
     yield place(_spelled_alike(name, places, _SLIP))
     yield words.lead_of_library([""], name)
     for part in words.parts(name):
-        yield words.lead_of(words.NAMES, [own, ""], part)
+        yield words.lead_of(NAMES, [own, ""], part)
     yield place(_spelled_alike(name, places, _ALIKE))
     for part in words.parts(name):
         yield place(words.with_part(part, places))
@@ -283,14 +122,14 @@ def _leads_of_attribute(
 ) -> Iterator[str | None]:
     """Iterate over leads, certain ones first; None where there is none."""
     owners = [base.__name__ for base in cls.__mro__]
-    yield words.lead_of(words.ATTRIBUTES, owners, name)
+    yield words.lead_of(ATTRIBUTES, owners, name)
     yield _use(_synonym(name, attributes))
     yield _use(_attribute_of_part(cls, name))
     yield words.lead_of_library(owners, name)
     yield _use(_spelled_alike(name, attributes, _SLIP))
     yield _use(_documented(cls, name))
     for part in words.parts(name):
-        yield words.lead_of(words.ATTRIBUTES, owners, part)
+        yield words.lead_of(ATTRIBUTES, owners, part)
         yield _use(words.with_part(part, attributes))
     yield _use(_spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
@@ -345,25 +184,6 @@ def attributes_of(cls: type) -> list[str]:
     names = dict.fromkeys([*fields, *dir(cls)])
     hidden = {"code_digest"}
     return [name for name in names if name[0] != "_" and name not in hidden]
-
-
-NEEDS = {
-    "continuation.range": "(low, high), as in `hj.continuation(cycle, 'k', (0.1, 0.5))`, with the "
-    "value of the cycle's system between them",
-    "sweep.values": "values by name, as in `hj.sweep(system, {'k': [0.1, 0.5]})`",
-    "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
-    "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
-    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
-    "estimate_phase.sections": "an event that happens once a cycle, such as "
-    "`hj.Crossing('y', 'falling')` of a signal 'y'",
-    "signals": "`hj.Recording(time, {'name': samples})`, or `hj.Recording.from_frame(table)`",
-    "identify_recording.inputs": "the signals that perturb; without any, "
-    "`hj.recordings.natural_multipliers(hj.recordings.sample_sections(recording, sections, "
-    "inputs=(), outputs=...))` estimates multipliers from variability",
-    "identify_recording.sections": "an event that happens once a cycle, such as "
-    "`hj.Crossing('y', 'falling')` of a signal 'y'",
-}
-"""What a missing argument is, of any function or of one."""
 
 
 def about_missing(
@@ -447,20 +267,20 @@ def _leads_of_argument(
     """Iterate over leads, certain ones first; None where there is none."""
     own = [function]
     for word in (name, *words.synonyms(name)):
-        yield words.lead_of(words.KEYWORDS, own, word)
+        yield words.lead_of(KEYWORDS, own, word)
     parameter = _parameter_like(name, _parameters(first))
     if parameter is not None:
-        about = words.lead_of(words.KEYWORDS, own, "parameter")
+        about = words.lead_of(KEYWORDS, own, "parameter")
         yield about and about.replace("'k'", f"'{parameter}'")
         yield f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
-    yield words.lead_of(words.KEYWORDS, owners, name)
+    yield words.lead_of(KEYWORDS, owners, name)
     yield _use(_spelled_alike(name, parameters, _SLIP))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
-        yield words.lead_of(words.KEYWORDS, owners, part)
+        yield words.lead_of(KEYWORDS, owners, part)
     yield _use(_spelled_alike(name, parameters, _ALIKE))
 
 
