@@ -219,6 +219,26 @@ hj.explore(hopper, parameters="k")                      -> hj.explore(system, 'k
 hj.Chart(("y", "v"), lambda t, q, u: q)                 -> def field(self, t, q, u)
 hj.HybridSystem()                                       -> hj.HybridSystem.from_functions
 hj.Guess("flight", {"yM": 2.0})                         -> in the order of the chart's states
+est.zeros()                                             -> fit_rational(htf)
+est.freqresp([0.1])                                     -> `htf.frequencies`
+est.dcgain()                                            -> abs(htf.H)
+cycle.amplitude                                         -> np.ptp(
+cycle.eigenvectors                                      -> model.monodromy()
+model.observability()                                   -> to_control
+hj.read_sbml("x.xml")                                   -> from_functions
+hj.SINDy()                                              -> hj.fit_model
+hj.models.Lorenz()                                      -> from_functions
+hj.period_doubling(cycle)                               -> branch.points
+hj.continuation(cycle, "k", bounds=(8, 12))             -> use `range`
+hj.continuation(cycle, "k", (8, 12), NMX=100)           -> `max_points`
+hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its name and range
+hj.linearize(cycle, sections, ts=0.1)                   -> no step of time
+hj.identify_recording(rec, apex, sections=16)           -> `n_sections`
+hj.plot.bode(est, dB=True)                              -> `log=True`
+hj.plot.bode(est, Hz=True)                              -> `unit='Hz'`
+hj.plot.bode(est, unit="Hz")                            -> needs the `period`
+hj.plot.poincare_map(cycle)                             -> hj.plot.return_map(cycle)
+hj.validate(fit, data, held_out=0.2)                    -> hj.recordings.hold_out
 setattr(hopper, "k", 9.0)                               -> system.replace(k=9.0)
 setattr(hopper, "stiffness", 9.0)                       -> use `k`
 setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)

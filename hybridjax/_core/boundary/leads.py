@@ -221,7 +221,8 @@ def _signals(thing: Any) -> list[str]:
     system = getattr(thing, "system", thing)
     if not _is_system(system):
         signals = getattr(thing, "signals", ())
-        return list(signals) if isinstance(signals, tuple) else []
+        # (Outputs often stand behind inputs, which do not mark a phase.)
+        return list(reversed(signals)) if isinstance(signals, tuple) else []
     try:
         charts = system.charts().values()
         return [str(name) for chart in charts for name in chart.states]

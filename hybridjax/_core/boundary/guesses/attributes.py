@@ -118,16 +118,20 @@ ATTRIBUTES = {
             "coherence coh mscohere"
         ),
         "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it": (
-            "magnitude gain mag db"
+            "magnitude gain mag db dcgain"
         ),
         "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it": "phase angle",
         "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values": (
             "harmonic eval evaluate evalfr at loc iloc sel isel"
         ),
-        "`hj.plot.bode(htf)` draws it": "bode nyquist freqz",
+        "`hj.plot.bode(htf)` draws it": "bode nyquist freqz bode_plot",
         "`htf.H` has the shape (harmonics, frequencies, outputs, inputs)": "shape",
         "`hj.fit_multipliers(htf, order)` estimates multipliers": (
-            "fit poles multipliers eigenvalues zeros"
+            "fit poles multipliers eigenvalues"
+        ),
+        "`hj.identify.fit_rational(htf)` has zeros": "zeros",
+        "it is the response: `htf.H` at `htf.frequencies`": (
+            "freqresp frequency_response response tf freq"
         ),
         "`htf.frequencies` are in cycles per period": "w omega f hz faxis fs",
     },
@@ -176,7 +180,7 @@ ATTRIBUTES = {
         "`model.impulse_response(n_lags)` returns it": "impulse",
         CONTROL: (
             "damp damping dcgain margin gramian gram norm hinf minreal balred ctrb obsv sample "
-            "to_tf to_ss c2d rlocus"
+            "to_tf to_ss c2d rlocus observability controllability"
         ),
         "`hj.identify.fit_rational(model.htf(frequencies))` has zeros": "zeros",
     },
@@ -184,6 +188,11 @@ ATTRIBUTES = {
         "`pieces` has the states at the beginnings of the cycle's pieces": "legs",
     },
     "LimitCycle": {
+        "`np.ptp(cycle.trajectory()('name')[1])` is that of a signal": (
+            "amplitude peak_to_peak max min"
+        ),
+        "`np.linalg.eig(model.monodromy())`, of `model = hj.linearize(cycle, sections)`, has "
+        "them": ("eigenvectors modes floquet_vectors"),
         "`cycle.trajectory()` follows the cycle, and `hj.simulate(system, chart, state, "
         "duration)` another state": "simulate",
         "`cycle.trajectory()` has times `t` and states `after`; `cycle.trajectory()('name')` one "

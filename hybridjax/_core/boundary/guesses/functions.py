@@ -161,6 +161,17 @@ NAMES = {
         "use `hj.continuation(cycle, parameter, (low, high))`": (
             "bifurcation bifurcation_diagram continue_cycle branch auto follow"
         ),
+        "use `branch.points`, of `hj.continuation(cycle, parameter, (low, high))`": (
+            "hopf hopf_points period_doubling fold limit_point neimark_sacker bifurcation_points"
+        ),
+        "equations are written as fields: `hj.HybridSystem.from_functions(states, field, "
+        "events)`": (
+            "sbml read_sbml load_sbml antimony tellurium cellml xppaut read_ode sympy"
+        ),
+        "equations are given, not discovered: `hj.fit_model(system, observations, parameters)` "
+        "fits their parameters, and `hj.fit_series(data, order)` a linear model": (
+            "sindy pysindy discover symbolic_regression dmd edmd koopman"
+        ),
         "use `hj.sweep(system, {'k': values})`": (
             "grid_search gridsearchcv grid param_grid scan parameter_sweep ensemble montecarlo"
         ),
@@ -247,6 +258,8 @@ IN_NAMESPACES = {
     "other fields are arrays",
     "hybridjax": "`dir(hj)` lists its names, and those of the page of each namespace, such as "
     "`hj.recordings`, are one level below",
+    "models": "`dir(hj.models)` lists its names; `hj.HybridSystem.from_functions(states, field, "
+    "events)`, or a subclass of `hj.HybridSystem`, is a model of your own",
     "plot": "`result.plot()` draws a result, and `dir(hj.plot)` lists all figures",
 }
 """Where a name is none of a namespace's, and close to no other one; `dir` in the others."""

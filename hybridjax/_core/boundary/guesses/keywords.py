@@ -164,8 +164,18 @@ KEYWORDS = {
     },
     "continuation": {
         "pass its name and range: `hj.continuation(cycle, 'k', (low, high))`": (
-            "parameter"
+            "parameter icp par active_parameter continuation_parameter"
         ),
+        "use `range`, (low, high)": (
+            "bounds limits interval values par_bounds stop rl0 rl1 p_min p_max"
+        ),
+        "`max_points` is the largest number of cycles in each direction": (
+            "nmx max_steps max_num_points max_iter"
+        ),
+        "`step` is the longest step, as a part of the range; the shortest follows from the curve": (
+            "dsmax dsmin ds0 min_step"
+        ),
+        "the branch goes to both ends of the range": "direction backward forward bothside",
     },
     "sweep": {
         "pass the values by name: `hj.sweep(system, {'k': values})`": (
@@ -185,6 +195,9 @@ KEYWORDS = {
             "settings"
         ),
         "derivatives are exact: there is no step": "eps step delta h method",
+        "a model has no step of time: its samples lie on the sections": (
+            "ts dt fs rate sample_time sampling_time"
+        ),
     },
 }
 """What to do instead of an argument that a function has not."""

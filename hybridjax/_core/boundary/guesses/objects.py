@@ -120,6 +120,8 @@ OBJECTS = {
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
     "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "identify_recording.int": "it is the event at which cycles begin, such as "
+    "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
     "Guess.dict": "pass the values in the order of the chart's states",
     "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
     "multisine.AbstractSections": "pass `sections.n_sections`",
