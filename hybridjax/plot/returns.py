@@ -1,13 +1,13 @@
 """The return map of one coordinate, with its cobweb."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Count
+from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
 from ..errors import DefinitionError
 from ..orbits.crossing import AtEvent, Crossing
@@ -48,7 +48,7 @@ def return_map(
     section: Crossing | AtEvent | None = None,
     range: tuple[float, float] | None = None,
     start: float | None = None,
-    iterates: Count = 10,
+    iterates: Annotated[int, Whole(1, 1000)] = 10,
     cobweb: bool = True,
     ax: AxesLike | None = None,
 ) -> Plot:
