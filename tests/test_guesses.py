@@ -462,6 +462,15 @@ def test_an_error_in_a_field_has_the_hint_that_fits():
     assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
 
 
+def test_a_system_without_inputs_is_not_linearized():
+    silent = hj.HybridSystem.from_functions(
+        ("x",), lambda t, q, u, p: (jnp.cos(t) - q[0],), period=2 * np.pi, inputs=()
+    )
+    cycle = hj.find_limit_cycle(silent, hj.Guess("main", (0.5,)))
+    with pytest.raises(hj.errors.DefinitionError, match="System has no inputs"):
+        hj.linearize(cycle, hj.ClockPhase(4))
+
+
 def test_settings_print_their_accuracy():
     assert "default rtol and atol of each call" in repr(hj.orbits.Settings())
     assert "default atol of each call" in repr(hj.orbits.Settings(rtol=1e-9))
