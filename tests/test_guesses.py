@@ -462,6 +462,29 @@ def test_an_error_in_a_field_has_the_hint_that_fits():
     assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
 
 
+def test_a_misspelt_method_of_a_system_is_refused():
+    """Else its events would never happen."""
+    with pytest.raises(hj.errors.DefinitionError, match="call it `transitions`"):
+
+        class Ball(hj.HybridSystem):
+            def charts(self):
+                return {}
+
+            def transition(self):
+                return ()
+
+
+def test_a_chart_without_states_is_refused():
+    class Flight(hj.Chart):
+        state = ("y", "v")
+
+        def field(self, t, q, u):
+            return q[1], -9.81
+
+    with pytest.raises(hj.errors.DefinitionError, match="class Flight.*states = "):
+        Flight()
+
+
 def test_a_system_without_inputs_is_not_linearized():
     silent = hj.HybridSystem.from_functions(
         ("x",), lambda t, q, u, p: (jnp.cos(t) - q[0],), period=2 * np.pi, inputs=()

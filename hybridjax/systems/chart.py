@@ -1,6 +1,7 @@
 """A chart: one mode of a hybrid system, with its own states and its own vector field."""
 
 import abc
+import dataclasses
 import operator
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -55,8 +56,9 @@ class Chart(eqx.Module):
 
     def __new__(cls, *args: Any, **options: Any):
         # (Some charts of this package have their states as a field.)
-        named = hasattr(cls, "states") or "states" in cls.__dataclass_fields__
-        if named and not cls.__abstractmethods__:
+        fields = {field.name for field in dataclasses.fields(cls)}
+        is_named = hasattr(cls, "states") or "states" in fields
+        if is_named and not cls.__abstractmethods__:
             return super().__new__(cls)
         name = "YourChart" if cls is Chart else cls.__name__
         raise DefinitionError(

@@ -314,6 +314,12 @@ class HybridSystem(Definition):
                     f"{cls.__name__}: `{name}` must be a method: write `def {name}(self): return "
                     "...`."
                 )
+        for name in ("charts", "transitions", "outputs"):
+            singular = name.removesuffix("s")
+            if callable(vars(cls).get(singular)) and name not in vars(cls):
+                raise DefinitionError(
+                    f"{cls.__name__}: nothing reads the method `{singular}`: call it `{name}`."
+                )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)

@@ -167,6 +167,13 @@ def test_the_period_of_a_cycle_is_in_its_own_unit(estimate):
         hj.plot.bode(estimate, unit="Hz", period=cycle("strides"))
 
 
+def test_a_branch_lists_the_lines_that_it_draws():
+    cycle = hj.find_limit_cycle(hj.models.HopfOscillator())
+    branch = hj.continuation(cycle, "mu", (0.1, 0.12), step=0.5)
+    legend = branch.plot().ax.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["stable"]
+
+
 def bodes(*given, **options):
     return hj.plot.bode({"a": given}, **options)
 
