@@ -224,9 +224,9 @@ def bode(
         for kind in dict.fromkeys(map(type, fits)):
             upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[kind])
         symbol = _name(harmonic)[1:-1]
-        bode_panels.label(symbol, same, drawn[-1].frequencies)
+        bode_panels.label(symbol, same, np.asarray(drawn[-1].frequencies))
         # (Over a logarithmic axis the upper right corner is no longer empty.)
-        _legend(upper, drawn, "best" if log else "upper right")
+        _legend(upper, drawn, over_log=log)
     return Plot(axes)
 
 
@@ -539,7 +539,10 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
     return phase
 
 
-def _legend(ax: Axes, htfs: Sequence[HTF], place: str = "upper right") -> None:
+def _legend(ax: Axes, htfs: Sequence[HTF], over_log: bool = False) -> None:
     if any(htf.source == "exact" for htf in htfs):
         ax.plot([], [], color="0.5", lw=3.0, alpha=0.3, label="exact")
-    ax.legend(loc=place, ncols=1 if place == "best" else 2)
+    if over_log:
+        ax.legend(loc="best")
+    else:
+        ax.legend(loc="upper right", ncols=2)

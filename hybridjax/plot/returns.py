@@ -162,10 +162,12 @@ class _Line(NamedTuple):
         multiplier = _largest_real(cycle)
         values, vectors = np.linalg.eig(_jacobian(returns, scales))
         nearest = int(np.argmin(np.abs(values - multiplier)))
-        vector = vectors[:, nearest].real
+        vector = np.real(vectors[:, nearest])
         parts = np.abs(vector) / scales
         largest = int(np.argmax(parts))
-        index = largest if coordinate is None else list(names).index(coordinate)
+        index = largest
+        if coordinate is not None:
+            index = list(map(str, names)).index(coordinate)
         if parts[index] < _SHOWN * parts[largest]:
             raise DefinitionError(
                 f"return_map: `{names[index]}` does not change along the eigenvector: take "
@@ -245,7 +247,7 @@ def _jacobian(
 def _largest_real(cycle: LimitCycle) -> float:
     """**Raises:** `DefinitionError` for a cycle without a real multiplier."""
     multipliers = cycle.multipliers
-    is_real = np.abs(multipliers.imag) <= _REAL * np.abs(multipliers)
+    is_real = np.abs(np.imag(multipliers)) <= _REAL * np.abs(multipliers)
     if not is_real.any():
         raise DefinitionError(
             "return_map: the cycle has no real multiplier. Deviations turn from period to period, "
@@ -253,4 +255,4 @@ def _largest_real(cycle: LimitCycle) -> float:
             "`hj.plot.multipliers(cycle)`."
         )
     # (They are sorted by modulus.)
-    return float(multipliers[is_real][0].real)
+    return float(np.real(multipliers[is_real][0]))

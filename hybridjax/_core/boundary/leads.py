@@ -319,7 +319,7 @@ def _about_object(function: str, kind: Kind | None, value: Any) -> str:
         if lead is not None:
             return f": {lead}"
     wanted = list(classes_in(kind))
-    if isinstance(value, type) and issubclass(value, tuple(wanted)):
+    if _is_class_of(value, wanted):
         return f": make one, as `{value.__name__}()`"
     for cls in wanted:
         part = _part(value, cls)
@@ -333,6 +333,11 @@ def _about_object(function: str, kind: Kind | None, value: Any) -> str:
                 return f": {step}"
     makers = [MAKERS[cls.__name__] for cls in wanted if cls.__name__ in MAKERS]
     return f": {makers[0]}" if makers else ""
+
+
+def _is_class_of(value: Any, wanted: Sequence[type]) -> bool:
+    """Test whether a class was given in place of its object."""
+    return isinstance(value, type) and issubclass(value, tuple(wanted))
 
 
 def classes_in(kind: Kind | None) -> Iterable[type]:
