@@ -94,7 +94,7 @@ def return_map(
     line = _Line.through(placed, coordinate)
     low, high = line.around(range)
     values = np.linspace(low, high, _STATES)
-    following = line.next(line.states(values))[line.index]
+    following = line.next(line.states(values))[line.place]
     with panels(ax, height=3.6) as axes:
         panel = axes[0, 0]
         panel.plot([low, high], [low, high], color=COLORS["gray"], lw=0.7)
@@ -138,8 +138,8 @@ class _Line(NamedTuple):
 
     returns: SectionMap
     names: Sequence[str]
-    index: int
-    """Of the coordinate."""
+    place: int
+    """The index of the coordinate."""
     direction: Float[np.ndarray, " n"]
     """The change of the state per change of the coordinate."""
     multiplier: float
@@ -184,12 +184,12 @@ class _Line(NamedTuple):
 
     @property
     def name(self) -> str:
-        return self.names[self.index]
+        return self.names[self.place]
 
     @property
     def fixed(self) -> float:
         """The coordinate of the cycle."""
-        return float(self.returns.fixed_point[self.index])
+        return float(self.returns.fixed_point[self.place])
 
     def around(self, range: tuple[float, float] | None) -> tuple[float, float]:
         """Return the ends of what is drawn.
@@ -225,7 +225,7 @@ class _Line(NamedTuple):
         for _ in range(iterates):
             state = self.next(state)
             now = x[-1]
-            after = float(state[self.index, 0])
+            after = float(state[self.place, 0])
             if not within[0] <= after <= within[1]:
                 break
             x += [now, after]
