@@ -211,6 +211,10 @@ hj.linearize(cycle)                                     -> hj.Crossing('yM', 'fa
 hj.identify_recording(rec, "yM", inputs="u", outputs="yM") -> hj.Crossing('yM', 'falling')
 cycle.state.yM                                          -> `['yM']`
 cycle.trajectory.t                                      -> `trajectory().t`
+cycle.k                                                 -> `.system.k`
+cycle.yM                                                -> cycle.trajectory()('yM')
+traj.yM                                                 -> trajectory('yM')
+rec.yM                                                  -> `['yM']`
 traj["yM"]                                              -> t, yM = trajectory('yM')
 hopper.replace(stiffness=3)                             -> use `k`
 hj.models.VerticalHopper(retentoin=3)                   -> use `retention`
@@ -431,6 +435,8 @@ def test_a_method_without_its_call_says_how_it_is_called(names):
     assert text == "<method of a LimitCycle: call it, as in `.trajectory(periods=1.0)`>"
     assert cycle.trajectory.__doc__.startswith("The orbit from")
     assert list(inspect.signature(cycle.trajectory).parameters) == ["periods"]
+    for inherited in (cycle.plot, names["fit"].interval, names["hopper"].replace):
+        assert repr(inherited).startswith("<method of a")
     # (As equinox binds methods: JAX takes them as arguments.)
     responses = jax.jit(lambda method: method.__self__.period)(cycle.trajectory)
     assert responses == cycle.period

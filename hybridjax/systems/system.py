@@ -24,7 +24,7 @@ from .._core.boundary.kinds import (
     Scalar,
     Vector,
 )
-from .._core.boundary.members import fixed_attribute, missing_attribute
+from .._core.boundary.members import Bound, fixed_attribute, missing_attribute
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
 from .._core.pieces.description import digest_of, marked
@@ -460,6 +460,10 @@ class HybridSystem(Definition):
         if self.solver is not None:
             rows.append(("solver", repr(self.solver), "how charts are integrated"))
         return type(self).__name__ + columns(rows)
+
+
+# (For type checkers it is a plain method.)
+setattr(HybridSystem, "replace", Bound(HybridSystem.replace))  # noqa: B010
 
 
 class _Functions(NamedTuple):

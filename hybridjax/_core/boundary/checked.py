@@ -75,7 +75,7 @@ def checked_methods(cls: Class) -> Class:
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
-        is_bound_otherwise = isinstance(member, classmethod | staticmethod)
+        is_bound_otherwise = isinstance(member, classmethod | staticmethod | Bound)
         function = member.__func__ if is_bound_otherwise else member
         if not inspect.isfunction(function):
             continue

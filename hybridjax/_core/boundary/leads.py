@@ -80,14 +80,18 @@ def about_called(package: str) -> str:
     return f"`hj.{name}` is a module: {lead}."
 
 
-def about_attribute(cls: type, name: str) -> str:
-    """Return the sentence about an attribute that a class has not."""
+def about_attribute(cls: type, name: str, thing: Any = None) -> str:
+    """Return the sentence about an attribute that a class has not.
+
+    **Arguments:** `thing`: the object, whose system may have a parameter or a state of this name.
+    """
     earlier = about_word(cls.__name__, name)
     if earlier is not None:
         return earlier
     head = f"{with_article(cls.__name__)} has no `{name}`"
     head = head[0].upper() + head[1:]
-    return f"{head}{_meant_attribute(cls, name)}."
+    part = _about_part(thing, name)
+    return f"{head}{part or _meant_attribute(cls, name)}."
 
 
 def about_setting(thing: Any, name: str, value: Any) -> str:
@@ -106,6 +110,22 @@ def about_setting(thing: Any, name: str, value: Any) -> str:
         if base.__name__ in MAKERS:
             return f"{head}: {MAKERS[base.__name__]}."
     return f"{head}: functions return new ones."
+
+
+def _about_part(thing: Any, name: str) -> str:
+    """Return the rest of the sentence about a parameter or a signal of what a result is about; ""
+    for other names."""
+    if _is_system(thing):
+        return ""
+    if name in _parameters(thing):
+        return f": `.system.{name}` is a parameter of its system"
+    if name not in _signals(thing):
+        return ""
+    if hasattr(type(thing), "trajectory"):
+        return f": `cycle.trajectory()('{name}')` has times and values of a signal"
+    if callable(thing):
+        return f": `trajectory('{name}')` has times and values of a signal"
+    return f": `['{name}']` has the values of a signal"
 
 
 def _meant_attribute(cls: type, name: str) -> str:
@@ -220,8 +240,8 @@ def _signals(thing: Any) -> list[str]:
     """Return the names of the states of a system, or of the signals of a recording."""
     system = getattr(thing, "system", thing)
     if not _is_system(system):
-        signals = getattr(thing, "signals", ())
         # (Outputs often stand behind inputs, which do not mark a phase.)
+        signals = getattr(thing, "signals", None)
         return list(reversed(signals)) if isinstance(signals, tuple) else []
     try:
         charts = system.charts().values()

@@ -4,6 +4,7 @@ call: each leads on in one line."""
 import dataclasses
 import functools
 import inspect
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -25,7 +26,7 @@ def missing_attribute(self: Any, name: str) -> Any:
     if inspect.getattr_static(type(self), name, None) is not None:
         # A property raised an AttributeError, which Python hides: it is raised again.
         return object.__getattribute__(self, name)
-    about = functools.partial(leads.about_attribute, type(self), name)
+    about = functools.partial(leads.about_attribute, type(self), name, self)
     raise UnknownAttribute(about)
 
 
@@ -78,7 +79,8 @@ class Method(eqx.Module):
 
 
 class Bound:
-    """A public method of an equinox module: of the class the function, of an object a `Method`."""
+    """A public method: of the class the function, of an equinox module a `Method`, and of other
+    objects as Python binds it."""
 
     def __init__(self, function: Callable):
         self.__func__ = function
@@ -87,4 +89,14 @@ class Bound:
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         if instance is None:
             return self.__func__
-        return Method(self.__func__, instance)
+        if isinstance(instance, eqx.Module):
+            return Method(self.__func__, instance)
+        return types.MethodType(self.__func__, instance)
+
+
+def bind_methods(cls: type) -> None:
+    """Make the public methods of a class `Bound`."""
+    for name, member in list(vars(cls).items()):
+        is_method = inspect.isfunction(member) and not name.startswith("_")
+        if is_method and not getattr(member, "__isabstractmethod__", False):
+            setattr(cls, name, Bound(member))
