@@ -182,6 +182,10 @@ hj.plot.bode(estimate, exact)
 # %%
 fit = hj.fit_multipliers(estimate, order=1)
 fit.compare(cycle.multipliers)
+# %% [markdown]
+# `p` is the share of such experiments whose error would be at least this large by chance if the fit
+# is right: here 4.3 %, an error of two standard errors. A value below 1 % would call for an
+# explanation, such as an amplitude that is too large.
 
 # %% [markdown]
 # ## Which parameter would help?

@@ -17,6 +17,11 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax._core.boundary import leads, words
+from hybridjax._core.boundary.guesses.attributes import ATTRIBUTES
+from hybridjax._core.boundary.guesses.functions import CALLED, IN_NAMESPACES, NAMES
+from hybridjax._core.boundary.guesses.keywords import KEYWORDS, NEEDS
+from hybridjax._core.boundary.guesses.objects import MAKERS, OBJECTS, STEPS
+from hybridjax._core.boundary.guesses.synonyms import ALIKE, WORDS
 from hybridjax._core.showable import Showable, WithMultipliers
 
 from .conftest import APEX, OUTPUTS
@@ -195,6 +200,54 @@ data.nlargest(3)                                        -> result.to_pandas()
 est.plot().set_rasterization_zorder(1)                  -> plot.axes[0, 0]
 hj.findLimitCycle(hopper)                               -> hj.find_limit_cycle
 fit.Multiplier                                          -> `multipliers`
+hj.find_cycle(hopper)                                   -> use `hj.find_limit_cycle(system)`
+hj.find_limit_cycle(hj.models.VerticalHopper)           -> `VerticalHopper()`
+hj.continuation(cycle, "k")                             -> hj.continuation(cycle, 'k', (0.1, 0.5))
+hj.continuation(cycle, "k", 9.0)                        -> (low, high)
+hj.continuation(cycle, stifness=(8, 9))                 -> it has `cycle`
+hj.continuation(cycle, retentio=(0.1, 0.9))             -> hj.continuation(cycle, 'retention'
+hj.linearize(cycle, "yM")                               -> hj.Crossing('yM', 'falling')
+hj.linearize(cycle)                                     -> hj.Crossing('yM', 'falling')
+hj.identify_recording(rec, "yM", inputs="u", outputs="yM") -> hj.Crossing('yM', 'falling')
+cycle.state.yM                                          -> `['yM']`
+cycle.trajectory.t                                      -> `trajectory().t`
+cycle.k                                                 -> `.system.k`
+cycle.yM                                                -> cycle.trajectory()('yM')
+traj.yM                                                 -> trajectory('yM')
+rec.yM                                                  -> `['yM']`
+traj["yM"]                                              -> t, yM = trajectory('yM')
+hopper.replace(stiffness=3)                             -> use `k`
+hj.models.VerticalHopper(retentoin=3)                   -> use `retention`
+hj.parameter(1.0, bounds=(0, 1))                        -> positive=True
+hj.explore(hopper, parameters="k")                      -> hj.explore(system, 'k')
+hj.Chart(("y", "v"), lambda t, q, u: q)                 -> def field(self, t, q, u)
+hj.HybridSystem()                                       -> hj.HybridSystem.from_functions
+hj.Guess("flight", {"yM": 2.0})                         -> in the order of the chart's states
+est.zeros()                                             -> fit_rational(htf)
+est.freqresp([0.1])                                     -> `htf.frequencies`
+est.dcgain()                                            -> abs(htf.H)
+cycle.amplitude                                         -> np.ptp(
+cycle.eigenvectors                                      -> model.monodromy()
+model.observability()                                   -> to_control
+hj.read_sbml("x.xml")                                   -> from_functions
+hj.SINDy()                                              -> hj.fit_model
+hj.models.Lorenz()                                      -> from_functions
+hj.period_doubling(cycle)                               -> branch.points
+hj.continuation(cycle, "k", bounds=(8, 12))             -> use `range`
+hj.continuation(cycle, "k", (8, 12), NMX=100)           -> `max_points`
+hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its name and range
+hj.linearize(cycle, sections, ts=0.1)                   -> no step of time
+hj.identify_recording(rec, apex, sections=16)           -> `n_sections`
+hj.plot.bode(est, dB=True)                              -> `log=True`
+hj.plot.bode(est, Hz=True)                              -> `unit='Hz'`
+hj.plot.bode(est, unit="Hz")                            -> needs the `period`
+hj.plot.poincare_map(cycle)                             -> hj.plot.return_map(cycle)
+hj.validate(fit, data, held_out=0.2)                    -> hj.recordings.hold_out
+setattr(hopper, "k", 9.0)                               -> system.replace(k=9.0)
+setattr(hopper, "stiffness", 9.0)                       -> use `k`
+setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)
+setattr(fit, "covariance", 0)                           -> hj.fit_multipliers(htf, order)
+setattr(data, "u", 0)                                   -> hj.run_experiments
 """
 
 
@@ -219,35 +272,132 @@ def test_the_error_of_a_guess_leads_on(names, line):
     assert "\n" not in text
 
 
+PLACES = {place.rpartition(".")[2]: thing for place, thing in all_members()}
+# Objects as the sentences call them, by the classes that they may be of.
+VARIABLES = {
+    "branch": "Branch",
+    "cycle": "LimitCycle",
+    "data": "ExperimentData SectionData",
+    "design": "Design",
+    "fit": "SeriesFit StructuredFit LDTPFit ModelFit ParameterEstimate RationalFit",
+    "htf": "HTF",
+    "model": "LDTP HTF",
+    "other": "SeriesFit",
+    "plan": "OptimalDesign",
+    "plot": "Plot",
+    "recording": "Recording",
+    "sections": "ClockPhase",
+    "selection": "OrderSelection",
+    "system": "HybridSystem",
+    "trajectory": "Trajectory",
+    "validation": "Validation",
+}
+# (`result` is a result of any kind.)
+VARIABLES["result"] = "Identification LimitCycle SectionData ExperimentData HTF"
+
+
+def sentences():
+    """All sentences of the tables."""
+    for table in (ATTRIBUTES, KEYWORDS, NAMES):
+        for owned in table.values():
+            yield from owned
+    for flat in (MAKERS, STEPS, OBJECTS, NEEDS, CALLED, IN_NAMESPACES):
+        yield from flat.values()
+
+
+def thing_at(path):
+    thing = types.SimpleNamespace(hj=hj)
+    for name in path.split("."):
+        thing = getattr(thing, name)
+    return thing
+
+
 def test_errors_name_calls_that_exist():
-    tables = inspect.getsource(leads) + inspect.getsource(words)
-    for path in re.findall(r"hj(?:\.\w+)+", tables):
-        thing = types.SimpleNamespace(hj=hj)
-        for name in path.split("."):
-            thing = getattr(thing, name)
+    for sentence in sentences():
+        for path in re.findall(r"hj(?:\.\w+)+", sentence):
+            assert thing_at(path) is not None
+
+
+def test_errors_name_attributes_that_exist():
+    for sentence in sentences():
+        for owner, name in re.findall(r"(?<![\w.'(/])(\w+)\.(\w+)", sentence):
+            classes = [PLACES[x] for x in VARIABLES.get(owner, "").split()]
+            attributes = {x for cls in classes for x in leads.attributes_of(cls)}
+            assert not classes or name in attributes, sentence
+
+
+def test_errors_name_arguments_that_exist():
+    for sentence in sentences():
+        for path, given in re.findall(r"(hj(?:\.\w+)+)\(([^()]*)\)", sentence):
+            known = inspect.signature(thing_at(path))
+            named = set(re.findall(r"(\w+)=", given))
+            assert named <= known.parameters.keys(), sentence
 
 
 def test_tables_of_words_have_owners_that_exist():
-    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
     classes = {
-        base.__name__ for x in places.values() for base in getattr(x, "__mro__", ())
+        base.__name__ for x in PLACES.values() for base in getattr(x, "__mro__", ())
     }
-    for owners in words.ATTRIBUTES:
+    for owners in ATTRIBUTES:
         assert set(owners.split()) <= classes
-    for owners in words.KEYWORDS:
-        assert set(owners.split()) <= {*places, *hj.__all__}
-    for namespace in words.NAMES:
+    for owners in KEYWORDS:
+        assert set(owners.split()) <= {*PLACES, *hj.__all__}
+    for namespace in NAMES:
         assert namespace == "" or namespace in hj.__all__
+
+
+@pytest.mark.parametrize("table", [ATTRIBUTES, KEYWORDS, NAMES])
+def test_a_word_leads_to_one_sentence_of_an_owner(table):
+    """Nobody sees the second one."""
+    found = {}
+    for owners, owned in table.items():
+        for owner in owners.split() or [""]:
+            for sentence, row in owned.items():
+                for word in row.split():
+                    first = found.setdefault((owner, words._plain(word)), word)
+                    assert first is word, (owner, first, word, sentence)
 
 
 def test_words_that_lead_on_are_no_names():
     """Else nobody sees the sentence."""
-    places = {place.rpartition(".")[2]: thing for place, thing in all_members()}
-    for owners, sentences in words.ATTRIBUTES.items():
-        for owner in set(owners.split()) & places.keys():
-            names = leads.attributes_of(places[owner])
-            known = {name for row in sentences.values() for name in row.split()}
+    for owners, owned in ATTRIBUTES.items():
+        for owner in set(owners.split()) & PLACES.keys():
+            names = leads.attributes_of(PLACES[owner])
+            known = {name for row in owned.values() for name in row.split()}
             assert not known & set(names), owner
+    # (These two are parts of names: `identify_walk`, `load_walk`.)
+    parts = {"identify", "load"}
+    for namespace, owned in NAMES.items():
+        names = getattr(hj, namespace).__all__ if namespace else hj.__all__
+        known = {name for row in owned.values() for name in row.split()}
+        assert not (known - parts) & set(names), namespace
+
+
+def test_words_stand_for_words_of_this_package():
+    known = set()
+    for thing in PLACES.values():
+        if isinstance(thing, type):
+            known |= set(leads.attributes_of(thing))
+            things = [
+                thing,
+                *(
+                    getattr(thing, x)
+                    for x in leads.attributes_of(thing)
+                    if hasattr(thing, x)
+                ),
+            ]
+        else:
+            things = [thing]
+        for callable_thing in filter(callable, things):
+            try:
+                known |= inspect.signature(callable_thing).parameters.keys()
+            except ValueError:  # (a class of C)
+                continue
+    for word, meant in WORDS.items():
+        assert set(meant) <= known, word
+    assert ALIKE.keys() <= WORDS.keys() | known
+    twice = [x for row in ALIKE.values() for x in row.split()]
+    assert len(twice) == len(set(twice))
 
 
 def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
@@ -266,6 +416,94 @@ def test_an_error_inside_of_a_property_is_not_taken_for_a_missing_attribute():
     with pytest.raises(AttributeError, match="use `k`"):
         Broken().K  # noqa: B018
     assert not hasattr(Broken(), "__jax_array__")
+
+
+def test_public_objects_do_not_change():
+    """The error of who sets an attribute leads on, where that of equinox does not."""
+    written_by_users = "Chart", "Abstract", "Drawing"
+    parts_of_results = "Finding", "Trial"
+    for place, thing in all_members():
+        name = place.rpartition(".")[2]
+        if isinstance(thing, type) and issubclass(thing, eqx.Module):
+            raw = thing.__setattr__ is eqx.Module.__setattr__
+            assert not raw or name.startswith(written_by_users + parts_of_results)
+
+
+def test_a_method_without_its_call_says_how_it_is_called(names):
+    cycle = names["cycle"]
+    text = repr(cycle.trajectory)
+    assert text == "<method of a LimitCycle: call it, as in `.trajectory(periods=1.0)`>"
+    assert cycle.trajectory.__doc__.startswith("The orbit from")
+    assert list(inspect.signature(cycle.trajectory).parameters) == ["periods"]
+    for inherited in (cycle.plot, names["fit"].interval, names["hopper"].replace):
+        assert repr(inherited).startswith("<method of a")
+    # (As equinox binds methods: JAX takes them as arguments.)
+    responses = jax.jit(lambda method: method.__self__.period)(cycle.trajectory)
+    assert responses == cycle.period
+
+
+OSCILLATOR = hj.HybridSystem.from_functions(
+    ("x", "v"),
+    lambda t, q, u, p: (q[1], -p.damping * q[1] - q[0]),
+    parameters={"damping": 1.0},
+)
+
+
+def test_the_place_of_rest_prints_no_rounding():
+    with pytest.raises(hj.errors.ComputationError, match="x 0, v 0, where nothing"):
+        hj.find_limit_cycle(OSCILLATOR, hj.Guess("main", (1.0, 0.0)))
+
+
+def test_an_error_in_a_field_has_the_hint_that_fits():
+    def error_of(field):
+        system = hj.HybridSystem.from_functions(("x",), field, (), {"damping": 1.0})
+        with pytest.raises(hj.errors.DefinitionError) as caught:
+            hj.simulate(system, hj.Guess("main", (1.0,)), 1.0)
+        return str(caught.value)
+
+    misspelt = error_of(lambda t, q, u, p: -p.dampin * q[0])
+    assert misspelt.endswith("A System has no `dampin`: use `damping`.")
+    assert "write `p.k`" in error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    assert "write `y, v = q`" in error_of(lambda t, q, u, p: -q["x"])
+    assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
+
+
+def test_a_misspelt_method_of_a_system_is_refused():
+    """Else its events would never happen."""
+    with pytest.raises(hj.errors.DefinitionError, match="call it `transitions`"):
+
+        class Ball(hj.HybridSystem):
+            def charts(self):
+                return {}
+
+            def transition(self):
+                return ()
+
+
+def test_a_chart_without_states_is_refused():
+    class Flight(hj.Chart):
+        state = ("y", "v")
+
+        def field(self, t, q, u):
+            return q[1], -9.81
+
+    with pytest.raises(hj.errors.DefinitionError, match="class Flight.*states = "):
+        Flight()
+
+
+def test_a_system_without_inputs_is_not_linearized():
+    silent = hj.HybridSystem.from_functions(
+        ("x",), lambda t, q, u, p: (jnp.cos(t) - q[0],), period=2 * np.pi, inputs=()
+    )
+    cycle = hj.find_limit_cycle(silent, hj.Guess("main", (0.5,)))
+    with pytest.raises(hj.errors.DefinitionError, match="System has no inputs"):
+        hj.linearize(cycle, hj.ClockPhase(4))
+
+
+def test_settings_print_their_accuracy():
+    assert "default rtol and atol of each call" in repr(hj.orbits.Settings())
+    assert "default atol of each call" in repr(hj.orbits.Settings(rtol=1e-9))
+    assert "default" not in repr(hj.orbits.Settings(rtol=1e-9, atol=1e-9))
 
 
 FITS = "fit", "ser", "ldtp", "phys"

@@ -1,6 +1,8 @@
 """The exceptions that hybridjax raises. All derive from `HybridJaxError`."""
 
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 
 class FindingWarning(UserWarning):
@@ -45,3 +47,20 @@ class FileFormatError(HybridJaxError, ValueError):
     """A file is damaged, foreign, or of a version that this one cannot read."""
 
     __module__ = "hybridjax.errors"
+
+
+class UnknownAttribute(HybridJaxError, AttributeError):
+    """An attribute that an object, or a name that a namespace, has not. The sentence is composed
+    when it is read: JAX and Python ask for many attributes that are not there."""
+
+    def __init__(self, about: Callable[[], str]):
+        # (With a `name` Python would suggest one again.)
+        super().__init__(name="")
+        self._about = about
+
+    def __str__(self) -> str:
+        return self._about()
+
+    def __reduce__(self) -> Any:
+        # (Processes hand on the sentence: the class may not exist elsewhere.)
+        return AttributeError, (str(self),)

@@ -13,6 +13,8 @@ import types
 from collections.abc import Callable
 from typing import Any
 
+from .exceptions import UnknownAttribute
+
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
@@ -117,22 +119,6 @@ def _leads() -> Any:
     return importlib.import_module(".boundary.leads", __package__)
 
 
-class UnknownName(AttributeError):
-    """A name that a namespace has not. The sentence is composed when it is read: Python asks
-    modules for many names that are not there."""
-
-    def __init__(self, *of: Any):
-        # (With a `name` Python would suggest one again.)
-        super().__init__(name="")
-        self._of = of
-
-    def __str__(self) -> str:
-        return about_name(*self._of)
-
-    def __reduce__(self) -> Any:
-        return AttributeError, (str(self),)
-
-
 def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package whose public names are listed in its
     `__init__.pyi`."""
@@ -143,7 +129,8 @@ def attach(package: str, file: str) -> tuple[Callable, Callable, list[str]]:
     def __getattr__(name: str) -> Any:
         home = homes.get(name)
         if home is None:
-            raise UnknownName(package, name, names)
+            about = functools.partial(about_name, package, name, names)
+            raise UnknownAttribute(about)
         module = importlib.import_module(home, package)
         is_namespace = home == f".{name}"
         return module if is_namespace else getattr(module, name)
@@ -162,6 +149,9 @@ def about_name(package: str, name: str, names: list[str]) -> str:
         return f"{asked} is {_NAMES[name]}"
     place = place_of(name)
     if place is not None:
+        other = _leads().other_than(package, name)
+        if other is not None:
+            return f"there is no {asked}: {other}; another function is {place}"
         return f"{asked} is {place}"
     namespace = package.replace("hybridjax", "hj", 1)
     known = {own: f"{namespace}.{own}" for own in names} | places()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from .boundary.leads import missing_attribute
+from .boundary.members import bind_methods, fixed_attribute, missing_attribute
 from .findings import Finding
 
 
@@ -25,6 +25,11 @@ class Showable:
     else:
         findings = ()
         __getattr__ = missing_attribute
+        __setattr__ = fixed_attribute
+
+        def __init_subclass__(cls, **options: Any):
+            super().__init_subclass__(**options)
+            bind_methods(cls)
 
     def plot(self, *args: Any, **options: Any) -> Any:
         """Draw what one would ask for first.
@@ -60,6 +65,9 @@ class Showable:
         ```
         """
         return importlib.import_module("hybridjax.convert").to_pandas(self)
+
+
+bind_methods(Showable)
 
 
 class WithMultipliers(Showable):

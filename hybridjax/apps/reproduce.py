@@ -194,7 +194,7 @@ def _figures(plot: Any, cycle: LimitCycle, families: Mapping[str, Family]) -> It
         drawn = plot.cycle(cycle, *OUTPUTS, sections=family.placed, perturbed=perturbed)
         yield f"fig1_cycle_{name}", drawn
         estimates |= {
-            f"2p1z, {name}": family.rational,
+            f"2 poles, 1 zero, {name}": family.rational,
             f"structured, {name}": family.structured,
         }
     pairs = {name: (family.estimate, family.exact) for name, family in families.items()}

@@ -149,9 +149,9 @@ def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
     classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
         members = np.flatnonzero(kept & (classes == number))
-        kept[
-            members[np.argsort(gain[members])][: max(len(members) - experiments, 0)]
-        ] = False
+        weakest_first = members[np.argsort(gain[members])]
+        too_many = max(len(members) - experiments, 0)
+        kept[weakest_first[:too_many]] = False
     return np.flatnonzero(kept)
 
 
@@ -169,19 +169,7 @@ def to_design(
     **Arguments:** `use`: the share of the limits that each cosine takes.
     """
     rng = np.random.default_rng(seed)
-    share = np.zeros((len(power), experiments))
-    classes = line_class(cosines.line, cosines.periods)
-    for number in np.unique(classes):
-        members = np.flatnonzero(classes == number)
-        count = np.ones(len(members), int)
-        while count.sum() < experiments:
-            count[np.argmax(use[members] / count)] += 1
-        place = np.repeat(np.arange(len(members)), count), rng.permutation(experiments)
-        share[members[place[0]], place[1]] = (use[members] / count)[place[0]]
-    for _ in range(_SWEEPS):
-        share *= use.sum() / experiments / share.sum(axis=0)
-        share *= (use / share.sum(axis=1))[:, None]
-    share[share < _WEAK * share.max(axis=1, keepdims=True)] = 0.0
+    share = _balanced(_dealt(cosines, use, experiments, rng), use)
     member, experiment = np.nonzero(share)
     order = np.lexsort((cosines.channel[member], cosines.line[member], experiment))
     member = member[order]
@@ -198,3 +186,31 @@ def to_design(
         experiments=experiments,
         inputs=usual.inputs,
     )
+
+
+def _dealt(
+    cosines: Candidates, use: Powers, experiments: int, rng: np.random.Generator
+) -> Float[np.ndarray, "K E"]:
+    """Return the share of the limits that each cosine takes in each experiment: of each class of
+    lines, of which an experiment holds one, strong cosines get several experiments."""
+    share = np.zeros((len(use), experiments))
+    classes = line_class(cosines.line, cosines.periods)
+    for number in np.unique(classes):
+        members = np.flatnonzero(classes == number)
+        count = np.ones(len(members), int)
+        while count.sum() < experiments:
+            count[np.argmax(use[members] / count)] += 1
+        member = np.repeat(np.arange(len(members)), count)
+        experiment = rng.permutation(experiments)
+        share[members[member], experiment] = (use[members] / count)[member]
+    return share
+
+
+def _balanced(share: Float[np.ndarray, "K E"], use: Powers) -> Float[np.ndarray, "K E"]:
+    """Return shares of which each experiment has the same sum, and each cosine its own, without
+    those that are negligible."""
+    experiments = share.shape[1]
+    for _ in range(_SWEEPS):
+        share = share * (use.sum() / experiments / share.sum(axis=0))
+        share = share * (use / share.sum(axis=1))[:, None]
+    return np.where(share < _WEAK * share.max(axis=1, keepdims=True), 0.0, share)

@@ -4,6 +4,11 @@
 column of values stands before those of derivatives, by the time, the n states and the inputs:
 (rows, 2 + n + nu, L). Where only `some` lanes are needed, the others are copies of one of these;
 one lane may stand for all.
+
+The file has three parts: what the engine asks for (`field` to `levels`), the functions of a single
+point behind them (`_field` to `_levels`), and the forms in which they are computed for lanes:
+`_expanded` with derivatives, `_ByMethod` in steps, `_Tangent` along directions (`Tangents`),
+`_BySystem` for many systems (`Systems`).
 """
 
 import copy

@@ -8,6 +8,12 @@ which carry the derivatives that `saltation.py` writes out.
 - `chain` multiplies the Jacobians of the moves on the host: of the Runge-Kutta step, of the
   crossing at its end, and of the reset. Every move is linearized at its recorded start, so that all
   moves in a chart are done in one pass.
+- `Variation` moves the start of a record, the numbers of the system and the times of the targets in
+  some directions, on the host, and gives the tangents of states and of the Jacobians of `chain`.
+
+A wrong derivative has its cause in a single move: compare `linear_moves` with differences of the
+three stages `_after_steps`, `_at_zeros` and `_after_resets`. If single moves are right, the order
+of the moves is wrong, which `recorded_moves` reads from the tape.
 """
 
 import dataclasses
@@ -272,13 +278,7 @@ class Variation:
         lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
         t = along.t + aside[0]
         q = along.q + aside[1:]
-        h = along.h + 0j
-        for g, transition in enumerate(s.transitions):
-            at = along.code == g
-            if isinstance(transition.guard, Scheduled) and at.any():
-                end = (t + h).real[at] + 0j
-                u = kernels.unpushed(s, lane[at])
-                h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
+        h = _until_ticks(s, along, t, q, lane)
         along = along._replace(t=t, q=q, h=h, lane=lane)
         # A direction that moves only the start of the flow needs no lanes of its own: the start of
         # each move is varied anyway.
@@ -341,6 +341,20 @@ class Variation:
         q = np.repeat(self._moves.q[:, move], P, axis=-1)
         inputs = self._s.pushed(np.arange(len(t)) % P)
         return t + aside[0], chart, q + aside[1:], inputs
+
+
+def _until_ticks(
+    s: kernels.Tangents, moves: Moves, t: np.ndarray, q: np.ndarray, lane: np.ndarray
+) -> np.ndarray:
+    """Lengths of moves, which end at the ticks of clocks where these move."""
+    h = moves.h + 0j
+    for g, transition in enumerate(s.transitions):
+        at = moves.code == g
+        if isinstance(transition.guard, Scheduled) and at.any():
+            end = (t + h).real[at] + 0j
+            u = kernels.unpushed(s, lane[at])
+            h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
+    return h
 
 
 def linear_moves(

@@ -76,7 +76,13 @@ class Settings(eqx.Module):
     "auto" (in `find_limit_cycle`), an implicit method in charts that are stiff on the cycle."""
 
     def __repr__(self):
-        return fields(self)
+        unset = [name for name in ("rtol", "atol") if getattr(self, name) is None]
+        text = fields(self)
+        if not unset:
+            return text
+        names = " and ".join(unset)
+        default = f"default {names} of each call, {LIMIT_CYCLE} in find_limit_cycle"
+        return f"{text[:-1]}; {default})"
 
     # (`rtol`, `atol` and `scale` may have lanes on a last axis of their own: see `PerLane`.)
 

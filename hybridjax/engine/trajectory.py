@@ -173,6 +173,13 @@ class Trajectory(Showable, eqx.Module):
         point = self.dense(per_step)
         return (point[0], *observed(self.structure, names, *point))
 
+    def __getitem__(self, name: object):
+        """**Raises:** `DefinitionError` with the call that has a signal."""
+        signal = name if isinstance(name, str) else "name"
+        raise DefinitionError(
+            f"a signal has values at its own times: write `t, {signal} = trajectory('{signal}')`."
+        )
+
     def __repr__(self):
         s = self.structure
         system = self.system

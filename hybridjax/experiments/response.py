@@ -61,6 +61,14 @@ class Feedback(NamedTuple):
     matrices: Matrices
     on_cycle: Float[Array, "N ny"]
 
+    def answer(
+        self, i: Array, state: Float[Array, "m S"], y: Float[Array, "ny S"]
+    ) -> tuple[Float[Array, "nu S"], Float[Array, "m S"]]:
+        """Return what the controller adds to the inputs at section i, and its next state."""
+        A, B, C, D, _ = (x[i] for x in self.matrices)
+        deviation = y - self.on_cycle[i][:, None]
+        return -(C @ state + D @ deviation), A @ state + B @ deviation
+
 
 class Course(eqx.Module):
     """The sections on a limit cycle, as experiments need them.
@@ -133,11 +141,9 @@ def flow_batch(
         i = k % N
         j = (k + 1) % N
         answer = None
-        if feedback is not None:  # of outputs before the input acts
-            A, B, C, D, _ = (x[i] for x in feedback.matrices)
-            deviation = observe(s, z, lanes, u) - feedback.on_cycle[i][:, None]
-            answer = -(C @ state + D @ deviation)
-            state = A @ state + B @ deviation
+        if feedback is not None:
+            # (The controller measures outputs before the input acts.)
+            answer, state = feedback.answer(i, state, observe(s, z, lanes, u))
             u = u + answer
         y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
         turns = (j == 0).astype(jnp.int32)
@@ -256,8 +262,9 @@ def response_function(
     cycle may be unstable if experiments are short.
 
     **Returns:** a `ResponseFunction`. Called with inputs (S, n, nu), and with `system=` another
-    system of the same class, it returns a `Response` with the outputs `y` (S, n, ny) minus those on
-    the cycle, and a code `result` (S,) for each experiment.
+    system of the same class, it returns a `Response` with the outputs `y` (S, n, ny), and a code
+    `result` (S,) for each experiment. The outputs are whole values. Those of data are deviations:
+    `data.cycle_outputs` has the outputs on the cycle.
 
     **Raises:** `DefinitionError` for outputs or sections that do not exist, or an accuracy out of
     range.
@@ -266,8 +273,9 @@ def response_function(
 
     ```python
     response = hj.experiments.response_function(cycle, sections, ("yM", "vM"))
+    measured = data.y[:1, :16] + np.tile(data.cycle_outputs, (2, 1))  # (two periods)
     def misfit(system):
-        return ((response(data.u[:1, :16], system=system).y - data.y[:1, :16]) ** 2).sum()
+        return ((response(data.u[:1, :16], system=system).y - measured) ** 2).sum()
     print(misfit(hj.models.VerticalHopper(k=10.1)))  # also jax.grad(misfit)(hopper)
     ```
 

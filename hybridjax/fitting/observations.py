@@ -336,12 +336,7 @@ class ObservedCycle(AbstractObservation):
         ):
             error = predicted[name] - measured
             if name == "times":
-                turns = jnp.round(
-                    (error if cycle.clocked else error - error[0]) / cycle.period
-                )
-                error = error - jax.lax.stop_gradient(turns) * cycle.period
-                if not cycle.clocked:  # any moment may be zero: only differences count
-                    error = helmert(len(error)) @ error
+                error = _without_turns(cycle, error)
             parts.append((error / scale).ravel())
         return jnp.concatenate(parts)
 
@@ -351,6 +346,15 @@ class ObservedCycle(AbstractObservation):
         return eqx.tree_at(lambda o: o.scales, self, scales)
 
 
+def _without_turns(cycle: LimitCycle, error: Float[Array, " N"]) -> Float[Array, " r"]:
+    """Errors of times without whole periods; of an autonomous cycle, whose zero of time may be any
+    moment, only their differences."""
+    apart = error if cycle.clocked else error - error[0]
+    turns = jnp.round(apart / cycle.period)
+    error = error - jax.lax.stop_gradient(turns) * cycle.period
+    return error if cycle.clocked else helmert(len(error)) @ error
+
+
 @jax.jit
 def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
     error = ((H - measured) * weights).ravel()
@@ -358,14 +362,13 @@ def _real(H: Array, measured: Array, weights: Array) -> Float[Array, " r"]:
 
 
 def _scale(name: str, std: Numbers | None, seen: Array) -> Float[Array, "..."]:
-    if (
-        std is None and name == "times"
-    ):  # (any moment may be zero: `prepare` knows the period)
+    """Return the standard deviation of a measurement, or the size of its values without one, of
+    the shape `seen.shape[1:]`."""
+    if std is None and name == "times":
+        # (Any moment may be zero: `prepare` knows the period.)
         return jnp.asarray(jnp.nan)
     if std is None:
-        size = jnp.sqrt(
-            jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0)
-        )  # of the shape seen.shape[1:]
+        size = jnp.sqrt(jnp.mean(jnp.atleast_1d(seen) ** 2, axis=0))
         if not jnp.all(size > 0):
             raise DefinitionError(
                 f"`{name}` are zero throughout and have no size: leave them out, or give their "

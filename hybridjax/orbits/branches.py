@@ -317,7 +317,8 @@ def _check(cycle, values) -> np.ndarray:
     steps = np.diff(np.asarray(values))
     if not len(steps) or abs(np.sign(steps).sum()) < len(steps):
         raise DefinitionError(
-            f"values must be two or more, ascending or descending; got {values}."
+            "`range` must be (low, high), or more numbers, ascending or descending, not "
+            f"{values.tolist()}."
         )
     return np.asarray(values)
 

@@ -15,6 +15,7 @@ from .._core.executor import from_host, namespace, to_host
 from .._core.precision import real
 from .._core.progress import say
 from .._core.results import Result
+from .._core.text import signal_values
 from ..engine import kernels
 from ..engine.lanes import IDLE, Lanes, lane_at, side_by_side
 from ..engine.move import Options, move
@@ -400,9 +401,12 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
         text = (
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
+    # (The equilibrium is known to a part of the sizes: what is less is zero.)
+    known = np.abs(lane.q[:n, 0]) > _REST * np.asarray(map.scale)[a, :n]
+    place = signal_values(s.states(a), np.where(known, lane.q[:n, 0], 0.0))
     raise ComputationError(
-        f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', "
-        f"{lane.q[:n, 0]}, where nothing moves: start elsewhere.{text}"
+        f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', {place}, where "
+        f"nothing moves: start elsewhere.{text}"
     )
 
 

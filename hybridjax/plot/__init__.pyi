@@ -20,4 +20,5 @@ from .motion import Motion as Motion, animate as animate
 from .orbit import cycle as cycle
 from .over_parameters import branch as branch, sweep as sweep
 from .plane import multipliers as multipliers, poles_zeros as poles_zeros
+from .returns import return_map as return_map
 from .subjects import forest as forest, paired as paired, subject_maps as subject_maps

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,12 +11,13 @@ from matplotlib.ticker import MaxNLocator
 from .._core.arguments import channel_index, require_among
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
-from .._core.signal import ratio, with_unit
+from .._core.signal import SECONDS, ratio, with_unit
 from ..errors import DefinitionError
 from ..identify.multipliers import StructuredFit
 from ..identify.rational import RationalFit
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
+from ..orbits.cycle import LimitCycle
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
@@ -26,6 +27,8 @@ Transfer = HTF | LDTP
 Families = Mapping[str, Transfer | Sequence[Transfer]]
 """HTFs by name, such as that of a family of sections."""
 Fits = Fit | Sequence[Fit]
+Unit = Literal["cycles/period", "Hz", "rad/s"]
+"""Units of frequencies."""
 FREQUENCY = "input frequency $f$ (cycles/period)"
 _OUTPUTS = [
     COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")
@@ -123,8 +126,8 @@ def _magnitude(
             line = _line(htf, drawn, style, _name(m))
             panel.plot(f, size, **line)
             if radius is not None:
-                lowest = 0.3 * np.min(size)
-                _band(panel, f, size, radius, line["color"], lowest)
+                edges = _edges(size, radius, 0.3 * np.min(size))
+                _fill(panel, f, *edges, line["color"])
     curve = _curve(name, pushed, first)
     label = with_unit(f"$|H_m|$, {curve}", ratio(name, pushed))
     panel.set(yscale="log", xlabel=FREQUENCY, ylabel=label)
@@ -141,6 +144,9 @@ def bode(
     harmonic: int = 0,
     outputs: SignalNames | None = None,
     input: str | int | None = None,
+    unit: Unit = "cycles/period",
+    period: Positive | LimitCycle | None = None,
+    log: bool = False,
     ax: AxesLike | None = None,
 ) -> Plot:
     """Draw magnitude and phase of one harmonic for several outputs and inputs, with fits in black.
@@ -158,25 +164,37 @@ def bode(
     - `outputs`: names of outputs. Default: all.
     - `input`: name or index of one input. Each output and input has a curve of its own color.
       Default: all.
+    - `unit`: the unit of frequencies, "cycles/period", "Hz" or "rad/s". The latter two need
+      `period`. Default: "cycles/period".
+    - `period`: the period in seconds, such as `result.phase.periods.mean()` of a recording, or the
+      limit cycle, whose `time_unit` then counts. Default: None.
+    - `log`: True draws as control engineers do, with a logarithmic axis of frequencies, from the
+      lowest positive one on, and the magnitude in decibels, 20 log10 of its value in units of the
+      output per unit of the input. Default: False.
     - `ax`: two Axes, for magnitude and phase; two per name of a dict. Default: a new figure.
 
     **Returns:** `hj.plot.Plot` with `axes` (2, 1), or (2, names) of a dict. Frequencies are in
     cycles per period, magnitudes in units of the output per unit of the input, phases in degrees.
 
     **Raises:** `DefinitionError` for a name or harmonic that does not exist, for fits that have
-    none of the inputs, for models without an HTF, or if `ax` does not hold one Axes per panel.
+    none of the inputs, for models without an HTF, for a unit of time without a period, if no
+    frequency is positive on a logarithmic axis, or if `ax` does not hold one Axes per panel.
 
     **Example:**
 
     ```python
     hj.plot.bode(htf, model, fits=fit, outputs=("yM",))
+    hj.plot.bode(htf, unit="Hz", period=cycle, log=True)
     ```
 
     **Before:** `hj.estimate_htf`. **After:** `hj.fit_multipliers`.
     """
     families = _families(htfs)
     if families is not None:
-        return _bodes(families, fits, harmonic, outputs, input, ax)
+        options = dict(harmonic=harmonic, outputs=outputs, input=input)
+        axis = dict(unit=unit, period=period, log=log)
+        return _bodes(families, fits, options | axis, ax)
+    scale = _Scale.of(unit, period, log)
     if isinstance(fits, Mapping):
         raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
     drawn = _exact_first(_one_by_one(htfs))
@@ -191,29 +209,145 @@ def bode(
     same = units.pop() if len(units) == 1 else ""
     with panels(ax, 2, 1, height=3.4, sharex=True) as axes:
         upper, lower = axes[:, 0]
+        bode_panels = _BodePanels(upper, lower, scale)
         for number, curve in enumerate(curves):
             color = _OUTPUTS[number % len(_OUTPUTS)]
             label = with_unit(curve.label, "" if same else curve.unit)
             reference = None
             for htf in drawn:
                 line = _line(htf, drawn, {"color": color}, label)
-                reference = _response(
-                    upper, lower, htf, harmonic, curve, line, reference
-                )
+                reference = bode_panels.response(htf, harmonic, curve, line, reference)
             for htf in fitted:
                 if curve.input in htf.inputs:
                     line = {**_FIT_STYLE, "zorder": 5}
-                    _response(upper, lower, htf, harmonic, curve, line, reference)
+                    bode_panels.response(htf, harmonic, curve, line, reference)
         for kind in dict.fromkeys(map(type, fits)):
             upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[kind])
         symbol = _name(harmonic)[1:-1]
-        upper.set(yscale="log", ylabel=with_unit(f"$|{symbol}|$", same))
-        lower.set(xlabel=FREQUENCY, ylabel=f"$\\angle {symbol}$ (degrees)")
-        for panel in (upper, lower):
-            _frequency_limits(panel, np.sort(drawn[-1].frequencies))
-        lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
-        _legend(upper, drawn)
+        bode_panels.label(symbol, same, np.asarray(drawn[-1].frequencies))
+        # (Over a logarithmic axis the upper right corner is no longer empty.)
+        _legend(upper, drawn, over_log=log)
     return Plot(axes)
+
+
+class _Scale(NamedTuple):
+    """How a Bode plot shows frequencies and magnitudes."""
+
+    label: str
+    """The label of the axis of frequencies."""
+    factor: float
+    """A frequency in its unit, of one cycle per period."""
+    log: bool
+    """Frequencies on a logarithmic axis, and magnitudes in decibels."""
+
+    @classmethod
+    def of(cls, unit: str, period: float | LimitCycle | None, log: bool) -> "_Scale":
+        """**Raises:** `DefinitionError` for a unit of time without a period in seconds."""
+        if unit == "cycles/period":
+            return cls(FREQUENCY, 1.0, log)
+        if period is None:
+            raise DefinitionError(
+                f"bode: `unit='{unit}'` needs the `period`: pass the limit cycle, or seconds, such "
+                "as `result.phase.periods.mean()` of a recording."
+            )
+        seconds = _seconds(period) if isinstance(period, LimitCycle) else period
+        if unit == "Hz":
+            return cls("input frequency (Hz)", 1 / seconds, log)
+        return cls("input frequency $\\omega$ (rad/s)", 2 * np.pi / seconds, log)
+
+    def magnitude(self, size: np.ndarray) -> np.ndarray:
+        if not self.log:
+            return size
+        with np.errstate(divide="ignore"):
+            return 20 * np.log10(size)
+
+
+def _seconds(cycle: LimitCycle) -> float:
+    """Return the period of a cycle in seconds. (A system without a unit of time has seconds.)
+
+    **Raises:** `DefinitionError` for a unit that is none of time.
+    """
+    unit = cycle.system.time_unit
+    if unit and unit not in SECONDS:
+        raise DefinitionError(
+            f"bode: the unit of time of {type(cycle.system).__name__}, '{unit}', is none of "
+            f"{', '.join(SECONDS)}: pass `period` in seconds."
+        )
+    return float(cycle.period) * SECONDS.get(unit, 1.0)
+
+
+class _BodePanels(NamedTuple):
+    """The two panels of a Bode plot."""
+
+    upper: Axes
+    lower: Axes
+    scale: _Scale
+
+    def response(
+        self,
+        htf: HTF,
+        harmonic: int,
+        curve: "_Curve",
+        line: dict[str, Any],
+        reference: tuple | None,
+    ) -> tuple:
+        """Draw magnitude and phase of one curve, with whole turns as in `reference`; return the
+        next reference: frequencies and phases that are certain."""
+        pushed = _same(curve.input, curve.which, htf.inputs)
+        f, values, radius = _values(htf, harmonic, curve.output, pushed)
+        size = np.abs(values)
+        is_certain = np.full(len(f), True)
+        if radius is not None:
+            is_certain = radius < size
+            # (Parts of a line, no single points.)
+            is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1
+        phase = _phase(f, values, is_certain, reference)
+        shown = f * self.scale.factor
+        self.upper.plot(shown, self.scale.magnitude(size), **line)
+        self.lower.plot(shown, phase, **line)
+        if radius is not None:
+            color = line["color"]
+            low, high = _edges(size, radius, 0.3 * np.min(size))
+            edges = self.scale.magnitude(low), self.scale.magnitude(high)
+            _fill(self.upper, shown, *edges, color)
+            sine = np.where(is_certain, radius, np.nan) / size
+            edges = _edges(phase, np.degrees(np.arcsin(sine)))
+            _fill(self.lower, shown, *edges, color)
+        return f[is_certain], phase[is_certain]
+
+    def label(self, symbol: str, unit: str, frequencies: np.ndarray) -> None:
+        """Label the axes, and set their limits and ticks.
+
+        **Arguments:** `unit`: that of all magnitudes; "" where they differ or have none.
+
+        **Raises:** `DefinitionError` for a logarithmic axis without a positive frequency.
+        """
+        f = np.sort(frequencies) * self.scale.factor
+        magnitude = with_unit(f"$|{symbol}|$", unit)
+        if self.scale.log:
+            reference = f"dB of 1 {unit}" if unit else "dB"
+            magnitude = f"$|{symbol}|$ ({reference})"
+        else:
+            self.upper.set_yscale("log")
+        self.upper.set_ylabel(magnitude)
+        self.lower.set(xlabel=self.scale.label, ylabel=f"$\\angle {symbol}$ (degrees)")
+        self.lower.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.8, 4.5, 9]))
+        for panel in self:
+            if isinstance(panel, Axes):
+                self._limit(panel, f)
+
+    def _limit(self, panel: Axes, f: np.ndarray) -> None:
+        if not self.scale.log:
+            _frequency_limits(panel, f)
+            return
+        positive = f[f > 0]
+        if not len(positive):
+            raise DefinitionError(
+                "bode: a logarithmic axis needs a frequency above 0: pass `log=False`."
+            )
+        panel.set_xscale("log")
+        panel.set_xlim(positive[0], 1.001 * positive[-1])
+        panel.grid(which="both", color="0.9", lw=0.4)
 
 
 class _Curve(NamedTuple):
@@ -245,59 +379,20 @@ def _curves(
     return curves
 
 
-def _response(
-    upper: Axes,
-    lower: Axes,
-    htf: HTF,
-    harmonic: int,
-    curve: _Curve,
-    line: dict[str, Any],
-    reference: tuple | None,
-) -> tuple:
-    """Draw magnitude and phase of one curve, with whole turns as in `reference`; return the next
-    reference: frequencies and phases that are certain."""
-    pushed = _same(curve.input, curve.which, htf.inputs)
-    f, values, radius = _values(htf, harmonic, curve.output, pushed)
-    size = np.abs(values)
-    is_certain = np.full(len(f), True)
-    if radius is not None:
-        is_certain = radius < size
-        # (Parts of a line, no single points.)
-        is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1
-    phase = _phase(f, values, is_certain, reference)
-    upper.plot(f, size, **line)
-    lower.plot(f, phase, **line)
-    if radius is not None:
-        color = line["color"]
-        sine = np.where(is_certain, radius, np.nan) / size
-        _band(upper, f, size, radius, color, 0.3 * np.min(size))
-        _band(lower, f, phase, np.degrees(np.arcsin(sine)), color)
-    return f[is_certain], phase[is_certain]
-
-
 def _bodes(
     families: Families,
     fits: Fits | Mapping[str, Fits],
-    harmonic: int,
-    outputs: SignalNames | None,
-    input: str | int | None,
+    options: dict[str, Any],
     ax: AxesLike | None,
 ) -> Plot:
-    """Bode plots side by side."""
+    """Bode plots side by side, with the same options of `bode`."""
     columns = _columns(families)
     if not isinstance(fits, Mapping):
         fits = dict.fromkeys(families, fits)
     require_among("name", fits, families, "`fits`: ")
     with _grid(columns, 2, 3.4, ax) as axes:
         for k, (family, drawn) in enumerate(columns.items()):
-            bode(
-                *drawn,
-                fits=fits.get(family, ()),
-                harmonic=harmonic,
-                outputs=outputs,
-                input=input,
-                ax=axes[:, k],
-            )
+            bode(*drawn, fits=fits.get(family, ()), ax=axes[:, k], **options)
     return Plot(axes)
 
 
@@ -423,10 +518,13 @@ def _line(htf: HTF, htfs: Sequence[HTF], line: dict, label: str) -> dict:
     return {**line, "ls": "-", "lw": 3.0, "alpha": 0.3, "zorder": 1, "label": label}
 
 
-def _band(ax: Axes, f, middle, radius, color: str, floor: float = -np.inf) -> None:
+def _edges(middle, radius, floor: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower edge of a band, no lower than a floor, and the upper one."""
     radius = np.where(np.isfinite(radius), radius, np.nan)
-    low = np.maximum(middle - radius, floor)
-    high = middle + radius
+    return np.maximum(middle - radius, floor), middle + radius
+
+
+def _fill(ax: Axes, f, low, high, color: str) -> None:
     ax.fill_between(f, low, high, color=color, alpha=0.25, lw=0, zorder=2)
 
 
@@ -441,7 +539,10 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
     return phase
 
 
-def _legend(ax: Axes, htfs: Sequence[HTF]) -> None:
+def _legend(ax: Axes, htfs: Sequence[HTF], over_log: bool = False) -> None:
     if any(htf.source == "exact" for htf in htfs):
         ax.plot([], [], color="0.5", lw=3.0, alpha=0.3, label="exact")
-    ax.legend(loc="upper right", ncols=2)
+    if over_log:
+        ax.legend(loc="best")
+    else:
+        ax.legend(loc="upper right", ncols=2)

@@ -62,14 +62,15 @@ def branch(
     with panels(ax) as axes:
         panel = axes[0, 0]
         shown = set()
+        drawn = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
             first = b[0].structure.charts[int(b[0].anchor.chart[0])].states[0]
             name = first if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):
-                panel.plot(
-                    b.values[part], height[part], "-" if stable else "--", color=color
-                )
+                line = "-" if stable else "--"
+                drawn.add(line)
+                panel.plot(b.values[part], height[part], line, color=color)
             for p in b.points:
                 marker, tint = _MARKS[p.kind]
                 panel.plot(
@@ -85,7 +86,8 @@ def branch(
                 )
                 shown.add(p.kind)
         for line, label in (("-", "stable"), ("--", "unstable")):
-            panel.plot([], [], line, color=COLORS["gray"], label=label)
+            if line in drawn:
+                panel.plot([], [], line, color=COLORS["gray"], label=label)
         parameter = Signal(
             b.parameter, unit_of_parameter(branches[0][0].system, b.parameter)
         )

@@ -40,6 +40,15 @@ _LEAST_STEEPNESS = 1e-4
 _AGAIN = "is crossed more than once in one period"
 
 
+class OutOfOrderError(ComputationError):
+    """Sections that the cycle meets in another order than they are given in. `phases` (N,): the
+    time from section 0 to each, within one period."""
+
+    def __init__(self, text: str, phases: Float[np.ndarray, " N"]):
+        super().__init__(text)
+        self.phases = phases
+
+
 def check_placed(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
     crossed twice, or by the clock at the time of an event."""
@@ -117,9 +126,11 @@ def _require_order(placed: PlacedSections) -> None:
         )
     if rounds > 1 + SAME:
         late = int(np.argmax(duration))
-        raise ComputationError(
+        begins = np.concatenate([[0.0], np.cumsum(duration)[:-1]])
+        raise OutOfOrderError(
             f"the sections are out of order: {name((late + 1) % N)} comes before section {late} on "
-            f"the cycle, so that one round of all sections takes {rounds:.3g} periods."
+            f"the cycle, so that one round of all sections takes {rounds:.3g} periods.",
+            begins % period,
         )
 
 

@@ -340,7 +340,8 @@ class _AngleLevels(AbstractLevels):
 
 @checked
 class SectionList(AbstractSections):
-    """Sections one by one, in the order in which the cycle crosses them.
+    """Sections one by one. Where they are placed on a cycle, the first one stays section 0, and the
+    others are sorted by the order in which the cycle meets them.
 
     **Fields:** `items`: a list of `Crossing` and `AtEvent`.
 

@@ -32,13 +32,15 @@ from ..orbits.scale import has_implicit
 from ..systems.structure import Structure
 from ..systems.transition import Scheduled, at_one_time
 from .along import flow_along
-from .checks import check_placed
-from .families import AbstractSections, BoundSections, Orbit
+from .checks import OutOfOrderError, check_placed
+from .families import AbstractSections, BoundSections, Orbit, SectionList
 from .placed import PlacedSections
 
 
 # The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
 _recent = Recent(4)
+# The same, by lists that were not in order.
+_sorted = Recent(4)
 
 
 def _patient(cycle: LimitCycle) -> ReturnMap:
@@ -64,6 +66,25 @@ def place_on_host(cycle: LimitCycle, family: AbstractSections) -> PlacedSections
     placed = PlacedSections(cycle, family, *fields)
     check_placed(placed, int(first))
     return _recent.keep(placed, cycle, family)
+
+
+def place_in_order(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:
+    """The sections of a family on a cycle that is no tracer, those of a list in the order in which
+    the cycle meets them.
+
+    **Raises:** as `place_sections`.
+    """
+    if not isinstance(family, SectionList):
+        return place_on_host(cycle, family)
+    known: PlacedSections | None = _sorted.get(cycle, family)
+    if known is not None:
+        return known
+    try:
+        return place_on_host(cycle, family)
+    except OutOfOrderError as error:
+        later = np.argsort(error.phases, kind="stable")
+    listed = SectionList([family.items[k] for k in later])
+    return _sorted.keep(place_on_host(cycle, listed), cycle, family)
 
 
 def place_in_program(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:

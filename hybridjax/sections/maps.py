@@ -12,7 +12,7 @@ from .._core.arguments import require_axes, require_index
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
 from .._core.boundary.values import Reals
-from .._core.compilation import host_first
+from .._core.compilation import host_first, on_the_host
 from .._core.executor import is_traced, namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
@@ -143,27 +143,49 @@ def section_map(
     return SectionMap(placed, i, j, dims)
 
 
+def arrivals(map: SectionMap, q: Float[np.ndarray, "n L"], patience: float) -> Arrival:
+    """Return the arrivals of many states at once without input, NaN for those that do not arrive
+    within `patience` periods. (On the host: a figure needs them once.)"""
+    nu = map.placed.cycle.structure.nu
+    count = q.shape[1]
+    t = np.full(count, np.asarray(map.placed.lanes.t)[map.i])
+    return _arrivals_on_host(map, q, np.zeros((nu, count)), t, patience)
+
+
 @host_first
 def _map(map: SectionMap, q, u, t) -> Arrival:
+    xp = namespace(q)
+    nu = map.placed.structure().nu
+    t = map.placed.lanes.t[map.i] if t is None else t
+    u = xp.broadcast_to(u, nu)[:, None]
+    arrival = _arrivals(map, q[:, None], u, t[None], _PATIENCE)
+    return Arrival(arrival.t[0], arrival.q[:, 0], arrival.result[0])
+
+
+def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
+    """Arrivals of lanes from states (n, L) under inputs (nu, L) at times (L,)."""
     placed, i, j = map.placed, map.i, map.j
     s, xp, lanes = placed.structure(), namespace(q), placed.lanes
-    t = lanes.t[i] if t is None else t
-    q = put(xp.zeros((s.d, 1)), (slice(len(q)), 0), q)
-    start = jax.tree_util.tree_map(lambda x: x[..., i : i + 1], lanes)._replace(
-        t=t[None], q=q
+    n, count = q.shape
+    q = put(xp.zeros((s.d, count)), slice(n), q)
+    start = jax.tree_util.tree_map(
+        lambda x: xp.broadcast_to(x[..., i : i + 1], (*x.shape[:-1], count)), lanes
     )
-    u = xp.broadcast_to(u, s.nu)[:, None]
-    target = placed.target(xp.array([j]), t[None], xp.array([1 if j <= i else 0]))
-    patience = target.limit + _PATIENCE * placed.cycle.period
+    start = start._replace(t=t, q=q)
+    turns = 1 if j <= i else 0
+    target = placed.target(xp.full(count, j), t, xp.full(count, turns))
+    late = target.limit + patience * placed.cycle.period
     # (The time of a clock section is the limit.)
-    limit = xp.where(xp.isfinite(target.time), target.limit, patience)
+    limit = xp.where(xp.isfinite(target.time), target.limit, late)
     target = dataclasses.replace(target, limit=limit)
     moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
     result = update_result(
         moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER
     )
-    keep = xp.where(
-        result == Result.OK, 1.0, xp.nan
-    )  # a factor makes derivatives NaN, too
-    return Arrival((keep * end.t)[0], (keep * end.q)[: map.dims[1], 0], result[0])
+    # (A factor makes derivatives NaN, too.)
+    keep = xp.where(result == Result.OK, 1.0, xp.nan)
+    return Arrival(keep * end.t, (keep * end.q)[: map.dims[1]], result)
+
+
+_arrivals_on_host = on_the_host(_arrivals)

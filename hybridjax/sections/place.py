@@ -26,7 +26,7 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import beginning, of_flow
 from ..systems.structure import Structure
 from .families import AbstractSections, FamilyLike, Orbit, as_family
-from .locate import normals, place_by_turn, place_in_program, place_on_host
+from .locate import normals, place_by_turn, place_in_order, place_in_program
 from .placed import PlacedSections, SectionsLike, observe
 from .walk import walk_beside, walked
 
@@ -39,8 +39,10 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
 
     - `cycle`: result of `hj.find_limit_cycle`.
     - `sections`: a family (`ClockPhase`, `ArcLength`, `KinematicPhase`, `SectionList`), or a list
-      of `Crossing` and `AtEvent`. The flow from each section to the next may take as many steps as
-      the cycle's `settings` allow, and at least 1024.
+      of `Crossing` and `AtEvent`, which is sorted: section 0 is the first one, and the others
+      follow in the order in which the cycle meets them (`placed.family.items`). Under
+      transformations of JAX a list must be in order. The flow from each section to the next may
+      take as many steps as the cycle's `settings` allow, and at least 1024.
 
     **Returns:** `PlacedSections`, which every function takes in place of a family: `lanes`, the N
     states on the cycle, and `duration` (N,), the times from section to section.
@@ -63,7 +65,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     require_x64(cycle, family)
     cycle.require_found()
     if not is_traced((cycle, family)):
-        return place_on_host(cycle, family)
+        return place_in_order(cycle, family)
     family.check(cycle.structure)
     require_program()
     walk = walk_beside(cycle, family)

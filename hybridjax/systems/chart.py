@@ -1,23 +1,18 @@
 """A chart: one mode of a hybrid system, with its own states and its own vector field."""
 
 import abc
+import dataclasses
 import operator
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._core.signal import signals
 from .._core.text import listed
+from ..errors import DefinitionError
 from .solver import Method, Solver
-
-
-if TYPE_CHECKING:
-    # Type checkers take equinox's own form for a field of the constructor.
-    from typing import ClassVar as AbstractClassVar
-else:
-    from equinox import AbstractClassVar
 
 
 class Chart(eqx.Module):
@@ -53,11 +48,24 @@ class Chart(eqx.Module):
         `{"ym": 0.0, "vm": 0.0}` for a foot at rest on the ground.
     """
 
-    states: AbstractClassVar[tuple[str, ...]]
+    states: ClassVar[tuple[str, ...]]
     units: ClassVar[tuple[str, ...]] = ()
     inputs: ClassVar[tuple[str, ...] | None] = None
     absent: ClassVar[Mapping[str, float]] = {}
     solver: ClassVar[Solver | Method | None] = None
+
+    def __new__(cls, *args: Any, **options: Any):
+        # (Some charts of this package have their states as a field.)
+        fields = {field.name for field in dataclasses.fields(cls)}
+        is_named = hasattr(cls, "states") or "states" in fields
+        if is_named and not cls.__abstractmethods__:
+            return super().__new__(cls)
+        name = "YourChart" if cls is Chart else cls.__name__
+        raise DefinitionError(
+            f"a chart is a class with `states` and `field`: write `class {name}(hj.Chart): states "
+            "= ('y', 'v')` and in it `def field(self, t, q, u): ...`; "
+            "`hj.HybridSystem.from_functions(states, field, events)` makes a system of one chart."
+        )
 
     @abc.abstractmethod
     def field(

@@ -16,7 +16,7 @@ from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.executor import is_traced
 from .._core.jax_compat import Equation, Program, is_variable
-from ..errors import DefinitionError
+from ..errors import DefinitionError, HybridJaxError
 from .chart import Chart
 from .solver import ByChart
 from .structure import (
@@ -350,16 +350,35 @@ def evaluating(what: str, takes: str = "") -> Iterator[None]:
     except DefinitionError:
         raise
     except Exception as error:
-        if takes and "positional argument" in str(error):
-            takes = _ARGUMENTS
-        problem = f"{str(error).rstrip('.')}{takes}."
-        if isinstance(error, jax.errors.JAXTypeError):
-            problem = (
-                "it uses a value that JAX does not know yet: write `jnp.where(a > 0, x, y)` for "
-                "`if a > 0`, `jnp.maximum` for `max`, `jnp.sin` for `math.sin` and `np.sin`, and "
-                "no `float`."
-            )
-        raise DefinitionError(f"the {what} cannot be evaluated: {problem}") from error
+        problem = _problem(error, takes)
+        raise DefinitionError(f"the {what} cannot be evaluated: {problem}.") from error
+
+
+def _problem(error: Exception, takes: str) -> str:
+    """Return what is wrong in a user's function that raised an error.
+
+    **Arguments:** `takes`: what the arguments of the function are, in brackets; "" if unknown.
+    """
+    text = str(error).rstrip(".")
+    if isinstance(error, jax.errors.JAXTypeError):
+        return (
+            "it uses a value that JAX does not know yet: write `jnp.where(a > 0, x, y)` for "
+            "`if a > 0`, `jnp.maximum` for `max`, `jnp.sin` for `math.sin` and `np.sin`, and "
+            "no `float`"
+        )
+    if takes and "positional argument" in text:
+        return text + _ARGUMENTS
+    if "string indexing" in text:
+        return (
+            "states and inputs have no names in it: write `y, v = q`, or `q[0]`, in the order of "
+            "the chart's `states`"
+        )
+    if "not subscriptable" in text:
+        return f"{text} (parameters are attributes: write `p.k` for `p['k']`)"
+    # (Sentences of this package lead on, and a name that is not there is none of the arguments.)
+    if isinstance(error, HybridJaxError | NameError | KeyError):
+        return text
+    return text + takes
 
 
 def _check_names(

@@ -148,6 +148,13 @@ class ByName(dict):
     def __missing__(self, name: str):
         raise KeyError(f"there is no '{name}'; names are {', '.join(self)}")
 
+    def __getattr__(self, name: str):
+        if name in self:
+            raise AttributeError(f"names stand in brackets here: write `['{name}']`.")
+        raise AttributeError(
+            f"there is no `{name}`; names are {', '.join(self)}, as in `['{next(iter(self))}']`."
+        )
+
 
 _kinds = Memory()
 _all_clocks = Memory()
@@ -223,8 +230,16 @@ class Structure:
     def inputs_among(
         self, names: Sequence[str] | None
     ) -> tuple[tuple[str, ...], Int[np.ndarray, " nu"]]:
-        """Names of inputs (Default: all) and their indices."""
+        """Names of inputs (Default: all) and their indices.
+
+        **Raises:** `DefinitionError` for a name that does not exist, and for a system without any.
+        """
         names = self.inputs if names is None else names
+        if not names:
+            raise DefinitionError(
+                f"{type(self.system).__name__} has no inputs: without `inputs = ()` in its class "
+                "(or call) it has one, `u`, which its functions may ignore."
+            )
         columns = np.array([_index("input", name, self.inputs) for name in names], int)
         return tuple(self.inputs[k] for k in columns), columns
 

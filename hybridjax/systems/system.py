@@ -24,7 +24,7 @@ from .._core.boundary.kinds import (
     PositiveScalar,
     Scalar,
 )
-from .._core.boundary.leads import missing_attribute
+from .._core.boundary.members import Bound, fixed_attribute, missing_attribute
 from .._core.boundary.values import Reals
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
@@ -321,9 +321,21 @@ class HybridSystem(Definition):
                     f"{cls.__name__}: `{name}` must be a method: write `def {name}(self): return "
                     "...`."
                 )
+        for name in ("charts", "transitions", "outputs"):
+            singular = name.removesuffix("s")
+            if callable(vars(cls).get(singular)) and name not in vars(cls):
+                raise DefinitionError(
+                    f"{cls.__name__}: nothing reads the method `{singular}`: call it `{name}`."
+                )
 
     def __new__(cls, *args, **kwargs):
         check_fields(cls, args, kwargs)
+        if cls.__abstractmethods__:
+            raise DefinitionError(
+                f"{cls.__name__} is a base class without `charts`: `hj.models` has systems, and "
+                "`hj.HybridSystem.from_functions(states, field, events)` or a class with `def "
+                "charts(self)` makes one."
+            )
         return super().__new__(cls)
 
     @abc.abstractmethod
@@ -443,6 +455,7 @@ class HybridSystem(Definition):
         return dataclasses.replace(self, **parameters)
 
     __getattr__ = missing_attribute
+    __setattr__ = fixed_attribute
 
     def __repr__(self):
         rows = []
@@ -454,6 +467,10 @@ class HybridSystem(Definition):
         if self.solver is not None:
             rows.append(("solver", repr(self.solver), "how charts are integrated"))
         return type(self).__name__ + columns(rows)
+
+
+# (For type checkers it is a plain method.)
+setattr(HybridSystem, "replace", Bound(HybridSystem.replace))  # noqa: B010
 
 
 class _Functions(NamedTuple):

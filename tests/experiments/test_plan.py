@@ -8,7 +8,7 @@ import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax.engine.settings import Settings
 from hybridjax.experiments import plan
-from hybridjax.sections.place import PATIENCE
+from hybridjax.orbits.return_map import PATIENCE
 
 from ..conftest import APEX
 

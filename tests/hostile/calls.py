@@ -378,6 +378,7 @@ def plots(t):
     yield plot.animate, dict(motion=t.cycle)
     yield hj.explore, dict(system=t.cycle, ranges={"a": (-9.0, 9.0)})
     yield hj.experiments.perturbed_trajectory, dict(placed=t.placed, inputs=t.data.u[0])
+    yield plot.return_map, dict(cycle=t.cycle)
     yield positional(plot.branch), dict(values=t.branch)
     yield plot.experiment, dict(data=t.data)
     yield plot.multipliers, dict(true=np.array([0.5]))

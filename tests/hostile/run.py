@@ -95,6 +95,7 @@ SLOW = {
     "optimize_phases",
     "place_sections",
     "response_function",
+    "return_map",
     "run_experiments",
     "section_map",
     "simulate",

@@ -2,6 +2,7 @@ import dataclasses
 import itertools
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -122,6 +123,55 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
         hj.errors.DefinitionError, match=f"there is no input '{exact.inputs[0]}'"
     ):
         hj.plot.bode(exact, fits=fit, input=0)
+
+
+def test_bode_in_hertz_and_decibels(estimate):
+    """As python-control draws it, with a gain of 20 log10 and the frequencies in units of time."""
+
+    def drawn(**options):
+        upper, lower = hj.plot.bode(estimate, outputs="vM", **options).axes[:, 0]
+        return upper, lower, labeled(upper)["vM"]
+
+    upper, lower, gain = drawn(unit="Hz", period=0.5, log=True)
+    f = np.asarray(estimate.frequencies)
+    assert_allclose(gain.get_xdata(), f / 0.5)
+    decibels = 20 * np.log10(np.abs(estimate[0][:, 1, 0]))
+    assert_allclose(gain.get_ydata(), decibels)
+    assert_allclose(lower.get_lines()[0].get_xdata(), f / 0.5)
+    assert (upper.get_xscale(), lower.get_xscale()) == ("log", "log")
+    assert upper.get_yscale() == "linear"
+    assert "(Hz)" in lower.get_xlabel()
+    assert "dB" in upper.get_ylabel()
+    upper, lower, gain = drawn(unit="rad/s", period=0.5)
+    assert_allclose(gain.get_xdata(), 4 * np.pi * f)
+    assert_allclose(gain.get_ydata(), np.abs(estimate[0][:, 1, 0]))
+    assert (upper.get_xscale(), upper.get_yscale()) == ("linear", "log")
+    with pytest.raises(hj.errors.DefinitionError, match="needs the `period`"):
+        drawn(unit="Hz")
+
+
+def test_the_period_of_a_cycle_is_in_its_own_unit(estimate):
+    def cycle(unit):
+        driven = hj.HybridSystem.from_functions(
+            ("x",),
+            lambda t, q, u, p: (-q[0] + jnp.cos(jnp.pi * t / 10),),
+            period=20.0,
+            time_unit=unit,
+        )
+        return hj.find_limit_cycle(driven, hj.Guess("main", (0.0,)))
+
+    drawn = hj.plot.bode(estimate, unit="Hz", period=cycle("ms"))
+    line = drawn.axes[0, 0].get_lines()[0]
+    assert_allclose(line.get_xdata(), np.asarray(estimate.frequencies) * 50)
+    with pytest.raises(hj.errors.DefinitionError, match="'strides', is none of s,"):
+        hj.plot.bode(estimate, unit="Hz", period=cycle("strides"))
+
+
+def test_a_branch_lists_the_lines_that_it_draws():
+    cycle = hj.find_limit_cycle(hj.models.HopfOscillator())
+    branch = hj.continuation(cycle, "mu", (0.1, 0.12), step=0.5)
+    legend = branch.plot().ax.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["stable"]
 
 
 def bodes(*given, **options):

@@ -7,15 +7,16 @@ import typing
 from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
+import equinox as eqx
 import jax
 
-from ..arguments import require_among
 from ..call import public_call
 from ..exceptions import DefinitionError
 from ..executor import as_numpy, is_hidden
 from ..memo import Memory
 from . import leads
 from .kinds import kind_of
+from .members import Bound, fixed_attribute, missing_attribute
 from .signature import ShortSignature
 from .values import Kind, Misfit
 
@@ -74,16 +75,22 @@ def checked_methods(cls: Class) -> Class:
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
-        is_bound_otherwise = isinstance(member, classmethod | staticmethod)
+        is_bound_otherwise = isinstance(member, classmethod | staticmethod | Bound)
         function = member.__func__ if is_bound_otherwise else member
         if not inspect.isfunction(function):
             continue
         if getattr(function, "__isabstractmethod__", False):
             continue
         wrapped = _wrapped(function, f"{cls.__name__}.{name}")
-        setattr(cls, name, type(member)(wrapped) if is_bound_otherwise else wrapped)
+        if is_bound_otherwise:
+            wrapped = type(member)(wrapped)
+        elif issubclass(cls, eqx.Module) and not name.startswith("_"):
+            wrapped = Bound(wrapped)
+        setattr(cls, name, wrapped)
     if not hasattr(cls, "__getattr__"):
-        setattr(cls, "__getattr__", leads.missing_attribute)  # noqa: B010
+        setattr(cls, "__getattr__", missing_attribute)  # noqa: B010
+    if cls.__setattr__ is eqx.Module.__setattr__:
+        setattr(cls, "__setattr__", fixed_attribute)  # noqa: B010
     return cls
 
 
@@ -97,9 +104,8 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
     fields = _fields.recall(cls, None, lambda: _Fields(constructor, cls))
     unknown = [name for name in kwargs if name not in fields.by_name]
     if unknown and inspect.getfullargspec(constructor).varkw is None:
-        require_among(
-            "parameter", unknown, list(fields.by_name)[1:], f"{cls.__name__}: "
-        )
+        known = list(fields.by_name)[1:]
+        raise DefinitionError(leads.about_parameter(cls, unknown[0], known))
     try:
         fields.take((None, *args), dict(kwargs))
     except Misfit as misfit:
@@ -223,7 +229,7 @@ class _Kinds:
         # (An argument that does not fit tells more than one that is missing.)
         self.take(args, dict(kwargs))
         name = next(x for x in names.in_order if x in names.required - given)
-        return leads.about_missing(function, name, self.by_name[name])
+        return leads.about_missing(function, name, self.by_name[name], args)
 
     def _lead(self, name: str, kind: Kind | None, value: Any, args: tuple) -> str:
         """Return the rest of the sentence about a value that does not fit."""
@@ -234,7 +240,7 @@ class _Kinds:
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
         called = self.function if self.cls is None else self.cls
-        return leads.about_object(called.__name__, kind, value)
+        return leads.about_object(called.__name__, kind, value, args)
 
     @functools.cached_property
     def _names(self) -> "_Names":

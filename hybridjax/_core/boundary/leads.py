@@ -1,184 +1,22 @@
-"""Which call, argument or attribute does what a wrong call means: tables that errors look up.
+"""Which call, argument or attribute does what a wrong call means: the sentences of errors.
 
-Users guess with the words of other libraries, and give an object of an earlier step. The tables are
-read only where an error is raised.
+Users guess with the words of other libraries, and give an object of an earlier step. The tables in
+`guesses` are read only where an error is raised.
 """
 
 import dataclasses
 import difflib
-import inspect
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from ..exceptions import HybridJaxError
 from ..public import about_word, place_of
 from . import words
-from .values import Kind, with_article
+from .guesses.attributes import ATTRIBUTES
+from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
+from .guesses.keywords import KEYWORDS, NEEDS
+from .guesses.objects import MAKERS, OBJECTS, STEPS
+from .values import Kind, show, with_article
 
-
-MAKERS = {
-    "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "
-    "sections",
-    "Branch": "`hj.continuation(cycle, parameter, (low, high))` makes one",
-    "Crossing": "`hj.Crossing('y', 'falling')` makes one",
-    "Design": "`hj.multisine(n_sections)` makes one",
-    "ExperimentData": "`hj.run_experiments(cycle, sections, design, outputs)` makes one",
-    "Guess": "`hj.Guess(chart, state)` makes one",
-    "HTF": "`hj.estimate_htf(data)` or `model.htf(frequencies)` makes one",
-    "HybridSystem": "`hj.models` has ready ones, and subclasses of `hj.HybridSystem` are others",
-    "HasMultipliers": "limit cycles, models and fits have them",
-    "HasRecords": "`hj.run_experiments(cycle, sections, design, outputs)` makes data, and "
-    "`hj.identify_recording` those of a recording",
-    "LDTP": "`hj.linearize(cycle, sections)` or `hj.fit_ldtp(data, ...)` makes one",
-    "LimitCycle": "`hj.find_limit_cycle(system)` makes one",
-    "LimitCycles": "`hj.orbits.find_limit_cycles(systems)` makes one",
-    "Fit": "`hj.fit_multipliers(htf, order)` or `hj.fit_series(data, order)` makes one",
-    "MultiplierFit": "`hj.fit_multipliers(htf, order)` makes one",
-    "OptimalDesign": "`hj.optimal_design(model)` makes one",
-    "Phase": "`hj.recordings.estimate_phase(recording, sections)` makes one",
-    "Plant": "`hj.plants` has ready ones",
-    "RationalFit": "`hj.identify.fit_rational(htf)` makes one",
-    "SectionSeries": "`data.records` has them",
-    "Recording": "`hj.read_recording(path)`, or `hj.Recording(time, signals)` of arrays, makes one",
-    "SectionData": "`hj.identify_recording(recording, ...).data` or "
-    "`hj.recordings.sample_sections(...)` is one",
-    "SeriesFit": "`hj.fit_series(data, order)` makes one",
-    "Settings": "`hj.orbits.Settings(rtol=1e-9)` makes one",
-    "StructuredFit": "`hj.fit_multipliers(htf, order)` makes one",
-    "Validation": "`hj.validate(model, data)` makes one",
-}
-"""For each type, the call that makes an object of it."""
-
-STEPS = {
-    (
-        "Phase",
-        "ClockPhase",
-    ): "recordings have no clock; its ticks are events: "
-    "`hj.Recording(time, signals, events={'tick': times})`, then `hj.AtEvent('tick')`",
-    (
-        "Phase",
-        "AbstractSections",
-    ): "`hj.Crossing('y', 'falling')` of a signal 'y', with `n_sections=8`, divides cycles by time",
-    (
-        "Crossing",
-        "str",
-    ): "`hj.Crossing('y', 'falling')` of a signal 'y', or `hj.AtEvent('strike')` of an event, is "
-    "one",
-    ("HTF", "ExperimentData"): "`hj.estimate_htf(data)` makes one of data",
-    (
-        "HTF",
-        "Identification",
-    ): "`result.fit` is a fit, and `hj.fit_series(result.data, order)` makes another",
-    ("HasRecords", "Identification"): "pass its `data`",
-    (
-        "ExperimentData",
-        "SectionData",
-    ): "`hj.fit_series(data, order)` fits data at sections",
-    ("HTF", "SectionData"): "`hj.fit_series(data, order)` fits data at sections",
-    ("HTF", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
-    ("HTF", "LDTP"): "`model.htf(frequencies)` makes one of a model",
-    (
-        "HTF",
-        "LimitCycle",
-    ): "`hj.linearize(cycle, sections).htf(frequencies)` makes one of a cycle",
-    ("HTF", "Fit"): "`fit.htf(frequencies)` makes one of a fit",
-    ("LDTP", "LimitCycle"): "`hj.linearize(cycle, sections)` makes one of a cycle",
-    (
-        "LDTP",
-        "HybridSystem",
-    ): "`hj.linearize(hj.find_limit_cycle(system), sections)` makes one of a system",
-    ("LDTP", "HTF"): "`hj.fit_ldtp(htf, ...)` makes one of an HTF",
-    (
-        "ExperimentData",
-        "HTF",
-    ): "it takes the data: `hj.fit_multipliers(htf, order)` takes an HTF",
-    (
-        "ExperimentData",
-        "Recording",
-    ): "`hj.identify_recording(recording, ...)` takes recordings",
-    (
-        "ExperimentData",
-        "LDTP",
-    ): "`hj.experiments.simulate_experiments(model, design)` makes data of a model",
-    (
-        "HasRecords",
-        "HTF",
-    ): "it takes the data; `hj.fit_multipliers(htf, order)` takes an HTF",
-    (
-        "HasRecords",
-        "Recording",
-    ): "`hj.identify_recording(recording, ...)` takes recordings",
-    (
-        "HasRecords",
-        "LimitCycle",
-    ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
-    ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
-    ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
-    ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
-    (
-        "LimitCycle",
-        "LDTP",
-    ): "it needs the cycle that was linearized: `hj.find_limit_cycle(system)`",
-    (
-        "AbstractObservation",
-        "HTF",
-    ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
-    (
-        "AbstractObservation",
-        "ExperimentData",
-    ): "`hj.fitting.ObservedSeries(data, sections)` makes one of data",
-}
-"""For a type that is needed, and one that was given, the step between them. A given type also
-stands for those derived from it."""
-
-OBJECTS = {
-    "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
-    "fit_series.LDTP": "are the model and the data in the wrong order?",
-    "continuation.int": "pass `(low, high)`",
-    "continuation.float": "pass `(low, high)`",
-    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
-    "multisine.AbstractSections": "pass `sections.n_sections`",
-    "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
-    "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
-    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
-    "save.Showable": "`hj.save('name.npz', result)` takes the name first",
-    "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
-    "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
-    "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
-    "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
-    "save.HybridSystem": "a system is code: keep the script that makes it",
-    "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
-    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
-    "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
-    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
-    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
-    "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
-    "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
-}
-"""For a function, and the type of the object that it was given, what to do. A given type also
-stands for those derived from it."""
-
-IN_NAMESPACES = {
-    "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
-    "other fields are arrays",
-    "hybridjax": "`dir(hj)` lists its names, and those of the page of each namespace, such as "
-    "`hj.recordings`, are one level below",
-    "plot": "`result.plot()` draws a result, and `dir(hj.plot)` lists all figures",
-}
-"""Where a name is none of a namespace's, and close to no other one; `dir` in the others."""
-
-CALLED = {
-    "identify": "`hj.fit_multipliers(htf, order)`, `hj.fit_series(data, order)` and "
-    "`hj.identify_recording(recording, ...)` identify",
-    "plot": "`result.plot()` draws a result, and `hj.plot.bode(htf)` an HTF",
-    "fitting": "`hj.fit_model(system, observations, parameters)` fits",
-    "experiments": "`hj.run_experiments(cycle, sections, design, outputs)` runs some",
-    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
-    "linear": "`hj.linearize(cycle, sections)` linearizes",
-    "convert": "`result.to_pandas()` and `hj.convert.to_xarray(result)` convert",
-    "models": "`hj.models.VerticalHopper()` is one",
-}
-"""What does what a call of a namespace means."""
 
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
 # is longer than a line.
@@ -205,6 +43,15 @@ def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
     return IN_NAMESPACES.get(namespace, f"`dir(hj.{namespace})` lists its names")
 
 
+def other_than(package: str, name: str) -> str | None:
+    """Return what a name of one namespace most often means in the package itself; None if it means
+    the name of the namespace."""
+    is_class = name[0].isupper()
+    if package != "hybridjax" or is_class:
+        return None
+    return words.lead_of(NAMES, [""], name)
+
+
 def _leads_of_name(
     namespace: str, name: str, places: Mapping[str, str]
 ) -> Iterator[str | None]:
@@ -214,13 +61,13 @@ def _leads_of_name(
         return None if meant is None else f"did you mean {places[meant]}?"
 
     own = "" if namespace == "hybridjax" else namespace
-    yield words.lead_of(words.NAMES, [own], name)
+    yield words.lead_of(NAMES, [own], name)
     yield place(words.same_word(name, places))
-    yield words.lead_of(words.NAMES, [""], name)
+    yield words.lead_of(NAMES, [""], name)
     yield place(_spelled_alike(name, places, _SLIP))
     yield words.lead_of_library([""], name)
     for part in words.parts(name):
-        yield words.lead_of(words.NAMES, [own, ""], part)
+        yield words.lead_of(NAMES, [own, ""], part)
     yield place(_spelled_alike(name, places, _ALIKE))
     for part in words.parts(name):
         yield place(words.with_part(part, places))
@@ -233,41 +80,52 @@ def about_called(package: str) -> str:
     return f"`hj.{name}` is a module: {lead}."
 
 
-class UnknownAttribute(HybridJaxError, AttributeError):
-    """An attribute that an object has not. The sentence is composed when it is read: JAX asks for
-    many attributes that are not there."""
+def about_attribute(cls: type, name: str, thing: Any = None) -> str:
+    """Return the sentence about an attribute that a class has not.
 
-    def __init__(self, cls: type, name: str):
-        # (With a `name` Python would suggest one again.)
-        super().__init__(name="")
-        self._of = cls, name
-
-    def __str__(self) -> str:
-        return about_attribute(*self._of)
-
-    def __reduce__(self) -> Any:
-        # (Processes hand on the sentence: the class may not exist elsewhere.)
-        return AttributeError, (str(self),)
-
-
-def missing_attribute(self: Any, name: str) -> Any:
-    """`__getattr__` of public classes: an error that leads on."""
-    if name.startswith("_"):
-        raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
-    if inspect.getattr_static(type(self), name, None) is not None:
-        # A property raised an AttributeError, which Python hides: it is raised again.
-        return object.__getattribute__(self, name)
-    raise UnknownAttribute(type(self), name)
-
-
-def about_attribute(cls: type, name: str) -> str:
-    """Return the sentence about an attribute that a class has not."""
+    **Arguments:** `thing`: the object, whose system may have a parameter or a state of this name.
+    """
     earlier = about_word(cls.__name__, name)
     if earlier is not None:
         return earlier
     head = f"{with_article(cls.__name__)} has no `{name}`"
     head = head[0].upper() + head[1:]
-    return f"{head}{_meant_attribute(cls, name)}."
+    part = _about_part(thing, name)
+    return f"{head}{part or _meant_attribute(cls, name)}."
+
+
+def about_setting(thing: Any, name: str, value: Any) -> str:
+    """Return the sentence about an attribute that a user sets."""
+    cls = type(thing)
+    kind = with_article(cls.__name__)
+    head = f"{kind[0].upper()}{kind[1:]} does not change"
+    if name not in attributes_of(cls):
+        return f"{head}, and has no `{name}`{_meant_attribute(cls, name)}."
+    if _is_system(thing):
+        new = show(value) if isinstance(value, int | float | str) else "..."
+        return (
+            f"{head}: `system.replace({name}={new})` returns one with another `{name}`."
+        )
+    for base in cls.__mro__:
+        if base.__name__ in MAKERS:
+            return f"{head}: {MAKERS[base.__name__]}."
+    return f"{head}: functions return new ones."
+
+
+def _about_part(thing: Any, name: str) -> str:
+    """Return the rest of the sentence about a parameter or a signal of what a result is about; ""
+    for other names."""
+    if _is_system(thing):
+        return ""
+    if name in _parameters(thing):
+        return f": `.system.{name}` is a parameter of its system"
+    if name not in _signals(thing):
+        return ""
+    if hasattr(type(thing), "trajectory"):
+        return f": `cycle.trajectory()('{name}')` has times and values of a signal"
+    if callable(thing):
+        return f": `trajectory('{name}')` has times and values of a signal"
+    return f": `['{name}']` has the values of a signal"
 
 
 def _meant_attribute(cls: type, name: str) -> str:
@@ -284,14 +142,14 @@ def _leads_of_attribute(
 ) -> Iterator[str | None]:
     """Iterate over leads, certain ones first; None where there is none."""
     owners = [base.__name__ for base in cls.__mro__]
-    yield words.lead_of(words.ATTRIBUTES, owners, name)
+    yield words.lead_of(ATTRIBUTES, owners, name)
     yield _use(_synonym(name, attributes))
     yield _use(_attribute_of_part(cls, name))
     yield words.lead_of_library(owners, name)
     yield _use(_spelled_alike(name, attributes, _SLIP))
     yield _use(_documented(cls, name))
     for part in words.parts(name):
-        yield words.lead_of(words.ATTRIBUTES, owners, part)
+        yield words.lead_of(ATTRIBUTES, owners, part)
         yield _use(words.with_part(part, attributes))
     yield _use(_spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
@@ -301,6 +159,22 @@ def _leads_of_attribute(
 
 def _use(name: str | None) -> str | None:
     return None if name is None else f"use `{name}`"
+
+
+def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
+    """Return the sentence about a parameter that a class has not."""
+    alike = (
+        _synonym(name, known),
+        _spelled_alike(name, known, _SLIP),
+        _documented(cls, name),
+        _spelled_alike(name, known, _ALIKE),
+    )
+    meant = next((x for x in alike if x is not None), None)
+    lead = "" if meant is None else f": use `{meant}`"
+    return (
+        f"{cls.__name__}: there is no parameter '{name}'; parameters are "
+        f"{', '.join(known) or 'none'}{lead}."
+    )
 
 
 def _documented(cls: type, name: str) -> str | None:
@@ -332,29 +206,56 @@ def attributes_of(cls: type) -> list[str]:
     return [name for name in names if name[0] != "_" and name not in hidden]
 
 
-NEEDS = {
-    "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
-    "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
-    "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
-    "estimate_phase.sections": "an event that happens once a cycle, such as "
-    "`hj.Crossing('y', 'falling')` of a signal 'y'",
-    "signals": "`hj.Recording(time, {'name': samples})`, or `hj.Recording.from_frame(table)`",
-    "identify_recording.inputs": "the signals that perturb; without any, "
-    "`hj.recordings.natural_multipliers(hj.recordings.sample_sections(recording, sections, "
-    "inputs=(), outputs=...))` estimates multipliers from variability",
-    "identify_recording.sections": "an event that happens once a cycle, such as "
-    "`hj.Crossing('y', 'falling')` of a signal 'y'",
-}
-"""What a missing argument is, of any function or of one."""
+def about_missing(
+    function: str, name: str, kind: Kind | None, given: Sequence[Any]
+) -> str:
+    """Return the sentence about an argument that a function needs.
 
-
-def about_missing(function: str, name: str, kind: Kind | None) -> str:
-    """Return the sentence about an argument that a function needs."""
+    **Arguments:** `given`: the arguments before it.
+    """
     lead = NEEDS.get(f"{function.rpartition('.')[2]}.{name}", NEEDS.get(name))
     if lead is not None:
-        return f"{function} needs `{name}`: {lead}."
+        return f"{function} needs `{name}`: {_in_names_of(given, lead)}."
     about = "" if kind is None else f" ({kind.allowed})"
-    return f"{function} needs `{name}`{about}{about_object(function, kind, None)}."
+    made = about_object(function, kind, None, given)
+    return f"{function} needs `{name}`{about}{made}."
+
+
+def _in_names_of(given: Sequence[Any], sentence: str) -> str:
+    """Return a sentence on a signal 'y' and a parameter 'k' with names of what was given."""
+    named = [x for x in given if isinstance(x, str)]
+    for thing in given:
+        for letter, names in (("'y'", _signals(thing)), ("'k'", _parameters(thing))):
+            if names:
+                meant = [name for name in named if name in names] or names
+                sentence = sentence.replace(letter, f"'{meant[0]}'")
+    return sentence
+
+
+def _is_system(thing: Any) -> bool:
+    return hasattr(type(thing), "charts") and hasattr(type(thing), "transitions")
+
+
+def _signals(thing: Any) -> list[str]:
+    """Return the names of the states of a system, or of the signals of a recording."""
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        # (Outputs often stand behind inputs, which do not mark a phase.)
+        signals = getattr(thing, "signals", None)
+        return list(reversed(signals)) if isinstance(signals, tuple) else []
+    try:
+        charts = system.charts().values()
+        return [str(name) for chart in charts for name in chart.states]
+    except Exception:  # (An error in a user's charts has its own sentence elsewhere.)
+        return []
+
+
+def _parameters(thing: Any) -> list[str]:
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        return []
+    fields = dataclasses.fields(system)
+    return [x.name for x in fields if x.repr and not x.metadata.get("static")]
 
 
 def about_keyword(
@@ -387,20 +288,25 @@ def _leads_of_argument(
     """Iterate over leads, certain ones first; None where there is none."""
     own = [function]
     for word in (name, *words.synonyms(name)):
-        yield words.lead_of(words.KEYWORDS, own, word)
-    system = getattr(first, "system", first)
-    if hasattr(type(system), "charts") and name in attributes_of(type(system)):
-        yield words.lead_of(words.KEYWORDS, own, "parameter")
-        yield f"`system.replace({name}=...)` returns a system with another `{name}`"
+        yield words.lead_of(KEYWORDS, own, word)
+    parameter = _parameter_like(name, _parameters(first))
+    if parameter is not None:
+        about = words.lead_of(KEYWORDS, own, "parameter")
+        yield about and about.replace("'k'", f"'{parameter}'")
+        yield f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
-    yield words.lead_of(words.KEYWORDS, owners, name)
+    yield words.lead_of(KEYWORDS, owners, name)
     yield _use(_spelled_alike(name, parameters, _SLIP))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
-        yield words.lead_of(words.KEYWORDS, owners, part)
+        yield words.lead_of(KEYWORDS, owners, part)
     yield _use(_spelled_alike(name, parameters, _ALIKE))
+
+
+def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
+    return name if name in parameters else _spelled_alike(name, parameters, _SLIP)
 
 
 def _synonym(name: str, among: Collection[str]) -> str | None:
@@ -416,14 +322,25 @@ def _spelled_alike(name: str, among: Collection[str], likeness: float) -> str | 
     return alike[0] if alike else None
 
 
-def about_object(function: str, kind: Kind | None, value: Any) -> str:
+def about_object(
+    function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
+) -> str:
     """Return the call that makes what a function needs instead of a value, or the part of it that
-    is needed, as the rest of a sentence; "" if none is known."""
+    is needed, as the rest of a sentence; "" if none is known.
+
+    **Arguments:** `given`: all arguments, whose names the call has.
+    """
+    return _in_names_of(given, _about_object(function, kind, value))
+
+
+def _about_object(function: str, kind: Kind | None, value: Any) -> str:
     for base in type(value).__mro__:
         lead = OBJECTS.get(f"{function}.{base.__name__}")
         if lead is not None:
             return f": {lead}"
     wanted = list(classes_in(kind))
+    if _is_class_of(value, wanted):
+        return f": make one, as `{value.__name__}()`"
     for cls in wanted:
         part = _part(value, cls)
         if part is not None:
@@ -436,6 +353,11 @@ def about_object(function: str, kind: Kind | None, value: Any) -> str:
                 return f": {step}"
     makers = [MAKERS[cls.__name__] for cls in wanted if cls.__name__ in MAKERS]
     return f": {makers[0]}" if makers else ""
+
+
+def _is_class_of(value: Any, wanted: Sequence[type]) -> bool:
+    """Test whether a class was given in place of its object."""
+    return isinstance(value, type) and issubclass(value, tuple(wanted))
 
 
 def classes_in(kind: Kind | None) -> Iterable[type]:

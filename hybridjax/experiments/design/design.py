@@ -168,7 +168,13 @@ class Design(Showable, eqx.Module):
         pair = np.unique(entry[:, :2], axis=0)
         check_sharing(pair[:, 0], pair[:, 1], P)
         self._check_together(len(pair))
+        self._check_phases()
 
+    def _check_phases(self) -> None:
+        """**Raises:** an error for frequencies on multiples of 1/2 without the phases they need."""
+        P = self.periods
+        N = self.n_sections
+        nu = len(self.inputs)
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
         power = np.bincount(group, np.abs(u) ** 2)

@@ -1,0 +1,146 @@
+"""Objects that functions need, and those of other steps that they are given instead."""
+
+MAKERS = {
+    "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "
+    "sections",
+    "Branch": "`hj.continuation(cycle, parameter, (low, high))` makes one",
+    "Crossing": "`hj.Crossing('y', 'falling')` makes one",
+    "Design": "`hj.multisine(n_sections)` makes one",
+    "ExperimentData": "`hj.run_experiments(cycle, sections, design, outputs)` makes one",
+    "Guess": "`hj.Guess(chart, state)` makes one",
+    "HTF": "`hj.estimate_htf(data)` or `model.htf(frequencies)` makes one",
+    "HybridSystem": "`hj.models` has ready ones, and subclasses of `hj.HybridSystem` are others",
+    "HasMultipliers": "limit cycles, models and fits have them",
+    "HasRecords": "`hj.run_experiments(cycle, sections, design, outputs)` makes data, and "
+    "`hj.identify_recording` those of a recording",
+    "LDTP": "`hj.linearize(cycle, sections)` or `hj.fit_ldtp(data, ...)` makes one",
+    "LimitCycle": "`hj.find_limit_cycle(system)` makes one",
+    "LimitCycles": "`hj.orbits.find_limit_cycles(systems)` makes one",
+    "Fit": "`hj.fit_multipliers(htf, order)` or `hj.fit_series(data, order)` makes one",
+    "MultiplierFit": "`hj.fit_multipliers(htf, order)` makes one",
+    "OptimalDesign": "`hj.optimal_design(model)` makes one",
+    "Phase": "`hj.recordings.estimate_phase(recording, sections)` makes one",
+    "Plant": "`hj.plants` has ready ones",
+    "RationalFit": "`hj.identify.fit_rational(htf)` makes one",
+    "SectionSeries": "`data.records` has them",
+    "Recording": "`hj.read_recording(path)`, or `hj.Recording(time, signals)` of arrays, makes one",
+    "SectionData": "`hj.identify_recording(recording, ...).data` or "
+    "`hj.recordings.sample_sections(...)` is one",
+    "SeriesFit": "`hj.fit_series(data, order)` makes one",
+    "Settings": "`hj.orbits.Settings(rtol=1e-9)` makes one",
+    "StructuredFit": "`hj.fit_multipliers(htf, order)` makes one",
+    "Validation": "`hj.validate(model, data)` makes one",
+}
+"""For each type, the call that makes an object of it."""
+
+STEPS = {
+    (
+        "Phase",
+        "ClockPhase",
+    ): "recordings have no clock; its ticks are events: "
+    "`hj.Recording(time, signals, events={'tick': times})`, then `hj.AtEvent('tick')`",
+    (
+        "Phase",
+        "AbstractSections",
+    ): "`hj.Crossing('y', 'falling')` of a signal 'y', with `n_sections=8`, divides cycles by time",
+    (
+        "Crossing",
+        "str",
+    ): "`hj.Crossing('y', 'falling')` of a signal 'y', or `hj.AtEvent('strike')` of an event, is "
+    "one",
+    ("HTF", "ExperimentData"): "`hj.estimate_htf(data)` makes one of data",
+    (
+        "HTF",
+        "Identification",
+    ): "`result.fit` is a fit, and `hj.fit_series(result.data, order)` makes another",
+    ("HasRecords", "Identification"): "pass its `data`",
+    (
+        "ExperimentData",
+        "SectionData",
+    ): "`hj.fit_series(data, order)` fits data at sections",
+    ("HTF", "SectionData"): "`hj.fit_series(data, order)` fits data at sections",
+    ("HTF", "Recording"): "`hj.identify_recording(recording, ...)` takes recordings",
+    ("HTF", "LDTP"): "`model.htf(frequencies)` makes one of a model",
+    (
+        "HTF",
+        "LimitCycle",
+    ): "`hj.linearize(cycle, sections).htf(frequencies)` makes one of a cycle",
+    ("HTF", "Fit"): "`fit.htf(frequencies)` makes one of a fit",
+    ("LDTP", "LimitCycle"): "`hj.linearize(cycle, sections)` makes one of a cycle",
+    (
+        "LDTP",
+        "HybridSystem",
+    ): "`hj.linearize(hj.find_limit_cycle(system), sections)` makes one of a system",
+    ("LDTP", "HTF"): "`hj.fit_ldtp(htf, ...)` makes one of an HTF",
+    (
+        "ExperimentData",
+        "HTF",
+    ): "it takes the data: `hj.fit_multipliers(htf, order)` takes an HTF",
+    (
+        "ExperimentData",
+        "Recording",
+    ): "`hj.identify_recording(recording, ...)` takes recordings",
+    (
+        "ExperimentData",
+        "LDTP",
+    ): "`hj.experiments.simulate_experiments(model, design)` makes data of a model",
+    (
+        "HasRecords",
+        "HTF",
+    ): "it takes the data; `hj.fit_multipliers(htf, order)` takes an HTF",
+    (
+        "HasRecords",
+        "Recording",
+    ): "`hj.identify_recording(recording, ...)` takes recordings",
+    (
+        "HasRecords",
+        "LimitCycle",
+    ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
+    ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
+    ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
+    ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
+    (
+        "LimitCycle",
+        "LDTP",
+    ): "it needs the cycle that was linearized: `hj.find_limit_cycle(system)`",
+    (
+        "AbstractObservation",
+        "HTF",
+    ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
+    (
+        "AbstractObservation",
+        "ExperimentData",
+    ): "`hj.fitting.ObservedSeries(data, sections)` makes one of data",
+}
+"""For a type that is needed, and one that was given, the step between them. A given type also
+stands for those derived from it."""
+
+OBJECTS = {
+    "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
+    "fit_series.LDTP": "are the model and the data in the wrong order?",
+    "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "identify_recording.int": "it is the event at which cycles begin, such as "
+    "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
+    "Guess.dict": "pass the values in the order of the chart's states",
+    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
+    "multisine.AbstractSections": "pass `sections.n_sections`",
+    "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
+    "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
+    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
+    "save.Showable": "`hj.save('name.npz', result)` takes the name first",
+    "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
+    "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
+    "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
+    "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
+    "save.HybridSystem": "a system is code: keep the script that makes it",
+    "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
+    "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
+    "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
+    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
+    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
+    "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
+    "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
+}
+"""For a function, and the type of the object that it was given, what to do. A given type also
+stands for those derived from it."""
