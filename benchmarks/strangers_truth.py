@@ -79,3 +79,53 @@ def periodic_response(loop: Loop, u: np.ndarray, settle: int = 60) -> np.ndarray
     repeats = -(-settle * len(loop.A) // u.shape[1]) + 1
     y = loop.response(np.tile(u, (1, repeats, 1)))
     return y[:, -u.shape[1] :]
+
+
+class Rhythm(NamedTuple):
+    """A recorded rhythm: dz/dt = (mu + i omega) z - mu |z|^2 z + u, a limit cycle of modulus 1.
+
+    Deviations of the modulus decay by exp(-2 mu T) in a period T.
+    """
+
+    time: np.ndarray
+    u: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    strikes: np.ndarray
+    """Times at which y rises through 0."""
+    multiplier: float
+
+
+def rhythm(
+    rng: np.random.Generator,
+    duration: float = 200.0,
+    rate: float = 100.0,
+    mu: float = 0.35,
+    push: float = 0.3,
+    noise: float = 0.002,
+) -> Rhythm:
+    """Return a recording with a period of 1 s, and pushes that are held for a tenth of it."""
+    fine = 10
+    step = 1 / rate / fine
+    steps = int(duration * rate) * fine
+    held = int(0.1 / step)
+    u = np.repeat(push * rng.normal(size=steps // held + 1), held)[:steps]
+    z = np.empty(steps, complex)
+    now = 1.0 + 0.0j
+    omega = 2 * np.pi
+
+    def slope(z: complex, force: float) -> complex:
+        return (mu + 1j * omega) * z - mu * abs(z) ** 2 * z + force
+
+    for k in range(steps):
+        z[k] = now
+        middle = now + step / 2 * slope(now, u[k])
+        now = now + step * slope(middle, u[k])
+    t = np.arange(steps) * step
+    y = z.imag
+    at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0))
+    strikes = t[at] - y[at] * step / (y[at + 1] - y[at])
+    kept = slice(None, None, fine)
+    x_seen = z.real[kept] + noise * rng.normal(size=steps // fine)
+    y_seen = y[kept] + noise * rng.normal(size=steps // fine)
+    return Rhythm(t[kept], u[kept], x_seen, y_seen, strikes, float(np.exp(-2 * mu)))

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate, contradicted_by
-from hybridjax.identify.series.fit import gradient_covariance
+from hybridjax.identify.series.fit import block_scores
 from hybridjax.identify.series.linearization import (
     each_fit,
     filtered_response,
@@ -163,7 +163,9 @@ def test_the_covariance_of_the_gradient_with_process_noise():
         )
         products = np.einsum("btn,tn->b", draws, slopes_of(problem, solution))
         measured += np.mean(products**2) / runs
-        estimated += gradient_covariance(problem, solution, 11).matrix[0, 0] / runs
+        estimated += (
+            block_scores(problem, solution, 11).covariance().matrix[0, 0] / runs
+        )
     assert estimated == pytest.approx(measured, rel=0.1)
 
 
