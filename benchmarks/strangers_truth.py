@@ -3,7 +3,6 @@
 Each returns data and the truth of `benchmarks/strangers.py`.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np

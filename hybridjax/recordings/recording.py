@@ -391,7 +391,7 @@ def _require_increasing(where: str, time: Series) -> None:
     bad = 1 + int(np.argmin(later))
     before = time[bad - 1]
     after = time[bad]
-    if after == before:
+    if not after < before:
         remedy = "leave out such samples"
     elif _begins_again(time, bad):
         # From the last sample before the fall to the first after it, a step passes.

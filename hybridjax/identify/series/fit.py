@@ -83,7 +83,7 @@ from .subspace import DelayedOutputs, late_outputs, total_least_squares
 _BIASED = "the fit is biased; name their `references`"
 # Level at which multipliers that change along the data are reported. Larger: chance is. Smaller:
 # changes of a few standard errors pass.
-_STEADY = 2e-3
+_STEADY = 0.01
 _CHANGES = Finding(
     "changing system",
     "the multipliers change along the data, more than chance explains: the fit is a mean, and its "

@@ -357,10 +357,16 @@ def _difference(
         )
         return
     if runs_backwards:
+        exchanged = [
+            f"{outputs[i]} and {outputs[j]}"
+            for i, j in combinations(range(len(outputs)), 2)
+            if correlations(_with_exchanged(mean, i, j)).min() > _CORRELATED
+        ]
+        or_exchanged = f"; or {exchanged[0]} have changed places" if exchanged else ""
         yield Finding(
             "backwards",
             f"cycles of trial '{name}' are those of the others in reverse, as if it ran backwards: "
-            "reverse all of its signals, or leave it out.",
+            f"reverse all of its signals, or leave it out{or_exchanged}.",
             "refused",
         )
         return
@@ -378,6 +384,13 @@ def _difference(
         "another cycle",
         f"the average cycle of {which} in trial '{name}' is not that of the others.",
     )
+
+
+def _with_exchanged(mean: Cycles, i: int, j: int) -> Cycles:
+    """Return average cycles with those of two signals exchanged."""
+    order = np.arange(len(mean))
+    order[[i, j]] = [j, i]
+    return mean[order]
 
 
 def slow_changes(

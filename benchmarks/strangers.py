@@ -1,0 +1,153 @@
+"""Estimates from data of strangers: generators that do not import the package.
+
+Each row is a command. It prints a table with the number of draws and p-values.
+
+    python benchmarks/strangers.py files            # recordings and files with something wrong
+
+`--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import one_thread
+
+
+one_thread.pin()
+
+import numpy as np  # noqa: E402
+import strangers_dirt as dirt  # noqa: E402
+
+import hybridjax as hj  # noqa: E402
+
+
+# Standard errors beyond which an answer without a word is wrong.
+_WRONG = 5.0
+
+
+def identified(
+    trials: list[dirt.Trial], sections: str
+) -> tuple[complex, float, list[str]]:
+    """Return the multiplier, its standard error and all that is said."""
+    recordings = []
+    for k, trial in enumerate(trials):
+        signals = {
+            name: x for name, x in trial.items() if name not in ("time", "strike")
+        }
+        recordings.append(
+            hj.Recording(
+                trial["time"], signals, events={"strike": trial["strike"]}, name=f"t{k}"
+            )
+        )
+    cycle: hj.AtEvent | hj.Crossing = hj.AtEvent("strike")
+    if sections == "trigger":
+        cycle = hj.Crossing("trigger", "rising", 2.5)
+    result = hj.identify_recording(
+        hj.Recording.join(recordings), cycle, "u", ("x", "y"), order=1, n_sections=8
+    )
+    said = [repr(x) for x in result.diagnosis.findings]
+    fit = result.fit
+    return complex(fit.multipliers[0]), float(fit.standard_errors[0]), said
+
+
+def of_recording(kind: dirt.Kind, seed: int, truth: float) -> tuple[str, str]:
+    """Return "right", "named", "said" or "SILENT", and a text."""
+    rng = np.random.default_rng(seed)
+    trials = kind.soil(dirt.clean(seed), rng)
+    try:
+        multiplier, error, said = identified(trials, kind.sections)
+    except hj.errors.HybridJaxError as refusal:
+        text = str(refusal)
+        named = bool(kind.words) and bool(re.search(kind.words, text))
+        return ("named" if named else "said"), text
+    text = "; ".join(said)
+    if kind.words and re.search(kind.words, text):
+        return "named", text
+    off = abs(multiplier - truth) / error
+    value = f"{multiplier:.3f}, {off:.1f} standard errors off; {text}"
+    if off < _WRONG:
+        return "right", value
+    return ("said" if said else "SILENT"), value
+
+
+def of_file(kind: dirt.FileKind, seed: int) -> tuple[str, str]:
+    """Return the same of a file."""
+    trial = dirt.clean(seed, (0.35,))[0]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            path = kind.write(Path(folder), trial)
+        except ImportError as error:
+            return "not run", str(error)
+        try:
+            found = hj.read_recording(path, signals=kind.signals)
+        except hj.errors.HybridJaxError as refusal:
+            text = str(refusal)
+            named = bool(kind.words) and bool(re.search(kind.words, text))
+            return ("named" if named else "said"), text
+    text = "; ".join(map(repr, found.findings))
+    if kind.words and re.search(kind.words, text):
+        return "named", text
+    names = [name for name in found.signals if name.split(".")[0] == "y"]
+    values = found[names[0]] if names else np.zeros(0)
+    right = len(values) == len(trial["y"]) and np.allclose(
+        values, trial["y"], atol=1e-4, equal_nan=True
+    )
+    if right:
+        return "right", text
+    return ("said" if text else "SILENT"), f"{len(values)} samples; {text}"
+
+
+def files(draws: int) -> None:
+    """Print, for each kind of dirt, how often it was named, or the answer right."""
+    truth = float(np.exp(-0.7))
+    totals: dict[str, int] = {}
+    print(f"{'kind':36} {'right':>5} {'named':>5} {'said':>5} {'SILENT':>6}")
+
+    def row(name: str, outcomes: list[tuple[str, str]]) -> None:
+        counts = {x: 0 for x in ("right", "named", "said", "SILENT", "not run")}
+        for outcome, _ in outcomes:
+            counts[outcome] += 1
+            totals[outcome] = totals.get(outcome, 0) + 1
+        numbers = [counts[x] for x in ("right", "named", "said", "SILENT")]
+        right, named, said, silent = numbers
+        print(f"{name:36} {right:5} {named:5} {said:5} {silent:6}")
+        for outcome, text in outcomes:
+            if outcome in ("said", "SILENT"):
+                print(f"    {outcome}: {text[:300]}")
+
+    for kind in dirt.RECORDINGS:
+        row(kind.name, [of_recording(kind, seed, truth) for seed in range(draws)])
+    for kind in dirt.FILES:
+        row(kind.name, [of_file(kind, seed) for seed in range(min(draws, 2))])
+    kinds = len(dirt.RECORDINGS) + len(dirt.FILES)
+    print(f"{kinds} kinds, {draws} draws: {totals}")
+
+
+# Each row with its usual number of draws.
+ROWS: dict[str, tuple[Callable[[int], None], int]] = {"files": (files, 5)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rows", nargs="+", choices=ROWS)
+    parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--short", action="store_true")
+    options = parser.parse_args()
+    hj.enable_x64()
+    warnings.simplefilter("ignore")
+    for name in options.rows:
+        row, usual = ROWS[name]
+        draws = options.draws or usual
+        if options.short:
+            draws = max(1, draws // 10)
+        row(draws)
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
