@@ -2,7 +2,9 @@
 
 Each row is a command. It prints a table with the number of draws and p-values.
 
-    python benchmarks/strangers.py files            # recordings and files with something wrong
+    python benchmarks/strangers.py files    # recordings and files with something wrong
+    python benchmarks/strangers.py groups   # false alarms between maps of two groups
+    python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -22,6 +24,8 @@ one_thread.pin()
 
 import numpy as np  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
+import strangers_truth as truth  # noqa: E402
+from scipy import stats  # noqa: E402
 
 import hybridjax as hj  # noqa: E402
 
@@ -55,7 +59,7 @@ def identified(
     return complex(fit.multipliers[0]), float(fit.standard_errors[0]), said
 
 
-def of_recording(kind: dirt.Kind, seed: int, truth: float) -> tuple[str, str]:
+def of_recording(kind: dirt.Kind, seed: int, true: float) -> tuple[str, str]:
     """Return "right", "named", "said" or "SILENT", and a text."""
     rng = np.random.default_rng(seed)
     trials = kind.soil(dirt.clean(seed), rng)
@@ -68,7 +72,7 @@ def of_recording(kind: dirt.Kind, seed: int, truth: float) -> tuple[str, str]:
     text = "; ".join(said)
     if kind.words and re.search(kind.words, text):
         return "named", text
-    off = abs(multiplier - truth) / error
+    off = abs(multiplier - true) / error
     value = f"{multiplier:.3f}, {off:.1f} standard errors off; {text}"
     if off < _WRONG:
         return "right", value
@@ -104,7 +108,7 @@ def of_file(kind: dirt.FileKind, seed: int) -> tuple[str, str]:
 
 def files(draws: int) -> None:
     """Print, for each kind of dirt, how often it was named, or the answer right."""
-    truth = float(np.exp(-0.7))
+    true = float(np.exp(-0.7))
     totals: dict[str, int] = {}
     print(f"{'kind':36} {'right':>5} {'named':>5} {'said':>5} {'SILENT':>6}")
 
@@ -121,15 +125,70 @@ def files(draws: int) -> None:
                 print(f"    {outcome}: {text[:300]}")
 
     for kind in dirt.RECORDINGS:
-        row(kind.name, [of_recording(kind, seed, truth) for seed in range(draws)])
+        row(kind.name, [of_recording(kind, seed, true) for seed in range(draws)])
     for kind in dirt.FILES:
         row(kind.name, [of_file(kind, seed) for seed in range(min(draws, 2))])
     kinds = len(dirt.RECORDINGS) + len(dirt.FILES)
     print(f"{kinds} kinds, {draws} draws: {totals}")
 
 
+def groups(draws: int) -> None:
+    """Print how often maps of two groups with the same mean differ, at a level of 5 %."""
+    print("sizes and spreads        values       alarms     n  share  p of 5 %")
+    for kind in ("normal", "lognormal"):
+        for n, spread, m, other in truth.GROUPS:
+            alarms = 0
+            table = {"subject": np.arange(n + m), "group": ["a"] * n + ["b"] * m}
+            for seed in range(draws):
+                rng = np.random.default_rng((seed, n, m))
+                y = truth.smooth_maps(rng, n + m)
+                if kind == "lognormal":
+                    y = np.exp(0.6 * y) - np.exp(0.18)
+                y[:n] *= spread
+                y[n:] *= other
+                maps = hj.recordings.PopulationMaps(
+                    table, y, {"phase": np.arange(60) / 60}
+                )
+                found = maps.difference("a", "b", draws=1000, seed=seed)
+                alarms += bool(found.significant.any())
+            p = stats.binomtest(alarms, draws, 0.05).pvalue
+            design = f"{n} ({spread:g}) and {m} ({other:g})"
+            print(
+                f"{design:24} {kind:10} {alarms:8} {draws:5} {alarms / draws:6.3f} {p:9.2g}",
+                flush=True,
+            )
+
+
+def bands(draws: int) -> None:
+    """Print how often the band of a mean of lognormal maps contains it."""
+    print("subjects  sigma   held     n  share  p of 95 %")
+    for n in (8, 12, 20, 40):
+        for size in (0.0, 0.3, 0.6, 1.0):
+            held = 0
+            for seed in range(draws):
+                rng = np.random.default_rng((seed, n))
+                y, mean = truth.lognormal_maps(rng, n, size)
+                if not size:
+                    y, mean = truth.smooth_maps(rng, n), 0.0
+                maps = hj.recordings.PopulationMaps(
+                    {"subject": np.arange(n)}, y, {"phase": np.arange(60) / 60}
+                )
+                found = maps.mean(draws=1000, seed=seed)
+                held += bool((np.abs(found.values - mean) <= found.reach).all())
+            p = stats.binomtest(held, draws, 0.95).pvalue
+            share = held / draws
+            print(
+                f"{n:8} {size:6.1f} {held:6} {draws:5} {share:6.3f} {p:9.2g}",
+                flush=True,
+            )
+
+
 # Each row with its usual number of draws.
-ROWS: dict[str, tuple[Callable[[int], None], int]] = {"files": (files, 5)}
+ROWS: dict[str, tuple[Callable[[int], None], int]] = {
+    "files": (files, 5),
+    "groups": (groups, 400),
+    "bands": (bands, 200),
+}
 
 
 def main() -> None:

@@ -128,3 +128,31 @@ def rhythm(
     x_seen = z.real[kept] + noise * rng.normal(size=steps // fine)
     y_seen = y[kept] + noise * rng.normal(size=steps // fine)
     return Rhythm(t[kept], u[kept], x_seen, y_seen, strikes, float(np.exp(-2 * mu)))
+
+
+def smooth_maps(rng: np.random.Generator, n: int, points: int = 60) -> np.ndarray:
+    """Return normal curves (n, points) of variance 1, correlated over six points."""
+    kernel = np.exp(-0.5 * (np.arange(-18, 19) / 6) ** 2)
+    kernel /= np.linalg.norm(kernel)
+    white = rng.normal(size=(n, points + 36))
+    return np.array([np.convolve(row, kernel, "valid") for row in white])
+
+
+def lognormal_maps(
+    rng: np.random.Generator, n: int, size: float, points: int = 60
+) -> tuple[np.ndarray, float]:
+    """Return lognormal curves, and their mean."""
+    return np.exp(size * smooth_maps(rng, n, points)), float(np.exp(size**2 / 2))
+
+
+# Sizes and spreads of two groups without a difference.
+GROUPS = [
+    (6, 2.0, 14, 1.0),
+    (8, 1.5, 24, 1.0),
+    (6, 2.0, 6, 1.0),
+    (14, 2.0, 6, 1.0),
+    (10, 1.0, 10, 1.0),
+    (5, 3.0, 20, 1.0),
+    (12, 1.0, 12, 3.0),
+    (6, 1.0, 30, 1.0),
+]
