@@ -5,6 +5,8 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py files    # recordings and files with something wrong
     python benchmarks/strangers.py groups   # false alarms between maps of two groups
     python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
+    python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
+    python benchmarks/strangers.py study    # studies whose data support a lower order
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -183,11 +185,106 @@ def bands(draws: int) -> None:
             )
 
 
+def series(draws: int) -> None:
+    """Print how often the region of `fit_ldtp` holds, and how often a miss has no finding."""
+    head = "data, noise of the fit              held  quiet     n  p of 95 %  findings"
+    print(head)
+    pair = [0.5 + 0.45j]
+    rows = [
+        ("white sensors, output", "output", pair, 0.0, 0.0),
+        ("noise of states, output", "output", pair, 0.5, 0.0),
+        ("noise of states, slow u, output", "output", pair, 0.5, 0.8),
+        ("noise of states, innovations", "innovations", pair, 0.5, 0.0),
+        ("a multiplier more, output", "output", [*pair, 0.6], 0.0, 0.0),
+        ("a multiplier more, innovations", "innovations", [*pair, 0.6], 0.0, 0.0),
+    ]
+    for name, noise, multipliers, size, color in rows:
+        fits = []
+        for seed in range(draws):
+            data = truth.noisy_series(multipliers, seed, size, color)
+            fits.append(_fitted(data, noise))
+        _series_row(name, fits)
+    fits = []
+    for seed in range(draws):
+        fits.append(_fitted(truth.controlled_series(seed), "innovations"))
+    _series_row("controller at once, innovations", fits)
+
+
+def _fitted(
+    data: tuple[truth.Loop, np.ndarray, np.ndarray], noise: str
+) -> tuple[bool, list[str]]:
+    """Return whether the region of two dimensions holds the multipliers, and the findings."""
+    loop, u, y = data
+    N = len(loop.A)
+    records = [
+        hj.experiments.SectionSeries(a, b, n_sections=N)
+        for a, b in zip(u, y, strict=True)
+    ]
+    fit = hj.fit_ldtp(records, 2, noise=noise)
+    holds = bool(fit.contains(loop.multipliers).all())
+    return holds, [finding.cause for finding in fit.findings]
+
+
+def _series_row(name: str, fits: list[tuple[bool, list[str]]]) -> None:
+    held = sum(holds for holds, _ in fits)
+    quiet = sum(not holds and not causes for holds, causes in fits)
+    counts: dict[str, int] = {}
+    for _, causes in fits:
+        for cause in causes or ["none"]:
+            counts[cause] = counts.get(cause, 0) + 1
+    p = stats.binomtest(held, len(fits), 0.95).pvalue
+    print(f"{name:34} {held:5} {quiet:6} {len(fits):5} {p:10.2g}  {counts}", flush=True)
+
+
+def study(draws: int) -> None:
+    """Print how studies end of whose multipliers the data support fewer, or none at first."""
+    print("truth, order, noise          ended as")
+    rows = [
+        ("2, 2, 3 times the signal", [0.7, 0.3], 2, 3.0),
+        ("3, 4, 2 %", [0.6 + 0.3j, 0.3], 4, 0.02),
+        ("2, 4, 2 %", [0.7, 0.4], 4, 0.02),
+        ("3, 3, 2 %", [0.6 + 0.3j, 0.3], 3, 0.02),
+    ]
+    for name, multipliers, order, noise in rows:
+        ends: dict[str, int] = {}
+        for seed in range(draws):
+            end = _studied(multipliers, order, noise, seed)
+            ends[end] = ends.get(end, 0) + 1
+        print(f"{name:28} {ends}", flush=True)
+
+
+def _studied(multipliers: list[complex], order: int, noise: float, seed: int) -> str:
+    """Return how a study of at most six blocks ends."""
+    rng = np.random.default_rng(seed)
+    loop = truth.loop_with(multipliers, 8, 2, rng)
+    first = hj.multisine(8, periods=24, lines="odd", frequencies=(0, 4), seed=seed)
+    first = first.scaled(1.0)
+    quest = hj.designs.SequentialDesign(first, order=order, standard_error=1e-2)
+    size = truth.periodic_response(loop, first.signals()).std(axis=(0, 1))
+    for _ in range(6):
+        u = quest.design.signals()
+        y = truth.periodic_response(loop, u)
+        y = y + noise * size * rng.normal(size=y.shape)
+        data = hj.experiments.ExperimentData(u, y, n_sections=8, periods=24)
+        try:
+            quest = quest.add(data)
+        except hj.errors.DefinitionError as error:
+            right = f"support {len(loop.multipliers)} multipliers, not {order}"
+            return "refused, right order" if right in str(error) else str(error)[:60]
+        if quest.done:
+            fit = quest.fit
+            holds = fit is not None and bool(fit.contains(loop.multipliers).all())
+            return "done, held" if holds else "done, missed"
+    return "not done after 6 blocks, says why" if "since" in repr(quest) else "not done"
+
+
 # Each row with its usual number of draws.
 ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "files": (files, 5),
     "groups": (groups, 400),
     "bands": (bands, 200),
+    "series": (series, 60),
+    "study": (study, 12),
 }
 
 

@@ -156,3 +156,42 @@ GROUPS = [
     (12, 1.0, 12, 3.0),
     (6, 1.0, 30, 1.0),
 ]
+
+
+def noisy_series(
+    multipliers: list[complex], seed: int, size: float, color: float
+) -> tuple[Loop, np.ndarray, np.ndarray]:
+    """Return a random loop with three sections, and inputs and outputs of three records.
+
+    **Arguments:** `size`: of the noise that drives the states. `color`: part of an input that is
+    left after a section (0: white).
+    """
+    rng = np.random.default_rng(seed)
+    loop = loop_with(multipliers, 3, 2, rng)
+    u = rng.normal(size=(3, 300, 1))
+    for i in range(1, 300):
+        u[:, i] = color * u[:, i - 1] + np.sqrt(1 - color**2) * u[:, i]
+    y = loop.response(u, size * rng.normal(size=(3, 300, loop.A.shape[1])))
+    return loop, u, y + 0.1 * y.std(axis=(0, 1)) * rng.normal(size=y.shape)
+
+
+def controlled_series(seed: int) -> tuple[Loop, np.ndarray, np.ndarray]:
+    """Return the same of a loop whose controller acts at the section where it measures.
+
+    Loops that the controller makes unstable are drawn again.
+    """
+    rng = np.random.default_rng(seed)
+    while True:
+        loop = loop_with([0.5 + 0.45j], 3, 2, rng)
+        gain = 0.2 * rng.normal(size=(2, 1))
+        x = np.zeros((3, 2))
+        u = np.zeros((3, 450, 1))
+        y = np.zeros((3, 450, 2))
+        for i in range(450):
+            n = i % 3
+            y[:, i] = x @ loop.C[n].T + 0.05 * rng.normal(size=(3, 2))
+            u[:, i] = rng.normal(size=(3, 1)) - y[:, i] @ gain
+            x = x @ loop.A[n].T + u[:, i] @ loop.B[n].T + 0.3 * rng.normal(size=(3, 2))
+            x = np.clip(x, -1e3, 1e3)
+        if np.abs(x).max() < 1e2:
+            return loop, u, y
