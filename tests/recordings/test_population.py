@@ -52,6 +52,14 @@ def test_equal_errors_give_the_t_interval():
     assert row["spread"][0] == pytest.approx(np.sqrt(y.var(ddof=1) - 0.09))
 
 
+def test_an_outlier_among_subjects_is_named():
+    y = np.random.default_rng(0).normal(size=N)
+    study(y, np.full(N, 0.3)).mean("gain")
+    y[3] += 8.0
+    with pytest.warns(hj.errors.FindingWarning, match="gain of the subjects .all. is"):
+        study(y, np.full(N, 0.3)).mean("gain")
+
+
 def test_equal_estimates_have_the_error_of_their_fits():
     row = study(np.ones(N), np.full(N, 0.3)).mean("gain")
     assert (
