@@ -28,6 +28,10 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
+# Level at which residuals of a fit to the same data are not white. (Fits make them whiter: of white
+# noise none of 120 was below 1 %.) Larger: white noise is doubted. Smaller: weak process noise
+# passes, whose standard errors are too small.
+_COLORED = 0.01
 # Shifts by whole cycles from which the dependence of residuals on inputs of other cycles follows,
 # and the deviates by which that on their own must exceed it. More shifts: time. Larger deviates:
 # too few dimensions are called noise. Smaller: noise is called too few dimensions.
@@ -214,7 +218,7 @@ def about_misfit(
     tested = ~is_exact(grid, error)
     depends = (p < ANSWER / ny) & tested
     _, p_white = whiteness_test(error, N)
-    is_colored = bool(((p_white < ANSWER / ny) & tested).any())
+    is_colored = bool(((p_white < _COLORED / ny) & tested).any())
     if is_colored and depends.any():
         depends &= _deviates_of(p) > _of_other_cycles(inputs, late) + _ALONE
     if depends.any():
