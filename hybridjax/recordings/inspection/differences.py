@@ -233,9 +233,11 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
         yield Finding("missed events", text, "refused" if everywhere else "warned")
 
 
-def alternating_cycles(phase: Phase, data: SectionData) -> Iterator[Finding]:
+def alternating_cycles(
+    data: SectionData, phase: Phase | None = None
+) -> Iterator[Finding]:
     """Find cycles of two kinds that alternate, as strides that were cut at each step."""
-    stretches = itertools.chain.from_iterable(phase.stretches)
+    stretches = itertools.chain.from_iterable(phase.stretches if phase else ())
     shares = [_alternating([np.diff(part.edges())[:, None] for part in stretches])]
     for k in range(len(data.outputs)):
         by_record = []

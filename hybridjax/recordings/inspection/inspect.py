@@ -164,7 +164,7 @@ def inspect_cycles(
     removed = data.records[0].drift or np.inf
     findings = [
         *differences.odd_cycles(recording, phase),
-        *differences.alternating_cycles(phase, data),
+        *differences.alternating_cycles(data, phase),
         *inexact_events(data),
         *differences.other_cycles(recording, phase, outputs),
         *differences.slow_changes(recording, phase, outputs, removed),
