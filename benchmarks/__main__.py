@@ -81,7 +81,7 @@ CASES = {
         "random flows with known zeros: events missed and invented",
     ),
     "strangers": (
-        "strangers.py files groups bands series study",
+        "strangers.py",
         90,
         "estimates from generators that do not import the package",
     ),

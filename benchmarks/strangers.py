@@ -290,13 +290,16 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rows", nargs="+", choices=ROWS)
+    parser.add_argument("rows", nargs="*", help=", ".join(ROWS))
     parser.add_argument("--draws", type=int, default=0)
     parser.add_argument("--short", action="store_true")
     options = parser.parse_args()
+    unknown = set(options.rows) - set(ROWS)
+    if unknown:
+        parser.error(f"no row {', '.join(unknown)}: choose from {', '.join(ROWS)}")
     hj.enable_x64()
     warnings.simplefilter("ignore")
-    for name in options.rows:
+    for name in options.rows or ROWS:
         row, usual = ROWS[name]
         draws = options.draws or usual
         if options.short:
