@@ -80,6 +80,11 @@ CASES = {
         15,
         "random flows with known zeros: events missed and invented",
     ),
+    "strangers": (
+        "strangers.py",
+        90,
+        "estimates from generators that do not import the package",
+    ),
     "branches": (
         "branches.py",
         20,

@@ -175,9 +175,7 @@ class SequentialDesign(Showable, eqx.Module):
         """True if the requested precision is reached."""
         if self.fit is None or not np.isfinite(self.standard_errors[-1]).all():
             return False
-        return bool(
-            self.standard_errors[-1].max() * _student(self.fit) <= self.standard_error
-        )
+        return self._suffices(self.fit, self.standard_errors[-1])
 
     @property
     def design(self) -> Design:
@@ -199,8 +197,9 @@ class SequentialDesign(Showable, eqx.Module):
         that are averaged. Default: 1.
 
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data
-        show more than `order` multipliers, and if the initial transient, relative to the response,
-        exceeds `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
+        show more than `order` multipliers, if they show fewer and determine these to
+        `standard_error`, and if the initial transient, relative to the response, exceeds
+        `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
         `fit_multipliers` and `optimal_design`.
         """
         require_equal(
@@ -219,6 +218,8 @@ class SequentialDesign(Showable, eqx.Module):
                 f"the data show more than {self.order} multipliers: add the blocks to a study with "
                 "a larger `order`."
             )
+        if 0 < best.supported < self.order:
+            self._refuse_surplus(blocks, best.supported)
         errors = _standard_errors(best.fit, self.goal)
         if best.objection:
             errors = np.full_like(errors, np.nan)
@@ -239,6 +240,24 @@ class SequentialDesign(Showable, eqx.Module):
         return eqx.tree_at(
             lambda s: s._history, self, history, is_leaf=lambda x: x is None
         )
+
+    def _suffices(self, fit: StructuredFit, errors: Float[np.ndarray, " g"]) -> bool:
+        """Return whether these standard errors are as small as requested."""
+        return bool(errors.max() * _student(fit) <= self.standard_error)
+
+    def _refuse_surplus(self, blocks: tuple[Block, ...], supported: int) -> None:
+        """**Raises:** `DefinitionError` if the multipliers that the data support are as precise as
+        requested already: the study would repeat its first block for ever."""
+        if (self.goal.which or 0) >= supported:
+            return
+        fewer = estimate(blocks, supported, self.goal)
+        errors = _standard_errors(fewer.fit, self.goal)
+        if not fewer.objection and self._suffices(fewer.fit, errors):
+            raise DefinitionError(
+                f"the data support {supported} multipliers, not {self.order}, and determine these "
+                f"to a standard error of {errors.max():.2g}: add the blocks to a study with order="
+                f"{supported}, or with a smaller `standard_error`."
+            )
 
     def _next(
         self,

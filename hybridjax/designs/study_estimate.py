@@ -12,10 +12,11 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
 from ..identify.multipliers import (
+    NoiseRatios,
     StructuredFit,
     fit_multipliers,
     noise_ratios,
-    unsupported,
+    supported,
 )
 from ..identify.spectral_sums import spectral_sums
 from ..identify.variable_projection import (
@@ -91,6 +92,8 @@ class Estimate(NamedTuple):
     """The same with the standard errors of white noise of these levels."""
     noise: Float[np.ndarray, "B ny"]
     """Standard deviation of each output's noise in each block."""
+    supported: int
+    """How many of the fit's multipliers noise alone does not account for."""
     objection: str
     """The reason to reject the fit; empty if the data support it."""
 
@@ -158,15 +161,31 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
         htf, order, extra_lags=goal.extra_lags, check=False, covariance="variance"
     )
     fit = max(by_scatter, by_level, key=lambda fit: fit.standard_errors.max())
+
+    def ratios(k: int) -> NoiseRatios:
+        if k == order:
+            return noise_ratios(groups, htf, fit.coefficients)
+        fewer = grouped(htf, k, goal.extra_lags)
+        coefficients, _ = maximum_likelihood(fewer, k)
+        return noise_ratios(fewer, htf, coefficients)
+
+    most, _ = supported(ratios, order)
     objection = ""
-    if unsupported(lambda _: noise_ratios(groups, htf, fit.coefficients), order):
-        # (The sentence advises on a single fit.)
-        objection = f"the data do not support {order} multipliers (lower `order` in a new study)"
-    if not objection and (np.abs(fit.multipliers) >= 1).any():
+    if not most:
+        objection = (
+            "the data show no multiplier above the noise (if that remains so, take a first design "
+            "of more power or of more experiments)"
+        )
+    elif most < order:
+        objection = (
+            f"the data support {most} multipliers, not {order} (if that remains so, lower `order` "
+            "in a new study)"
+        )
+    elif (np.abs(fit.multipliers) >= 1).any():
         objection = (
             "the estimate is unstable, and an unstable system has no periodic response"
         )
-    return Estimate(fit, by_level, noise, objection)
+    return Estimate(fit, by_level, noise, most, objection)
 
 
 def refuse_transient(

@@ -396,14 +396,13 @@ def noise_ratios(
     return values, tails * float(np.sqrt(2 / dof))
 
 
-def unsupported(
-    ratios: Callable[[int], NoiseRatios], order: int, refused: bool = False
-) -> list[Finding]:
-    """Return a finding if noise alone may account for multipliers of a fit.
+def supported(ratios: Callable[[int], NoiseRatios], order: int) -> tuple[int, float]:
+    """Return how many multipliers of a fit noise alone does not account for, and the strength of
+    the weakest that it may account for, relative to the noise.
 
-    The number that it names is supported by a fit of that order, too.
+    A fit of the returned number supports all of its multipliers, too.
 
-    **Arguments:** `ratios(k)`: those of a fit of order k. `refused`: whether such a fit is refused.
+    **Arguments:** `ratios(k)`: those of a fit of order k.
     """
     most = order
     weakest = 0.0
@@ -415,7 +414,18 @@ def unsupported(
         if above.all():
             break
         most = int(above.sum())
-        weakest = np.sqrt(max(values[1], 0.0))
+        weakest = float(np.sqrt(max(values[1], 0.0)))
+    return most, weakest
+
+
+def unsupported(
+    ratios: Callable[[int], NoiseRatios], order: int, refused: bool = False
+) -> list[Finding]:
+    """Return a finding if noise alone may account for multipliers of a fit.
+
+    **Arguments:** as of `supported`. `refused`: whether such a fit is refused.
+    """
+    most, weakest = supported(ratios, order)
     if most == order:
         return []
     remedy = f"lower `order` to {most}" if most else "excite more"

@@ -33,6 +33,7 @@ from ..identify.multiplier_estimate import (
 )
 from .data import SectionData
 from .fit_warnings import about_natural_multipliers
+from .inspection.differences import alternating_cycles
 
 
 # Draws of the bootstrap. More: time. Fewer: the ends of intervals scatter.
@@ -205,7 +206,7 @@ def natural_multipliers(
     **Before:** `hj.recordings.sample_sections(..., inputs=())`. **After:** `natural.interval`.
     """
     result = _estimate(data, order, seed)
-    findings = list(about_natural_multipliers(result))
+    findings = [*alternating_cycles(data), *about_natural_multipliers(result)]
     try:
         larger = _estimate(data, order + 1, seed)
     except DefinitionError:

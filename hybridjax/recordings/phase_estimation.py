@@ -35,6 +35,9 @@ _ENOUGH = 20
 # Fraction of long intervals that makes them part of the rhythm. Larger: rhythms of long and short
 # cycles are cut at each long one. Smaller: missed events pass for cycles.
 _COMMON = 0.1
+# Part of its range by which a switch jumps, and between its values; and part of its samples at
+# these. Larger: noisy triggers are smoothed, and lost. Smaller: waves (41 %) are not smoothed.
+_SWITCHED = 0.8
 
 
 @checked
@@ -54,7 +57,8 @@ def estimate_phase(
           it turns.
         - a `Crossing`: the phase grows by one from each crossing of a level by a signal to the
           next, linearly in between. The signal should cross the level once in each cycle in this
-          direction, and fast: at mid-stance, at the apex.
+          direction, and fast: at mid-stance, at the apex. A signal that jumps there, as of a
+          trigger, is not smoothed.
         - `AtEvent`: the phase grows by one from each recorded event to the next, linearly in
           between. Events that follow the one before by less than half of the trial's median period
           are taken for doubled and left out; where an interval is longer than 1.5 median periods an
@@ -104,12 +108,36 @@ def _from_crossings(
     """Return a phase with one cycle per crossing of a smooth signal."""
     name = str(crossing)
     if bandwidth is None:  # noise adds crossings of the samples themselves
-        rough = _from_events(recording.mark(name, crossing), name)
+        of_samples = recording.mark(name, crossing)
+        rough = _from_events(of_samples, name)
+        if _is_switched(of_samples, crossing, name):
+            return rough
         bandwidth = HARMONICS / 2 / rough.period
     marked = recording.mark(name, crossing, bandwidth=bandwidth)
     phase = _from_events(marked, name)
     require_passing(bandwidth, 1 / phase.period)
     return phase
+
+
+def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
+    """Return whether a signal stays at two values and jumps at its marked crossings, as that of a
+    trigger does. Smoothing would move its crossings, or remove them with its pulses."""
+    shares = []
+    at_two_values = []
+    for trial, x in recording.samples(signal_of(crossing)):
+        low = np.nanmin(x)
+        range_ = np.nanmax(x) - low
+        is_at_one = np.abs((x - low) / range_ - 0.5) > _SWITCHED / 2
+        at_two_values.append(is_at_one[np.isfinite(x)].mean())
+        after = np.searchsorted(trial.time, trial.events[name])
+        after = np.clip(after, 1, len(x) - 1)
+        # A sampled edge may lie on the level, or on a sample.
+        last = np.minimum(after + 1, len(x) - 1)
+        first = np.maximum(after - 2, 0)
+        jumps = np.abs(np.stack([x[after] - x[after - 1], x[last] - x[first]]))
+        shares.append(np.nanmax(jumps, axis=0) / range_)
+    jumps_there = np.nanmedian(np.concatenate(shares)) > _SWITCHED
+    return bool(jumps_there and min(at_two_values) > _SWITCHED)
 
 
 def signals_of(definition: PhaseDefinition) -> set[str]:

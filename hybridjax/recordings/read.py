@@ -10,7 +10,14 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, SignalNames
 from .._core.findings import Finding
 from ..errors import DefinitionError, FileFormatError
-from .formats.arrays import read_arrow, read_excel, read_hdf5, read_matlab, read_npz
+from .formats.arrays import (
+    read_arrow,
+    read_excel,
+    read_hdf5,
+    read_matlab,
+    read_netcdf,
+    read_npz,
+)
 from .formats.bag import read_bag
 from .formats.c3d import read_c3d
 from .formats.columns import Columns, Wanted, assumed, parse_table, time_unit
@@ -31,13 +38,15 @@ def read_recording(
       semicolons, tabs or blanks, and numbers below. Lines above the names are left out if they have
       fewer fields. A unit may follow a name in parentheses or brackets, `force (N)`, or stand in a
       row below the names. Empty fields, `nan` and `NA` are missing samples. Decimal commas are read
-      where another character separates; lines that begin with `#`, `%` or `//` are comments. UTF-8,
-      UTF-16 or Latin-1.
+      where another character separates; lines that begin with `#`, `%` or `//` are comments.
+      Columns of text are left out, with a finding. UTF-8, UTF-16 or Latin-1.
     - *Excel* (`.xlsx`, `.xlsm`): the first sheet, in the same way.
     - *Parquet*, *Feather*, *NPZ*: an array for each column.
     - *MATLAB* (`.mat`, of all versions) and *HDF5* (`.h5`, `.hdf5`): arrays by their names in
       structs, `imu.gyro`, or their paths, `imu/gyro`; columns of matrices are `imu.gyro.0`, ...
       The times of an array are those in its struct or group, or in the nearest around it.
+    - *NetCDF* (`.nc`): variables by their names, with their scale factors, offsets and marks of
+      missing values.
     - *C3D*: markers `LASI.x`, `LASI.y`, `LASI.z`, analog channels, events with their contexts.
     - *OpenSim* (`.mot`, `.sto`), *Motion Analysis* (`.trc`) and *Vicon* (`.csv`, `.txt`).
     - *ROS* (`.bag`, `.db3`, folders of them) and *MCAP*: numbers of messages as `topic.field`, at
@@ -99,6 +108,7 @@ _READERS = {
     ".npz": read_npz,
     ".mat": read_matlab,
     **dict.fromkeys((".h5", ".hdf5"), read_hdf5),
+    ".nc": read_netcdf,
     ".c3d": read_c3d,
     **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
 }

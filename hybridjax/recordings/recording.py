@@ -249,10 +249,16 @@ class Recording(Showable, eqx.Module):
             known = np.diff(t) <= bridgeable(t, 0.5 / bandwidth)
             at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & known)
             if not len(at):
+                if np.nanmin(x) < level < np.nanmax(x) and bandwidth < np.inf:
+                    remedy = (
+                        f"its samples cross it, but not its smoothing spline of {bandwidth:.4g} "
+                        "Hz: give a larger `bandwidth`"
+                    )
+                else:
+                    remedy = f"choose a `value` between {np.nanmin(x):.4g} and {np.nanmax(x):.4g}"
                 raise DefinitionError(
                     f"trial '{trial.name}': {signal} is never seen to cross {level:g}, "
-                    f"{crossing.direction}: choose a `value` between {np.nanmin(x):.4g} and "
-                    f"{np.nanmax(x):.4g}."
+                    f"{crossing.direction}: {remedy}."
                 )
             crossed = find_root(_minus(curve, level), (t[at], t[at + 1])).x
             trials.append(replace(trial, events=trial.events | {event: crossed}))
@@ -385,13 +391,30 @@ def _require_increasing(where: str, time: Series) -> None:
     bad = 1 + int(np.argmin(later))
     before = time[bad - 1]
     after = time[bad]
-    remedy = "leave out such samples"
-    if after < before:
-        remedy = "sort, or make a trial of each part"
+    if not after < before:
+        remedy = "leave out such samples"
+    elif _begins_again(time, bad):
+        # From the last sample before the fall to the first after it, a step passes.
+        period = before - after + float(np.nanmedian(np.diff(finite)))
+        remedy = (
+            "if the clock wraps, undo it (`numpy.unwrap` with "
+            f"period={period:.10g}); if a new trial begins, make a trial of each part"
+        )
+    else:
+        remedy = "sort the samples by their times"
     raise DefinitionError(
         f"{where}: time does not increase at sample {bad} ({before:.10g}, then {after:.10g}): "
         f"{remedy}."
     )
+
+
+def _begins_again(time: Series, bad: int) -> bool:
+    """Return whether time falls at sample `bad` by more than half of its range so far, and goes on
+    from there."""
+    so_far = np.ptp(time[:bad])
+    after = time[bad : bad + 3]
+    goes_on = len(after) > 1 and bool((np.diff(after) > 0).all())
+    return time[bad - 1] - time[bad] > so_far / 2 and goes_on and bad > 2
 
 
 def signal_of(crossing: Crossing) -> str:

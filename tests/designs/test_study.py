@@ -81,8 +81,7 @@ def test_too_much_noise_to_begin_with(model, first):
     assert np.isnan(lost.standard_errors).all()
     assert lost.plan is None
     text = repr(lost)
-    assert "the first design again, since the data " in text
-    assert "lower `order` in a new study" in text
+    assert "the first design again, since the data show no multiplier above" in text
     assert "check=" not in text
     assert_array_equal(lost.design.line, first.line)
     assert (lost.design.phase != first.phase).all()
@@ -122,6 +121,20 @@ def test_an_order_that_is_too_low_is_named(model, first):
     study = hj.designs.SequentialDesign(first, 1, 1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="show more than 1 multipliers"):
         for k in range(4):
+            study = study.add(measured(model, study.design, seed=k))
+
+
+@pytest.mark.parametrize("order", [3, 4])
+def test_an_order_that_is_too_high_is_named(model, first, order):
+    """Of the first block, too, the fits of all lower orders are compared with the noise."""
+    study = hj.designs.SequentialDesign(first, order, 2.5e-4)
+    study = study.add(measured(model, first))
+    assert f"the data support 2 multipliers, not {order}" in repr(study)
+    with pytest.raises(
+        hj.errors.DefinitionError,
+        match=f"support 2 multipliers, not {order}, .*study with order=2",
+    ):
+        for k in range(1, 6):
             study = study.add(measured(model, study.design, seed=k))
 
 

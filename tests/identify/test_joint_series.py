@@ -157,7 +157,7 @@ def test_residuals_of_exact_data_tell_nothing(small):
         size=grid.y.shape
     )
     for size, told in ((1e-3, True), (1e-13, False)):
-        found = about_misfit(grid, grid, size * response, innovations=False)
+        found = about_misfit(grid, grid, size * response, False, direct=True)
         assert bool(found) == told == ("noise='innovations'" in repr(found))
     feedback = np.roll(response.reshape(1, -1, 2), 1, axis=1).reshape(response.shape)
     assert not about_answers(grid, 1e-13 * feedback, ("u",), "")
@@ -244,3 +244,40 @@ def test_the_spectrum_of_noise(small):
     for row, m in zip(found, (-1, 1), strict=True):
         H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
         np.testing.assert_allclose(row, (np.abs(H) ** 2).sum(axis=(0, 3)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("size, cause", [(0.0, None), (0.5, "process noise")])
+def test_noise_of_the_states_is_named_where_only_sensors_were_fitted(size, cause):
+    """Three sections, a pair of modulus 0.67; the remedy that is named leaves no doubt."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(600, 1))
+    turn = np.array([[0.5, 0.45], [-0.45, 0.5]])
+    x = np.zeros(2)
+    y = np.zeros((600, 2))
+    for i in range(600):
+        y[i] = x + 0.3 * rng.normal(size=2)
+        x = (turn if i % 3 == 2 else np.eye(2)) @ x + [u[i, 0], 0.3 * u[i, 0]]
+        x = x + size * rng.normal(size=2)
+    data = hj.experiments.SectionSeries(u, y, n_sections=3)
+    found = [finding.cause for finding in hj.fit_ldtp(data, 2).findings]
+    assert found == ([cause] if cause else [])
+    if cause:
+        assert not hj.fit_ldtp(data, 2, noise="innovations").findings
+
+
+def test_a_controller_at_the_section_of_its_measurement_is_no_lack_of_dimensions():
+    """Inputs that answer outputs at once are correlated with their errors, which D would take."""
+    rng = np.random.default_rng(1)
+    turn = np.array([[0.5, 0.45], [-0.45, 0.5]])
+    x = np.zeros(2)
+    u = np.zeros((1200, 1))
+    y = np.zeros((1200, 2))
+    for i in range(1200):
+        y[i] = x + 0.1 * rng.normal(size=2)
+        u[i] = rng.normal() - 0.3 * y[i, 0] - 0.2 * y[i, 1]
+        x = (turn if i % 2 else np.eye(2)) @ x + [u[i, 0], 0.3 * u[i, 0]]
+        x = x + 0.3 * rng.normal(size=2)
+    data = hj.experiments.SectionSeries(u, y, n_sections=2)
+    fit = hj.fit_ldtp(data, 2, noise="innovations")
+    assert {finding.cause for finding in fit.findings} == {"feedback"}
+    assert fit.contains(turn[0, 0] + 1j * turn[0, 1]).all()

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate, contradicted_by
-from hybridjax.identify.series.fit import gradient_covariance
+from hybridjax.identify.series.fit import block_scores
 from hybridjax.identify.series.linearization import (
     each_fit,
     filtered_response,
@@ -163,7 +163,9 @@ def test_the_covariance_of_the_gradient_with_process_noise():
         )
         products = np.einsum("btn,tn->b", draws, slopes_of(problem, solution))
         measured += np.mean(products**2) / runs
-        estimated += gradient_covariance(problem, solution, 11).matrix[0, 0] / runs
+        estimated += (
+            block_scores(problem, solution, 11).covariance().matrix[0, 0] / runs
+        )
     assert estimated == pytest.approx(measured, rel=0.1)
 
 
@@ -383,3 +385,27 @@ def test_inputs_have_units_of_their_own(unit):
         hj.fit_series(
             hj.experiments.SectionSeries(u[:, :1] * units, y, n_sections=4), 2
         )
+
+
+def test_a_multiplier_that_changes_along_the_data_is_named():
+    """Trials with multipliers from 0.7 to 0.3, then the same with 0.5 in all."""
+
+    def records(multipliers):
+        rng = np.random.default_rng(1)
+        each = []
+        for z in multipliers:
+            u = rng.normal(size=(160, 1))
+            x = np.zeros(161)
+            for i in range(160):
+                # Two sections in a period.
+                x[i + 1] = (z if i % 2 else 1.0) * x[i] + u[i, 0]
+            y = x[:160, None] + 0.1 * rng.normal(size=(160, 1))
+            each.append(hj.experiments.SectionSeries(u, y, n_sections=2))
+        return each
+
+    def causes(multipliers):
+        fit = hj.fit_series(records(multipliers), 1, check=False)
+        return {finding.cause for finding in fit.findings}
+
+    assert "changing system" in causes(np.linspace(0.7, 0.3, 8))
+    assert causes([0.5] * 8) == set()

@@ -522,3 +522,88 @@ def test_errors_of_a_reader_itself_are_no_damage(tmp_path, monkeypatch):
     monkeypatch.setattr(arrays, "Columns", None)
     with pytest.raises(TypeError, match="'NoneType' object is not callable"):
         hj.read_recording(tmp_path / "x.h5")
+
+
+def test_attributes_of_netcdf_apply(tmp_path):
+    """A scale, an offset and a mark of missing numbers, in a file of version 4 and of version 3."""
+    h5py = pytest.importorskip("h5py")
+    y = 4.0 + X
+    stored = np.round((y - 4.0) / 1e-4).astype(np.int32)
+    stored[3] = -32767
+    y[3] = np.nan
+    path = tmp_path / "new.nc"
+    with h5py.File(path, "w") as file:
+        file["time"] = SLOW * 1e3
+        file["time"].attrs["units"] = "ms since 2026-01-01"
+        file["y"] = stored
+        file["y"].attrs.update(
+            {"scale_factor": 1e-4, "add_offset": 4.0, "_FillValue": np.int32(-32767)}
+        )
+    old = tmp_path / "old.nc"
+    netcdf_file = pytest.importorskip("scipy.io").netcdf_file
+    with netcdf_file(old, "w") as file:
+        file.createDimension("time", len(SLOW))
+        time = file.createVariable("time", "d", ("time",))
+        time[:] = SLOW
+        time.units = "s"
+        packed = file.createVariable("y", "i", ("time",))
+        packed[:] = stored
+        packed.scale_factor = 1e-4
+        packed.add_offset = 4.0
+        packed.missing_value = np.int32(-32767)
+    for found in map(hj.read_recording, (path, old)):
+        assert not found.findings
+        np.testing.assert_allclose(found.time, SLOW, atol=1e-12)
+        np.testing.assert_allclose(found["y"], y, atol=1e-4)
+
+
+def test_texts_in_tables(tmp_path):
+    """A row that begins with an error of a sheet, a column of text, and one byte of Latin-1."""
+    rows = [f"{x:.4f},{t:.3f},stance" for x, t in zip(X, SLOW, strict=True)]
+    rows[4] = f"#N/A,{SLOW[4]:.3f},stance"
+    path = tmp_path / "walk.csv"
+    head = b"# M\xfcller\n" + "Öffnung (°),time (s),phase\n".encode()
+    path.write_bytes(head + "\n".join(rows).encode())
+    found = hj.read_recording(path)
+    assert found.signals == ("Öffnung",)
+    assert found.units == ("°",)
+    assert np.flatnonzero(np.isnan(found["Öffnung"])) == [4]
+    assert "text were left out: 'phase'" in repr(found)
+    assert not hj.read_recording(path, signals="Öffnung").findings
+    refused("'phase' holds 'stance'", path, signals="phase")
+    path.write_text(path.read_text("latin-1").replace("time (s)", "time"), "latin-1")
+    rows[5] = rows[5].replace("0.05", "12:00:05")
+    path.write_text("\n".join(["x,time,phase", *rows]))
+    refused("column 'time' holds '12:00:05", path)
+
+
+def test_c3d_that_is_longer_than_its_header_can_say(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [200]
+    file["parameters"]["POINT"]["LABELS"]["value"] = ["M"]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["data"]["points"] = np.ones((4, 1, 66_000))
+    path = tmp_path / "long.c3d"
+    file.write(str(path))
+    refused("of which only 65535 can be read: export parts", path)
+
+
+def test_mcap_with_a_hole(tmp_path):
+    """The index counts more messages than the file still has."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    number = store.types["std_msgs/msg/Float64"]
+    kind = number.__msgtype__
+    plugin = rosbag2.StoragePlugin.MCAP
+    with rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        topic = writer.add_connection("/force", kind, typestore=store)
+        for k in range(200):
+            writer.write(topic, k * 10**7, store.serialize_cdr(number(1.0 * k), kind))
+    (path,) = (tmp_path / "bag").glob("*.mcap")
+    data = bytearray(path.read_bytes())
+    assert len(hj.read_recording(path).time) == 200
+    data[len(data) // 3 : len(data) // 3 + 300] = bytes(300)
+    path.write_bytes(data)
+    refused("damaged: it has .* messages of 'force', its header 200", path)

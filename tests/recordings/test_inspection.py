@@ -244,3 +244,85 @@ def test_none_is_silently_wrong(hopper_cycle, mishap):
     except hj.errors.DefinitionError:
         return
     assert found.findings or found.fit.contains(hopper_cycle.multipliers, 0.999).all()
+
+
+def test_coarse_stamps_are_named_and_lost_samples_are_not():
+    """Samples 1/64 s apart have stamps of 60 Hz frames; then a third of the samples is missing."""
+    (trial, *_) = made_up(0).trials
+    values = {"f": trial.values[:, 0], "x": trial.values[:, 1], "v": trial.values[:, 2]}
+
+    def named(time, kept):
+        recording = hj.Recording(time[kept], {k: x[kept] for k, x in values.items()})
+        found = hj.recordings.check_recording(
+            recording, inputs="f", outputs=("x", "v")
+        ).findings
+        return {finding.cause for finding in found}
+
+    every = np.ones(len(trial.time), bool)
+    coarse = np.round(trial.time / 0.007) * 0.007
+    assert named(coarse, every) == {"coarse time stamps"}
+    lost = np.random.default_rng(0).random(len(trial.time)) < 1 / 3
+    assert named(trial.time, every) == set()
+    assert "coarse time stamps" not in named(trial.time, ~lost)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_strikes_of_both_sides_are_named(late):
+    """Cycles that begin at each step would give a multiplier of -1."""
+    recording = made_up(0)
+    trials = []
+    for trial in recording.trials:
+        at = trial.events["top"]
+        other = (at[1:] + at[:-1]) / 2 + late
+        steps = np.sort(np.concatenate([at, other]))
+        events = {"step": steps, "top": at}
+        trials.append(eqx.tree_at(lambda t: t.events, trial, events))
+    recording = recording.with_trials(trials)
+    assert "alternating cycles" in causes(recording, hj.AtEvent("step"))
+    assert causes(recording, hj.AtEvent("top")) == set()
+
+
+def test_a_trial_that_runs_backwards_is_named():
+    """Its average cycle is that of the others in reverse: here a wave that rises fast and falls
+    slowly, which no change of sign explains."""
+    trials = []
+    for k, trial in enumerate(made_up(0).trials):
+        angle = 2 * np.pi * trial.time
+        f, x, v = trial.values.T
+        x = x + 0.9 * np.sin(2 * angle) + 0.6 * np.sin(3 * angle)
+        order = slice(None, None, -1) if k == 1 else slice(None)
+        signals = {"f": f[order], "x": x[order], "v": v[order]}
+        trials.append(hj.Recording(trial.time, signals, name=f"trial {k}"))
+    (found,) = [
+        finding
+        for finding in findings(hj.Recording.join(trials))
+        if finding.action == "refused"
+    ]
+    assert found.cause == "backwards"
+    assert "'trial 1'" in found.text
+
+
+@pytest.mark.parametrize("width", [0.001, 0.003, 0.01])
+def test_a_short_trigger_defines_the_phase(width):
+    time = np.arange(0, 40, 0.001)
+    strikes = np.cumsum(np.random.default_rng(0).uniform(0.9, 1.1, size=37)) + 0.5
+    since = time - strikes[np.searchsorted(strikes, time) - 1]
+    pulse = 5.0 * ((since >= 0) & (since < width))
+    recording = hj.Recording(time, {"trigger": pulse, "x": np.sin(time)})
+    crossing = hj.Crossing("trigger", "rising", 2.5)
+    (found,) = hj.recordings.estimate_phase(recording, crossing).periods
+    np.testing.assert_allclose(found, np.diff(strikes), atol=0.0015)
+    with pytest.raises(
+        hj.errors.DefinitionError, match="not its smoothing spline of 8 Hz"
+    ):
+        hj.recordings.estimate_phase(recording, crossing, bandwidth=8.0)
+
+
+def test_the_advice_for_a_clock_that_wraps_undoes_it():
+    time = np.arange(0, 50, 0.01)
+    wrapped = np.mod(time + 7.0, 32.768)
+    with pytest.raises(hj.errors.DefinitionError, match="numpy.unwrap") as error:
+        hj.Recording(wrapped, {"x": time})
+    period = float(str(error.value).split("period=")[1].split(")")[0])
+    undone = hj.Recording(np.unwrap(wrapped, period=period), {"x": time})
+    np.testing.assert_allclose(undone.time, time + 7.0, atol=1e-6)

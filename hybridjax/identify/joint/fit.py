@@ -91,7 +91,8 @@ class LDTPFit(WithCost, MultiplierFit):
     - `findings`: "feedback" for inputs of time series that a controller makes, or may make (not
       with a `references`); "drift" if drift of the outputs of time series (in the first 1000
       cycles) gives multipliers outside of each other's confidence regions; "left over" if residuals
-      depend on the inputs, or "misfit" if they are larger than their variances, or alike at
+      depend on the inputs, "process noise" or "colored noise" if they are correlated in time, or
+      "misfit" if they are larger than their variances, or alike at
       neighboring frequencies: the dimensions are too few, or the iteration found a local minimum;
       "order" if one dimension less explains the data; "undetermined"; "no convergence".
     """
@@ -442,7 +443,9 @@ def _doubts(
         return unknown
     if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
-    return residuals.about_misfit(outside.whole(), grid, error, how.innovations)
+    # (References do not respond to outputs, at no section.)
+    direct = fit._coordinates.direct or outside is not records
+    return residuals.about_misfit(outside.whole(), grid, error, how.innovations, direct)
 
 
 def _likelier(records: PreparedRecords, guess: Guess, how: _How) -> LDTPFit:

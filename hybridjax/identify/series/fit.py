@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import special
 
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import (
@@ -80,6 +81,14 @@ from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
 _BIASED = "the fit is biased; name their `references`"
+# Level at which multipliers that change along the data are reported. Larger: chance is. Smaller:
+# changes of a few standard errors pass.
+_STEADY = 0.01
+_CHANGES = Finding(
+    "changing system",
+    "the multipliers change along the data, more than chance explains: the fit is a mean, and its "
+    "intervals are too narrow. Fit earlier and later records one by one.",
+)
 
 
 class SeriesFit(MultiplierFit):
@@ -107,7 +116,8 @@ class SeriesFit(MultiplierFit):
     - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
       multiplier more, or two, give multipliers outside of each other's confidence regions;
       "feedback" if inputs answer earlier residuals, as by a controller: the fit is then biased;
-      "undetermined"; "no convergence".
+      "changing system" if the multipliers of earlier and later cycles differ; "undetermined"; "no
+      convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -340,7 +350,7 @@ def _fit_open_loop(
         return _Weighted(problem, solution, converged, ratios)
 
     best = weighted(order)
-    covariance = coefficient_covariance(best.problem, best.solution)
+    covariance, p_steady = _uncertainty(best.problem, best.solution)
     fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
     error = np.where(grid.sampled, grid.y - fit.predicted(grid, free_start), 0.0)
@@ -359,7 +369,10 @@ def _fit_open_loop(
             partial(_of_order, order + k, records, fit, free_start) for k in (1, 2)
         ]
         doubts = order_doubts(fit, higher)
-    return dataclasses.replace(fit, findings=(*fit.findings, *doubts, *answers))
+    changes = [_CHANGES] if p_steady < _STEADY else []
+    return dataclasses.replace(
+        fit, findings=(*fit.findings, *doubts, *changes, *answers)
+    )
 
 
 def _about_drift(
@@ -506,12 +519,23 @@ def _noise_ratios(
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
 # by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
 _WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
+# Blocks beyond the number of coefficients from which changes in time are tested. Fewer: the test
+# sees nothing.
+_FEWEST_BLOCKS = 6
 
 
 def coefficient_covariance(
     problem: OutputErrorProblem, solution: Linearization
 ) -> Covariance:
     """Return the covariance of c, for errors that may depend on each other and on the inputs."""
+    covariance, _ = _uncertainty(problem, solution)
+    return covariance
+
+
+def _uncertainty(
+    problem: OutputErrorProblem, solution: Linearization
+) -> tuple[Covariance, float]:
+    """Return the covariance of c, and the p-value of a c that does not change along the data."""
 
     def draws(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
         sampled = part.sampled[:, :, n, :, None]
@@ -524,11 +548,15 @@ def coefficient_covariance(
     curvature = (solution.curvature - noise).sum(axis=0)
     whole = solution.curvature.sum(axis=0)
     if not np.linalg.eigvalsh(whole)[0] > 0:
-        return sandwich(curvature, whole)
+        return sandwich(curvature, whole), 1.0
     cycles = problem.records.cycles
     lags = denominator.correlated_cycles(multipliers_of(solution.c), cycles)
-    gradient = gradient_covariance(problem, solution, lags + 1)
-    return sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
+    scores = block_scores(problem, solution, lags + 1)
+    if scores is None:
+        return sandwich(curvature, Covariance.unknown(len(whole)).matrix), 1.0
+    gradient = scores.covariance()
+    covariance = sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
+    return covariance, scores.trend()
 
 
 class _BlockSums(NamedTuple):
@@ -544,10 +572,52 @@ class _BlockSums(NamedTuple):
     """Products of the slopes filtered backward."""
 
 
-def gradient_covariance(
+class BlockScores(NamedTuple):
+    """The gradient at a minimum, as a sum over blocks of cycles."""
+
+    scaled: Float[np.ndarray, "B d"]
+    """In units in which noise like that of the data makes the sum of their squares one."""
+    share: Float[np.ndarray, "B d d"]
+    """Their expected squares for white noise."""
+    root: Float[np.ndarray, "d d"]
+    """A root of the expected covariance of the gradient."""
+    time: Float[np.ndarray, " B"]
+    """The middle of each block, in cycles since the first record."""
+
+    def covariance(self) -> Covariance:
+        """Return the covariance of the gradient."""
+        d = self.scaled.shape[1]
+        # Scores add up to zero at the minimum, which takes this part of the sum away.
+        taken = np.einsum("bij,bji->", self.share, self.share) / d
+        square = self.scaled.T @ self.scaled / max(1 - taken, 0.5)
+        matrix = self.root @ square @ self.root.T
+        return Covariance(matrix, denominator.block_freedom(self.scaled, self.share))
+
+    def trend(self) -> float:
+        """Return the p-value of coefficients that do not change linearly in time.
+
+        A score test: if they change, scores of earlier and later blocks differ. Their sum, weighted
+        by the time, is compared with its squares (Hotelling's T; for constancy of parameters:
+        Nyblom, J. Amer. Stat. Assoc. 84, 1989).
+        """
+        blocks, d = self.scaled.shape
+        if blocks < d + _FEWEST_BLOCKS:
+            return 1.0
+        weight = np.trace(self.share, axis1=1, axis2=2)
+        # (Without the mean, errors of the fit itself do not count.)
+        late = self.time - weight @ self.time / weight.sum()
+        weighted = late[:, None] * self.scaled
+        total = weighted.sum(axis=0)
+        square = float(total @ np.linalg.pinv(weighted.T @ weighted) @ total)
+        ratio = square / max(blocks - square, 1e-300) * (blocks - d) / d
+        return float(special.fdtrc(d, blocks - d, ratio))
+
+
+def block_scores(
     problem: OutputErrorProblem, solution: Linearization, cycles: int
-) -> Covariance:
-    """Return the covariance of the gradient at the minimum, from blocks of at least so many cycles.
+) -> BlockScores | None:
+    """Return the gradient at the minimum in blocks of at least so many cycles; None if nothing is
+    left of any block.
 
     Errors of neighboring cycles may depend on each other and on the inputs. Numerators take the
     common part of these errors, and no correction of single residuals restores it. The errors of a
@@ -557,7 +627,6 @@ def gradient_covariance(
     white noise, and noise filtered by 1 / chi, as process noise is. The amounts of both follow from
     two sums of squares of the residuals (variance components: Rao 1971).
     """
-    d = len(solution.c)
     memory = fading(solution.c)
 
     def outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny C"]:
@@ -593,14 +662,20 @@ def gradient_covariance(
         half = np.linalg.inv(np.linalg.cholesky(expected))
         true = np.linalg.cholesky(true)
         share = np.linalg.inv(np.linalg.cholesky(by_white.sum(axis=0)))
-    except np.linalg.LinAlgError:  # nothing is left of any block
-        return Covariance.unknown(d)
-    scaled = score[:, 0] @ half.T
-    share = share @ by_white @ share.T
-    # Scores add up to zero at the minimum, which takes this part of the sum away.
-    taken = np.einsum("bij,bji->", share, share) / d
-    matrix = true @ scaled.T @ scaled @ true.T / max(1 - taken, 0.5)
-    return Covariance(matrix, denominator.block_freedom(scaled, share))
+    except np.linalg.LinAlgError:
+        return None
+    time = []
+    for grid, begins in zip(problem.parts(), problem.records.begins, strict=True):
+        T = grid.y.shape[1]
+        count = max(1, T // cycles)
+        middle = (np.arange(count) + 0.5) * -(-T // count)
+        time.append((begins[:, None] + middle).ravel())
+    return BlockScores(
+        scaled=score[:, 0] @ half.T,
+        share=share @ by_white @ share.T,
+        root=true,
+        time=np.concatenate(time),
+    )
 
 
 def _block_sums(

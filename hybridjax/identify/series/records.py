@@ -112,8 +112,9 @@ class PreparedRecords:
     """Records as grids of similar lengths.
 
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
-    `SectionSeries`; `about`: by name. `grids`: the grids. `cycles`: number of cycles of the longest
-    record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
+    `SectionSeries`; `about`: by name. `grids`: the grids. `begins`: for each grid (S,) the cycles
+    of all records before each of its own. `cycles`: number of cycles of the longest record.
+    `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
 
     **Arguments:** `free_start`: whether the states at the starts are unknown. Records that drift
     are then cut into pieces with starts and drifts of their own, because the time of fits grows
@@ -132,7 +133,7 @@ class PreparedRecords:
         self.lead = first.lead
         self.inputs = first.inputs
         self.outputs = first.outputs
-        self.grids = _grids(self.records)
+        self.grids, self.begins = _grids(self.records)
         self.cycles = max(map(count_cycles, self.records))
         counts = [grid.sampled.sum(axis=(0, 1)) for grid in self.grids]
         self.sampled = np.sum(counts, axis=0)
@@ -185,16 +186,24 @@ def _pieces(record: SectionSeries) -> list[SectionSeries]:
     return [record.part(k, k + n) for k in range(0, samples, n)]
 
 
-def _grids(records: Sequence[SectionSeries]) -> list[CycleGrid]:
-    """Put records on grids, each at least half as long as the longest of its grid."""
-    left = sorted(records, key=count_cycles, reverse=True)
+def _grids(
+    records: Sequence[SectionSeries],
+) -> tuple[list[CycleGrid], list[Int[np.ndarray, " S"]]]:
+    """Put records on grids, each at least half as long as the longest of its grid.
+
+    **Returns:** the grids, and the number of cycles of all records before each of theirs.
+    """
+    cycles = np.array([count_cycles(record) for record in records])
+    before = np.cumsum(cycles) - cycles
+    left = np.argsort(-cycles, kind="stable")
     grids = []
-    while left:
-        longest = count_cycles(left[0])
-        alike = [record for record in left if 2 * count_cycles(record) >= longest]
-        grids.append(CycleGrid.from_records(alike))
+    begins = []
+    while len(left):
+        alike = left[2 * cycles[left] >= cycles[left[0]]]
+        grids.append(CycleGrid.from_records([records[k] for k in alike]))
+        begins.append(before[alike])
         left = left[len(alike) :]
-    return grids
+    return grids, begins
 
 
 def lagged_inputs(

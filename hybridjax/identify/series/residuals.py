@@ -28,6 +28,14 @@ _POWER = 0.8
 # reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
 # are refused.
 ANSWER = 1e-3
+# Level at which residuals of a fit to the same data are not white. (Fits make them whiter: of white
+# noise none of 120 was below 1 %.) Larger: white noise is doubted. Smaller: weak process noise
+# passes, whose standard errors are too small.
+_COLORED = 0.01
+# Shifts by whole cycles from which the dependence of residuals on inputs of other cycles follows,
+# and the deviates by which that on their own must exceed it. More shifts: time. Larger deviates:
+# too few dimensions are called noise. Smaller: noise is called too few dimensions.
+_SHIFTS, _ALONE = 8, 4.0
 # Advice where inputs answer residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"
@@ -187,24 +195,69 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
 
 
 def about_misfit(
-    outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool
+    outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool, direct: bool
 ) -> list[Finding]:
-    """Return a finding if residuals depend on inputs of the period before them.
+    """Return a finding if residuals depend on inputs of the period before them, or on each other.
+
+    Residuals that depend on each other may seem to depend on the inputs, too, if these are also
+    correlated in time. The inputs of other cycles then seem as related to them, and are compared.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
-    `grid`, NaN where an output was not sampled.
+    `grid`, NaN where an output was not sampled. `innovations`: whether the fit has process noise.
+    `direct`: whether it has a D. Without one, inputs at the section of a residual are no cause of
+    it: a controller may have made them of the output.
     """
-    N, ny = error.shape[2:]
+    S, T, N, ny = error.shape
     late = np.where((grid.age > N)[..., None], error, np.nan)
-    _, p, _ = independence_test(outside.u, late, N, ANSWER)
-    if not ((p < ANSWER / ny) & ~is_exact(grid, error)).any():
-        return []
-    noise = "" if innovations else ", noise='innovations'"
-    text = (
-        "residuals depend on the inputs, so multipliers may be wrong by more than their standard "
-        f"errors: give more dimensions{noise}, or another `initial` model."
-    )
-    return [Finding("left over", text)]
+    inputs = outside.u
+    if not direct:
+        earlier = np.zeros((S, T * N, inputs.shape[3]))
+        earlier[:, 1:] = inputs.reshape(S, T * N, -1)[:, :-1]
+        inputs = earlier.reshape(inputs.shape)
+    _, p, _ = independence_test(inputs, late, N, ANSWER)
+    tested = ~is_exact(grid, error)
+    depends = (p < ANSWER / ny) & tested
+    _, p_white = whiteness_test(error, N)
+    is_colored = bool(((p_white < _COLORED / ny) & tested).any())
+    if is_colored and depends.any():
+        depends &= _deviates_of(p) > _of_other_cycles(inputs, late) + _ALONE
+    if depends.any():
+        noise = "" if innovations else ", noise='innovations'"
+        text = (
+            "residuals depend on the inputs, so multipliers may be wrong by more than their "
+            f"standard errors: give more dimensions{noise}, or another `initial` model."
+        )
+        return [Finding("left over", text)]
+    if is_colored and innovations:
+        text = (
+            "errors one step ahead are correlated in time, so standard errors may be too small: "
+            "give more dimensions, which colored noise needs."
+        )
+        return [Finding("colored noise", text)]
+    if is_colored:
+        text = (
+            "residuals are correlated in time, as noise makes them that drives the system, so "
+            "standard errors are too small: pass noise='innovations'."
+        )
+        return [Finding("process noise", text)]
+    return []
+
+
+def _deviates_of(p: ByOutput) -> ByOutput:
+    """Return Gaussian deviates of p-values."""
+    return stats.norm.isf(np.clip(p, 1e-300, 1 - 1e-16))
+
+
+def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
+    """Return the mean deviate by which residuals seem to depend on the inputs of other cycles."""
+    cycles = error.shape[1]
+    shifts = np.linspace(0.2, 0.8, _SHIFTS) * cycles
+    deviates = []
+    for shift in np.unique(shifts.astype(int)):
+        moved = np.roll(inputs, shift, axis=1)
+        _, p, _ = independence_test(moved, error, error.shape[2], ANSWER)
+        deviates.append(_deviates_of(p))
+    return np.mean(deviates, axis=0)
 
 
 def about_answers(

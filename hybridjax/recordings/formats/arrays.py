@@ -1,5 +1,5 @@
-"""Files of named arrays (HDF5, MATLAB of all versions, NPZ) and of one table (Parquet, Feather,
-Excel)."""
+"""Files of named arrays (HDF5, NetCDF, MATLAB of all versions, NPZ) and of one table (Parquet,
+Feather, Excel)."""
 
 import csv
 import io
@@ -34,6 +34,9 @@ from .text import read_plain
 # The rows of a sheet of Excel. Smaller: long recordings are refused. Larger: a row with a wrong
 # number takes memory for all rows before it.
 _MOST_ROWS = 2**20
+# Attributes of NetCDF that change stored numbers: marks of missing ones, and a line.
+_MARKS = ("_FillValue", "missing_value")
+_PACKING = (*_MARKS, "scale_factor", "add_offset")
 Place = tuple[str, ...]
 """Names of groups, from the outermost on, and of an array."""
 
@@ -43,10 +46,25 @@ class Leaf(NamedTuple):
 
     array: Any
     unit: str = ""
+    packing: Mapping[str, Any] = {}
+    """Attributes of NetCDF (`scale_factor`, `_FillValue`, ...) that change the stored numbers."""
+
+    def values(self) -> np.ndarray:
+        """Return the numbers that the stored ones stand for; NaN where they stand for none."""
+        stored = np.asarray(self.array[()])
+        if not self.packing:
+            return stored
+        marks = [np.ravel(self.packing[x]) for x in _MARKS if x in self.packing]
+        missing = np.isin(stored, np.concatenate([np.zeros(0), *marks]))
+        scale = float(np.ravel(self.packing.get("scale_factor", 1.0))[0])
+        offset = float(np.ravel(self.packing.get("add_offset", 0.0))[0])
+        return np.where(missing, np.nan, stored * scale + offset)
 
 
 def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]:
     """Read datasets by their paths, such as `imu/gyro`; an attribute `units` is their unit.
+
+    Attributes of NetCDF 4 apply: scale factors, offsets, and marks of missing numbers.
 
     **Raises:** `FileFormatError` for a damaged file, one that declares more than it can hold, for
     arrays that lie in other files, for arrays of structs, and as `_read_tree`.
@@ -75,16 +93,43 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
             raise FileFormatError(
                 f"'{path}': '{name}' lies in other files: copy it into this."
             )
-        unit = node.attrs.get("units", "")
-        if isinstance(unit, bytes):
-            unit = unit.decode()
-        leaves[place] = Leaf(node, str(unit))
+        packing = {x: node.attrs[x] for x in _PACKING if x in node.attrs}
+        leaves[place] = Leaf(node, _unit_of(node.attrs.get("units", "")), packing)
 
     with reading(path, "HDF5 file"), h5py.File(path, "r") as file:
         file.visititems(visit)
         numbers = sum(math.prod(leaf.array.shape) for leaf in leaves.values())
         check_declared(path, 8 * numbers)
         return _read_tree(path, leaves, separator, wanted)
+
+
+def _unit_of(attribute: Any) -> str:
+    """Return the unit in an attribute; `seconds since 2026-01-01` of NetCDF is `seconds`."""
+    unit = attribute.decode() if isinstance(attribute, bytes) else str(attribute)
+    return unit.partition(" since ")[0]
+
+
+def read_netcdf(path: Path, wanted: Wanted) -> list[Columns]:
+    """Read a NetCDF file: version 4 is HDF5; of version 3, variables by their names.
+
+    **Raises:** `FileFormatError` for a damaged file, and as `_read_tree`.
+    """
+    with open(path, "rb") as file:
+        is_version_3 = file.read(3) == b"CDF"
+    if not is_version_3:
+        return read_hdf5(path, wanted)
+    from scipy.io import netcdf_file
+
+    leaves: dict[Place, Leaf] = {}
+    with reading(path, "NetCDF file"), netcdf_file(path, "r", mmap=False) as file:
+        for name, variable in file.variables.items():
+            if variable.data.dtype.kind not in "fiu":
+                continue
+            attributes = vars(variable).get("_attributes", {})
+            packing = {x: attributes[x] for x in _PACKING if x in attributes}
+            unit = _unit_of(attributes.get("units", ""))
+            leaves[(name,)] = Leaf(variable.data, unit, packing)
+        return _read_tree(path, leaves, "/", wanted)
 
 
 def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
@@ -174,12 +219,12 @@ def _read_tree(
             )
         if group not in tables:
             clock = leaves[clocks[group]]
-            times = np.atleast_1d(np.squeeze(clock.array[()]))
+            times = np.atleast_1d(np.squeeze(clock.values()))
             header = with_unit(wanted.time, clock.unit)
             tables[group] = Columns({header: times}, events={})
         table = tables[group]
         if is_event:
-            table.events[place[-1]] = np.ravel(leaf.array[()])
+            table.events[place[-1]] = np.ravel(leaf.values())
         else:
             table.values.update(_columns(path, name, leaf, table))
     return list(tables.values())
@@ -201,7 +246,7 @@ def _columns(
 ) -> dict[str, Float[np.ndarray, " n"]]:
     """Return an array, or the columns of a matrix, with a row for each of the table's times."""
     times = next(iter(table.values.values()))
-    values = np.atleast_1d(np.squeeze(leaf.array[()]))
+    values = np.atleast_1d(np.squeeze(leaf.values()))
     if values.ndim == 2 and len(values) != len(times):
         values = values.T
     if values.ndim > 2 or len(values) != len(times):
@@ -255,7 +300,7 @@ def read_excel(path: Path, wanted: Wanted) -> list[Columns]:
         book.close()
     width = max(map(len, rows), default=0)
     check_declared(path, width * sum(map(bool, rows)))
-    table = read_plain(path, [_line(row, width) for row in rows])
+    table = read_plain(path, [_line(row, width) for row in rows], wanted)
     if len(names) > 1:
         text = f"of {len(names)} sheets the first one, '{names[0]}', was read."
         table = table.with_finding(assumed(text))

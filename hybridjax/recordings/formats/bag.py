@@ -10,7 +10,7 @@ import numpy as np
 
 from ..._core.arguments import package
 from ...errors import FileFormatError
-from .columns import Columns, Wanted, assumed, reading
+from .columns import Columns, Wanted, assumed, check_rows, reading
 
 
 # Longest array in a message whose numbers become signals. Longer: scans and images become thousands
@@ -25,7 +25,7 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
     the start of the bag.
 
     **Raises:** `DefinitionError` for a topic that does not exist; `FileFormatError` for a damaged
-    file, and arrays whose length changes.
+    file, one with fewer messages than its index counts, and arrays whose length changes.
     """
     highlevel = package("rosbags.highlevel")
     typesys = package("rosbags.typesys")
@@ -40,9 +40,15 @@ def read_bag(path: Path, wanted: Wanted) -> list[Columns]:
         topics = {x.topic: _Topic(names[x.topic]) for x in chosen}
         if not chosen:
             return []
+        counted = dict.fromkeys(topics, 0)
+        for connection in chosen:
+            counted[connection.topic] += connection.msgcount
         for connection, arrival, data in bag.messages(chosen):
             message = bag.deserialize(data, connection.msgtype)
             topics[connection.topic].add(path, message, arrival, wanted)
+        for name, topic in topics.items():
+            count = len(topic.arrivals)
+            check_rows(path, count, counted[name], f"messages of '{topic.name}'")
         return [
             topic.columns(bag.start_time) for topic in topics.values() if topic.names
         ]

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..._core.arguments import package
 from ..._core.signal import with_unit
+from ...errors import FileFormatError
 from .columns import Columns, Wanted, check_rows, reading, two_columns
 
 
@@ -34,6 +35,8 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
         declared = _declared_frames(path)
     data = file["data"]
     frames = data["points"].shape[2]
+    if declared is None:
+        _refuse_frames_beyond(path, frames, data)
     check_rows(path, frames, declared, "frames")
     header = file["header"]["points"]
     parameters = file["parameters"]
@@ -64,6 +67,30 @@ def _declared_frames(path: Path) -> int | None:
         order = ">" if file.read(1) == b"\x56" else "<"
     first, last = struct.unpack(f"{order}HH", head[-4:])
     return last - first + 1 if last < 2**16 - 1 else None
+
+
+def _refuse_frames_beyond(path: Path, frames: int, data: Mapping[str, Any]) -> None:
+    """**Raises:** `FileFormatError` if the file is so long that it holds more than these frames.
+
+    The header counts frames with 16 bits, and ezc3d reads no more.
+    """
+    with open(path, "rb") as file:
+        head = file.read(20)
+        file.seek(512 * (head[0] - 1) + 3)
+        order = ">" if file.read(1) == b"\x56" else "<"
+    (scale,) = struct.unpack(f"{order}f", head[12:16])
+    (first_block,) = struct.unpack(f"{order}H", head[16:18])
+    channels, samples = data["analogs"].shape[1:]
+    values = 4 * data["points"].shape[1] + channels * (samples // frames)
+    # Negative scales mark numbers of four bytes.
+    size = values * (4 if scale < 0 else 2)
+    written = (path.stat().st_size - 512 * (first_block - 1)) // size
+    # The last block of 512 bytes is filled up.
+    if written - frames > 512 // size:
+        raise FileFormatError(
+            f"'{path}' holds about {written} frames, of which only {frames} can be read: export "
+            f"parts of at most {2**16 - 1} frames."
+        )
 
 
 def _points(

@@ -25,17 +25,17 @@ def read_text(path: Path, wanted: Wanted) -> list[Columns]:
     lines = read_lines(path)
     head = [x.strip().lower() for x in lines[:100]]
     if "endheader" in head:
-        return [_opensim(path, lines, head.index("endheader"))]
+        return [_opensim(path, lines, head.index("endheader"), wanted)]
     if head[0].startswith("pathfiletype"):
-        return [_trc(path, lines)]
+        return [_trc(path, lines, wanted)]
     if any(x.startswith(("frame", '"frame')) for x in head):
-        blocks = list(_vicon(path, lines))
+        blocks = list(_vicon(path, lines, wanted))
         if blocks:
             return blocks
-    return [read_plain(path, lines)]
+    return [read_plain(path, lines, wanted)]
 
 
-def _opensim(path: Path, lines: list[str], end: int) -> Columns:
+def _opensim(path: Path, lines: list[str], end: int, wanted: Wanted) -> Columns:
     """Read a motion or storage file: `key=value` up to `endheader`, then names, then numbers."""
     facts = {}
     for line in lines[:end]:
@@ -52,14 +52,14 @@ def _opensim(path: Path, lines: list[str], end: int) -> Columns:
         "time (s)" if name == "time" else name
         for name in split_names(lines[start], separator)
     ]
-    table = read_table(path, names, lines, start + 1, separator)
+    table = read_table(path, names, lines, start + 1, separator, wanted)
     check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
     if facts.get("indegrees") == "yes":
         table = table.with_finding(assumed("angles are in degrees."))
     return table
 
 
-def _trc(path: Path, lines: list[str]) -> Columns:
+def _trc(path: Path, lines: list[str], wanted: Wanted) -> Columns:
     """Read columns `MARKER.x`, `MARKER.y` and `MARKER.z`; empty fields are missing samples."""
     names = split_names(lines[3], "\t") if len(lines) >= 5 else []
     if [x.lower() for x in names[:2]] != ["frame#", "time"]:
@@ -73,13 +73,13 @@ def _trc(path: Path, lines: list[str]) -> Columns:
     columns = ["frame#", "time (s)"]
     for marker in names[2::3]:
         columns += [with_unit(f"{marker}.{axis}", unit) for axis in "xyz"]
-    table = read_table(path, columns, lines, 5, "\t")
+    table = read_table(path, columns, lines, 5, "\t", wanted)
     frames = table.values.pop("frame#")
     check_rows(path, len(frames), facts.get("numframes"), "frames")
     return table
 
 
-def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
+def _vicon(path: Path, lines: list[str], wanted: Wanted) -> Iterator[Columns]:
     """Read a table for each block of devices or markers; times count from the first frame.
 
     A block has a title, a rate, the devices, their components, units, and then a row for each
@@ -96,7 +96,7 @@ def _vicon(path: Path, lines: list[str]) -> Iterator[Columns]:
         if not (rate > 0 and names and names[0].lower() == "frame"):
             continue
         stop = next(k for k in ends if k >= start + 5)
-        table = read_table(path, names, lines[:stop], start + 5, separator)
+        table = read_table(path, names, lines[:stop], start + 5, separator, wanted)
         per_frame, sample = _place(path, table)
         time = {"time (s)": sample / rate}
         yield table._replace(values=time | table.values)

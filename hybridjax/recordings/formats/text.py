@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
-from .columns import Columns, assumed, is_unit, split_header, two_columns
+from .columns import EVENT, Columns, Wanted, assumed, is_unit, split_header, two_columns
 
 
 # Bytes that no text holds, in any encoding with one byte for each ASCII character.
@@ -22,10 +22,21 @@ _CONTROL = bytes(set(range(32)) - set(b"\t\n\v\f\r\x1a\x1b"))
 _COMMENTS = ("#", "%", "//")
 # Marks of a missing sample, in any case of letters.
 _MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none"}
+# A sheet writes these for a cell without a number. A row that begins with one is no comment.
+_ERRORS_OF_CELLS = (
+    "#n/a",
+    "#null!",
+    "#div/0!",
+    "#value!",
+    "#ref!",
+    "#name?",
+    "#num!",
+)
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read a file in UTF-8, UTF-16 with a byte order mark, or else Latin-1, with any line ends.
+    """Read a file in UTF-8, or UTF-16 with a byte order mark, with any line ends. Bytes that are no
+    UTF-8 are read as Latin-1.
 
     **Raises:** `FileFormatError` if it is no text.
     """
@@ -33,22 +44,42 @@ def read_lines(path: Path) -> list[str]:
     utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if not utf_16 and len(data.translate(None, _CONTROL)) < len(data):
         raise FileFormatError(f"'{path}' is not a text file.")
-    try:
-        text = data.decode("utf-16" if utf_16 else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        if utf_16:
+    if utf_16:
+        try:
+            text = data.decode("utf-16")
+        except UnicodeDecodeError as error:
             raise FileFormatError(f"'{path}' is not a text file.") from error
-        text = data.decode("latin-1")
+    else:
+        text = data.decode("utf-8-sig", errors=_LATIN_1)
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def read_plain(path: Path, lines: list[str]) -> Columns:
+def _byte_of_latin_1(error: UnicodeError) -> tuple[str, int]:
+    """Return the letters that bytes are in Latin-1, and where decoding goes on.
+
+    One letter of another program, as in a comment, thus leaves the names in UTF-8 as they are.
+    """
+    if not isinstance(error, UnicodeDecodeError):
+        raise error
+    return error.object[error.start : error.end].decode("latin-1"), error.end
+
+
+_LATIN_1 = "hybridjax.latin-1"
+codecs.register_error(_LATIN_1, _byte_of_latin_1)
+
+
+def _is_comment(line: str) -> bool:
+    start = line.lstrip().lower()
+    return start.startswith(_COMMENTS) and not start.startswith(_ERRORS_OF_CELLS)
+
+
+def read_plain(path: Path, lines: list[str], wanted: Wanted) -> Columns:
     """Read names in the first line that is no comment, perhaps units below, then numbers.
 
     **Raises:** `FileFormatError` if there is no table, with the line.
     """
     filled = [k for k, x in enumerate(lines) if x.strip(" \t,;")]
-    content = [k for k in filled if not lines[k].lstrip().startswith(_COMMENTS)]
+    content = [k for k in filled if not _is_comment(lines[k])]
     if not content:
         raise FileFormatError(f"'{path}' has no line with the names of its columns.")
     above = content[0]
@@ -61,13 +92,13 @@ def read_plain(path: Path, lines: list[str]) -> Columns:
         comments = [
             lines[k].lstrip().lstrip("#%/").strip() for k in filled if k < first
         ]
-        return _with_names_in_comment(path, lines, first, comments, len(names))
+        return _with_names_in_comment(path, lines, first, comments, len(names), wanted)
     start = first + 1
     fields = split_line(below, separator)
     if _are_units(fields):
         names = _with_units(names, fields)
         start = content[1] + 1
-    table = read_table(path, names, lines, start, separator)
+    table = read_table(path, names, lines, start, separator, wanted)
     if first != above:
         table = table.with_finding(assumed("lines above the names were left out."))
     return table
@@ -79,6 +110,7 @@ def _with_names_in_comment(
     first: int,
     comments: Sequence[str],
     width: int,
+    wanted: Wanted,
 ) -> Columns:
     """Read numbers from a line on, whose names are the last comment above: `numpy.savetxt`.
 
@@ -90,7 +122,7 @@ def _with_names_in_comment(
         raise FileFormatError(
             f"'{path}' begins with numbers: its first line must be names."
         )
-    return read_table(path, names, lines, first, separator)
+    return read_table(path, names, lines, first, separator, wanted)
 
 
 def _are_units(fields: Sequence[str]) -> bool:
@@ -168,18 +200,20 @@ def read_table(
     lines: Sequence[str],
     start: int,
     sep: str,
+    wanted: Wanted,
 ) -> Columns:
     """Read the numbers in `lines[start:]`, with one field for each header.
 
-    Columns without a name are left out, as are empty fields after the last column. Decimal commas
-    are understood where the separator is no comma.
+    Columns without a name are left out, as are empty fields after the last column, columns of texts
+    alone, and texts in columns that are not wanted. Decimal commas are understood where the
+    separator is no comma.
 
     **Raises:** `FileFormatError` for two columns of one name, and text that is no number, with its
     line.
     """
     two_columns(path, [x for x in headers if x])
     findings = []
-    lines = ["" if x.lstrip().startswith(_COMMENTS) else x for x in lines[start:]]
+    lines = ["" if _is_comment(x) else x for x in lines[start:]]
     if sep != "," and any("," in x for x in lines):
         findings.append(assumed("decimal commas were read as such."))
         _require_no_points(path, lines, start)
@@ -191,7 +225,13 @@ def read_table(
             lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"'
         )
     if values.shape[1] != len(headers):
-        values = _by_line(path, headers, lines, start, sep)
+        values, texts = _by_line(path, headers, lines, start, sep, wanted)
+        if texts and wanted.signals is None:
+            names = ", ".join(f"'{headers[k]}'" for k in texts)
+            findings.append(assumed(f"columns of text were left out: {names}."))
+        kept = [k for k in range(len(headers)) if k not in texts]
+        headers = [headers[k] for k in kept]
+        values = values[:, kept]
     if not values.size:
         raise FileFormatError(f"'{path}' has a header, but no samples.")
     if not all(headers):
@@ -217,10 +257,15 @@ def _by_line(
     lines: Sequence[str],
     start: int,
     separator: str,
-) -> Float[np.ndarray, "n k"]:
-    """Read files with missing fields, or with an error whose line is to be reported."""
+    wanted: Wanted,
+) -> tuple[Float[np.ndarray, "n k"], list[int]]:
+    """Read files with missing fields, texts, or an error whose line is to be reported.
+
+    **Returns:** the numbers, and the columns that hold texts and no number.
+    """
     rows = []
     count = len(headers)
+    first_texts: dict[int, tuple[int, str]] = {}
     for number, line in enumerate(lines, start + 1):
         fields = split_line(line, separator)
         if not any(fields):
@@ -231,11 +276,23 @@ def _by_line(
                 "columns (decimal commas need another separator)."
             )
         row = [to_number(x) for x in fields[:count]]
-        if None in row:
-            k = row.index(None)
-            raise FileFormatError(
-                f"'{path}', line {number}: column '{headers[k]}' holds '{fields[k][:40]}', which "
-                "is not a number."
-            )
+        for k, value in enumerate(row):
+            if value is None:
+                row[k] = np.nan
+                first_texts.setdefault(k, (number, fields[k]))
         rows.append(row)
-    return np.array(rows, float).reshape(-1, count)
+    values = np.array(rows, float).reshape(-1, count)
+    texts = []
+    for k, (number, field) in first_texts.items():
+        header = headers[k]
+        is_required = wanted.is_time(header) or header.startswith(EVENT)
+        if wanted.signals is not None:
+            is_required = wanted.includes(header)
+        if np.isnan(values[:, k]).all() and not is_required:
+            texts.append(k)
+        elif wanted.includes(header):
+            raise FileFormatError(
+                f"'{path}', line {number}: column '{header}' holds '{field[:40]}', which is not a "
+                "number."
+            )
+    return values, texts

@@ -1,5 +1,6 @@
 """Trials that differ from the others in units, columns, clocks or cycles, and slow changes."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy import fft, stats
 
 from ..._core.findings import Finding, listed
+from ..data import SectionData, whole_cycles
 from ..findings import CLEAR
 from ..phase import HARMONICS, Phase
 from ..recording import Recording
@@ -33,6 +35,15 @@ _STRETCH = 8
 # in periods. Larger: lost samples pass. Smaller: variable rhythms are reported.
 _ODD = 12.0
 _ALIKE_PERIODS = 0.05
+# Fewest steps of time from which a grid of stamps is found, most different ones, and the least grid
+# in steps. Larger grid: errors of a fifth of a step pass. Smaller: stamps in ms are reported.
+_STAMPS = 50
+_MOST_STEPS = 6
+_COARSE = 0.2
+# Part of the variance of durations, or of outputs, that changes sign from cycle to cycle if two
+# kinds of cycles alternate. Larger: alternating steps pass. Smaller: multipliers of -0.9 are
+# reported in short recordings.
+_ALTERNATING = 0.5
 # Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES = 24
@@ -148,6 +159,50 @@ def clocks(recording: Recording) -> Iterator[Finding]:
         )
 
 
+def coarse_stamps(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
+    """Find times that are multiples of a step which is not that of the samples."""
+    for trial in recording.trials:
+        for name in names:
+            x = trial.values[:, recording.column(name)]
+            # (Signals of other rates have times in between.)
+            step = np.diff(trial.time[np.isfinite(x)])
+            grid = _grid_of(step)
+            if grid is None:
+                continue
+            yield Finding(
+                "coarse time stamps",
+                f"times of {name} in trial '{trial.name}' are multiples of {grid:.3g} s, samples "
+                f"are {step.mean():.4g} s apart: times may be wrong by {grid / 2:.2g} s. If the "
+                "samples are regular, number them: time = sample / rate.",
+            )
+            return
+
+
+def _grid_of(step: Series) -> float | None:
+    """Return the number of which all steps between samples are multiples, if they differ by it and
+    it is a large part of them."""
+    if len(step) < _STAMPS:
+        return None
+    usual = float(np.median(step))
+    differing = np.abs(step / usual - 1) > _COARSE / 2
+    # Single steps are lost samples.
+    if differing.mean() < _COARSE / 2:
+        return None
+    ascending = np.sort(step)
+    rises = np.diff(ascending)
+    is_rise = rises > _COARSE / 2 * usual
+    if not is_rise.any() or is_rise.sum() > _MOST_STEPS:
+        return None
+    grid = float(rises[is_rise].min())
+    count = step / grid
+    off = np.abs(count - np.round(count)).max()
+    # Steps of once and twice the usual one are those of lost samples, too.
+    is_multiple = abs(grid / usual - 1) < _COARSE / 2
+    if off > 0.05 or is_multiple or grid < _COARSE * usual:
+        return None
+    return grid
+
+
 def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
     """Find single cycles of another duration, and many that are two periods long."""
     missed = []
@@ -178,6 +233,46 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
         yield Finding("missed events", text, "refused" if everywhere else "warned")
 
 
+def alternating_cycles(
+    data: SectionData, phase: Phase | None = None
+) -> Iterator[Finding]:
+    """Find cycles of two kinds that alternate, as strides that were cut at each step."""
+    stretches = itertools.chain.from_iterable(phase.stretches if phase else ())
+    shares = [_alternating([np.diff(part.edges())[:, None] for part in stretches])]
+    for k in range(len(data.outputs)):
+        by_record = []
+        for record in data.records:
+            y = record.y[whole_cycles(record), k]
+            by_record.append(y.reshape(-1, data.n_sections))
+        shares.append(_alternating(by_record))
+    share = max(shares)
+    if share > _ALTERNATING:
+        yield Finding(
+            "alternating cycles",
+            f"{100 * share:.0f} % of what differs between cycles changes its sign from one to the "
+            "next, as if events of the left and the right side were one list: use those of one "
+            "side (every second). Otherwise the rhythm has twice the period.",
+        )
+
+
+def _alternating(parts: Sequence[Cycles]) -> float:
+    """Return the part of the variance between cycles that changes its sign from one to the next.
+
+    **Arguments:** `parts`: values of successive cycles, a row for each, without a gap.
+    """
+    whole = np.finfo(float).tiny
+    alternating = 0.0
+    for values in parts:
+        if len(values) < _STRETCH:
+            continue
+        deviation = np.nan_to_num(values - np.nanmean(values, axis=0))
+        sign = np.resize([1.0, -1.0], len(values))
+        amplitude = sign @ deviation / len(values)
+        whole += float((deviation**2).sum())
+        alternating += float((amplitude**2).sum()) * len(values)
+    return alternating / whole
+
+
 def other_cycles(
     recording: Recording,
     phase: Phase,
@@ -193,7 +288,9 @@ def other_cycles(
     if len(known) < 2:
         return
     for s in known:
-        usual = np.median(mean[:, known[known != s]], axis=1)
+        # A trial among three or more does not move their median far.
+        peers = known if len(known) > 2 else known[known != s]
+        usual = np.median(mean[:, peers], axis=1)
         yield from _difference(mean[:, s], usual, names[s], outputs)
 
 
@@ -245,14 +342,36 @@ def _difference(
     unlike = np.flatnonzero(alike <= _CORRELATED).tolist()
     if not unlike:
         return
+    backwards = mean[:, ::-1]
+    turned = [correlations(np.roll(backwards, m, axis=1)).min() for m in range(_PHASES)]
+    shifted = [correlations(np.roll(mean, m, axis=1)).min() for m in range(_PHASES)]
+    runs_backwards = max(turned) > _CORRELATED and max(turned) > max(shifted)
     if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
+        remedy = "turn it."
+        if runs_backwards:
+            remedy = (
+                "turn it; or the trial runs backwards: then reverse all of its signals."
+            )
         yield Finding(
             "another sign",
-            f"{outputs[unlike[0]]} has the other sign in trial '{name}': turn it.",
+            f"{outputs[unlike[0]]} has the other sign in trial '{name}': {remedy}",
             "refused",
         )
         return
-    shifted = [correlations(np.roll(mean, m, axis=1)).min() for m in range(_PHASES)]
+    if runs_backwards:
+        exchanged = [
+            f"{outputs[i]} and {outputs[j]}"
+            for i, j in combinations(range(len(outputs)), 2)
+            if correlations(_with_exchanged(mean, i, j)).min() > _CORRELATED
+        ]
+        or_exchanged = f"; or {exchanged[0]} have changed places" if exchanged else ""
+        yield Finding(
+            "backwards",
+            f"cycles of trial '{name}' are those of the others in reverse, as if it ran backwards: "
+            f"reverse all of its signals, or leave it out{or_exchanged}.",
+            "refused",
+        )
+        return
     best = int(np.argmax(shifted))
     if best and shifted[best] > _CORRELATED:
         away = min(best, _PHASES - best) / _PHASES
@@ -267,6 +386,13 @@ def _difference(
         "another cycle",
         f"the average cycle of {which} in trial '{name}' is not that of the others.",
     )
+
+
+def _with_exchanged(mean: Cycles, i: int, j: int) -> Cycles:
+    """Return average cycles with those of two signals exchanged."""
+    order = np.arange(len(mean))
+    order[[i, j]] = [j, i]
+    return mean[order]
 
 
 def slow_changes(

@@ -100,6 +100,7 @@ def check_recording(
         clean = clean.with_trials(trials)
         findings += differences.other_settings(clean, names, outputs)
         findings += differences.clocks(clean)
+        findings += differences.coarse_stamps(clean, names)
     else:
         findings.append(
             Finding(
@@ -163,6 +164,7 @@ def inspect_cycles(
     removed = data.records[0].drift or np.inf
     findings = [
         *differences.odd_cycles(recording, phase),
+        *differences.alternating_cycles(data, phase),
         *inexact_events(data),
         *differences.other_cycles(recording, phase, outputs),
         *differences.slow_changes(recording, phase, outputs, removed),

@@ -10,8 +10,9 @@ from ..._core.arguments import Numbers, package, require_equal
 from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, OptionalNames, Positive, Seed
 from ..._core.boundary.values import Reals
+from ..._core.findings import Finding, warn_of
 from ..._core.showable import Showable
-from ..._core.text import folded
+from ..._core.text import folded, p_value
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierFit
 from ...scale.draws import monte_carlo
@@ -21,6 +22,9 @@ from .tables import Columns, cells_of, factors_of, require, rows_with, signed, t
 
 Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
+# Fewest subjects whose distribution is tested, and the level. Fewer subjects: the test sees
+# nothing. Larger level: normal subjects are doubted. Smaller: outliers pass.
+_FEWEST_TESTED, _NORMAL = 5, 0.02
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
 
@@ -139,13 +143,15 @@ class Population(Showable):
 
         Intervals of the mean, and of the slopes of covariates, are those of Hartung and Knapp
         (2001, 2003); those of the spread (a standard deviation, without the errors of the
-        estimates) follow from the Q profile (Viechtbauer 2007). With covariates, the mean is that
-        at the mean of each covariate.
+        estimates) follow from the Q profile (Viechtbauer 2007). They assume normal subjects: a
+        warning (`FindingWarning`) reports others (Shapiro and Wilk 1965). With covariates, the mean
+        is that at the mean of each covariate.
 
         **Raises:** `DefinitionError` for an unknown quantity or covariate, and for too few
         subjects.
         """
         parts = []
+        findings: list[Finding] = []
         for cell, data in self._cells(quantity, 2 + len(covariates), covariates):
             y = data["y"].to_numpy()
             v = data["v"].to_numpy()
@@ -153,6 +159,8 @@ class Population(Showable):
             x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
             fit = meta(y, v, x)
             spread = (np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x))
+            residual = (y - x @ fit.coefficients) / np.sqrt(v + fit.between[0, 0])
+            findings += _about_distribution(quantity, cell, residual)
             names = ["mean", *slopes]
             if cell != "all":
                 names = [f"{name}, {cell}" for name in names]
@@ -161,6 +169,7 @@ class Population(Showable):
             )
             part.loc[0, "p"] = np.nan
             parts.append(part)
+        warn_of(findings)
         return _result(
             parts,
             f"Means of {quantity} and 95 % intervals: random-effects model with the standard error "
@@ -198,6 +207,8 @@ class Population(Showable):
         if len(y) > 2:
             bounds = spread_interval(y, v, np.ones((len(y), 1)))
             spread = (np.sqrt(w @ fit.between @ w), *bounds)
+            residual = (y - y.mean()) / np.sqrt(v + w @ fit.between @ w)
+            warn_of(_about_distribution(quantity, f"{a} - {b}", residual))
         n = subject.max() + 1
         names = [f"{a} - {b}", *slopes]
         rows = self._effects(quantity, names, n, fit, weights, spread)
@@ -486,6 +497,26 @@ def _require_comparable(
                 f"the fit of subject '{subject}' has no covariance: record more strides, or leave "
                 "the subject out."
             )
+
+
+def _about_distribution(
+    quantity: str, cell: str, residual: np.ndarray
+) -> list[Finding]:
+    """Return a finding if subjects are not normally distributed, by the test of Shapiro and
+    Wilk."""
+    if len(residual) < _FEWEST_TESTED or not np.ptp(residual) > 0:
+        return []
+    p = float(stats.shapiro(residual).pvalue)
+    if p > _NORMAL:
+        return []
+    return [
+        Finding(
+            "not normal",
+            f"{quantity} of the subjects ({cell}) is not normally distributed ({p_value(p)}), as "
+            "intervals assume; that of the spread may be far too narrow. Look for outliers, or "
+            "take logarithms.",
+        )
+    ]
 
 
 def _result(parts: list, text: str) -> Any:

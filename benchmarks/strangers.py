@@ -1,0 +1,312 @@
+"""Estimates from data of strangers: generators that do not import the package.
+
+Each row is a command. It prints a table with the number of draws and p-values.
+
+    python benchmarks/strangers.py files    # recordings and files with something wrong
+    python benchmarks/strangers.py groups   # false alarms between maps of two groups
+    python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
+    python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
+    python benchmarks/strangers.py study    # studies whose data support a lower order
+
+`--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import one_thread
+
+
+one_thread.pin()
+
+import numpy as np  # noqa: E402
+import strangers_dirt as dirt  # noqa: E402
+import strangers_truth as truth  # noqa: E402
+from scipy import stats  # noqa: E402
+
+import hybridjax as hj  # noqa: E402
+
+
+# Standard errors beyond which an answer without a word is wrong.
+_WRONG = 5.0
+
+
+def identified(
+    trials: list[dirt.Trial], sections: str
+) -> tuple[complex, float, list[str]]:
+    """Return the multiplier, its standard error and all that is said."""
+    recordings = []
+    for k, trial in enumerate(trials):
+        signals = {
+            name: x for name, x in trial.items() if name not in ("time", "strike")
+        }
+        recordings.append(
+            hj.Recording(
+                trial["time"], signals, events={"strike": trial["strike"]}, name=f"t{k}"
+            )
+        )
+    cycle: hj.AtEvent | hj.Crossing = hj.AtEvent("strike")
+    if sections == "trigger":
+        cycle = hj.Crossing("trigger", "rising", 2.5)
+    result = hj.identify_recording(
+        hj.Recording.join(recordings), cycle, "u", ("x", "y"), order=1, n_sections=8
+    )
+    said = [repr(x) for x in result.diagnosis.findings]
+    fit = result.fit
+    return complex(fit.multipliers[0]), float(fit.standard_errors[0]), said
+
+
+def of_recording(kind: dirt.Kind, seed: int, true: float) -> tuple[str, str]:
+    """Return "right", "named", "said" or "SILENT", and a text."""
+    rng = np.random.default_rng(seed)
+    trials = kind.soil(dirt.clean(seed), rng)
+    try:
+        multiplier, error, said = identified(trials, kind.sections)
+    except hj.errors.HybridJaxError as refusal:
+        text = str(refusal)
+        named = bool(kind.words) and bool(re.search(kind.words, text))
+        return ("named" if named else "said"), text
+    text = "; ".join(said)
+    if kind.words and re.search(kind.words, text):
+        return "named", text
+    off = abs(multiplier - true) / error
+    value = f"{multiplier:.3f}, {off:.1f} standard errors off; {text}"
+    if off < _WRONG:
+        return "right", value
+    return ("said" if said else "SILENT"), value
+
+
+def of_file(kind: dirt.FileKind, seed: int) -> tuple[str, str]:
+    """Return the same of a file."""
+    trial = dirt.clean(seed, (0.35,))[0]
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            path = kind.write(Path(folder), trial)
+        except ImportError as error:
+            return "not run", str(error)
+        try:
+            found = hj.read_recording(path, signals=kind.signals)
+        except hj.errors.HybridJaxError as refusal:
+            text = str(refusal)
+            named = bool(kind.words) and bool(re.search(kind.words, text))
+            return ("named" if named else "said"), text
+    text = "; ".join(map(repr, found.findings))
+    if kind.words and re.search(kind.words, text):
+        return "named", text
+    names = [name for name in found.signals if name.split(".")[0] == "y"]
+    values = found[names[0]] if names else np.zeros(0)
+    right = len(values) == len(trial["y"]) and np.allclose(
+        values, trial["y"], atol=1e-4, equal_nan=True
+    )
+    if right:
+        return "right", text
+    return ("said" if text else "SILENT"), f"{len(values)} samples; {text}"
+
+
+def files(draws: int) -> None:
+    """Print, for each kind of dirt, how often it was named, or the answer right."""
+    true = float(np.exp(-0.7))
+    totals: dict[str, int] = {}
+    print(f"{'kind':36} {'right':>5} {'named':>5} {'said':>5} {'SILENT':>6}")
+
+    def row(name: str, outcomes: list[tuple[str, str]]) -> None:
+        counts = {x: 0 for x in ("right", "named", "said", "SILENT", "not run")}
+        for outcome, _ in outcomes:
+            counts[outcome] += 1
+            totals[outcome] = totals.get(outcome, 0) + 1
+        numbers = [counts[x] for x in ("right", "named", "said", "SILENT")]
+        right, named, said, silent = numbers
+        print(f"{name:36} {right:5} {named:5} {said:5} {silent:6}")
+        for outcome, text in outcomes:
+            if outcome in ("said", "SILENT"):
+                print(f"    {outcome}: {text[:300]}")
+
+    for kind in dirt.RECORDINGS:
+        row(kind.name, [of_recording(kind, seed, true) for seed in range(draws)])
+    for kind in dirt.FILES:
+        row(kind.name, [of_file(kind, seed) for seed in range(min(draws, 2))])
+    kinds = len(dirt.RECORDINGS) + len(dirt.FILES)
+    print(f"{kinds} kinds, {draws} draws: {totals}")
+
+
+def groups(draws: int) -> None:
+    """Print how often maps of two groups with the same mean differ, at a level of 5 %."""
+    print("sizes and spreads        values       alarms     n  share  p of 5 %")
+    for kind in ("normal", "lognormal"):
+        for n, spread, m, other in truth.GROUPS:
+            alarms = 0
+            table = {"subject": np.arange(n + m), "group": ["a"] * n + ["b"] * m}
+            for seed in range(draws):
+                rng = np.random.default_rng((seed, n, m))
+                y = truth.smooth_maps(rng, n + m)
+                if kind == "lognormal":
+                    y = np.exp(0.6 * y) - np.exp(0.18)
+                y[:n] *= spread
+                y[n:] *= other
+                maps = hj.recordings.PopulationMaps(
+                    table, y, {"phase": np.arange(60) / 60}
+                )
+                found = maps.difference("a", "b", draws=1000, seed=seed)
+                alarms += bool(found.significant.any())
+            p = stats.binomtest(alarms, draws, 0.05).pvalue
+            design = f"{n} ({spread:g}) and {m} ({other:g})"
+            print(
+                f"{design:24} {kind:10} {alarms:8} {draws:5} {alarms / draws:6.3f} {p:9.2g}",
+                flush=True,
+            )
+
+
+def bands(draws: int) -> None:
+    """Print how often the band of a mean of lognormal maps contains it."""
+    print("subjects  sigma   held     n  share  p of 95 %")
+    for n in (8, 12, 20, 40):
+        for size in (0.0, 0.3, 0.6, 1.0):
+            held = 0
+            for seed in range(draws):
+                rng = np.random.default_rng((seed, n))
+                y, mean = truth.lognormal_maps(rng, n, size)
+                if not size:
+                    y, mean = truth.smooth_maps(rng, n), 0.0
+                maps = hj.recordings.PopulationMaps(
+                    {"subject": np.arange(n)}, y, {"phase": np.arange(60) / 60}
+                )
+                found = maps.mean(draws=1000, seed=seed)
+                held += bool((np.abs(found.values - mean) <= found.reach).all())
+            p = stats.binomtest(held, draws, 0.95).pvalue
+            share = held / draws
+            print(
+                f"{n:8} {size:6.1f} {held:6} {draws:5} {share:6.3f} {p:9.2g}",
+                flush=True,
+            )
+
+
+def series(draws: int) -> None:
+    """Print how often the region of `fit_ldtp` holds, and how often a miss has no finding."""
+    head = "data, noise of the fit              held  quiet     n  p of 95 %  findings"
+    print(head)
+    pair = [0.5 + 0.45j]
+    rows = [
+        ("white sensors, output", "output", pair, 0.0, 0.0),
+        ("noise of states, output", "output", pair, 0.5, 0.0),
+        ("noise of states, slow u, output", "output", pair, 0.5, 0.8),
+        ("noise of states, innovations", "innovations", pair, 0.5, 0.0),
+        ("a multiplier more, output", "output", [*pair, 0.6], 0.0, 0.0),
+        ("a multiplier more, innovations", "innovations", [*pair, 0.6], 0.0, 0.0),
+    ]
+    for name, noise, multipliers, size, color in rows:
+        fits = []
+        for seed in range(draws):
+            data = truth.noisy_series(multipliers, seed, size, color)
+            fits.append(_fitted(data, noise))
+        _series_row(name, fits)
+    fits = []
+    for seed in range(draws):
+        fits.append(_fitted(truth.controlled_series(seed), "innovations"))
+    _series_row("controller at once, innovations", fits)
+
+
+def _fitted(
+    data: tuple[truth.Loop, np.ndarray, np.ndarray], noise: str
+) -> tuple[bool, list[str]]:
+    """Return whether the region of two dimensions holds the multipliers, and the findings."""
+    loop, u, y = data
+    N = len(loop.A)
+    records = [
+        hj.experiments.SectionSeries(a, b, n_sections=N)
+        for a, b in zip(u, y, strict=True)
+    ]
+    fit = hj.fit_ldtp(records, 2, noise=noise)
+    holds = bool(fit.contains(loop.multipliers).all())
+    return holds, [finding.cause for finding in fit.findings]
+
+
+def _series_row(name: str, fits: list[tuple[bool, list[str]]]) -> None:
+    held = sum(holds for holds, _ in fits)
+    quiet = sum(not holds and not causes for holds, causes in fits)
+    counts: dict[str, int] = {}
+    for _, causes in fits:
+        for cause in causes or ["none"]:
+            counts[cause] = counts.get(cause, 0) + 1
+    p = stats.binomtest(held, len(fits), 0.95).pvalue
+    print(f"{name:34} {held:5} {quiet:6} {len(fits):5} {p:10.2g}  {counts}", flush=True)
+
+
+def study(draws: int) -> None:
+    """Print how studies end of whose multipliers the data support fewer, or none at first."""
+    print("truth, order, noise          ended as")
+    rows = [
+        ("2, 2, 3 times the signal", [0.7, 0.3], 2, 3.0),
+        ("3, 4, 2 %", [0.6 + 0.3j, 0.3], 4, 0.02),
+        ("2, 4, 2 %", [0.7, 0.4], 4, 0.02),
+        ("3, 3, 2 %", [0.6 + 0.3j, 0.3], 3, 0.02),
+    ]
+    for name, multipliers, order, noise in rows:
+        ends: dict[str, int] = {}
+        for seed in range(draws):
+            end = _studied(multipliers, order, noise, seed)
+            ends[end] = ends.get(end, 0) + 1
+        print(f"{name:28} {ends}", flush=True)
+
+
+def _studied(multipliers: list[complex], order: int, noise: float, seed: int) -> str:
+    """Return how a study of at most six blocks ends."""
+    rng = np.random.default_rng(seed)
+    loop = truth.loop_with(multipliers, 8, 2, rng)
+    first = hj.multisine(8, periods=24, lines="odd", frequencies=(0, 4), seed=seed)
+    first = first.scaled(1.0)
+    quest = hj.designs.SequentialDesign(first, order=order, standard_error=1e-2)
+    size = truth.periodic_response(loop, first.signals()).std(axis=(0, 1))
+    for _ in range(6):
+        u = quest.design.signals()
+        y = truth.periodic_response(loop, u)
+        y = y + noise * size * rng.normal(size=y.shape)
+        data = hj.experiments.ExperimentData(u, y, n_sections=8, periods=24)
+        try:
+            quest = quest.add(data)
+        except hj.errors.DefinitionError as error:
+            right = f"support {len(loop.multipliers)} multipliers, not {order}"
+            return "refused, right order" if right in str(error) else str(error)[:60]
+        if quest.done:
+            fit = quest.fit
+            holds = fit is not None and bool(fit.contains(loop.multipliers).all())
+            return "done, held" if holds else "done, missed"
+    return "not done after 6 blocks, says why" if "since" in repr(quest) else "not done"
+
+
+# Each row with its usual number of draws.
+ROWS: dict[str, tuple[Callable[[int], None], int]] = {
+    "files": (files, 5),
+    "groups": (groups, 400),
+    "bands": (bands, 200),
+    "series": (series, 60),
+    "study": (study, 12),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("rows", nargs="*", help=", ".join(ROWS))
+    parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--short", action="store_true")
+    options = parser.parse_args()
+    unknown = set(options.rows) - set(ROWS)
+    if unknown:
+        parser.error(f"no row {', '.join(unknown)}: choose from {', '.join(ROWS)}")
+    hj.enable_x64()
+    warnings.simplefilter("ignore")
+    for name in options.rows or ROWS:
+        row, usual = ROWS[name]
+        draws = options.draws or usual
+        if options.short:
+            draws = max(1, draws // 10)
+        row(draws)
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
