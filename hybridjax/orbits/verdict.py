@@ -43,6 +43,13 @@ _STEPS = 1e4
 # Largest difference of sums of powers of multipliers of the two integrations, relative to their
 # size. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken for faults.
 _DIFFERENT = 1e-4
+# Largest difference of the product of all multipliers from that of the determinants of all moves,
+# relative to it; of cycles with larger errors, `_STEPS` times the error of a step.
+# Larger: multipliers that are only rounding pass. Smaller: errors of the walk are taken for faults.
+_OTHER_PRODUCT = 1e-6
+# The least product of multipliers that is compared. Smaller: those that are nearly zero, of which
+# only the size is known, are taken for faults. Larger: fewer cycles are compared.
+_LEAST_PRODUCT = 1e-6
 # A guard is beyond zero if its value exceeds the change that deviations of this size, in sizes of
 # the states, could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
 _BEYOND = 1e-6
@@ -128,6 +135,8 @@ class _Path(NamedTuple):
     distance: float
     """Largest distance to the cycle, in sizes of the states."""
     monodromy: Float[np.ndarray, "d d"]
+    volume: float
+    """Product of the determinants of all moves; 0 where charts have other numbers of states."""
     findings: list[Finding]
     """Faults at events."""
 
@@ -190,6 +199,7 @@ def _verdict(cycle) -> Verdict:
     if accurate and s.d <= _MANY and not refused:
         apart = _apart(cycle, path.monodromy)
         findings += _other_multipliers(apart)
+        findings += _unresolved_multipliers(cycle, path)
     return Verdict(
         path.distance if accurate else np.nan,
         apart,
@@ -237,7 +247,9 @@ def _walk_along(cycle) -> _Path:
     points = np.column_stack([moves.q[:, 1:], map.anchor.q])
     charts = np.append(moves.chart[1:], map.anchor.chart)
     distance = _distance(s, scale, (chart, q), (charts, points))
-    return _Path(t, moves.chart, event, moves.q, walked, distance, monodromy, findings)
+    volume = float(np.prod(np.linalg.det(by_state)))
+    linear = monodromy, volume
+    return _Path(t, moves.chart, event, moves.q, walked, distance, *linear, findings)
 
 
 def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
@@ -600,6 +612,31 @@ def _other_multipliers(apart: float) -> list[Finding]:
         "the first."
     )
     return [Finding("other multipliers", text, "refused")]
+
+
+def _unresolved_multipliers(cycle, path: _Path) -> list[Finding]:
+    """A finding on multipliers whose product is not that of the determinants of all moves.
+
+    Each determinant is known to nearly all digits. Multipliers are not where deviations grow by
+    many powers of ten within the period, and shrink again, as beside a separatrix.
+    """
+    if abs(path.volume) < _LEAST_PRODUCT:
+        return []
+    multipliers = np.asarray(cycle._multipliers)
+    product = float(np.prod(multipliers).real)
+    allowed = max(
+        _OTHER_PRODUCT, _STEPS * float(np.max(np.asarray(cycle.settings.rtol)))
+    )
+    if abs(product / path.volume - 1) <= allowed:
+        return []
+    growth = np.abs(path.monodromy).max()
+    text = (
+        f"the product of the multipliers is {product:.9g}, but that of the determinants of all "
+        f"steps is {path.volume:.9g}: deviations grow by up to {growth:.1g} within the period, so "
+        "that rounding errors decide on the multipliers, and on the period. The cycle is very "
+        "close to an equilibrium, or to a cycle that is unstable: look for one elsewhere."
+    )
+    return [Finding("multipliers of rounding", text, "refused")]
 
 
 def _not_reached(cycle, visits: list[Visit]) -> tuple[str, ...]:
