@@ -7,9 +7,10 @@ first integration left, and tests what that integration assumed.
 It sees: pieces of the cycle that are not trajectories of the vector field; events at which the
 guard is not zero, or is not crossed in its direction; guards that the cycle passes, or lies beyond
 all along, without an event; scheduled events that were left out; a period that is a multiple of the
-shortest; multipliers that differ from those of the walk. It does not see: a guard that dips below
-zero and back between two of its points (eight in each step), whether functions mean what their
-author meant, and multipliers of systems with more than `_MANY` states.
+shortest; multipliers that differ from those of the walk, or that only rounding decides on. It does
+not see: a guard that dips below zero and back between two of its points (eight in each step),
+whether functions mean what their author meant, and multipliers of systems with more than `_MANY`
+states.
 """
 
 from collections.abc import Iterable
