@@ -431,7 +431,7 @@ def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
         # (At the end of a visit the guard of its own event is zero up to errors.)
         level = levels[k, :-1] if g == visit.event else levels[k]
         for point in _crossings(level):
-            if _may_happen(s, g, visit, np.array([point])):
+            if _may_happen(s, g, _at_zero(visit, level, point), np.array([0])):
                 yield _passed(s.transitions[g], float(visit.t[point]))
                 break
 
@@ -441,6 +441,16 @@ def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
     points = np.flatnonzero(level)
     falls = (level[points][1:] < 0) & (level[points][:-1] > 0)
     return points[1:][falls]
+
+
+def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
+    """The point of a visit at which a guard, which is negative at `point`, has passed zero: on the
+    chord from the point where it was positive."""
+    before = int(np.flatnonzero(level[:point])[-1])
+    part = level[before] / (level[before] - level[point])
+    t = visit.t[before] + part * (visit.t[point] - visit.t[before])
+    q = visit.q[:, before] + part * (visit.q[:, point] - visit.q[:, before])
+    return visit._replace(t=t[None], q=q[:, None])
 
 
 def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
