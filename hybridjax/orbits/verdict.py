@@ -642,10 +642,10 @@ def _unresolved_multipliers(cycle, path: _Path) -> list[Finding]:
         return []
     growth = np.abs(path.monodromy).max()
     text = (
-        f"the product of the multipliers is {product:.9g}, but that of the determinants of all "
-        f"steps is {path.volume:.9g}: deviations grow by up to {growth:.1g} within the period, so "
-        "that rounding errors decide on the multipliers, and on the period. The cycle is very "
-        "close to an equilibrium, or to a cycle that is unstable: look for one elsewhere."
+        f"the product of the multipliers, {product:.9g}, differs from that of the determinants of "
+        f"all steps, {path.volume:.9g}: deviations grow by up to {growth:.1g} within the period, "
+        "so that rounding errors decide on the multipliers, and on the period. The cycle comes "
+        "very close to an equilibrium, or to an unstable cycle: look for one elsewhere."
     )
     return [Finding("multipliers of rounding", text, "refused")]
 
