@@ -92,6 +92,7 @@ WRONG = {
         "--phase y,v --scale 1,-2": "--scale: '1,-2' is not two positive numbers",
         "--event e --order 1000000000000": "--order: '1000000000000' is not a whole number",
         "--event e --drift 2": "--drift: '2' is not a number of cycles, four or more",
+        "--event e --drift inf": "--drift: 'inf' is not a number of cycles, four or more",
         "--event e --bandwidth 0": "--bandwidth: '0' is not a positive number",
         "--event e --sections 8.5": "--sections: '8.5' is not a whole number from 1 to",
         "--crossing u:falling": "u is an input: define the phase by another signal",

@@ -103,21 +103,49 @@ def rival_of(
 
     **Arguments:** `lanes`, `watched`: before the resets.
     """
-    xp = namespace(fired)
     other = (np.arange(len(s.transitions))[:, None] != fired) & (fired >= 0)
     by_guard = (s.clocks < 0)[:, None]
     falls = falls_within(watched.value[:-1], watched.rate[:-1], TOGETHER * span)
     due = lanes.armed & other & by_guard & falls
 
-    def first_enabled():
-        which = xp.full_like(fired, -1)
+    return _first_enabled(s, lanes, u, due)
+
+
+def due_at_once(
+    s: Structure, lanes: Lanes, watched: Watch, u: Inputs, span: Times
+) -> Index:
+    """The transitions (by index; -1: none) whose events are due at once where lanes are: armed
+    guards that are beyond zero, or at it and fall, and scheduled events that have not happened yet.
+
+    A flow that begins there does not know of them: `arm` takes a guard beyond zero for one that the
+    input has led there.
+    """
+    xp = namespace(lanes.t)
+    falls = falls_within(watched.value[:-1], watched.rate[:-1], TOGETHER * span)
+    by_guard = (s.clocks < 0)[:, None] & (falls | overdue(watched, lanes.t, span))
+    none = xp.zeros_like(lanes.armed)
+    is_over = await_schedules(s, none, lanes.t, lanes.t)
+    by_clock = (s.clocks >= 0)[:, None] & ~is_over
+    due = lanes.armed & (by_guard | by_clock) & belongs(s, lanes.chart)[:-1]
+    return _first_enabled(s, lanes, u, due)
+
+
+def _first_enabled(
+    s: Structure, lanes: Lanes, u: Inputs, due: Bool[Array, "G L"]
+) -> Index:
+    """The first transition of each lane that is `due` and whose predicate holds; -1 for none."""
+    xp = namespace(lanes.t)
+    none = xp.full_like(lanes.chart, -1)
+
+    def first():
+        which = none
         for g in range(len(s.transitions)):
-            rival = xp.where(due[g] & (which < 0), np.int32(g), np.int32(-1))
-            holds = enabled(s, lanes.t, lanes.q, u, rival)
-            which = xp.where(holds & (rival >= 0), rival, which)
+            candidate = xp.where(due[g] & (which < 0), np.int32(g), np.int32(-1))
+            holds = enabled(s, lanes.t, lanes.q, u, candidate)
+            which = xp.where(holds & (candidate >= 0), candidate, which)
         return which
 
-    return cond(due.any(), first_enabled, lambda: xp.full_like(fired, -1))
+    return cond(due.any(), first, lambda: none)
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:

@@ -7,16 +7,18 @@ from typing import Annotated, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
 from .._core.boundary.values import Reals
+from .._core.executor import is_traced
 from .._core.meaning import require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.text import folded, listed
-from ..engine.lanes import Lanes
+from ..engine.lanes import Lanes, fixed
 from ..engine.move import move
 from ..engine.settings import EXPERIMENT, Settings
 from ..errors import DefinitionError
@@ -25,7 +27,13 @@ from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
 from ..sections.families import BoundSections
 from ..sections.place import as_placed
-from ..sections.placed import PlacedSections, SectionsLike, observe, section_target
+from ..sections.placed import (
+    PlacedSections,
+    SectionsLike,
+    followed_at_once,
+    observe,
+    section_target,
+)
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem, Output, OutputNames, arrays_of
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
@@ -83,11 +91,15 @@ class Course(eqx.Module):
     lanes: Lanes
     period: Float[Array, ""]
     event_sequence: tuple[int, ...] = eqx.field(static=True)
+    has_event_sections: bool = eqx.field(static=True)
+    """Whether a section is an event."""
 
 
 def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
     """Return the course of experiments around a limit cycle."""
     cycle = placed.cycle
+    event = placed.bound.event
+    has_event_sections = is_traced(event) or bool((np.asarray(event) >= 0).any())
     return Course(
         cycle.system,
         tuple(outputs),
@@ -95,6 +107,7 @@ def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
         placed.lanes,
         cycle.period,
         cycle.event_sequence,
+        has_event_sections,
     )
 
 
@@ -134,6 +147,14 @@ def flow_batch(
     lanes = jax.tree_util.tree_map(many, course.lanes)
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
+    def examined(result, lanes, u, section):
+        """The results of lanes on a section: an event that happens there at once is missed."""
+        if not course.has_event_sections:
+            return result
+        at_event = (result == Result.OK) & (course.bound.event[section] >= 0)
+        missed = followed_at_once(*fixed((s, lanes, u)), at_event, period)
+        return update_result(result, missed >= 0, Result.EVENT_ORDER)
+
     @jax.checkpoint
     def section(carry, xs):
         lanes, result, state = carry
@@ -156,6 +177,7 @@ def flow_batch(
         expected = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - expected) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)
+        result = examined(result, moved.lanes, u, j)
         # Times and events are counted within one turn, so that every turn is computed alike.
         t = moved.lanes.t - turns * period
         events = moved.lanes.events - turns * one_turn
@@ -166,7 +188,9 @@ def flow_batch(
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
     states = 0 if feedback is None else feedback.matrices.A.shape[1]
-    begin = (lanes, jnp.zeros(S, jnp.int32), jnp.zeros((states, S)))
+    still = jnp.zeros((s.nu, 1))
+    result = examined(jnp.zeros(S, jnp.int32), lanes, still, 0)
+    begin = (lanes, result, jnp.zeros((states, S)))
     (lanes, result, _), (y, ok, shares, answers) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)

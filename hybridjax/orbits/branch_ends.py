@@ -155,7 +155,7 @@ def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
     """An end at which the cycle reaches a guard where there was no event before."""
     s = cycle.structure
-    for visit in visits:
+    for before, visit in zip([visits[-1], *visits[:-1]], visits, strict=True):
         guards = s.guards(visit.chart)
         if not guards:
             continue
@@ -170,6 +170,11 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             if _has_minimum(level, near):
                 text = f"the guard of '{name}' is touched tangentially (grazing)"
                 return End(Result.GRAZING, text)
+            is_least_at_begin = np.argmin(level[:-1]) == 0 and level[0] <= near
+            if before.event >= 0 and g != before.event and is_least_at_begin:
+                earlier = s.transitions[before.event].name
+                text = f"the event '{name}' begins to happen at once after '{earlier}'"
+                return End(Result.EVENT_ORDER, text)
             least_at_end = np.argmin(level[1:]) == len(level) - 2
             if g != visit.event and least_at_end and level[-2] <= near:
                 text = f"the event '{name}' begins to happen at the end of a stay"

@@ -24,7 +24,7 @@ from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
 from ..systems.system import HybridSystem, Output, OutputNames
 from ..systems.transition import SAME_TIME, Scheduled
-from .coincidence import SAME
+from .coincidence import SAME, about_begin
 from .cycle import LimitCycle, orbit
 from .return_map import Turn
 from .rivals import coincident
@@ -354,8 +354,13 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
     code = Result(int(cycle.result))
+    map = cycle.return_map
+    if code == Result.EVENT_ORDER and map.event >= 0:
+        follows = int(map.followed(turn.end))
+        if follows >= 0:
+            return about_begin(map, follows)
     if code == Result.SIMULTANEOUS:
-        pair = coincident(cycle.return_map, turn)
+        pair = coincident(map, turn)
         if pair is not None:
             return _about_coincidence(cycle, pair)
     if code == Result.SINGULAR:

@@ -295,7 +295,6 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
 def check_begin(map: ReturnMap) -> None:
     """**Raises:** `ComputationError` if turns begin at an event that may or may not belong to
     them."""
-    s = map.structure
     base = map.base
     if not (base is None or isinstance(base, AtEvent)):
         return
@@ -308,16 +307,19 @@ def check_begin(map: ReturnMap) -> None:
         due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)
         due[map.event] = False
     if due.any():
-        name = s.transitions[int(np.argmax(due))].name
-        begins = (
-            "the beginning of every turn"
-            if base is None
-            else f"'{base.name}', its beginning"
-        )
-        raise ComputationError(
-            f"the event '{name}' coincides with {begins}, so that it may or may not belong to the "
-            "turn: take another section, or a guess at another time."
-        )
+        raise ComputationError(about_begin(map, int(np.argmax(due))))
+
+
+def about_begin(map: ReturnMap, g: int) -> str:
+    """The reason for which turns cannot begin where event g happens, too."""
+    name = map.structure.transitions[g].name
+    begins = "the beginning of every turn"
+    if isinstance(map.base, AtEvent):
+        begins = f"'{map.base.name}', its beginning"
+    return (
+        f"the event '{name}' coincides with {begins}, so that it may or may not belong to the "
+        "turn: take another section, or a guess at another time."
+    )
 
 
 @host_first

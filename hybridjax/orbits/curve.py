@@ -221,7 +221,7 @@ class Curve:
         last = np.inf
         for k in range(FEW_STEPS):
             turn = self.turn(map, z)
-            failure = self._failure(turn)
+            failure = self._failure(turn, z)
             if failure is not None:
                 return failure
             point = Point(anchor, z, size, forward, turn, k)
@@ -249,7 +249,7 @@ class Curve:
         tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
         return turn._replace(tapes=tapes)
 
-    def _failure(self, turn: Turn) -> Result | None:
+    def _failure(self, turn: Turn, z: Float[np.ndarray, " n"]) -> Result | None:
         if int(turn.result) != Result.OK:
             return Result(int(turn.result))
         sequence = _rotated(turn.events)
@@ -259,6 +259,10 @@ class Curve:
             return Result.EVENT_ORDER
         if turn.closed and int(turn.meetings) > self.map.multiplicity:
             return Result.EXTRA_TURNS
+        if turn.closed and self.map.event >= 0:
+            map = to_host(self.map.at_phase_of(self.system_at(z[-1])))
+            if map.followed(turn.end) >= 0:
+                return Result.EVENT_ORDER
         return None
 
     def _ranges(self, pieces: Lanes) -> Float[np.ndarray, " d"]:

@@ -30,7 +30,7 @@ from .._core.memo import remembered
 from .._core.results import Result
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.events import arm, await_schedules, belongs, enabled
+from ..engine.events import arm, belongs, due_at_once, enabled
 from ..engine.itinerary.rows import PIECES
 from ..engine.lanes import Lanes, Tape, for_each_chart, only, side_by_side, start_lanes
 from ..engine.move import Options, flow_jacobian, follow, stride, tape_jacobian, through
@@ -42,7 +42,6 @@ from ..engine.watch import Watch, slopes, watch
 from ..linear.time_response import monodromy
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem
-from ..systems.transition import TOGETHER
 from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
@@ -386,9 +385,9 @@ class ReturnMap(eqx.Module):
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
         code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
         if self.base is not None:
-            if self.event >= 0 and not self.expected.ndim:  # (not in sweeps)
-                ends_at_once = turn.closed & self._follows(turn.end)
-                code = xp.where(ends_at_once, Result.SIMULTANEOUS, code)
+            if self.event >= 0:
+                ends_at_once = turn.closed & (self.followed(turn.end) >= 0)
+                code = xp.where(ends_at_once, Result.EVENT_ORDER, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             at_rest = turn.closed & self._rests(q, turn)
@@ -454,20 +453,16 @@ class ReturnMap(eqx.Module):
         # (An event that happens may leave the state beyond its guard.)
         return (passed & ~fine & ~xp.stack(fired)).any(axis=0)
 
-    def _follows(self, end: Lanes) -> Bool[Array, ""]:
-        """Test whether another event follows at once on the one with which a turn ends, so that the
-        next turn would begin without it."""
-        s, xp = self.structure, namespace(end.t)
+    def followed(self, end: Lanes) -> Int[Array, ""]:
+        """The transition (by index; -1: none) that follows at once on the event with which a turn
+        ends, so that the next turn would begin without it."""
+        if self.expected.ndim:
+            end = side_by_side(end)
+        xp = namespace(end.t)
         watched = self.watch(end, until(end.t))
-        value, rate = watched.value[:-1], watched.rate[:-1]
+        u = xp.zeros((self.structure.nu, len(end.t)))
         span = xp.atleast_1d(self.expected)
-        by_guard = end.armed & (value <= TOGETHER * span * xp.abs(rate)) & (rate < 0)
-        by_guard = by_guard & (s.clocks < 0)[:, None]
-        waiting = (
-            xp.asarray(s.clocks >= 0)[:, None] & end.armed & belongs(s, end.chart)[:-1]
-        )
-        idle = await_schedules(s, xp.zeros_like(end.armed), end.t, end.t)
-        return self.each((by_guard | (waiting & ~idle)).any(axis=0))
+        return self.each(due_at_once(self.structure, end, watched, u, span))
 
     def held(
         self, q: Float[Array, " d"], varied: Varied | None = None

@@ -7,9 +7,10 @@ first integration left, and tests what that integration assumed.
 It sees: pieces of the cycle that are not trajectories of the vector field; events at which the
 guard is not zero, or is not crossed in its direction; guards that the cycle passes, or lies beyond
 all along, without an event; scheduled events that were left out; a period that is a multiple of the
-shortest; multipliers that differ from those of the walk. It does not see: a guard that dips below
-zero and back between two of its points (eight in each step), whether functions mean what their
-author meant, and multipliers of systems with more than `_MANY` states.
+shortest; multipliers that differ from those of the walk, or that only rounding decides on. It does
+not see: a guard that dips below zero and back between two of its points (eight in each step),
+whether functions mean what their author meant, and multipliers of systems with more than `_MANY`
+states.
 """
 
 from collections.abc import Iterable
@@ -43,6 +44,13 @@ _STEPS = 1e4
 # Largest difference of sums of powers of multipliers of the two integrations, relative to their
 # size. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken for faults.
 _DIFFERENT = 1e-4
+# Largest difference of the product of all multipliers from that of the determinants of all moves,
+# relative to it; of cycles with larger errors, `_STEPS` times the error of a step.
+# Larger: multipliers that are only rounding pass. Smaller: errors of the walk are taken for faults.
+_OTHER_PRODUCT = 1e-6
+# The least product of multipliers that is compared. Smaller: those that are nearly zero, of which
+# only the size is known, are taken for faults. Larger: fewer cycles are compared.
+_LEAST_PRODUCT = 1e-6
 # A guard is beyond zero if its value exceeds the change that deviations of this size, in sizes of
 # the states, could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
 _BEYOND = 1e-6
@@ -128,6 +136,8 @@ class _Path(NamedTuple):
     distance: float
     """Largest distance to the cycle, in sizes of the states."""
     monodromy: Float[np.ndarray, "d d"]
+    volume: float
+    """Product of the determinants of all moves; 0 where charts have other numbers of states."""
     findings: list[Finding]
     """Faults at events."""
 
@@ -190,6 +200,7 @@ def _verdict(cycle) -> Verdict:
     if accurate and s.d <= _MANY and not refused:
         apart = _apart(cycle, path.monodromy)
         findings += _other_multipliers(apart)
+        findings += _unresolved_multipliers(cycle, path)
     return Verdict(
         path.distance if accurate else np.nan,
         apart,
@@ -237,7 +248,9 @@ def _walk_along(cycle) -> _Path:
     points = np.column_stack([moves.q[:, 1:], map.anchor.q])
     charts = np.append(moves.chart[1:], map.anchor.chart)
     distance = _distance(s, scale, (chart, q), (charts, points))
-    return _Path(t, moves.chart, event, moves.q, walked, distance, monodromy, findings)
+    volume = float(np.prod(np.linalg.det(by_state)))
+    linear = monodromy, volume
+    return _Path(t, moves.chart, event, moves.q, walked, distance, *linear, findings)
 
 
 def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
@@ -418,7 +431,7 @@ def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
         # (At the end of a visit the guard of its own event is zero up to errors.)
         level = levels[k, :-1] if g == visit.event else levels[k]
         for point in _crossings(level):
-            if _may_happen(s, g, visit, np.array([point])):
+            if _may_happen(s, g, _at_zero(visit, level, point), np.array([0])):
                 yield _passed(s.transitions[g], float(visit.t[point]))
                 break
 
@@ -428,6 +441,16 @@ def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
     points = np.flatnonzero(level)
     falls = (level[points][1:] < 0) & (level[points][:-1] > 0)
     return points[1:][falls]
+
+
+def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
+    """The point of a visit at which a guard, which is negative at `point`, has passed zero: on the
+    chord from the point where it was positive."""
+    before = int(np.flatnonzero(level[:point])[-1])
+    part = level[before] / (level[before] - level[point])
+    t = visit.t[before] + part * (visit.t[point] - visit.t[before])
+    q = visit.q[:, before] + part * (visit.q[:, point] - visit.q[:, before])
+    return visit._replace(t=t[None], q=q[:, None])
 
 
 def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
@@ -600,6 +623,31 @@ def _other_multipliers(apart: float) -> list[Finding]:
         "the first."
     )
     return [Finding("other multipliers", text, "refused")]
+
+
+def _unresolved_multipliers(cycle, path: _Path) -> list[Finding]:
+    """A finding on multipliers whose product is not that of the determinants of all moves.
+
+    Each determinant is known to nearly all digits. Multipliers are not where deviations grow by
+    many powers of ten within the period, and shrink again, as beside a separatrix.
+    """
+    if abs(path.volume) < _LEAST_PRODUCT:
+        return []
+    multipliers = np.asarray(cycle._multipliers)
+    product = float(np.prod(multipliers).real)
+    allowed = max(
+        _OTHER_PRODUCT, _STEPS * float(np.max(np.asarray(cycle.settings.rtol)))
+    )
+    if abs(product / path.volume - 1) <= allowed:
+        return []
+    growth = np.abs(path.monodromy).max()
+    text = (
+        f"the product of the multipliers, {product:.9g}, differs from that of the determinants of "
+        f"all steps, {path.volume:.9g}: deviations grow by up to {growth:.1g} within the period, "
+        "so that rounding errors decide on the multipliers, and on the period. The cycle comes "
+        "very close to an equilibrium, or to an unstable cycle: look for one elsewhere."
+    )
+    return [Finding("multipliers of rounding", text, "refused")]
 
 
 def _not_reached(cycle, visits: list[Visit]) -> tuple[str, ...]:

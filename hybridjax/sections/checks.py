@@ -23,7 +23,7 @@ from ..systems.structure import Structure
 from ..systems.transition import at_one_time
 from . import families
 from .along import levels_at
-from .placed import PlacedSections
+from .placed import PlacedSections, followed_at_once
 
 
 # Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
@@ -96,6 +96,8 @@ def _require_reached(placed: PlacedSections, results: list[int]) -> None:
             raise ComputationError(
                 f"{name(i - 1)} coincides with an event: move the sections, or use `AtEvent`."
             )
+        if code == Result.EVENT_ORDER:
+            raise ComputationError(_about_next_event(placed, i - 1))
         if i:
             what = f"{name(i % N)} is not reached from section {i - 1} on the cycle"
         else:
@@ -107,6 +109,20 @@ def _require_reached(placed: PlacedSections, results: list[int]) -> None:
         if code == Result.STEP_LIMIT:
             hint = ". Give them to the search for the cycle, or place more sections."
         raise ComputationError(f"{what}: {Result(code).message}{hint}")
+
+
+def _about_next_event(placed: PlacedSections, i: int) -> str:
+    """The reason for which section i, at an event that another one follows at once, is refused."""
+    cycle = to_host(placed.cycle)
+    s = cycle.structure
+    lanes, event = to_host((placed.lanes, placed.bound.event))
+    still = np.zeros((s.nu, 1))
+    missed = followed_at_once(s, lanes, still, event >= 0, cycle.period)
+    name = s.transitions[int(missed[i])].name
+    return (
+        f"the event '{name}' coincides with {placed.family.describe(i)}, so that it may or may not "
+        "belong to the flow from there: take a section after the last of these events."
+    )
 
 
 def _require_order(placed: PlacedSections) -> None:

@@ -34,7 +34,7 @@ from ..systems.transition import Scheduled, at_one_time
 from .along import flow_along
 from .checks import OutOfOrderError, check_placed
 from .families import AbstractSections, BoundSections, Orbit, SectionList
-from .placed import PlacedSections
+from .placed import PlacedSections, followed_at_once
 
 
 # The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
@@ -151,6 +151,10 @@ def _locate(
     duration = moved.lanes.t - lanes.t
     near = _near_events(map, bound, lanes, moved.lanes, tape)
     result = update_result(moved.result, near, Result.SIMULTANEOUS)
+    # (An event that is missed on a section is the cause of a failure on the way from there.)
+    still = xp.zeros((s.nu, 1))
+    missed = followed_at_once(s, lanes, still, bound.event >= 0, period)
+    result = xp.where(missed >= 0, xp.int32(Result.EVENT_ORDER), result)
     if not on_host(period):  # (on the host `_check` says more)
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)

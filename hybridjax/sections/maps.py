@@ -22,7 +22,7 @@ from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
 from .place import as_placed
-from .placed import PlacedSections, SectionsLike
+from .placed import PlacedSections, SectionsLike, followed_at_once
 
 
 # Periods after which a state is given up that has not reached the section. Fewer: states far from
@@ -39,7 +39,8 @@ class Arrival(NamedTuple):
     q: Float[Array, " n"]
     """State in the chart in which the cycle crosses section j."""
     result: Int[Array, ""]
-    """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's."""
+    """`Result` code; `EVENT_ORDER` if section j is reached in another chart than the cycle's, or
+    another event happens at once on one of the sections."""
 
 
 @checked_methods
@@ -50,7 +51,8 @@ class SectionMap(Showable, eqx.Module):
     returns states that are padded with zeros to the largest chart's dimension.
 
     **Raises** (outside of JAX transformations): `ComputationError` if section j is not reached,
-    or is reached in another chart than the cycle's.
+    or is reached in another chart than the cycle's, and if another event happens at once on section
+    i or j.
     """
 
     placed: PlacedSections
@@ -183,6 +185,11 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
     result = update_result(
         moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER
     )
+    period = placed.cycle.period
+    for k, on_section in ((i, start), (j, end)):
+        at_event = (result == Result.OK) & (placed.bound.event[k] >= 0)
+        missed = followed_at_once(s, on_section, u, at_event, period)
+        result = update_result(result, missed >= 0, Result.EVENT_ORDER)
     # (A factor makes derivatives NaN, too.)
     keep = xp.where(result == Result.OK, 1.0, xp.nan)
     return Arrival(keep * end.t, (keep * end.q)[: map.dims[1]], result)

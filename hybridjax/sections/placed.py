@@ -9,7 +9,15 @@ from jaxtyping import Bool, Float, Int
 from .._core.boundary.checked import checked_methods
 from .._core.call import once_in_call
 from .._core.compilation import at_ease, host_first
-from .._core.executor import Array, is_hidden, is_traced, namespace, on_host, to_host
+from .._core.executor import (
+    Array,
+    cond,
+    is_hidden,
+    is_traced,
+    namespace,
+    on_host,
+    to_host,
+)
 from .._core.html import card, facts
 from .._core.meaning import require_as_made
 from .._core.precision import require_x64
@@ -17,9 +25,11 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import folded, number
 from ..engine import kernels
+from ..engine.events import due_at_once
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
 from ..engine.move import tape_jacobian
-from ..engine.target import Target
+from ..engine.target import Target, until
+from ..engine.watch import watch
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.structure import Outputs, Structure
@@ -237,6 +247,30 @@ def section_target(
     return Target(
         time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED
     )
+
+
+def followed_at_once(
+    s: Structure,
+    lanes: Lanes,
+    u: Float[Array, "nu #L"],
+    at_event: Bool[Array, " L"],
+    period: Float[Array, ""],
+) -> Int[Array, " L"]:
+    """The transitions (by index; -1: none) that happen at once where lanes are on sections that are
+    events (`at_event`), since these have led there. Flows that begin on the section would miss
+    them.
+
+    **Arguments:** `u`: the inputs until the events.
+    """
+    xp = namespace(lanes.t)
+    none = xp.full_like(lanes.chart, -1)
+
+    def next_event():
+        target = until(lanes.t)
+        watched = watch(s, lanes.t, lanes.chart, lanes.q, u, target, at_event)
+        return xp.where(at_event, due_at_once(s, lanes, watched, u, period), none)
+
+    return cond(at_event.any(), next_event, lambda: none)
 
 
 SectionsLike: TypeAlias = FamilyLike | PlacedSections

@@ -384,3 +384,100 @@ def test_experiments_near_full_and_zero_duty():
             cycle = hj.find_limit_cycle(Converter(duty, by_ramp), guess)
             ldtp = hj.linearize(cycle, hj.ClockPhase(4, 0.3), "x")
             assert_allclose(ldtp.multipliers, [np.exp(-1)], rtol=1e-9)
+
+
+class Beat(hj.HybridSystem):
+    """x decays, and a pacemaker kicks it each unit of time. Where it is then above 1.2 it is set
+    back at once, from where it would also decay by itself."""
+
+    jump: float = hj.parameter(0.5)
+
+    def charts(self):
+        def rates(t, q, u):
+            return (u[0] - 0.7 * q[0], 1.0)
+
+        return {"calm": Field(("x", "p"), rates)}
+
+    def transitions(self):
+        def kick(t, q, u):
+            return (q[0] + self.jump, 0.0)
+
+        def set_back(t, q, u):
+            return (0.4 * q[0] ** 2, q[1])
+
+        return (
+            hj.Transition("kick", "calm", "calm", lambda t, q, u: 1 - q[1], reset=kick),
+            hj.Transition(
+                "set back", "calm", "calm", lambda t, q, u: 1.2 - q[0], reset=set_back
+            ),
+        )
+
+
+LIMIT = 1.2 * (1 - np.exp(-0.7))  # the jump from which on x is set back
+COINCIDES = "event 'set back' coincides with"
+
+
+def beating():
+    """The cycle without the second event, by a section at the first one."""
+    guess = hj.Guess("calm", (0.9, 0.02))
+    return hj.find_limit_cycle(Beat(), guess, section=hj.AtEvent("kick"))
+
+
+def test_an_event_at_once_that_begins_beside_the_known_cycle_is_not_missed():
+    """Turns begin right after the kick: they would not have the event that it brings about."""
+    cycle = beating()
+    for _ in range(3):  # (by a search, and by the known itinerary)
+        with pytest.raises(hj.errors.ComputationError, match=COINCIDES):
+            hj.find_limit_cycle(Beat(0.8), cycle)
+    jumps = np.linspace(0.5, 0.9, 9)
+    exists = jumps < LIMIT
+    found = hj.orbits.find_limit_cycles([Beat(float(x)) for x in jumps], cycle)
+    assert_array_equal(found.ok, exists)
+    assert_array_equal(np.isnan(found.period), ~exists)
+    swept = hj.sweep(Beat(), {"jump": jumps.tolist()}, guess=cycle)
+    assert_array_equal(swept.result == hj.errors.Result.OK, exists)
+    branch = hj.continuation(cycle, "jump", (0.5, 0.9))
+    assert_allclose(branch.values.max(), LIMIT, rtol=1e-3)
+    assert "'set back' begins to happen at once after 'kick'" in str(branch)
+    result = jax.jit(jax.vmap(lambda x: hj.find_limit_cycle(Beat(x), cycle).result))
+    assert_array_equal(result(jnp.asarray(jumps)) == hj.errors.Result.OK, exists)
+
+
+@pytest.mark.parametrize("with_another_section", [False, True])
+def test_experiments_do_not_miss_an_event_at_once_on_a_section(with_another_section):
+    """A push of 0.1 leaves x below 1.2 after the next kick, and one of 0.3 does not."""
+    cycle = beating()
+    sections = (hj.AtEvent("kick"),)
+    if with_another_section:
+        sections += (hj.Crossing("p", "rising", 0.45),)
+    N = len(sections)
+    pushes = np.array([0.1, 0.3])
+    u = np.zeros((2, 24 * N, 1))
+    u[:, 20 * N : 21 * N, 0] = pushes[:, None]
+    data = hj.run_experiments(cycle, sections, u, ["x"], discard=2)
+    assert_array_equal(data.ok, [True, False])
+    decay = np.exp(-0.7)
+    off = pushes[0] / 0.7 * (1 - decay)
+    after = data.y[0, 20 * N :: N, 0]
+    assert_allclose(after[:3], [0.0, off, off * decay], atol=1e-8)
+    response = hj.experiments.response_function(cycle, sections, ["x"])
+    order = hj.errors.Result.EVENT_ORDER
+    assert_array_equal(response(u[:, 18 * N :]).result, [0, order])
+    other = response(np.zeros((1, 4 * N, 1)), system=Beat(0.8))
+    assert_array_equal(other.result, [order])
+    returns = hj.sections.section_map(cycle, sections, 0, 0)
+    begin = np.asarray(returns.fixed_point)
+    assert_allclose(returns(begin, u=pushes[:1]).q[0], begin[0] + off, atol=1e-9)
+    for start, push in ((begin, 0.3), (np.array([1.3, 0.0]), 0.0)):
+        with pytest.raises(hj.errors.ComputationError, match="events came in another"):
+            returns(start, u=np.array([push]))
+
+
+def test_a_section_at_an_event_that_another_one_follows_at_once_is_refused():
+    cycle = hj.find_limit_cycle(Kicked(), hj.Guess("calm", (0.5,), time=0.5))
+    for call in (hj.linearize, hj.experiments.response_function):
+        with pytest.raises(
+            hj.errors.ComputationError,
+            match="'halve' coincides with section 0 .after kick.",
+        ):
+            call(cycle, hj.AtEvent("kick"), ["x"])

@@ -461,3 +461,51 @@ def test_a_step_to_where_other_events_happen_ends_no_search_in_a_program():
 
     assert result(1.01 * left) == hj.errors.Result.OK
     assert result(0.99 * left) == hj.errors.Result.NOT_CONVERGED
+
+
+class Window(hj.HybridSystem):
+    """x follows a clocked drive, and falls where it rises through 1, where alone it may."""
+
+    size: hj.Parameter = hj.parameter(0.5)
+
+    def charts(self):
+        def rate(t, q, u):
+            return (self.size * (1 + jnp.sin(2 * jnp.pi * t)) - q[0],)
+
+        return {"follows": Field(("x",), rate)}
+
+    def transitions(self):
+        def fall(t, q, u):
+            return (q[0] - 0.5,)
+
+        def is_near(t, q, u):
+            return jnp.abs(q[0] - 1) < 1e-3
+
+        return [
+            hj.Transition(
+                "fall",
+                "follows",
+                "follows",
+                lambda t, q, u: 1 - q[0],
+                reset=fall,
+                enabled=is_near,
+            )
+        ]
+
+    def period(self):
+        return 1.0
+
+
+def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
+    """Not at the ends of a step, but at the zero of the guard within."""
+    cycle = hj.find_limit_cycle(Window(), hj.Guess("follows", (0.5,)))
+    sizes = np.linspace(0.5, 1.1, 13)
+    has_no_event = sizes * (1 + 1 / np.sqrt(1 + 4 * np.pi**2)) < 1
+    result = jax.jit(
+        jax.vmap(lambda size: hj.find_limit_cycle(Window(size), cycle).result)
+    )
+    found = result(jnp.asarray(sizes)) == hj.errors.Result.OK
+    np.testing.assert_array_equal(found, has_no_event)
+    for _ in range(4):  # (by a search, and by the known itinerary)
+        beside = hj.find_limit_cycle(Window(1.0), cycle, throw=False)
+        assert beside.result != hj.errors.Result.OK or beside.event_sequence

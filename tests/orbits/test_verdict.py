@@ -261,3 +261,26 @@ def test_a_clock_that_is_too_long_is_a_doubt(turns):
     causes = [finding.cause for finding in cycle.findings]
     assert ("a long clock" in causes) == (turns > 1)
     assert ("shortest period" in repr(cycle)) == (turns == 1)
+
+
+class Swinging(hj.HybridSystem):
+    """A pendulum without friction: each swing is a cycle, of a family, with the multiplier 1."""
+
+    def charts(self):
+        return {
+            "swing": Field(("angle", "rate"), lambda t, q, u: (q[1], -jnp.sin(q[0])))
+        }
+
+    def transitions(self):
+        return ()
+
+
+@pytest.mark.parametrize("below", [0.0, 1e-14, 1e-12, 1e-10])
+def test_multipliers_that_are_only_rounding_are_refused(below):
+    """Beside the separatrix, at the rate 2, deviations grow by more than 1e10, and shrink again:
+    the multiplier, which is 1, comes out as -1.1 to 0.999, and the period as any."""
+    guess = hj.Guess("swing", (0.0, 2.0 - below))
+    with pytest.raises(
+        ComputationError, match="rounding errors decide on the multipliers"
+    ):
+        hj.find_limit_cycle(Swinging(), guess)

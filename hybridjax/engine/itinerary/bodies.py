@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from ...systems.structure import Kind, Member, Structure
 from ...systems.transition import SAME_TIME, Scheduled
 from ..arrays import Array
+from ..cubic import interpolate, root_near_end
 from ..settings import Settings
 from ..target import AbstractLevels
 from . import steps
@@ -135,7 +136,7 @@ class Bodies:
 
     def _act(self, motion: Motion, row: Row, course, flags: Flags):
         """A row that begins in a chart: a step, or the end of a leg."""
-        course, now = self._in_chart(motion, row, self._observe, course)
+        course, now = self._in_chart(motion, row, self._observe, course, flags.before)
         seen = still(motion.values(course)), now
         alone = Alone(motion.constants)
         flags, due = alone.apply(self._lane(self._noted, row), flags, seen)
@@ -189,14 +190,18 @@ class Bodies:
 
     # What a row sees where it begins.
 
-    def _observe(self, a: int, row: Row, s: Structure, constants, course: Course, _):
-        """The field of chart a, and its watched functions."""
+    def _observe(
+        self, a: int, row: Row, s: Structure, constants, course: Course, before: Watched
+    ):
+        """The field of chart a, and its watched functions, which had values `before`."""
         q = _state(s, a, course)
         t, u = course.t, jnp.zeros(s.nu)
         field = steps.field(s, a, t, q)
+        field_before = course.rate
         course = course._replace(rate=_padded(field, course.rate))
+        padded = still(course.y[0])
         if not count_watched(s, a, constants.levels):
-            return course, Watched.unknown(still(t), self.form.watched)
+            return course, Watched.unknown(still(t), self.form.watched, padded)
 
         def values(t, q):
             return watched(s, a, constants.levels, row, t, q, u)
@@ -208,10 +213,9 @@ class Bodies:
         value = jnp.pad(value, (0, more), constant_values=jnp.inf)
         rate = jnp.pad(rate, (0, more), constant_values=1.0)
         enabled = jnp.ones(self.form.watched, bool)
-        for place, g in enumerate(s.guards(a)):
-            if s.transitions[g].enabled is not None:
-                enabled = enabled.at[place].set(s.enabled(g, t, q, u))
-        return course, still(Watched(t, value, rate, enabled))
+        now = still(Watched(t, value, rate, enabled, ~enabled, padded))
+        fields = still((field_before, course.rate))
+        return course, _with_predicates(a, s, before, now, fields)
 
     def _noted(self, row: Row, s: Structure, _, flags: Flags, seen):
         """The flags, and the guards that are due."""
@@ -396,7 +400,8 @@ class Bodies:
         """The course where a leg has ended, and the next one begins."""
         flags, now, jumping = notes
         rival = row.is_jump & has_rival(row, still(course.begin), now)
-        unknown = Watched.unknown(still(course.t), self.form.watched)
+        at = still((course.t, course.y[0]))
+        unknown = Watched.unknown(at[0], self.form.watched, at[1])
         on_level = leveled(row, flags).before
         select = ft.partial(jnp.where, row.is_jump)
         before = jax.tree_util.tree_map(select, unknown, on_level)
@@ -426,6 +431,36 @@ class Bodies:
 
 def _state(s: Structure, a: int, course: Course) -> Float[Array, " n"]:
     return course.y[0, : s.dims[a]]
+
+
+def _with_predicates(
+    a: int, s: Structure, before: Watched, now: Watched, fields: tuple
+) -> Watched:
+    """Watched functions of chart a with the predicates of their events, now and where they have
+    fallen through zero. `fields`: at the times before and now."""
+    predicates = [
+        (place, g)
+        for place, g in enumerate(s.guards(a))
+        if s.transitions[g].enabled is not None
+    ]
+    if not predicates:
+        return now
+    n = s.dims[a]
+    u = jnp.zeros(s.nu)
+    h = now.t - before.t
+    enabled = now.enabled
+    enabled_at_zero = now.enabled_at_zero
+    for place, g in predicates:
+        values = before.value[place], now.value[place]
+        slopes = h * before.rate[place], h * now.rate[place]
+        zero = root_near_end(*values, *slopes)
+        # (NaN where nothing is known of the time before.)
+        x = jnp.clip(jnp.nan_to_num(zero, nan=1.0), 0.0, 1.0)
+        state = interpolate(x, h, before.q, now.q, *fields)
+        holds = s.enabled(g, before.t + x * h, state[:n], u)
+        enabled = enabled.at[place].set(s.enabled(g, now.t, now.q[:n], u))
+        enabled_at_zero = enabled_at_zero.at[place].set(holds)
+    return now._replace(enabled=enabled, enabled_at_zero=enabled_at_zero)
 
 
 def _padded(

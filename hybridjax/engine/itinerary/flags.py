@@ -38,12 +38,19 @@ class Watched(NamedTuple):
     rate: Float[Array, " G"]
     enabled: Bool[Array, " G"] | bool = True
     """Whether their events are enabled."""
+    enabled_at_zero: Bool[Array, " G"] | bool = False
+    """Whether they were where the functions fell through zero, since the time before."""
+    q: Float[Array, " d"] | None = None
+    """The state."""
 
     @classmethod
-    def unknown(cls, t: Float[Array, ""], width: int) -> "Watched":
-        """Watched functions of which nothing is known."""
+    def unknown(
+        cls, t: Float[Array, ""], width: int, q: Float[Array, " d"]
+    ) -> "Watched":
+        """Watched functions of which nothing is known, of a state."""
         far = jnp.full(width, jnp.inf)
-        return cls(t, far, jnp.ones(width), jnp.ones(width, bool))
+        enabled = jnp.ones(width, bool)
+        return cls(t, far, jnp.ones(width), enabled, ~enabled, q)
 
 
 class Entry(NamedTuple):
@@ -149,8 +156,8 @@ def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     returns = known & ~begins & dips(before, now, jnp.sign(now.value))
     positive = (before.value > 0) & ~begins
     falls = known & positive & ~(now.value > 0)
-    enabled = falls & (before.enabled | now.enabled)
-    left = (other | unknown | returns | enabled).any()
+    enabled = before.enabled | now.enabled | now.enabled_at_zero
+    left = (other | unknown | returns | (falls & enabled)).any()
     return left | _misses(row, before, now)
 
 

@@ -210,7 +210,7 @@ def _departed(
     )
     t = jax.lax.stop_gradient(t)
     zero = jnp.zeros_like(t)
-    before = Watched.unknown(t, form.watched)
+    before = Watched.unknown(t, form.watched, jax.lax.stop_gradient(q))
     entry = Entry.departure(form.watched)
     left = jnp.asarray(False)
     return course, Flags(before, entry, error=zero, last=zero, left=left)
