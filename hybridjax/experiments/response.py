@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -190,7 +190,7 @@ def flow_batch(
     states = 0 if feedback is None else feedback.matrices.A.shape[1]
     still = jnp.zeros((s.nu, 1))
     result = examined(jnp.zeros(S, jnp.int32), lanes, still, 0)
-    begin = (lanes, result, jnp.zeros((states, S)))
+    begin: Any = (lanes, result, jnp.zeros((states, S)))
     (lanes, result, _), (y, ok, shares, answers) = jax.lax.scan(section, begin, xs)
     failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
     each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)

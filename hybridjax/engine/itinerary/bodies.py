@@ -448,8 +448,9 @@ def _with_predicates(
     n = s.dims[a]
     u = jnp.zeros(s.nu)
     h = now.t - before.t
-    enabled = now.enabled
-    enabled_at_zero = now.enabled_at_zero
+    assert now.q is not None
+    enabled = jnp.asarray(now.enabled)
+    enabled_at_zero = jnp.asarray(now.enabled_at_zero)
     for place, g in predicates:
         values = before.value[place], now.value[place]
         slopes = h * before.rate[place], h * now.rate[place]
