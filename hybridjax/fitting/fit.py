@@ -307,6 +307,10 @@ def _summary(
     is_same = abs(float(cycle.period) - period) <= _SAME_PERIOD * period
     if int(cycle.result) != Result.OK or not is_same:
         cycle = _cycle_at(problem, system, best.x, best.cycle)
+    result = best.result
+    if result == Result.OK:
+        # (Inside of the iteration cycles have fewer checks: it may end at one that is none.)
+        result = int(cycle.result)
     values = decode(best.x)
     size = np.asarray(_sizes(jnp.asarray(values)))
     sensitivity = _relative(parameters, jnp.asarray(best.x), best.jacobian)
@@ -326,6 +330,6 @@ def _summary(
         dof=float(dof),
         identifiability=identified,
         guesses=guesses,
-        result=best.result,
+        result=result,
         problem=problem,
     )
