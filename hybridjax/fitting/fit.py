@@ -386,8 +386,12 @@ def _of_end(
         for end in ends
     )
     values = decode(best.x)
+    result = best.result
     if cycle is not None:
         fitted = cycle.system
+        if result == Result.OK:
+            # (Inside of the iteration cycles have fewer checks: it may end at one that is none.)
+            result = int(cycle.result)
     else:
         assert isinstance(problem, TransientProblem)
         fitted = parameters.insert(problem.system, jnp.asarray(values))
@@ -409,6 +413,6 @@ def _of_end(
         dof=float(dof),
         identifiability=identified,
         guesses=guesses,
-        result=best.result,
+        result=result,
         problem=problem,
     )
