@@ -70,10 +70,7 @@ def pass_through(
     and second order with respect to all floating-point arrays: states, times, inputs, parameters,
     the target.
     """
-    # (Without sizes of the states, steps are only as short as their own errors ask for.)
-    options = Options(
-        tape=True, new_input=new_input, tangents=settings.scale is not None
-    )
+    options = Options(tape=True, new_input=new_input)
     return _passed(s, lanes, u, target, times, settings, options, most_events)
 
 
@@ -89,7 +86,7 @@ def _passed(s, lanes, u, target, times, settings, options, most_events) -> Passa
 def _passed_jvp(primals, tangents):
     s, lanes, u, target, times, settings, options, most_events = primals
     still = fixed((s, lanes, u, target))
-    moved, tape = _recorded(*still, settings, options)
+    moved, tape = _recorded(*still, settings, options._replace(tangents=True))
     target, levels = target.split()
 
     def repeat(by_lane, common):

@@ -69,7 +69,7 @@ class Settings(eqx.Module):
     the default, 256, ends a search for a limit cycle, the search is repeated with 4096."""
     scale: Float[Array, "A d"] | None
     """Characteristic magnitudes of states, by chart, padded with positive numbers to the largest
-    dimension. `None`: magnitudes in the current step, which do not suffice for derivatives."""
+    dimension. `None`: magnitudes in the current step."""
     solver: Any = eqx.field(static=True)
     """Method for the charts, which overrides that of the system: a Runge-Kutta method of diffrax
     with an error estimate, `hj.systems.Radau()`, a mapping from names of charts to methods, or
@@ -130,13 +130,18 @@ def _kept(x: Any) -> Any:
 
 def size(settings: Settings, a: int, *q: States) -> States:
     """Sizes of states of chart a against which errors are judged: those of `q` or, where `q` is
-    small, the usual ones, which must be known."""
-    if settings.scale is None or settings.rtol is None:
-        raise DefinitionError(
-            "derivatives of the flow need the sizes of states: give `scale`."
-        )
+    small, the usual ones.
+
+    If these are not known, a state that is zero is as large as the largest one, and a chart at rest
+    at zero has states of size 1.
+    """
     xp = namespace(q[0])
     largest = ft.reduce(xp.maximum, map(xp.abs, q))
+    if settings.scale is None:
+        most = xp.max(largest, axis=0, initial=0.0)
+        most = xp.where(most > 0, most, 1.0)
+        return xp.where(largest > 0, largest, most)
+    assert settings.rtol is not None
     usual = settings.scale[a, : len(largest)].reshape(len(largest), -1)
     return largest + settings.atol / settings.rtol * usual
 

@@ -111,8 +111,3 @@ def test_a_chain_of_integrators_from_zero():
     t = 10.0
     expected = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
     assert_allclose(found.after[-1][1:], expected, rtol=1e-9)
-
-
-def test_derivatives_need_sizes():
-    with pytest.raises(hj.errors.DefinitionError, match="need the sizes of states"):
-        flow(1.0, 1.0, None, True)

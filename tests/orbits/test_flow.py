@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 
 import hybridjax as hj
 from hybridjax.errors import ComputationError, DefinitionError, Result
@@ -100,6 +101,30 @@ def test_derivatives_through_events_are_those_of_the_closed_form():
     leaves = jax.tree_util.tree_leaves
     for x, y in zip(leaves(own), leaves(true), strict=True):
         assert_allclose(x, y, rtol=1e-11, atol=1e-11)
+
+
+def test_derivatives_at_a_state_of_rest():
+    """Its own error would allow any step, but that of the derivative does not."""
+
+    def field(t, q, u, p):
+        return q[1], -(1 + p.a * jnp.cos(t)) * q[0]
+
+    mathieu = hj.HybridSystem.from_functions(
+        ("x", "v"), field, parameters={"a": 0.5}, period=2 * np.pi, inputs=()
+    )
+
+    def end(q):
+        return hj.flow(mathieu, hj.Guess("main", q), 7.0).state
+
+    def rates(t, columns):
+        x, v = columns[:2], columns[2:]
+        return np.concatenate([v, -(1 + 0.5 * np.cos(t)) * x])
+
+    true = solve_ivp(
+        rates, (0, 7), np.eye(2).ravel(), method="DOP853", rtol=1e-12, atol=1e-14
+    )
+    own = jax.jit(jax.jacfwd(end))(jnp.zeros(2))
+    assert_allclose(own, true.y[:, -1].reshape(2, 2), rtol=1e-9)
 
 
 def test_many_flows_one_of_which_fails():
