@@ -80,6 +80,11 @@ CASES = {
         15,
         "random flows with known zeros: events missed and invented",
     ),
+    "conformance": (
+        "conformance.py random",
+        25,
+        "derivatives of flows through events, against scipy; `rows`, `peers`, `speed`",
+    ),
     "strangers": (
         "strangers.py",
         90,
