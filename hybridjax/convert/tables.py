@@ -26,6 +26,7 @@ from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.branches import Branch
 from ..orbits.cycle import LimitCycle
+from ..orbits.flow import Flow
 from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import PhaseCurve
 from ..orbits.sensitivity import Sensitivity
@@ -56,7 +57,7 @@ def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
     - `Recording`, `SectionData`: a row for each sample, with time and trial;
       `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise,
       with the number of the experiment, the cycle and the section.
-    - `Design`: a row for each cosine. `Trajectory`: a row for each end of a step.
+    - `Design`: a row for each cosine. `Trajectory`, `Flow`: a row for each end of a step.
     - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
     - `PhaseCurve`, `ImpulseResponses`: a row for each value. `Sensitivity`: a row for each event.
       `Identifiability`: a row for each parameter. `PlantCycle`: a row for each section.
@@ -227,6 +228,11 @@ def _samples(thing: Any, sample: np.ndarray, signals: np.ndarray) -> dict[str, A
     names = map(str, (*thing.inputs, *thing.outputs))
     columns = dict(zip(names, signals.T, strict=True))
     return {"cycle": cycle, "section": section, **columns}
+
+
+@_columns.register
+def _(thing: Flow) -> Any:
+    return _columns(thing.require_trajectory())
 
 
 @_columns.register

@@ -95,12 +95,19 @@ class Flow(Showable, eqx.Module):
 
         **Raises:** `DefinitionError` for other flows.
         """
+        return self.require_trajectory().events
+
+    def require_trajectory(self) -> Trajectory:
+        """Return the trajectory.
+
+        **Raises:** `DefinitionError` if there is none.
+        """
         if self.trajectory is None:
             raise DefinitionError(
-                "`events` lists those of a single flow outside of `jax.jit`: read `event_times`, "
-                "`event_index`, `before` and `after` here."
+                "only a single flow outside of `jax.jit` keeps its steps: read `event_times`, "
+                "`event_index`, `before`, `after` and `at(times)` here."
             )
-        return self.trajectory.events
+        return self.trajectory
 
     @property
     def system(self) -> HybridSystem:

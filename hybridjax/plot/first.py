@@ -27,6 +27,7 @@ from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.branches import Branch
 from ..orbits.cycle import LimitCycle
+from ..orbits.flow import Flow
 from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import Coupling, PhaseCurve, Responses
 from ..plants.cycle import PlantCycle
@@ -163,6 +164,12 @@ def _(result: Trajectory, *names: str, ax: AxesLike | None = None) -> Plot:
             panel.axvline(event.time, color=COLORS["gray"], lw=0.5, ls=":")
     plot.axes[-1, 0].set_xlabel(with_unit("time", unit))
     return plot
+
+
+@draw.register
+def _(result: Flow, *names: str, ax: AxesLike | None = None) -> Plot:
+    """The same, of a single flow."""
+    return draw(result.require_trajectory(), *names, ax=ax)
 
 
 @draw.register

@@ -62,6 +62,15 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
     assert third.count == 1
 
 
+def test_figures_and_tables_are_those_of_its_steps():
+    found = hj.flow(ball(), DROP, 1.0)
+    assert found.plot().axes.shape == (2, 1)
+    assert found.to_pandas()["y"].iloc[-1] == found.state[0]
+    many = hj.flow(ball(), hj.Guess("main", jnp.ones((2, 2))), 0.1)
+    with pytest.raises(DefinitionError, match="only a single flow"):
+        many.plot()
+
+
 def test_states_at_times_between():
     times = np.array([0.2, FIRST + 0.1, 1.0])
     charts, states = hj.flow(ball(), DROP, 1.0).at(times)
