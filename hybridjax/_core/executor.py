@@ -88,6 +88,12 @@ def from_host(tree: Any) -> Any:
     return jax.tree_util.tree_map(lambda x: next(arrays) if on_host(x) else x, tree)
 
 
+def some(mask: Array) -> Any:
+    """Whether a mask holds for any lane, also among those that `jax.vmap` maps: a condition for
+    branches that lanes pass through unchanged if they are not in the mask."""
+    return mask.any() if on_host(mask) else jax_compat.some_of_all(mask)
+
+
 def cond(some: Any, yes: Callable, no: Callable, *operands: Any) -> Any:
     """`jax.lax.cond`."""
     if on_host(some):

@@ -13,6 +13,7 @@ import pathlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias, TypeGuard
 
+import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.extend.core as jex
@@ -497,3 +498,10 @@ def bits_of(x: Any) -> int | None:
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         return None
     return jnp.finfo(np.dtype(dtype)).bits
+
+
+def some_of_all(mask: jax.Array) -> jax.Array:
+    """Whether a mask holds anywhere, in all that `jax.vmap` maps: a predicate that stays a single
+    one, so that a branch stays a branch. (If equinox moves its function, `cond` with `mask.any()`
+    does the same, but computes both sides under `vmap`.)"""
+    return eqxi.unvmap_any(mask)

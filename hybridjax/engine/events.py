@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import cond, namespace, put
+from .._core.executor import cond, namespace, put, some
 from .._core.lanes import put_rows
 from ..systems.structure import Kind, Member, Structure
 from ..systems.transition import SAME_TIME, TOGETHER, Scheduled
@@ -264,7 +264,7 @@ def apply_resets(
             new = put(xp.zeros_like(q), slice(s.dims[b]), new)
             return xp.where(here, new, q), xp.where(here, b, chart)
 
-        q, chart = cond(chosen.any(), work, lambda carry: carry, (q, chart))
+        q, chart = cond(some(chosen), work, lambda carry: carry, (q, chart))
     return q, chart
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from .._core.executor import cond, lane, namespace, on_host, put
+from .._core.executor import cond, lane, namespace, on_host, put, some
 from ..errors import DefinitionError
 from ..systems.structure import Structure
 from .arrays import Array, Index, Mask, Padded, Times
@@ -73,7 +73,7 @@ def for_each_chart(s: Structure, chart: Index, mask: Mask, work: Callable, out):
         def present(out, a=a, here=within):
             return work(a, here, out)
 
-        out = cond(within.any(), present, lambda out: out, out)
+        out = cond(some(within), present, lambda out: out, out)
     return out
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
-from .._core.executor import namespace
+from .._core.executor import namespace, some
 from .._core.host_derivatives import NotOnHostError
 from ..systems.structure import Member, Structure
 from ..systems.transition import Scheduled
@@ -112,7 +112,7 @@ def _replayed(
             t, q, _ = carry
             return carry, kept(t, q, q)
 
-        return jax.lax.cond((code != IDLE).any(), move, stay, carry)
+        return jax.lax.cond(some(code != IDLE), move, stay, carry)
 
     def kept(*ends):
         return ends if keeps else None
@@ -128,7 +128,7 @@ def _replayed(
             return carry, kept(*repeated)
 
         _, code, _ = rows
-        return jax.lax.cond((code != IDLE).any(), follow, stay, carry)
+        return jax.lax.cond(some(code != IDLE), follow, stay, carry)
 
     # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
     # mode keeps no more of a block than where it starts.
@@ -174,7 +174,7 @@ def _advance(
             end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
 
-        q1, f1 = jax.lax.cond(here.any(), step, lambda: (q0, q0))
+        q1, f1 = jax.lax.cond(some(here), step, lambda: (q0, q0))
         t1 = t0 + h0
 
         def land():
@@ -182,7 +182,7 @@ def _advance(
             return t1 + zero.past, zero.q
 
         if flow.rows:
-            t1, q1 = jax.lax.cond((crossing >= 0).any(), land, lambda: (t1, q1))
+            t1, q1 = jax.lax.cond(some(crossing >= 0), land, lambda: (t1, q1))
         t_out = jnp.where(here, t1, t_out)
         q_out = q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
         return t_out, q_out

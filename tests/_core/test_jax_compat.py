@@ -329,3 +329,16 @@ def test_annotations_of_numpy():
     array = np.typing.ArrayLike.__args__[0]
     assert jax_compat.is_numpy_annotation(getattr(array, "__origin__", array))
     assert not jax_compat.is_numpy_annotation(np.ndarray)
+
+
+def test_a_branch_on_some_lanes_stays_a_branch_under_vmap():
+    """equinox 0.11 to 0.13: `unvmap_any`."""
+
+    def function(mask):
+        some = jax_compat.some_of_all(mask)
+        return jax.lax.cond(some, lambda: jnp.ones(()), lambda: jnp.zeros(()))
+
+    masks = jnp.array([[False, True], [False, False]])
+    assert "select_n" not in str(jax.make_jaxpr(jax.vmap(function))(masks))
+    assert jax.vmap(function)(masks).tolist() == [1.0, 1.0]
+    assert jax.vmap(function)(masks[1:]).tolist() == [0.0]
