@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.lanes import lane_jvp
-from .._core.results import Result
 from ..systems.structure import Structure
-from .arrays import Array, Inputs
+from .arrays import Array, Index, Inputs
 from .lanes import ARRIVE_TIME, IDLE, Lanes, Tape, blank_tape, fixed, pace_of
 from .move import _search, stride
 from .replay import Ways, replay, replayed_ways
@@ -63,20 +62,24 @@ def pass_through(
     most_events: int,
     new_input: bool,
     times: Float[Array, "K L"],
+    result: Index,
 ) -> Passage:
-    """Flow every lane to its target under a constant input, as `move` does.
+    """Flow every lane to its target under a constant input, as `move` does. Those whose `result`
+    is not OK stay where they are.
 
     Times and states of the end, of the events and at the `times` have exact derivatives of first
     and second order with respect to all floating-point arrays: states, times, inputs, parameters,
     the target.
     """
     options = Options(tape=True, new_input=new_input)
-    return _passed(s, lanes, u, target, times, settings, options, most_events)
+    return _passed(s, lanes, u, target, times, settings, options, most_events, result)
 
 
 @eqx.filter_custom_jvp
-def _passed(s, lanes, u, target, times, settings, options, most_events) -> Passage:
-    moved, tape = _recorded(s, lanes, u, target, settings, options)
+def _passed(
+    s, lanes, u, target, times, settings, options, most_events, result
+) -> Passage:
+    moved, tape = _recorded(s, lanes, u, target, settings, options, result)
     ways = Ways(tape.t, tape.before, tape.after)
     samples = _samples(s, lanes, u, tape, ways, times)
     return Passage(moved, _events(tape, ways, most_events), samples)
@@ -84,9 +87,9 @@ def _passed(s, lanes, u, target, times, settings, options, most_events) -> Passa
 
 @_passed.def_jvp
 def _passed_jvp(primals, tangents):
-    s, lanes, u, target, times, settings, options, most_events = primals
+    s, lanes, u, target, times, settings, options, most_events, result = primals
     still = fixed((s, lanes, u, target))
-    moved, tape = _recorded(*still, settings, options._replace(tangents=True))
+    moved, tape = _recorded(*still, settings, options._replace(tangents=True), result)
     target, levels = target.split()
 
     def repeat(by_lane, common):
@@ -168,9 +171,8 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
     return Lanes(t, chart, q, armed, chart * 0, pace_of(chart * 0))
 
 
-def _recorded(s, lanes, u, target, settings, options) -> tuple[Moved, Tape]:
+def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Tape]:
     first = initial_step(s, lanes, u, target.limit - lanes.t, settings)
-    result = jnp.full(lanes.t.shape, Result.OK, jnp.int32)
     setout = fixed(stride(first))
     recorded = _search(s, lanes, u, target, setout, result, settings, options)
     assert recorded.tape is not None

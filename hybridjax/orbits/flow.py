@@ -113,6 +113,11 @@ class Flow(Showable, eqx.Module):
     def system(self) -> HybridSystem:
         return self.structure.system
 
+    @property
+    def lane_results(self) -> Int[Array, " L"]:
+        """The codes, also of a single flow on an axis."""
+        return namespace(self.result).atleast_1d(self.result)
+
     def at(
         self, times: Annotated[Numbers, Reals("K")]
     ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
@@ -154,6 +159,8 @@ class _Request(eqx.Module):
 
     system: HybridSystem
     lanes: Lanes
+    result: Int[Array, " L"]
+    """Lanes whose code is not OK stay where they are."""
     u: Float[Array, "nu #L"]
     target: Target
     settings: Settings
@@ -259,21 +266,27 @@ def requested(
     check_system(system)
     check_symmetry(system)
     constant = constant_input(system, input)
-    if callable(input):
-        system = current(Driven(system, input))
+    drive = input if callable(input) else None
+    u = constant[:, None]
+    if isinstance(start, Flow) and input is None:
+        before = start.request
+        u = before.u
+        drive = before.system.drive if isinstance(before.system, Driven) else None
+    if drive is not None:
+        system = current(Driven(system, drive))
     s = Structure(system)
     check_schedules(s)
     if isinstance(start, Flow):
-        lanes, many = start.lanes, start.request.many
-        if input is None:
-            constant = start.request.u
+        _require_start(start, s)
+        lanes, many, result = start.lanes, start.request.many, start.lane_results
     else:
         lanes, many = _lanes_of(s, start)
-    u = constant if np.ndim(constant) == 2 else constant[:, None]
+        result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)
     target, ends_in = _target_of(s, lanes, until, events, within)
     return _Request(
         system=system,
         lanes=lanes,
+        result=result,
         u=u,
         target=target,
         settings=settings,
@@ -282,6 +295,21 @@ def requested(
         many=many,
         ends_in=ends_in,
     )
+
+
+def _require_start(start: Flow, s: Structure) -> None:
+    """**Raises:** `DefinitionError` for a flow that failed, or of a system with other charts."""
+    if start.structure.names != s.names or start.structure.dims != s.dims:
+        raise DefinitionError(
+            "`start` is a flow of a system with other charts: give a `hj.Guess`."
+        )
+    if is_traced(start.result) or start.request.many:
+        return
+    if start.result != Result.OK:
+        raise DefinitionError(
+            f"the flow that ended at `start` failed ({Result(int(start.result)).message}): nothing "
+            "can go on from there."
+        )
 
 
 def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:
@@ -388,10 +416,10 @@ def _some(request: _Request, lanes: Int[np.ndarray, " L"]) -> _Request:
         return x[..., lanes] if x.shape[-1] > 1 else x
 
     target, levels = request.target.split()
-    own = request.lanes, request.u, target
-    some, u, target = jax.tree_util.tree_map(of, own)
+    own = request.lanes, request.result, request.u, target
+    some, result, u, target = jax.tree_util.tree_map(of, own)
     return dataclasses.replace(
-        request, lanes=some, u=u, target=target.with_levels(levels)
+        request, lanes=some, result=result, u=u, target=target.with_levels(levels)
     )
 
 
@@ -417,6 +445,7 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
         request.most_events,
         request.new_input,
         jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
+        jnp.asarray(request.result),
     )
     moved, events, _ = passage
     early = jnp.isfinite(target.time) & (target.time < lanes.t)

@@ -71,6 +71,34 @@ def test_figures_and_tables_are_those_of_its_steps():
         many.plot()
 
 
+def test_what_goes_on_from_a_flow():
+    """Its input goes on, too, as a function of time; nothing goes on from a flow that failed."""
+
+    def pushed(t, q, u, p):
+        return (u[0],)
+
+    mass = hj.HybridSystem.from_functions(("x",), pushed)
+    start = hj.Guess("main", (0.0,))
+    first = hj.flow(mass, start, 1.0, input=lambda t: jnp.stack([jnp.cos(t)]))
+    assert_allclose(hj.flow(mass, first, 2.0).state, [np.sin(2.0)], rtol=1e-11)
+    constant = hj.flow(mass, first, 2.0, input=3.0)
+    assert_allclose(constant.state, [np.sin(1.0) + 3.0], rtol=1e-11)
+
+    rests = hj.flow(ball(), DROP, 5.0, throw=False)
+    with pytest.raises(DefinitionError, match=r"`start` failed \(events accum"):
+        hj.flow(ball(), rests, 6.0)
+    with pytest.raises(DefinitionError, match="other charts"):
+        hj.flow(ball(), first, 6.0)
+
+    @jax.jit
+    def program(height):
+        begin = hj.Guess("main", jnp.stack([height, 0.0]))
+        return hj.flow(ball(), hj.flow(ball(), begin, 2.0), 2.1)
+
+    assert program(0.1).result == Result.ZENO
+    assert program(1.0).result == Result.OK
+
+
 def test_states_at_times_between():
     times = np.array([0.2, FIRST + 0.1, 1.0])
     charts, states = hj.flow(ball(), DROP, 1.0).at(times)
