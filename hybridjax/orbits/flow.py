@@ -223,6 +223,8 @@ def flow(
     landing = hj.flow(hopper, start, "touchdown", within=5.0)
     print(landing.t, landing.state)
 
+    import jax
+
     def height(k):
         return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
 
