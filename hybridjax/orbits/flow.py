@@ -596,7 +596,10 @@ def _require_ends(found: Flow) -> None:
             f"{message}, and its derivatives depend on the order. `throw=False` returns the "
             "events."
         )
+    where = ""
+    if not is_traced(lanes):
+        chart = found.structure.names[int(lanes.chart[0])]
+        where = f" at t = {float(lanes.t[0]):.6g} in chart '{chart}'"
     raise ComputationError(
-        f"the flow stopped at t = {float(lanes.t[0]):.6g} in chart "
-        f"'{found.structure.names[int(lanes.chart[0])]}': {message}. `throw=False` returns it."
+        f"the flow stopped{where}: {message}. `throw=False` returns it."
     )

@@ -164,6 +164,20 @@ def test_derivatives_at_a_state_of_rest():
     assert_allclose(own, true.y[:, -1].reshape(2, 2), rtol=1e-9)
 
 
+def test_derivatives_where_states_are_small_for_a_moment():
+    """The foot of the hopper rests on the ground, and leaves it slowly."""
+    hopper = hj.models.VerticalHopper()
+    start = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
+
+    def height(k):
+        return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
+
+    slope = jax.grad(height)(10.0)
+    step = 1e-5
+    difference = (height(10.0 + step) - height(10.0 - step)) / (2 * step)
+    assert_allclose(slope, difference, rtol=1e-7)
+
+
 def test_many_flows_one_of_which_fails():
     """A ball that comes to rest before the end has NaN, and the others are untouched."""
     states = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])

@@ -247,6 +247,9 @@ def _errors(
     error = xp.max(xp.abs(motion) / allowed, axis=0, initial=0.0)
     if change is not None:
         scale = size(settings, a, q, step.q)
+        if settings.scale is None:
+            # (Beside a state that is just small, others would never be accurate enough.)
+            scale = xp.broadcast_to(xp.max(scale, axis=0), scale.shape)
         if along is None:
             scale = _ASIDE * scale
         else:
