@@ -32,7 +32,7 @@ def show(name: str, value: object) -> None:
 # Rows with closed forms.
 
 
-class Chart(hj.Chart):
+class Given(hj.Chart):
     """A chart with a field that is given."""
 
     function: object
@@ -40,6 +40,10 @@ class Chart(hj.Chart):
 
     def field(self, t, q, u):
         return self.function(t, q)
+
+
+def Chart(function, states):  # noqa: N802 (it makes one)
+    return Given(function=function, states=states)
 
 
 class Ramp(hj.HybridSystem):
