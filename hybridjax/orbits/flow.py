@@ -206,7 +206,7 @@ def flow(
       `Flow`, its input.
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
     - `max_events`: number of events of which times and states are kept. Default: 16.
-    - `max_steps`: largest number of steps. Default: 1024.
+    - `max_steps`: largest number of steps, unless `settings` has a larger one. Default: 1024.
     - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
       transformations, `result` has the reason, and times and states are NaN.
 
@@ -264,7 +264,9 @@ def requested(
     settings = Settings() if settings is None else settings
     system = settings.system(system)
     settings = settings.filled(_ACCURACY)
-    settings = Settings(settings.rtol, settings.atol, max_steps, settings.scale)
+    # (Messages name the steps of the settings, which count, too, if they are more.)
+    most = max(max_steps, settings.max_steps)
+    settings = Settings(settings.rtol, settings.atol, most, settings.scale)
     check_system(system)
     check_symmetry(system)
     constant = constant_input(system, input)
