@@ -12,7 +12,7 @@ from .._core.lanes import lane_jvp
 from ..systems.structure import Structure
 from .arrays import Array, Index, Inputs
 from .lanes import ARRIVE_TIME, IDLE, Lanes, Tape, blank_tape, fixed, pace_of
-from .move import _search, stride
+from .move import searched, stride
 from .replay import Ways, replay, replayed_ways
 from .search.search import initial_step
 from .search.state import Moved, Options
@@ -174,7 +174,7 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
 def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Tape]:
     first = initial_step(s, lanes, u, target.limit - lanes.t, settings)
     setout = fixed(stride(first))
-    recorded = _search(s, lanes, u, target, setout, result, settings, options)
+    recorded = searched(s, lanes, u, target, setout, result, settings, options)
     assert recorded.tape is not None
     return recorded.moved, recorded.tape
 

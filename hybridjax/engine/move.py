@@ -110,9 +110,11 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
 
 
 @eqx.filter_jit
-def _search(
+def searched(
     s, lanes, u, target, setout, result, settings, options: Options
 ) -> Recorded:
+    """The search as a program, with the axes that `jax.vmap` maps as more lanes. No derivatives."""
+
     def run(s, target, common, by_lane):
         settings, options = common
         lanes, u, setout, result = by_lane
@@ -137,7 +139,7 @@ def _over_lanes(
 
 @eqx.filter_custom_jvp
 def _move(s, lanes, u, target, setout, result, settings, options: Options) -> Recorded:
-    return _search(s, lanes, u, target, setout, result, settings, options)
+    return searched(s, lanes, u, target, setout, result, settings, options)
 
 
 @_move.def_jvp
@@ -145,7 +147,7 @@ def _move_jvp(primals, tangents):
     s, lanes, u, target, setout, result, settings, options = primals
     taped = options._replace(tape=True, tangents=True)
     still = fixed((s, lanes, u, target, setout))
-    recorded: Recorded = _search(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
+    recorded: Recorded = searched(*still, result, settings, taped)  # pyright: ignore[reportCallIssue]
     primals = s, lanes, u, target, recorded
     ends = _follow_jvp(primals, (*tangents[:4], None))
     return ends if options.tape else tuple(x._replace(tape=None) for x in ends)
