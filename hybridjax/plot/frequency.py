@@ -174,7 +174,8 @@ def bode(
     - `ax`: two Axes, for magnitude and phase; two per name of a dict. Default: a new figure.
 
     **Returns:** `hj.plot.Plot` with `axes` (2, 1), or (2, names) of a dict. Frequencies are in
-    cycles per period, magnitudes in units of the output per unit of the input, phases in degrees.
+    `unit`, magnitudes in units of the output per unit of the input (with `log`, in decibels of
+    these), phases in degrees.
 
     **Raises:** `DefinitionError` for a name or harmonic that does not exist, for fits that have
     none of the inputs, for models without an HTF, for a unit of time without a period, if no
@@ -213,14 +214,7 @@ def bode(
         for number, curve in enumerate(curves):
             color = _OUTPUTS[number % len(_OUTPUTS)]
             label = with_unit(curve.label, "" if same else curve.unit)
-            reference = None
-            for htf in drawn:
-                line = _line(htf, drawn, {"color": color}, label)
-                reference = bode_panels.response(htf, harmonic, curve, line, reference)
-            for htf in fitted:
-                if curve.input in htf.inputs:
-                    line = {**_FIT_STYLE, "zorder": 5}
-                    bode_panels.response(htf, harmonic, curve, line, reference)
+            bode_panels.curve(curve, harmonic, drawn, fitted, color, label)
         for kind in dict.fromkeys(map(type, fits)):
             upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[kind])
         symbol = _name(harmonic)[1:-1]
@@ -282,6 +276,25 @@ class _BodePanels(NamedTuple):
     upper: Axes
     lower: Axes
     scale: _Scale
+
+    def curve(
+        self,
+        curve: "_Curve",
+        harmonic: int,
+        drawn: Sequence[HTF],
+        fitted: Sequence[HTF],
+        color: str,
+        label: str,
+    ) -> None:
+        """Draw one output and input of all HTFs in one color, and of fits in black."""
+        reference = None
+        for htf in drawn:
+            line = _line(htf, drawn, {"color": color}, label)
+            reference = self.response(htf, harmonic, curve, line, reference)
+        for htf in fitted:
+            if curve.input in htf.inputs:
+                line = {**_FIT_STYLE, "zorder": 5}
+                self.response(htf, harmonic, curve, line, reference)
 
     def response(
         self,
