@@ -111,6 +111,55 @@ def test_states_at_times_between():
     assert np.isnan(hj.flow(ball(), DROP, 1.0).at([1.1])[1]).all()
 
 
+def test_a_sample_at_an_event_is_the_state_after_it():
+    found = hj.flow(ball(), DROP, 1.0)
+    first = found.event_times[:1]
+    _, states = found.at(first)
+    assert_allclose(states[0, 1], 0.7 * 9.81 * FIRST, rtol=1e-12)
+
+
+class Thermostat(hj.HybridSystem):
+    """Heats from 18 to 22 degrees, and cools down again."""
+
+    inputs = ()
+
+    def charts(self):
+        class On(hj.Chart):
+            states = ("T",)
+
+            def field(self, t, q, u):
+                return (30.0 - q[0],)
+
+        class Off(hj.Chart):
+            states = ("T",)
+
+            def field(self, t, q, u):
+                return (-q[0],)
+
+        return {"on": On(), "off": Off()}
+
+    def transitions(self):
+        return [
+            hj.Transition("hot", "on", "off", lambda t, q, u: 22.0 - q[0]),
+            hj.Transition("cold", "off", "on", lambda t, q, u: q[0] - 18.0),
+        ]
+
+
+def test_samples_are_those_of_their_charts():
+    found = hj.flow(Thermostat(), hj.Guess("on", (18.0,)), 0.7)
+    hot = np.log(12 / 8)
+    cold = hot + np.log(22 / 18)
+    assert_allclose(found.event_times[:2], [hot, cold], rtol=1e-11)
+    charts, states = found.at([hot - 0.1, hot + 0.1, cold + 0.05])
+    assert charts.tolist() == [0, 1, 0]
+    expected = [
+        30 - 12 * np.exp(0.1 - hot),
+        22 * np.exp(-0.1),
+        30 - 12 * np.exp(-0.05),
+    ]
+    assert_allclose(states[:, 0], expected, rtol=1e-11)
+
+
 def third_bounce(height, g, e):
     start = hj.Guess("main", jnp.stack([height, 0.0]))
     found = hj.flow(ball(g=g, e=e), start, events=3, within=9.0)
