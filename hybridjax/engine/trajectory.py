@@ -14,6 +14,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
+from .._core.executor import is_traced, namespace
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
@@ -386,7 +387,7 @@ def recorded(
     )
 
 
-def constant_input(system: HybridSystem, input) -> np.ndarray:
+def constant_input(system: HybridSystem, input: Any) -> Any:
     """The constant part of an input of the right shape; zero for a function of time."""
     names = system.inputs
     nu = len(names)
@@ -395,14 +396,15 @@ def constant_input(system: HybridSystem, input) -> np.ndarray:
         with evaluating("input, a function of t alone,"):
             shape = jax.eval_shape(lambda t: jnp.asarray(input(t), float), value).shape
     else:
-        value = value if input is None else np.asarray(input, float)
+        if input is not None:
+            value = input if is_traced(input) else np.asarray(input, float)
         shape = value.shape
     if shape not in ((), (nu,)):
         raise DefinitionError(
             f"the input has shape {shape}, but {type(system).__name__} has the inputs "
             f"({', '.join(names)}): give one number for each."
         )
-    return np.broadcast_to(value, (nu,))
+    return namespace(value).broadcast_to(value, (nu,))
 
 
 def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:

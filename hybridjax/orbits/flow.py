@@ -286,6 +286,8 @@ def requested(
     else:
         lanes, many = _lanes_of(s, start)
         result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)
+    if is_traced(system, lanes, until, within, u):
+        lanes = jax.tree_util.tree_map(jnp.asarray, lanes)
     target, ends_in = _target_of(s, lanes, until, events, within)
     return _Request(
         system=system,
@@ -437,19 +439,19 @@ def sampled(request: _Request, times: Float[Array, " K"]) -> tuple[Flow, Samples
 def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Passage:
     """The flow of all lanes, with samples at some times."""
     s = Structure(request.system)
-    lanes, target = jax.tree_util.tree_map(jnp.asarray, (request.lanes, request.target))
-    lanes = lanes._replace(events=lanes.events * 0)
+    target = request.target
+    lanes = request.lanes._replace(events=request.lanes.events * 0)
     times = jnp.zeros(0) if times is None else times
     passage = pass_through(
         s,
         lanes,
-        jnp.asarray(request.u),
+        request.u,
         target,
         request.settings,
         request.most_events,
         request.new_input,
         jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
-        jnp.asarray(request.result),
+        request.result,
     )
     moved, events, _ = passage
     early = jnp.isfinite(target.time) & (target.time < lanes.t)

@@ -99,6 +99,37 @@ def test_what_goes_on_from_a_flow():
     assert program(1.0).result == Result.OK
 
 
+def test_events_are_counted_from_each_start():
+    @jax.jit
+    def program(height):
+        begin = hj.Guess("main", jnp.stack([height, 0.0]))
+        second = hj.flow(ball(), begin, events=2, within=3.0)
+        return hj.flow(ball(), second, events=2, within=3.0)
+
+    fourth = program(1.0)
+    assert_allclose(fourth.t, FIRST * (1 + 2 * (0.7 + 0.49 + 0.343)), rtol=1e-12)
+    assert fourth.count == 2
+
+
+def test_an_event_that_another_has_caused_at_once_happens_after_a_break():
+    """The first reset leads across the guard of the second event."""
+
+    def sink(t, q, u, p):
+        return -1.0, -1.0
+
+    events = [
+        ("first", lambda t, q, u, p: q[0], lambda t, q, u, p: (3.0, -1.0)),
+        ("second", lambda t, q, u, p: q[1], lambda t, q, u, p: (q[0], 10.0)),
+    ]
+    system = hj.HybridSystem.from_functions(("y", "z"), sink, events)
+    start = hj.Guess("main", (1.0, 5.0))
+    whole = hj.flow(system, start, 1.5)
+    assert [event.name for event in whole.events] == ["first", "second"]
+    broken = hj.flow(system, hj.flow(system, start, "first", within=2.0), 1.5)
+    assert_allclose(broken.state, whole.state, rtol=1e-12)
+    assert_allclose(broken.state, (2.5, 9.5), rtol=1e-12)
+
+
 def test_states_at_times_between():
     times = np.array([0.2, FIRST + 0.1, 1.0])
     charts, states = hj.flow(ball(), DROP, 1.0).at(times)
@@ -189,6 +220,35 @@ def test_derivatives_through_events_are_those_of_the_closed_form():
         assert_allclose(x, y, rtol=1e-11, atol=1e-11)
 
 
+def test_derivatives_by_the_end_the_section_the_input_and_times_between():
+    """Each alone is traced, beside a start that is not."""
+
+    def pushed(t, q, u, p):
+        return q[1], u[0]
+
+    mass = hj.HybridSystem.from_functions(("x", "v"), pushed)
+    start = hj.Guess("main", (0.0, 1.0))
+
+    def by_end(t):
+        return hj.flow(mass, start, t, input=2.0).state[0]
+
+    def by_input(u):
+        return hj.flow(mass, start, 3.0, input=u).state[0]
+
+    def by_section(x):
+        section = hj.Crossing("x", "rising", x)
+        return hj.flow(mass, start, section, within=9.0, input=2.0).t
+
+    def by_time(t):
+        return hj.flow(mass, start, 3.0, input=2.0).at(jnp.stack([t]))[1][0, 0]
+
+    # x = t + t^2, or t + u t^2 / 2.
+    assert_allclose(jax.grad(by_end)(3.0), 7.0, rtol=1e-12)
+    assert_allclose(jax.grad(by_input)(2.0), 4.5, rtol=1e-12)
+    assert_allclose(jax.grad(by_section)(12.0), 1 / 7.0, rtol=1e-11)
+    assert_allclose(jax.grad(by_time)(1.5), 4.0, rtol=1e-12)
+
+
 def test_derivatives_at_a_state_of_rest():
     """Its own error would allow any step, but that of the derivative does not."""
 
@@ -247,6 +307,19 @@ def test_many_flows_one_of_which_fails():
     assert np.isnan(slopes[1]).all()
     by_one = jax.grad(height)(states[0])
     assert_allclose(slopes[0], by_one, rtol=1e-11)
+
+
+def test_so_many_flows_that_they_are_computed_part_by_part():
+    height = np.linspace(0.5, 2.0, 1030)
+    states = np.stack([height, 0 * height], axis=1)
+    found = hj.flow(ball(), hj.Guess("main", states), events=2, within=3.0)
+    assert_allclose(found.t, np.sqrt(2 * height / 9.81) * 2.4, rtol=1e-11)
+
+
+def test_an_end_before_the_start_is_a_code_in_programs():
+    program = jax.jit(lambda end: hj.flow(ball(), DROP, end))
+    assert program(-1.0).result == Result.BAD_INPUT
+    assert program(0.1).result == Result.OK
 
 
 class Pair(hj.HybridSystem):
