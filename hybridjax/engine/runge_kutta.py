@@ -175,6 +175,10 @@ def short_step(
     return q + h * slope, h * xp.maximum(xp.abs(slope - k2), xp.abs(slope - k3))
 
 
+# Relative change at which increments are settled: a few rounding errors. Larger: steps have errors
+# of this size. Smaller: iterations go on without an end.
+_SETTLED = 4.0 * float(np.finfo(float).eps)
+
 # Implicit methods. The increments w_i = h f(t + c_i h, q + sum_j a_ij w_j) of all stages are solved
 # for together, by Newton's method with the Jacobian J of the field at the start of the step. Its
 # linear systems (1 - h A x J) dw = r are decoupled as by E. Hairer and G. Wanner, Solving Ordinary
@@ -213,27 +217,11 @@ def _implicit_step(
     derivatives, by the implicit function theorem.
     """
     start = [jax.lax.stop_gradient(x) for x in (t, q, h)]
-    w, left, J = _increments(method, still or field, *start)
+    w, left, J = increments(method, still or field, *start)
     if still is not None:
         w = _with_derivatives(method, field, still, (t, q, h), w)
+    estimate, local = errors(method, w, left, J, start[2])
     change = _contract(method.b, w)
-    plain = _contract(method.error, w)
-    rough = _contract(method.rough or np.zeros(len(method.b)), w)
-    estimate = plain
-    if method.filter:
-        shift = _shifted(J, method.filter * start[2])
-        estimate = _apply(inverse(shift), plain)
-
-    # The method has a higher order than the estimate where it is smooth: the ratio of two estimates
-    # takes the place of the step. It has not where a fast mode was excited, by however little, and
-    # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
-    def divide(x):
-        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
-
-    ratio = jnp.where(rough == 0, 1.0, jnp.maximum(divide(rough), 1 - divide(plain)))
-    powers = round(method.order - method.order / method.gain)
-    local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
-    estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     end = q + change
     f0 = field(t, q)
     f1 = field(t + h, end)
@@ -260,15 +248,45 @@ def step_along(
     return value, tangent.q, tangent.estimate
 
 
-def _increments(method, field, t, q, h):
+def errors(
+    method: Method, w: Float[Array, "s n L"], left: States, J, h: AnyTimes
+) -> tuple[States, States]:
+    """The embedded estimate of a step, and that of its error, however little is excited.
+
+    **Arguments:** `w`: increments of the stages, which are right but for `left`. `J`: the Jacobian
+    of the field at the start.
+    """
+    plain = _contract(method.error, w)
+    rough = _contract(method.rough or np.zeros(len(method.b)), w)
+    estimate = plain
+    if method.filter:
+        shift = _shifted(J, method.filter * h)
+        estimate = _apply(inverse(shift), plain)
+
+    # The method has a higher order than the estimate where it is smooth: the ratio of two estimates
+    # takes the place of the step. It has not where a fast mode was excited, by however little, and
+    # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
+    def divide(x):
+        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
+
+    ratio = jnp.where(rough == 0, 1.0, jnp.maximum(divide(rough), 1 - divide(plain)))
+    powers = round(method.order - method.order / method.gain)
+    local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
+    estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
+    return estimate, local
+
+
+def increments(method, field, t, q, h, small: float = _SETTLED):
     """Increments (s, n, L) by Newton's method, their last change (n, L), and the Jacobian (n, n, L)
-    at the start."""
+    at the start.
+
+    **Arguments:** `small`: change at which a component is settled, relative to its size.
+    """
     J = _jacobian(field, t, q)
     c = np.array(method.c)[:, None]
     left, R, right = _decoupled(method)
     solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
     evaluate = jax.vmap(field)
-    small = 4.0 * jnp.finfo(q.dtype).eps  # a few rounding errors
 
     def correction(w):
         stages = q + _contract(method.a, w)
@@ -309,18 +327,68 @@ def _with_derivatives(method, field, still, start, w):
     t, q, h = start
     A = np.array(method.a)
     times = t + np.array(method.c)[:, None] * h
-    s, n, L = w.shape
-    fixed = jax.lax.stop_gradient
-    jacobians = jax.vmap(ft.partial(_jacobian, still))
-    J = jacobians(fixed(times), fixed(q + _contract(A, w)))
-    coupled = jnp.einsum("ij,iabL->iajbL", A, J).reshape(s * n, s * n, L)
-    newton = inverse(_shifted(coupled, fixed(h)))
+    fixed = [jax.lax.stop_gradient(x) for x in start]
+    equations = StageEquations.at(method, still, *fixed, w)
     for _ in range(2):
         stages = q + _contract(A, w)
         residual = h * jax.vmap(field)(times, stages) - w
-        correction = _apply(newton, residual.reshape(s * n, L))
-        w = w + correction.reshape(s, n, L)
+        w = w + equations.solve(residual)
     return w
+
+
+class StageEquations(NamedTuple):
+    """The Jacobian of the equations of all stages together, factored by blocks of one stage each.
+
+    Block (i, j) is 1 - h a_ii J_i on the diagonal, which is not singular in steps that resolve the
+    field, and - h a_ij J_i beside it.
+    """
+
+    inverses: tuple[Float[Array, "n n L"], ...]
+    """Of the blocks on the diagonal, once those before are eliminated."""
+    lower: dict[tuple[int, int], Float[Array, "n n L"]]
+    """Multiples of earlier rows of blocks that are taken from later ones."""
+    upper: dict[tuple[int, int], Float[Array, "n n L"]]
+
+    @classmethod
+    def at(
+        cls, method: Method, field: LaneField, t, q, h, w: Float[Array, "s n L"]
+    ) -> "StageEquations":
+        """Those at increments w of a step from (t, q) over h."""
+        A = np.array(method.a)
+        times = t + np.array(method.c)[:, None] * h
+        J = jax.vmap(ft.partial(_jacobian, field))(times, q + _contract(A, w))
+        stages = range(len(A))
+        # Blocks that are not zero, those before stage k eliminated.
+        rest = {(i, j): -A[i, j] * h * J[i] for i, j in np.argwhere(A).tolist()}
+        for k in stages:
+            rest[k, k] = jnp.eye(len(q))[..., None] + rest.get((k, k), 0.0)
+        inverses = []
+        lower: dict[tuple[int, int], Array] = {}
+        for k in stages:
+            inverses.append(inverse(rest[k, k]))
+            later = stages[k + 1 :]
+            for i in later:
+                if (i, k) not in rest:
+                    continue
+                lower[i, k] = _product(rest[i, k], inverses[k])
+                for j in later:
+                    if (k, j) in rest:
+                        taken = _product(lower[i, k], rest[k, j])
+                        rest[i, j] = rest.get((i, j), 0.0) - taken
+        upper = {(k, j): block for (k, j), block in rest.items() if j > k}
+        return cls(tuple(inverses), lower, upper)
+
+    def solve(self, right: Float[Array, "s n L"]) -> Float[Array, "s n L"]:
+        """The solution of the linear equations with this right side."""
+        rows = list(right)
+        for (i, k), factor in self.lower.items():
+            rows[i] = rows[i] - _apply(factor, rows[k])
+        for k in reversed(range(len(rows))):
+            for j in range(k + 1, len(rows)):
+                if (k, j) in self.upper:
+                    rows[k] = rows[k] - _apply(self.upper[k, j], rows[j])
+            rows[k] = _apply(self.inverses[k], rows[k])
+        return jnp.stack(rows)
 
 
 def _jacobian(field: LaneField, t, q) -> Float[Array, "n n L"]:
@@ -340,6 +408,12 @@ def _apply(
     matrix: Inexact[Array, "n m #L"], x: Inexact[Array, "m L"]
 ) -> Inexact[Array, "n L"]:
     return jnp.sum(matrix * x, axis=1)
+
+
+def _product(
+    matrix: Float[Array, "n m #L"], other: Float[Array, "m k #L"]
+) -> Float[Array, "n k L"]:
+    return jnp.sum(matrix[:, :, None] * other, axis=1)
 
 
 def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:

@@ -46,6 +46,9 @@ _SMALL = 0.5
 # Steps of an itinerary for each one that the search took, first for all systems, then for those
 # whose errors are too large. More: turns last longer. Fewer: more systems need the second.
 _DENSITY, _FINER = 0.9, 2.0
+# The same of implicit methods. More: turns last longer. Fewer: where fast phases lie in other parts
+# of the period, as beside relaxation oscillators, most systems need finer steps.
+_IMPLICIT_DENSITY = 3.0
 # Steps of the second integration for each one of the first: they share no node.
 _OTHER = 0.83
 # Largest distance, in sizes of the states, of the end of the second integration from its beginning,
@@ -150,8 +153,7 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     map = to_host(map)
     pieces = side_by_side(to_host(map.pieces())) if turn is None else turn
     s, levels = map.structure, levels_of(map)
-    # (Steps of implicit methods differ much in length: joined ones have large errors.)
-    density = _FINER if has_implicit(s) else _DENSITY
+    density = _IMPLICIT_DENSITY if has_implicit(s) else _DENSITY
     densities = density, density * _FINER, density * _OTHER
     first, finer, other = (recorded(s, pieces, levels, x) for x in densities)
     begin = map.anchor.t[0]

@@ -509,3 +509,22 @@ def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     for _ in range(4):  # (by a search, and by the known itinerary)
         beside = hj.find_limit_cycle(Window(1.0), cycle, throw=False)
         assert beside.result != hj.errors.Result.OK or beside.event_sequence
+
+
+def test_a_guard_that_a_reset_puts_on_its_zero_is_not_about_to_fall(monkeypatch):
+    """The compass walker's guard is zero after heelstrike, but for rounding of either sign, and
+    falls. On the cycles of its neighbors it has not passed its zero again."""
+    monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
+    # (Systems that seem to leave the itinerary would be searched.)
+    monkeypatch.setattr(batches.Tiles, "solve", None)
+    monkeypatch.setattr(limit_cycles, "_search", None)
+    hip, leg = np.meshgrid(np.linspace(9.5, 10.5, 6), np.linspace(4.9, 5.1, 6))
+    make = eqx.filter_vmap(lambda mH, m: hj.models.CompassGait(mH=mH, m=m))
+    systems = make(jnp.asarray(hip.ravel()), jnp.asarray(leg.ravel()))
+
+    guess = hj.find_limit_cycle(hj.models.CompassGait())
+    cycles = hj.orbits.find_limit_cycles(systems, guess)
+
+    assert cycles.ok.all()
+    alone = hj.find_limit_cycle(cycles[0].system)
+    assert_allclose(cycles.period[0], alone.period, rtol=1e-9)

@@ -296,8 +296,12 @@ class Bodies:
             stages = [self._lane(self._rates, a, part) for a in charts]
             return choose(motion, place, stages, motion.join(course, y))[0]
 
-        y, error = steps.unit_step(solver, rates, motion.part(course, "y"))
-        return y, motion.values(error)[..., 0, :]
+        def packed_rates(part, y):
+            return motion.pack(rates(part, motion.unpack(y)))
+
+        begin = motion.pack(motion.part(course, "y"))
+        y, error = steps.unit_step(solver, packed_rates, begin)
+        return motion.unpack(y), motion.values(motion.unpack(error))[..., 0, :]
 
     def _rates(self, a: int, part, s: Structure, _, moving, notes):
         """Rates of the state and of its columns within a step of chart a."""

@@ -111,7 +111,11 @@ def noted(
     if due.size:
         lost = lost & ~due[_fired(form, s, row)]
     left = flags.left | is_new | lost | _has_left(row, flags.before, now)
-    return flags._replace(before=now, left=left), due
+    # (A guard that a reset has put on its zero is no more to fall than on the recorded trajectory,
+    # whichever sign rounding gives it.)
+    at_zero = jnp.abs(now.value) <= SAME_TIME * duration * jnp.abs(now.rate)
+    value = jnp.where((row.signs == 0) & at_zero, 0.0, now.value)
+    return flags._replace(before=now._replace(value=value), left=left), due
 
 
 def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from ..._core.loops import pushed
@@ -37,6 +38,13 @@ class Alone(NamedTuple):
     def values(self, moving: Any) -> Any:
         return moving
 
+    def pack(self, moving: Any) -> Array:
+        """One array of what moves."""
+        return moving
+
+    def unpack(self, moving: Array) -> Any:
+        return moving
+
 
 class InDirections(NamedTuple):
     """What moves is a pair: its values, and their derivatives in directions on the first axis."""
@@ -61,6 +69,14 @@ class InDirections(NamedTuple):
 
     def values(self, moving: Any) -> Any:
         return moving[0]
+
+    def pack(self, moving: Any) -> Array:
+        """One array of what moves: the values, then their derivatives."""
+        values, columns = moving
+        return jnp.concatenate([values[None], columns])
+
+    def unpack(self, moving: Array) -> Any:
+        return moving[0], moving[1:]
 
 
 Motion: TypeAlias = Alone | InDirections

@@ -15,8 +15,12 @@ from jaxtyping import Array, Float
 
 from ...systems.solver import Method
 from ...systems.structure import Structure
-from ..runge_kutta import take_step
+from ..runge_kutta import StageEquations, errors, increments
 
+
+# Change at which Newton's method for the stages of a state ends, relative to its size. Larger: two
+# further steps do not reach rounding in the columns. Smaller: they follow too late.
+_NEAR = 1e-9
 
 Solver: TypeAlias = Any
 """A solver of diffrax, or an implicit `Method`."""
@@ -100,25 +104,29 @@ def implicit_step(
     h,
     inputs: Float[Array, "C nu"] | None,
 ) -> tuple[Float[Array, "1+C n"], Float[Array, " n"]]:
-    """A state and its columns after a step of an implicit method from t to t + h, as derivatives of
-    the whole step, and the state's estimated error."""
+    """A state and its columns after a step of an implicit method from t to t + h, and the state's
+    estimated error.
 
-    def whole(q, u):
-        def of_lane(t, q):
-            return s.field(a, t, q, u)
+    Newton's method for the stages of the state comes near their solution. Two steps of it follow
+    for the state and its columns together, with the same matrix: the second one gives them their
+    first derivatives in directions from outside, by the implicit function theorem.
+    """
+    A, c = np.array(method.a), np.array(method.c)
 
-        def lanes(t, q):
-            return jax.vmap(lambda q: of_lane(t[0], q), -1, -1)(q)
+    def lanes(t, q):
+        return jax.vmap(lambda q: field(s, a, t[0], q), -1, -1)(q)
 
-        end = take_step(method, lanes, t[None], q[:, None], h[None], still=lanes)
-        return end.q[:, 0], end.error[:, 0]
-
-    still = jnp.zeros(s.nu)
-    if inputs is None:
-        step = jax.linearize(lambda q: whole(q, still), y[0], has_aux=True)
-        end, linear, error = step
-        columns = jax.vmap(linear)(y[1:])
-    else:
-        end, linear, error = jax.linearize(whole, y[0], still, has_aux=True)
-        columns = jax.vmap(linear)(y[1:], inputs)
-    return jnp.concatenate([end[None], columns]), error
+    begin = jax.lax.stop_gradient((t[None], y[0][:, None], h[None]))
+    near, _, J = increments(method, lanes, *begin, small=_NEAR)
+    equations = StageEquations.at(method, lanes, *begin, near)
+    # (From here on, the columns stand where lanes do.)
+    w = jnp.concatenate([near, jnp.zeros((*near.shape[:2], len(y) - 1))], axis=2)
+    for _ in range(2):
+        stages = y.T + jnp.tensordot(A, w, 1)
+        along = jax.vmap(lambda t, y: rates(s, a, t, y.T, inputs).T)(t + c * h, stages)
+        change = equations.solve(h * along - w)
+        w = w + change
+    left = jnp.max(jnp.abs(change[..., :1]), axis=0)
+    of_state = jax.lax.stop_gradient((w[..., :1], left))
+    _, error = errors(method, *of_state, J, begin[2])
+    return y + jnp.tensordot(np.array(method.b), w, 1).T, error[:, 0]
