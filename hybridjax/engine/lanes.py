@@ -95,6 +95,38 @@ def fixed(tree):
     return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
+# A number that is no zero leaves all bounds if it is multiplied twice by this one. Smaller: small
+# derivatives of lanes that failed are kept. (It must be finite: zero times infinity is NaN.)
+_LARGE = 1e300
+
+
+def nan_where(failed: Mask, x: Array) -> Array:
+    """x, with NaN for the lanes that failed. Their derivatives are NaN, too, where they are used.
+
+    A lane whose result nobody uses has a derivative of zero in reverse mode. It stays zero: zero
+    times NaN would be NaN, and would reach the parameters, which all lanes share.
+    """
+    if on_host(x):
+        return np.where(failed, np.nan, x)
+    return _nan_where(failed, x)
+
+
+@jax.custom_jvp
+def _nan_where(failed: Mask, x: Array) -> Array:
+    return jnp.where(failed, jnp.nan, x)
+
+
+@_nan_where.defjvp
+def _nan_where_jvp(primals, tangents):
+    failed, x = primals
+    _, t_x = tangents
+    large = jnp.where(failed, _LARGE, 1.0)
+    none = jnp.where(failed, 0.0, 1.0)
+    # (Infinity times zero is NaN, from the left, and in reverse mode from the right.)
+    spoiled = t_x * large * large * none * large * large
+    return _nan_where(failed, x), spoiled
+
+
 def needed(mask: Mask, tree):
     """`tree` itself, without derivatives if `mask` has no lanes.
 

@@ -16,13 +16,13 @@ from .._core.boundary.values import Reals
 from .._core.compilation import quick_jit
 from .._core.executor import Array, is_traced, namespace
 from .._core.findings import Finding, print_findings, warn_of
-from .._core.meaning import current
+from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
 from ..engine.flow import Events, Passage, Samples, pass_through
-from ..engine.lanes import Lanes, lane_at, start_lanes
+from ..engine.lanes import Lanes, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until as until_time
@@ -129,6 +129,7 @@ class Flow(Showable, eqx.Module):
         **Returns:** `charts` (K,), their indices, and `states` (K, d).
         """
         require_x64(self)
+        require_as_made(self.system, "this flow was computed")
         samples = _program(self.request, jnp.asarray(times)).samples
         chart = jnp.moveaxis(samples.chart, -1, 0)
         q = jnp.moveaxis(samples.q, -1, 0)
@@ -442,6 +443,10 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
     target = request.target
     lanes = request.lanes._replace(events=request.lanes.events * 0)
     times = jnp.zeros(0) if times is None else times
+    early = jnp.isfinite(target.time) & (target.time < lanes.t)
+    # (A time that is infinite or NaN is the limit, too.)
+    bad = early | ~jnp.isfinite(target.limit)
+    begin = update_result(request.result, bad, Result.BAD_INPUT)
     passage = pass_through(
         s,
         lanes,
@@ -451,13 +456,11 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
         request.most_events,
         request.new_input,
         jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
-        request.result,
+        begin,
     )
     moved, events, _ = passage
-    early = jnp.isfinite(target.time) & (target.time < lanes.t)
-    result = update_result(moved.result, early, Result.BAD_INPUT)
     result = update_result(
-        result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
+        moved.result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
     )
     return passage._replace(moved=moved._replace(result=result))
 
@@ -489,9 +492,7 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
     s = Structure(request.system)
     moved = passage.moved
     xp = namespace(moved.lanes.t)
-    arrived = moved.result == Result.OK
-    # (A factor makes derivatives NaN, too.)
-    keep = xp.where(arrived, 1.0, xp.nan)
+    failed = moved.result != Result.OK
     n = s.d if request.ends_in is None else s.dims[request.ends_in]
     events = passage.events
 
@@ -500,8 +501,8 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
         return x if request.many else x[0]
 
     return Flow(
-        t=of_lanes(keep * moved.lanes.t),
-        state=of_lanes(keep * moved.lanes.q[:n]),
+        t=of_lanes(nan_where(failed, moved.lanes.t)),
+        state=of_lanes(nan_where(failed, moved.lanes.q[:n])),
         chart=of_lanes(moved.lanes.chart),
         result=of_lanes(moved.result),
         event_times=of_lanes(events.t),

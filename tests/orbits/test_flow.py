@@ -309,6 +309,37 @@ def test_many_flows_one_of_which_fails():
     assert_allclose(slopes[0], by_one, rtol=1e-11)
 
 
+def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
+    """They share the parameters. What uses the flow that failed has no derivative."""
+    starts = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
+    times = jnp.array([0.4, 0.8])
+
+    def of_batch(g):
+        found = hj.flow(ball(g=g), hj.Guess("main", starts), 0.9, throw=False)
+        return found.result, found.state[:, 0], found.at(times)[1][:, :, 0].sum(axis=1)
+
+    def of_each(g):
+        def one(start):
+            found = hj.flow(ball(g=g), hj.Guess("main", start), 0.9)
+            return found.result, found.state[0], found.at(times)[1][:, 0].sum()
+
+        return jax.vmap(one)(starts)
+
+    def heights(g, flows):
+        result, *parts = flows(g)
+        return sum(jnp.where(result == 0, part, 0.0) for part in parts)
+
+    step = 1e-4
+    for flows in (of_batch, of_each):
+        ahead, back = heights(9.81 + step, flows), heights(9.81 - step, flows)
+        by_difference = (ahead - back) / (2 * step)
+        for jacobian in (jax.jacrev, jax.jacfwd):
+            slopes = jacobian(heights)(9.81, flows)
+            assert_allclose(slopes, by_difference, rtol=1e-6)
+    total = jax.grad(lambda g: of_batch(g)[1].sum())(9.81)
+    assert np.isnan(total)
+
+
 def test_so_many_flows_that_they_are_computed_part_by_part():
     height = np.linspace(0.5, 2.0, 1030)
     states = np.stack([height, 0 * height], axis=1)
@@ -318,8 +349,40 @@ def test_so_many_flows_that_they_are_computed_part_by_part():
 
 def test_an_end_before_the_start_is_a_code_in_programs():
     program = jax.jit(lambda end: hj.flow(ball(), DROP, end))
-    assert program(-1.0).result == Result.BAD_INPUT
+    for end in (-1.0, np.nan, np.inf):
+        assert program(end).result == Result.BAD_INPUT
     assert program(0.1).result == Result.OK
+
+
+@pytest.mark.parametrize("time", [0.0, 5.0])
+def test_a_flow_that_ends_where_it_starts(time):
+    start = hj.Guess("main", (1.0, 2.0), time)
+    found = hj.flow(ball(), start, time)
+    assert found.t == time
+    assert found.count == 0
+    assert_allclose(found.state, (1.0, 2.0))
+
+    def end(t):
+        return hj.flow(ball(), start, t).state
+
+    assert_allclose(jax.jit(end)(time), (1.0, 2.0))
+    assert_allclose(jax.jit(jax.jacfwd(end))(time), (2.0, -9.81))
+
+
+GRAVITY = 9.81
+
+
+def test_states_between_of_a_system_that_has_changed(monkeypatch):
+    def fall(t, q, u, p):
+        return q[1], -GRAVITY
+
+    stone = hj.HybridSystem.from_functions(("y", "v"), fall)
+    found = hj.flow(stone, DROP, 1.0)
+    assert_allclose(found.at([1.0])[1][0], found.state)
+    monkeypatch.setitem(globals(), "GRAVITY", 1.62)
+    with pytest.raises(DefinitionError, match="has changed since this flow was comp"):
+        found.at([1.0])
+    assert_allclose(hj.flow(stone, DROP, 1.0).state, (1 - 0.81, -1.62))
 
 
 class Pair(hj.HybridSystem):
