@@ -369,6 +369,46 @@ def test_a_flow_that_ends_where_it_starts(time):
     assert_allclose(jax.jit(jax.jacfwd(end))(time), (2.0, -9.81))
 
 
+@pytest.mark.parametrize("transformed", [jax.grad, jax.vmap, jax.jit])
+def test_functions_of_values_that_are_traced(transformed):
+    """JAX would lose the derivatives by what a function reads otherwise than by its arguments."""
+
+    def pushed(t, q, u, p):
+        return q[1], u[0]
+
+    mass = hj.HybridSystem.from_functions(("x", "v"), pushed)
+    start = hj.Guess("main", (0.0, 1.0))
+
+    def by_section(x):
+        def distance(t, q):
+            return q[0] - x
+
+        section = hj.Crossing(distance, "rising")
+        return hj.flow(mass, start, section, within=9.0, input=2.0).t
+
+    def by_input(k):
+        def growing(t):
+            return k * t
+
+        return hj.flow(mass, start, 3.0, input=growing).t
+
+    def by_field(k):
+        def field(t, q, u, p):
+            return q[1], k * q[0]
+
+        system = hj.HybridSystem.from_functions(("x", "v"), field)
+        return hj.flow(system, start, 3.0).t
+
+    value = jnp.ones(3) if transformed is jax.vmap else 1.0
+    every = {by_section: "distance", by_input: "growing", by_field: "field"}
+    for function, name in every.items():
+        for program in (transformed(function), jax.jit(transformed(function))):
+            with pytest.raises(
+                DefinitionError, match=f"{name}` reads a value that JAX"
+            ):
+                program(value)
+
+
 GRAVITY = 9.81
 
 
