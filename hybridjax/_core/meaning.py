@@ -106,8 +106,9 @@ def code_digest(x: Definition) -> str:
     If JAX remembers a trace of a function that computes something else now, its caches are cleared.
 
     **Raises:** `DefinitionError` for a part of a system that computes another value each time, for
-    a function that reads a value which JAX traces, and for another definition whose code reads files, the clock, random numbers, or values by names
-    that are computed (`eval`, `globals`, `sys.modules`, ...).
+    a function that reads a value which JAX traces, and for another definition whose code reads
+    files, the clock, random numbers, or values by names that are computed (`eval`, `globals`,
+    `sys.modules`, ...).
     """
     digest = once_in_call(("digest", _identity(x)), x, lambda: _digest_of(x))
     if x.code_digest not in ("", digest) and _are_many(x):
