@@ -100,7 +100,7 @@ def fixed(tree):
 _LARGE = 1e300
 
 
-def nan_where(failed: Mask, x: Array) -> Array:
+def nan_where(failed: Mask, x: Float[Array, "*K n L"]) -> Float[Array, "*K n L"]:
     """x, with NaN for the lanes that failed. Their derivatives are NaN, too, where they are used.
 
     A lane whose result nobody uses has a derivative of zero in reverse mode. It stays zero: zero
@@ -112,7 +112,7 @@ def nan_where(failed: Mask, x: Array) -> Array:
 
 
 @jax.custom_jvp
-def _nan_where(failed: Mask, x: Array) -> Array:
+def _nan_where(failed, x):
     return jnp.where(failed, jnp.nan, x)
 
 
@@ -124,7 +124,9 @@ def _nan_where_jvp(primals, tangents):
     none = jnp.where(failed, 0.0, 1.0)
     # (Infinity times zero is NaN, from the left, and in reverse mode from the right.)
     spoiled = t_x * large * large * none * large * large
-    return _nan_where(failed, x), spoiled
+    # (A number that does not change has NaN, too, where others of its lane do.)
+    others = jnp.sum(spoiled, axis=-2, keepdims=True)
+    return _nan_where(failed, x), spoiled + jnp.where(failed, others, 0.0)
 
 
 def needed(mask: Mask, tree):

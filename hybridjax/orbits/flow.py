@@ -494,6 +494,8 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
     xp = namespace(moved.lanes.t)
     failed = moved.result != Result.OK
     n = s.d if request.ends_in is None else s.dims[request.ends_in]
+    end = xp.concatenate([moved.lanes.t[None], moved.lanes.q[:n]])
+    end = nan_where(failed, end)
     events = passage.events
 
     def of_lanes(x):
@@ -501,8 +503,8 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
         return x if request.many else x[0]
 
     return Flow(
-        t=of_lanes(nan_where(failed, moved.lanes.t)),
-        state=of_lanes(nan_where(failed, moved.lanes.q[:n])),
+        t=of_lanes(end[0]),
+        state=of_lanes(end[1:]),
         chart=of_lanes(moved.lanes.chart),
         result=of_lanes(moved.result),
         event_times=of_lanes(events.t),

@@ -192,9 +192,9 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
         missed = followed_at_once(s, on_section, u, at_event, period)
         result = update_result(result, missed >= 0, Result.EVENT_ORDER)
     failed = result != Result.OK
-    t = nan_where(failed, end.t)
-    q = nan_where(failed, end.q[: map.dims[1]])
-    return Arrival(t, q, result)
+    n = map.dims[1]
+    arrival = nan_where(failed, xp.concatenate([end.t[None], end.q[:n]]))
+    return Arrival(arrival[0], arrival[1:], result)
 
 
 _arrivals_on_host = on_the_host(_arrivals)

@@ -340,6 +340,58 @@ def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
     assert np.isnan(total)
 
 
+class Wall(hj.HybridSystem):
+    """A swing that may hit a wall at 1, and loses half of its speed there."""
+
+    inputs = ()
+
+    def charts(self):
+        class Swing(hj.Chart):
+            states = ("x", "v")
+
+            def field(self, t, q, u):
+                return q[1], -q[0]
+
+        return {"swing": Swing()}
+
+    def transitions(self):
+        def distance(t, q, u):
+            return 1.0 - q[0]
+
+        def stop(t, q, u):
+            return q[0], -0.5 * q[1]
+
+        return [hj.Transition("hit", "swing", "swing", distance, reset=stop)]
+
+
+def test_a_guard_that_is_touched():
+    """Rounding decides whether the wall is hit, and would be the derivative."""
+
+    @jax.jit
+    def swing(a):
+        return hj.flow(Wall(), hj.Guess("swing", jnp.stack([-a, 0.0])), 4.0)
+
+    def end(a):
+        return swing(a).state[0]
+
+    for a in (1.0, 1.0 + 1e-14, 1.0 + 1e-12):
+        assert swing(a).result == Result.GRAZING
+        assert np.isnan(jax.grad(end)(a))
+        assert np.isnan(jax.jacfwd(end)(a))
+        with pytest.raises(ComputationError, match="tangentially"):
+            hj.flow(Wall(), hj.Guess("swing", (-a, 0.0)), 4.0)
+
+    def exact(a):
+        hit = jnp.pi - jnp.arccos(1 / a)
+        left = 4.0 - hit
+        return jnp.cos(left) - 0.5 * a * jnp.sin(hit) * jnp.sin(left)
+
+    for a in (1.0 + 1e-6, 1.1):
+        assert_allclose(end(a), exact(a), rtol=1e-9)
+        assert_allclose(jax.grad(end)(a), jax.grad(exact)(a), rtol=1e-6)
+    assert_allclose(jax.grad(end)(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
+
+
 def test_so_many_flows_that_they_are_computed_part_by_part():
     height = np.linspace(0.5, 2.0, 1030)
     states = np.stack([height, 0 * height], axis=1)
