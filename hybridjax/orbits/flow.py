@@ -50,6 +50,10 @@ _ACCURACY = 1e-12
 # Steps of a flow, accepted or rejected. Fewer: more flows end early. More: programs keep longer
 # records.
 MOST_STEPS = 1024
+# A crossing after a smaller part of the longest duration may be lost in the rounding of times,
+# which is relative to this duration. Larger: users are sent to `within` where a guard is touched.
+# Smaller: they are told of a touch where there is none.
+_MUCH_SHORTER = 1e-4
 # Lanes of a program that JAX does not trace. More: records of many steps take gigabytes. Fewer:
 # more calls.
 _PART = 1024
@@ -122,17 +126,21 @@ class Flow(Showable, eqx.Module):
         self, times: Annotated[Numbers, Reals("K")]
     ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
         """Charts and states, padded to d numbers, at some times, as accurate as the flow itself and
-        differentiable like it. They are NaN at times before its start and after its end.
+        differentiable like it. They are NaN at times before its start and after its end, and at all
+        times if events coincide whose order matters.
 
         **Arguments:** `times` (K,).
 
         **Returns:** `charts` (K,), their indices, and `states` (K, d).
+
+        **Raises:** `DefinitionError` if the system's code has changed since.
         """
         require_x64(self)
         require_as_made(self.system, "this flow was computed")
         samples = _program(self.request, jnp.asarray(times)).samples
+        depends = jnp.asarray(self.lane_results) == Result.SIMULTANEOUS
         chart = jnp.moveaxis(samples.chart, -1, 0)
-        q = jnp.moveaxis(samples.q, -1, 0)
+        q = jnp.moveaxis(nan_where(depends, samples.q), -1, 0)
         return (chart, q) if self.request.many else (chart[0], q[0])
 
     def __repr__(self):
@@ -202,7 +210,8 @@ def flow(
       that ended there. A `Guess` with states (L, n) starts L flows.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
-    - `within`: the longest duration. It is needed for ends that are no times.
+    - `within`: the longest duration. It is needed for ends that are no times. Times are rounded to
+      1e-12 of it: one that is 1e5 times too long makes events fail.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0; after a
       `Flow`, its input.
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
@@ -602,6 +611,14 @@ def _require_ends(found: Flow) -> None:
         raise ComputationError(
             f"{message}, and its derivatives depend on the order. `throw=False` returns the "
             "events."
+        )
+    begin = found.request.lanes.t[0]
+    longest = found.request.target.limit[0] - begin
+    if codes[k] == Result.GRAZING and lanes.t[0] - begin < _MUCH_SHORTER * longest:
+        raise ComputationError(
+            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than `within` "
+            f"({float(longest):.3g}), by which times are rounded: give a shorter `within`, or a "
+            "guard or section is touched tangentially there (grazing)."
         )
     where = ""
     if not is_traced(lanes):

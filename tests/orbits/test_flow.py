@@ -515,6 +515,8 @@ def test_events_that_coincide():
     # (Programs do not compare the orders.)
     program = jax.jit(lambda x: hj.flow(Pair(), hj.Guess("air", x), 2.0))
     assert program(together.state).result == Result.SIMULTANEOUS
+    assert np.isnan(program(together.state).at([1.9])[1]).all()
+    assert np.isfinite(found.at([1.9])[1]).all()
     apart = program(jnp.array([1.0, 0.0, 1.1, 0.0]))
     assert apart.result == Result.OK
 
@@ -557,6 +559,13 @@ def test_events_at_the_start_and_at_the_end():
 def test_bad_arguments(call, message):
     with pytest.raises(DefinitionError, match=message):
         call()
+
+
+def test_a_longest_duration_that_is_far_too_long():
+    """The advice helps."""
+    with pytest.raises(ComputationError, match=r"than `within` \(1e\+09\).* shorter"):
+        hj.flow(ball(), DROP, "bounce", within=1e9)
+    assert_allclose(hj.flow(ball(), DROP, "bounce", within=1e3).t, FIRST, rtol=1e-12)
 
 
 def test_a_section_that_is_not_reached():

@@ -30,9 +30,9 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
-# A guard that would turn within so many half rounding errors below zero is touched (grazing). Higher:
-# crossings whose derivatives are right to four digits are called grazing. Lower: derivatives of
-# crossings are made of rounding errors.
+# A guard that would turn within so many half rounding errors below zero is touched (grazing).
+# Higher: crossings whose derivatives are right to four digits are called grazing. Lower:
+# derivatives of crossings are made of rounding errors.
 _SHALLOW = 1e5
 # Only crossings slower than this part of the rate at the start of the step may be that shallow.
 # Higher: rounding errors are computed for more events. Lower: steps from nearer by hide a touch.
