@@ -344,6 +344,8 @@ def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:
             f"{', '.join(s.charts[a].states)} of chart '{start.chart}'; got an array of shape "
             f"{q.shape}."
         )
+    if not q.size:
+        raise DefinitionError("`start` has no states: give one state (n,), or (L, n).")
     states = jnp.atleast_2d(q).T
     states = jnp.pad(states, ((0, s.d - len(states)), (0, 0)))
     L = states.shape[1]

@@ -340,6 +340,22 @@ def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
     assert np.isnan(total)
 
 
+def test_flows_without_events_one_of_which_blows_up():
+    def grows(t, q, u, p):
+        return (p.a * q[0] ** 2,)
+
+    tower = hj.HybridSystem.from_functions(("x",), grows, parameters={"a": 1.0})
+    starts = hj.Guess("main", jnp.array([[0.5], [2.0]]))
+
+    def total(a):
+        found = hj.flow(tower.replace(a=a), starts, 1.0, throw=False)
+        return jnp.where(found.result == 0, found.state[:, 0], 0.0).sum()
+
+    # x = 1 / (1 / x(0) - a t)
+    assert_allclose(total(1.0), 1.0, rtol=1e-11)
+    assert_allclose(jax.grad(total)(1.0), 1.0, rtol=1e-11)
+
+
 class Wall(hj.HybridSystem):
     """A swing that may hit a wall at 1, and loses half of its speed there."""
 
@@ -552,6 +568,10 @@ def test_events_at_the_start_and_at_the_end():
         (
             lambda: hj.flow(ball(), hj.Guess("main", jnp.ones((3, 1))), 1.0),
             r"2 states y, v of chart .* shape \(3, 1\)",
+        ),
+        (
+            lambda: hj.flow(ball(), hj.Guess("main", jnp.ones((0, 2))), 1.0),
+            "`start` has no states",
         ),
         (lambda: hj.flow(ball(), (1.0, 0.0), 1.0), "`start` must be a Guess or a Flow"),
     ],

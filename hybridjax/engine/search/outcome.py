@@ -202,6 +202,8 @@ def _is_shallow(
 ) -> Mask:
     """Test for lanes that land on a guard which would turn a few rounding errors below zero."""
     s = task.s
+    if not s.transitions:
+        return verdict.lands & False
     lanes = state.lanes
     approach = state.approach
     xp = namespace(t)
