@@ -78,6 +78,17 @@ def first_of(x: Thing) -> Thing:
     return jax.tree_util.tree_map(lambda y: y[0] if eqx.is_array(y) else y, x)
 
 
+def _require_values(reading: Reading) -> None:
+    """**Raises:** `DefinitionError` for a function that reads a value which JAX traces: derivatives
+    by it would be lost."""
+    for function in reading.traced:
+        raise DefinitionError(
+            f"the function `{function}` reads a value that JAX traces, and that is none of its "
+            "arguments: make this value a parameter of the system, or of a `hj.Crossing` the "
+            "`value`."
+        )
+
+
 def _mark(x: Any, digest: str) -> Any:
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
@@ -94,9 +105,10 @@ def code_digest(x: Definition) -> str:
 
     If JAX remembers a trace of a function that computes something else now, its caches are cleared.
 
-    **Raises:** `DefinitionError` for a part of a system that computes another value each time, and
-    for another definition whose code reads files, the clock, random numbers, or values by names
-    that are computed (`eval`, `globals`, `sys.modules`, ...).
+    **Raises:** `DefinitionError` for a part of a system that computes another value each time, for
+    a function that reads a value which JAX traces, and for another definition whose code reads
+    files, the clock, random numbers, or values by names that are computed (`eval`, `globals`,
+    `sys.modules`, ...).
     """
     digest = once_in_call(("digest", _identity(x)), x, lambda: _digest_of(x))
     if x.code_digest not in ("", digest) and _are_many(x):
@@ -132,8 +144,10 @@ def _digest_of(x: Definition) -> str:
     if parts_of.dispatch(type(x)) is parts_of.dispatch(object):
         reading = Reading(_without_arrays(x))
         _refuse((*reading.hidden, *reading.moving))
+        _require_values(reading)
         return reading.digest
     reading = Reading(_with_forms(x), marks=True)
+    _require_values(reading)
     # (A class that has not been seen is traced, however much it is like another one.)
     read: collections.OrderedDict[str, None]
     read = _read.recall(type(x), None, collections.OrderedDict)

@@ -115,6 +115,7 @@ class Reading:
     - `hidden`: of these, what reads files, or values by computed names, as sentences.
     - `moving`: of these, what draws random numbers or reads the clock, as sentences.
     - `retraced`: whether JAX may remember the trace of a function that was read.
+    - `traced`: names of functions that read a value which JAX traces.
 
     **Arguments:** `marks`: do not read what takes longer than tracing (large arrays, objects of
     other libraries); it counts as unread.
@@ -125,6 +126,7 @@ class Reading:
         self.hidden: list[str] = []
         self.moving: list[str] = []
         self.retraced = False
+        self.traced: list[str] = []
         self._marks = marks
         self._hash = hashlib.blake2b(digest_size=16)
         self._words: list[tuple] = []  # of which the hash is not yet taken
@@ -173,6 +175,7 @@ class Reading:
             raise _TooMany
         self._note(kind.__qualname__)
         if is_tracer(x):
+            self.traced.append(self._function_name)
             return self._note(str(x.aval))
         reader: Any = _reader_of(kind)  # type: ignore[arg-type]  # (a class)
         return reader(self, x)
@@ -227,6 +230,7 @@ class Reading:
         self.unread += other.unread
         self.hidden += other.hidden
         self.moving += other.moving
+        self.traced += other.traced
         self.retraced = self.retraced or other.retraced
 
     def _array(self, x: Any) -> None:
@@ -275,6 +279,8 @@ class Reading:
         if is_installed:
             # (Wrappers of a package may remember there what they have been called with.)
             cells = tuple(filter(_is_option, cells))
+        else:
+            self._function_name = x.__qualname__
         self._visit_all(cells)
         if not is_installed:
             self._visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})

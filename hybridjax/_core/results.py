@@ -31,7 +31,10 @@ class Result(enum.IntEnum):
     )
     NOT_CONVERGED = 8, "the iteration did not converge"
     SINGULAR = 9, "J - I is singular: the cycle is not isolated"
-    BAD_INPUT = 10, "the start or the input is NaN or infinite"
+    BAD_INPUT = (
+        10,
+        "the start, the end or the input is NaN or infinite, or the end comes before the start",
+    )
     EQUILIBRIUM = 11, "the iteration ended in an equilibrium instead of a cycle"
     EXTRA_TURNS = (
         12,

@@ -10,13 +10,23 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.lanes import lane_jvp
 from ..systems.structure import Structure
-from .arrays import Array, Index, Inputs
-from .lanes import ARRIVE_TIME, IDLE, Lanes, Tape, blank_tape, fixed, pace_of
+from .arrays import Array, Index, Inputs, Times
+from .events import INSTANT
+from .lanes import (
+    ARRIVE_TIME,
+    IDLE,
+    Lanes,
+    Tape,
+    blank_tape,
+    fixed,
+    nan_where,
+    pace_of,
+)
 from .move import searched, stride
 from .replay import Ways, replay, replayed_ways
 from .search.search import initial_step
 from .search.state import Moved, Options
-from .settings import Settings
+from .settings import ROUNDING, Settings
 from .target import Target, until
 
 
@@ -72,7 +82,12 @@ def pass_through(
     the target.
     """
     options = Options(tape=True, new_input=new_input)
-    return _passed(s, lanes, u, target, times, settings, options, most_events, result)
+    passage = _passed(
+        s, lanes, u, target, times, settings, options, most_events, result
+    )
+    within = _is_within(times, lanes, passage.moved.lanes.t)
+    q = nan_where(~within[:, None], passage.samples.q)
+    return passage._replace(samples=passage.samples._replace(q=q))
 
 
 @eqx.filter_custom_jvp
@@ -132,21 +147,32 @@ def _samples(
     ways: Ways,
     times: Float[Array, "K L"],
 ) -> Samples:
-    """The states at some times, by a step from the end of the last move before each."""
+    """The states at some times, by a step from the end of the last move before each. Those outside
+    of the flow have no meaning."""
     K, L = times.shape
     if not K:
         return Samples(jnp.zeros((0, L), jnp.int32), jnp.zeros((0, s.d, L)))
+    last = jnp.max(jnp.where(tape.code != IDLE, tape.t, lanes.t), axis=0)
+    within = _is_within(times, lanes, last).ravel()
     begin = _before(lanes, tape, ways, times)
-    every = times.ravel()
+    # (No step is taken to times outside, where a state may leave all bounds.)
+    every = jnp.where(within, times.ravel(), begin.t)
     row = blank_tape(1, begin)
     row = row._replace(code=jnp.full((1, K * L), ARRIVE_TIME, jnp.int32))
     inputs = u if u.shape[-1] == 1 else jnp.tile(u, (1, K))
     _, q = replay(s, begin, inputs, until(every), row)
-    last = jnp.max(jnp.where(tape.code != IDLE, tape.t, -jnp.inf), axis=0)
-    within = (times >= lanes.t) & (times <= jnp.maximum(last, lanes.t))
     q = jnp.moveaxis(q.reshape(-1, K, L), 1, 0)
-    q = jnp.where(within[:, None], q, jnp.nan)
     return Samples(begin.chart.reshape(K, L), q)
+
+
+def _is_within(
+    times: Float[Array, "K L"], lanes: Lanes, end: Times
+) -> Bool[Array, "K L"]:
+    """Test whether times lie between the start and the end, which other programs know but for
+    rounding."""
+    times, start, end = jax.lax.stop_gradient((times, lanes.t, end))
+    late = INSTANT * (end - start) + ROUNDING * jnp.abs(end)
+    return (times >= start) & (times <= end + late)
 
 
 def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) -> Lanes:

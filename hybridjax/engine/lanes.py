@@ -95,6 +95,40 @@ def fixed(tree):
     return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
+# A number that is no zero leaves all bounds if it is multiplied twice by this one. Smaller: small
+# derivatives of lanes that failed are kept. (It must be finite: zero times infinity is NaN.)
+_LARGE = 1e300
+
+
+def nan_where(failed: Mask, x: Float[Array, "*K n L"]) -> Float[Array, "*K n L"]:
+    """x, with NaN for the lanes that failed. Their derivatives are NaN, too, where they are used.
+
+    A lane whose result nobody uses has a derivative of zero in reverse mode. It stays zero: zero
+    times NaN would be NaN, and would reach the parameters, which all lanes share.
+    """
+    if on_host(x):
+        return np.where(failed, np.nan, x)
+    return _nan_where(failed, x)
+
+
+@jax.custom_jvp
+def _nan_where(failed, x):
+    return jnp.where(failed, jnp.nan, x)
+
+
+@_nan_where.defjvp
+def _nan_where_jvp(primals, tangents):
+    failed, x = primals
+    _, t_x = tangents
+    large = jnp.where(failed, _LARGE, 1.0)
+    none = jnp.where(failed, 0.0, 1.0)
+    # (Infinity times zero is NaN, from the left, and in reverse mode from the right.)
+    spoiled = t_x * large * large * none * large * large
+    # (A number that does not change has NaN, too, where others of its lane do.)
+    others = jnp.sum(spoiled, axis=-2, keepdims=True)
+    return _nan_where(failed, x), spoiled + jnp.where(failed, others, 0.0)
+
+
 def needed(mask: Mask, tree):
     """`tree` itself, without derivatives if `mask` has no lanes.
 

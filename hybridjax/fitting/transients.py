@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core.arguments import Numbers, require_axes
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import OptionalNames
+from .._core.boundary.kinds import OptionalNames, PositiveScalar
 from .._core.boundary.values import Reals
 from .._core.text import fields
 from ..engine.flow import Samples
@@ -77,8 +77,8 @@ class ObservedTrajectory(AbstractObservation):
         values: Annotated[Numbers, Reals("K outputs", missing=True)] | None = None,
         *,
         std: Deviations | None = None,
-        events: Mapping[str, Any] | None = None,
-        events_std: Deviations | None = None,
+        events: Mapping[str, Annotated[Numbers, Reals()]] | None = None,
+        events_std: PositiveScalar | None = None,
         unknown_states: OptionalNames = (),
         input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
         settings: Settings | None = None,
@@ -89,14 +89,19 @@ class ObservedTrajectory(AbstractObservation):
         - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing.
         - `std`: their standard deviation, one number or one for each output.
         - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
-          `events_std`: their standard deviation.
+          `events_std`: their standard deviation, one number.
         - `unknown_states`: names of states at the start that are fitted, too; `start` has guesses.
         - `input`, `settings`: as in `hj.flow`.
 
-        **Raises:** `DefinitionError` without any measurement, for shapes that do not fit, times
-        that do not increase or come before the start, and standard deviations that are not given
-        for all.
+        **Raises:** `DefinitionError` without any measurement, for several starts, for shapes that
+        do not fit, times that do not increase or come before the start, and standard deviations
+        that are not given for all.
         """
+        if np.ndim(start.state) != 1:
+            raise DefinitionError(
+                "ObservedTrajectory: `start` must have one state: make an ObservedTrajectory of "
+                "each trajectory, and give `hj.fit_model` the list."
+            )
         self.start = start
         self.unknown_states = tuple(unknown_states)
         self.input = input
@@ -117,11 +122,16 @@ class ObservedTrajectory(AbstractObservation):
         axes = {"times": len(own_times), "outputs": len(self.outputs)}
         require_axes("`values`", samples, axes)
         missing = np.isnan(samples)
+        if samples.size and missing.all():
+            raise DefinitionError(
+                "ObservedTrajectory: `values` are all missing: leave them out, or give `events` "
+                "alone."
+            )
         self.known = tuple(np.flatnonzero(~missing).tolist())
         self.times = jnp.asarray(own_times)
         self.values = jnp.asarray(np.where(missing, 0.0, samples))
         self.events = tuple(events or ())
-        lists = [np.atleast_1d(np.asarray(x, float)) for x in (events or {}).values()]
+        lists = [_event_times(name, x) for name, x in (events or {}).items()]
         self.event_times = tuple(jnp.asarray(x) for x in lists)
         _require_times(start, own_times, *lists)
         self.scale = _sizes("values", std, samples)
@@ -240,6 +250,19 @@ def with_start(
     return eqx.tree_at(lambda o: o.start.state, observation, state)
 
 
+def _event_times(name: str, times: Any) -> Float[np.ndarray, " E"]:
+    """The times of the events of one name.
+
+    **Raises:** `DefinitionError` for none, and for a table.
+    """
+    times = np.atleast_1d(np.asarray(times, float))
+    if times.ndim > 1 or not len(times):
+        raise DefinitionError(
+            f"`events['{name}']` must be one time or more, not of shape {times.shape}."
+        )
+    return times
+
+
 def _require_times(start: Guess, *lists: np.ndarray) -> None:
     """**Raises:** `DefinitionError` for times that do not increase, or come before the start."""
     for times in lists:
@@ -256,11 +279,18 @@ def _sizes(
 ) -> Float[Array, " ny"]:
     """Standard deviations of each output, or its rms.
 
-    **Raises:** `DefinitionError` for an output that is zero throughout, without one.
+    **Raises:** `DefinitionError` for another number of them, and for an output that is zero
+    throughout, without one.
     """
     ny = samples.shape[1]
     if std is not None:
-        return jnp.broadcast_to(jnp.asarray(std, float), (ny,))
+        sizes = jnp.asarray(std, float)
+        if sizes.shape not in ((), (ny,)):
+            raise DefinitionError(
+                f"`std` must be one number, or one for each of {ny} outputs, not of shape "
+                f"{sizes.shape}."
+            )
+        return jnp.broadcast_to(sizes, (ny,))
     if not ny:
         return jnp.ones(0)
     size = np.sqrt(np.nanmean(samples**2, axis=0))

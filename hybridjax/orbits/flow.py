@@ -16,13 +16,13 @@ from .._core.boundary.values import Reals
 from .._core.compilation import quick_jit
 from .._core.executor import Array, is_traced, namespace
 from .._core.findings import Finding, print_findings, warn_of
-from .._core.meaning import current
+from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
 from .._core.text import folded, number, signal_values
 from ..engine.flow import Events, Passage, Samples, pass_through
-from ..engine.lanes import Lanes, lane_at, start_lanes
+from ..engine.lanes import Lanes, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until as until_time
@@ -50,6 +50,10 @@ _ACCURACY = 1e-12
 # Steps of a flow, accepted or rejected. Fewer: more flows end early. More: programs keep longer
 # records.
 MOST_STEPS = 1024
+# A crossing after a smaller part of the longest duration may be lost in the rounding of times,
+# which is relative to this duration. Larger: users are sent to `within` where a guard is touched.
+# Smaller: they are told of a touch where there is none.
+_MUCH_SHORTER = 1e-4
 # Lanes of a program that JAX does not trace. More: records of many steps take gigabytes. Fewer:
 # more calls.
 _PART = 1024
@@ -122,16 +126,21 @@ class Flow(Showable, eqx.Module):
         self, times: Annotated[Numbers, Reals("K")]
     ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
         """Charts and states, padded to d numbers, at some times, as accurate as the flow itself and
-        differentiable like it. They are NaN at times before its start and after its end.
+        differentiable like it. They are NaN at times before its start and after its end, and at all
+        times if events coincide whose order matters.
 
         **Arguments:** `times` (K,).
 
         **Returns:** `charts` (K,), their indices, and `states` (K, d).
+
+        **Raises:** `DefinitionError` if the system's code has changed since.
         """
         require_x64(self)
+        require_as_made(self.system, "this flow was computed")
         samples = _program(self.request, jnp.asarray(times)).samples
+        depends = jnp.asarray(self.lane_results) == Result.SIMULTANEOUS
         chart = jnp.moveaxis(samples.chart, -1, 0)
-        q = jnp.moveaxis(samples.q, -1, 0)
+        q = jnp.moveaxis(nan_where(depends, samples.q), -1, 0)
         return (chart, q) if self.request.many else (chart[0], q[0])
 
     def __repr__(self):
@@ -201,7 +210,8 @@ def flow(
       that ended there. A `Guess` with states (L, n) starts L flows.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
-    - `within`: the longest duration. It is needed for ends that are no times.
+    - `within`: the longest duration. It is needed for ends that are no times. Times are rounded to
+      1e-12 of it: one that is 1e5 times too long makes events fail.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0; after a
       `Flow`, its input.
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
@@ -334,6 +344,8 @@ def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:
             f"{', '.join(s.charts[a].states)} of chart '{start.chart}'; got an array of shape "
             f"{q.shape}."
         )
+    if not q.size:
+        raise DefinitionError("`start` has no states: give one state (n,), or (L, n).")
     states = jnp.atleast_2d(q).T
     states = jnp.pad(states, ((0, s.d - len(states)), (0, 0)))
     L = states.shape[1]
@@ -442,6 +454,10 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
     target = request.target
     lanes = request.lanes._replace(events=request.lanes.events * 0)
     times = jnp.zeros(0) if times is None else times
+    early = jnp.isfinite(target.time) & (target.time < lanes.t)
+    # (A time that is infinite or NaN is the limit, too.)
+    bad = early | ~jnp.isfinite(target.limit)
+    begin = update_result(request.result, bad, Result.BAD_INPUT)
     passage = pass_through(
         s,
         lanes,
@@ -451,13 +467,11 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
         request.most_events,
         request.new_input,
         jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
-        request.result,
+        begin,
     )
     moved, events, _ = passage
-    early = jnp.isfinite(target.time) & (target.time < lanes.t)
-    result = update_result(moved.result, early, Result.BAD_INPUT)
     result = update_result(
-        result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
+        moved.result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
     )
     return passage._replace(moved=moved._replace(result=result))
 
@@ -489,10 +503,10 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
     s = Structure(request.system)
     moved = passage.moved
     xp = namespace(moved.lanes.t)
-    arrived = moved.result == Result.OK
-    # (A factor makes derivatives NaN, too.)
-    keep = xp.where(arrived, 1.0, xp.nan)
+    failed = moved.result != Result.OK
     n = s.d if request.ends_in is None else s.dims[request.ends_in]
+    end = xp.concatenate([moved.lanes.t[None], moved.lanes.q[:n]])
+    end = nan_where(failed, end)
     events = passage.events
 
     def of_lanes(x):
@@ -500,8 +514,8 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
         return x if request.many else x[0]
 
     return Flow(
-        t=of_lanes(keep * moved.lanes.t),
-        state=of_lanes(keep * moved.lanes.q[:n]),
+        t=of_lanes(end[0]),
+        state=of_lanes(end[1:]),
         chart=of_lanes(moved.lanes.chart),
         result=of_lanes(moved.result),
         event_times=of_lanes(events.t),
@@ -599,6 +613,14 @@ def _require_ends(found: Flow) -> None:
         raise ComputationError(
             f"{message}, and its derivatives depend on the order. `throw=False` returns the "
             "events."
+        )
+    begin = found.request.lanes.t[0]
+    longest = found.request.target.limit[0] - begin
+    if codes[k] == Result.GRAZING and lanes.t[0] - begin < _MUCH_SHORTER * longest:
+        raise ComputationError(
+            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than `within` "
+            f"({float(longest):.3g}), by which times are rounded: give a shorter `within`, or a "
+            "guard or section is touched tangentially there (grazing)."
         )
     where = ""
     if not is_traced(lanes):

@@ -18,6 +18,7 @@ from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
 from .._core.text import folded
+from ..engine.lanes import nan_where
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -190,9 +191,10 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
         at_event = (result == Result.OK) & (placed.bound.event[k] >= 0)
         missed = followed_at_once(s, on_section, u, at_event, period)
         result = update_result(result, missed >= 0, Result.EVENT_ORDER)
-    # (A factor makes derivatives NaN, too.)
-    keep = xp.where(result == Result.OK, 1.0, xp.nan)
-    return Arrival(keep * end.t, (keep * end.q)[: map.dims[1]], result)
+    failed = result != Result.OK
+    n = map.dims[1]
+    arrival = nan_where(failed, xp.concatenate([end.t[None], end.q[:n]]))
+    return Arrival(arrival[0], arrival[1:], result)
 
 
 _arrivals_on_host = on_the_host(_arrivals)

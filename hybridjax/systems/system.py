@@ -431,6 +431,9 @@ class HybridSystem(Definition):
         namespace: dict[str, Any] = {
             "__annotations__": dict.fromkeys(values, Parameter),
             "__doc__": "A system of one chart, made from functions.",
+            # (Changes of what these functions read are noticed in classes of users only.)
+            "__module__": "__main__",
+            "_made_of": made,
             **{key: parameter(value) for key, value in values.items()},
             "charts": lambda self: made.charts(self),
             "transitions": lambda self: made.transitions(self),

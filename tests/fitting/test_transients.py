@@ -111,6 +111,40 @@ def test_standard_errors_are_those_of_many_draws():
             lambda d: d(hj.Guess("main", (1.0, 0.0), 0.5), [0.2], "y", [[1.0]]),
             "0.2, comes before the start at 0.5",
         ),
+        (
+            lambda d: d(hj.Guess("main", ((1.0, 0.0), (2.0, 0.0))), [0.2], "y", [[1]]),
+            "`start` must have one state",
+        ),
+        (
+            lambda d: d(hj.Guess("main", (1.0, 0.0)), [0.2], "y", [[np.nan]], std=0.1),
+            "are all missing",
+        ),
+        (
+            lambda d: d(hj.Guess("main", (1.0, 0.0)), [0.2], "y", [[1]], std=(1, 2)),
+            r"`std` must be one number, or one for each of 1 outputs, .* \(2,\)",
+        ),
+        *[
+            (
+                lambda d, times=times: d(
+                    hj.Guess("main", (1.0, 0.0)), events={"bounce": times}
+                ),
+                message,
+            )
+            for times, message in (
+                ((0.4, np.nan), r"`events\['bounce'\]` must be finite, but is nan"),
+                ("late", r"`events\['bounce'\]` must be "),
+                ((), r"`events\['bounce'\]` must be one time or more"),
+                (((0.4, 0.8),), r"one time or more, not of shape \(1, 2\)"),
+            )
+        ],
+        (
+            lambda d: d(
+                hj.Guess("main", (1.0, 0.0)),
+                events={"bounce": (0.4, 0.8)},
+                events_std=(0.1, 0.2),
+            ),
+            "`events_std` must be one number",
+        ),
     ],
 )
 def test_bad_measurements(call, message):

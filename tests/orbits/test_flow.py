@@ -309,6 +309,105 @@ def test_many_flows_one_of_which_fails():
     assert_allclose(slopes[0], by_one, rtol=1e-11)
 
 
+def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
+    """They share the parameters. What uses the flow that failed has no derivative."""
+    starts = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
+    times = jnp.array([0.4, 0.8])
+
+    def of_batch(g):
+        found = hj.flow(ball(g=g), hj.Guess("main", starts), 0.9, throw=False)
+        return found.result, found.state[:, 0], found.at(times)[1][:, :, 0].sum(axis=1)
+
+    def of_each(g):
+        def one(start):
+            found = hj.flow(ball(g=g), hj.Guess("main", start), 0.9)
+            return found.result, found.state[0], found.at(times)[1][:, 0].sum()
+
+        return jax.vmap(one)(starts)
+
+    def heights(g, flows):
+        result, *parts = flows(g)
+        return sum(jnp.where(result == 0, part, 0.0) for part in parts)
+
+    step = 1e-4
+    for flows in (of_batch, of_each):
+        ahead, back = heights(9.81 + step, flows), heights(9.81 - step, flows)
+        by_difference = (ahead - back) / (2 * step)
+        for jacobian in (jax.jacrev, jax.jacfwd):
+            slopes = jacobian(heights)(9.81, flows)
+            assert_allclose(slopes, by_difference, rtol=1e-6)
+    total = jax.grad(lambda g: of_batch(g)[1].sum())(9.81)
+    assert np.isnan(total)
+
+
+def test_flows_without_events_one_of_which_blows_up():
+    def grows(t, q, u, p):
+        return (p.a * q[0] ** 2,)
+
+    tower = hj.HybridSystem.from_functions(("x",), grows, parameters={"a": 1.0})
+    starts = hj.Guess("main", jnp.array([[0.5], [2.0]]))
+
+    def total(a):
+        found = hj.flow(tower.replace(a=a), starts, 1.0, throw=False)
+        return jnp.where(found.result == 0, found.state[:, 0], 0.0).sum()
+
+    # x = 1 / (1 / x(0) - a t)
+    assert_allclose(total(1.0), 1.0, rtol=1e-11)
+    assert_allclose(jax.grad(total)(1.0), 1.0, rtol=1e-11)
+
+
+class Wall(hj.HybridSystem):
+    """A swing that may hit a wall at 1, and loses half of its speed there."""
+
+    inputs = ()
+
+    def charts(self):
+        class Swing(hj.Chart):
+            states = ("x", "v")
+
+            def field(self, t, q, u):
+                return q[1], -q[0]
+
+        return {"swing": Swing()}
+
+    def transitions(self):
+        def distance(t, q, u):
+            return 1.0 - q[0]
+
+        def stop(t, q, u):
+            return q[0], -0.5 * q[1]
+
+        return [hj.Transition("hit", "swing", "swing", distance, reset=stop)]
+
+
+def test_a_guard_that_is_touched():
+    """Rounding decides whether the wall is hit, and would be the derivative."""
+
+    @jax.jit
+    def swing(a):
+        return hj.flow(Wall(), hj.Guess("swing", jnp.stack([-a, 0.0])), 4.0)
+
+    def end(a):
+        return swing(a).state[0]
+
+    for a in (1.0, 1.0 + 1e-14, 1.0 + 1e-12):
+        assert swing(a).result == Result.GRAZING
+        assert np.isnan(jax.grad(end)(a))
+        assert np.isnan(jax.jacfwd(end)(a))
+        with pytest.raises(ComputationError, match="tangentially"):
+            hj.flow(Wall(), hj.Guess("swing", (-a, 0.0)), 4.0)
+
+    def exact(a):
+        hit = jnp.pi - jnp.arccos(1 / a)
+        left = 4.0 - hit
+        return jnp.cos(left) - 0.5 * a * jnp.sin(hit) * jnp.sin(left)
+
+    for a in (1.0 + 1e-6, 1.1):
+        assert_allclose(end(a), exact(a), rtol=1e-9)
+        assert_allclose(jax.grad(end)(a), jax.grad(exact)(a), rtol=1e-6)
+    assert_allclose(jax.grad(end)(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
+
+
 def test_so_many_flows_that_they_are_computed_part_by_part():
     height = np.linspace(0.5, 2.0, 1030)
     states = np.stack([height, 0 * height], axis=1)
@@ -318,8 +417,80 @@ def test_so_many_flows_that_they_are_computed_part_by_part():
 
 def test_an_end_before_the_start_is_a_code_in_programs():
     program = jax.jit(lambda end: hj.flow(ball(), DROP, end))
-    assert program(-1.0).result == Result.BAD_INPUT
+    for end in (-1.0, np.nan, np.inf):
+        assert program(end).result == Result.BAD_INPUT
     assert program(0.1).result == Result.OK
+
+
+@pytest.mark.parametrize("time", [0.0, 5.0])
+def test_a_flow_that_ends_where_it_starts(time):
+    start = hj.Guess("main", (1.0, 2.0), time)
+    found = hj.flow(ball(), start, time)
+    assert found.t == time
+    assert found.count == 0
+    assert_allclose(found.state, (1.0, 2.0))
+
+    def end(t):
+        return hj.flow(ball(), start, t).state
+
+    assert_allclose(jax.jit(end)(time), (1.0, 2.0))
+    assert_allclose(jax.jit(jax.jacfwd(end))(time), (2.0, -9.81))
+
+
+@pytest.mark.parametrize("transformed", [jax.grad, jax.vmap, jax.jit])
+def test_functions_of_values_that_are_traced(transformed):
+    """JAX would lose the derivatives by what a function reads otherwise than by its arguments."""
+
+    def pushed(t, q, u, p):
+        return q[1], u[0]
+
+    mass = hj.HybridSystem.from_functions(("x", "v"), pushed)
+    start = hj.Guess("main", (0.0, 1.0))
+
+    def by_section(x):
+        def distance(t, q):
+            return q[0] - x
+
+        section = hj.Crossing(distance, "rising")
+        return hj.flow(mass, start, section, within=9.0, input=2.0).t
+
+    def by_input(k):
+        def growing(t):
+            return k * t
+
+        return hj.flow(mass, start, 3.0, input=growing).t
+
+    def by_field(k):
+        def field(t, q, u, p):
+            return q[1], k * q[0]
+
+        system = hj.HybridSystem.from_functions(("x", "v"), field)
+        return hj.flow(system, start, 3.0).t
+
+    value = jnp.ones(3) if transformed is jax.vmap else 1.0
+    every = {by_section: "distance", by_input: "growing", by_field: "field"}
+    for function, name in every.items():
+        for program in (transformed(function), jax.jit(transformed(function))):
+            with pytest.raises(
+                DefinitionError, match=f"{name}` reads a value that JAX"
+            ):
+                program(value)
+
+
+GRAVITY = 9.81
+
+
+def test_states_between_of_a_system_that_has_changed(monkeypatch):
+    def fall(t, q, u, p):
+        return q[1], -GRAVITY
+
+    stone = hj.HybridSystem.from_functions(("y", "v"), fall)
+    found = hj.flow(stone, DROP, 1.0)
+    assert_allclose(found.at([1.0])[1][0], found.state)
+    monkeypatch.setitem(globals(), "GRAVITY", 1.62)
+    with pytest.raises(DefinitionError, match="has changed since this flow was comp"):
+        found.at([1.0])
+    assert_allclose(hj.flow(stone, DROP, 1.0).state, (1 - 0.81, -1.62))
 
 
 class Pair(hj.HybridSystem):
@@ -360,6 +531,8 @@ def test_events_that_coincide():
     # (Programs do not compare the orders.)
     program = jax.jit(lambda x: hj.flow(Pair(), hj.Guess("air", x), 2.0))
     assert program(together.state).result == Result.SIMULTANEOUS
+    assert np.isnan(program(together.state).at([1.9])[1]).all()
+    assert np.isfinite(found.at([1.9])[1]).all()
     apart = program(jnp.array([1.0, 0.0, 1.1, 0.0]))
     assert apart.result == Result.OK
 
@@ -396,12 +569,23 @@ def test_events_at_the_start_and_at_the_end():
             lambda: hj.flow(ball(), hj.Guess("main", jnp.ones((3, 1))), 1.0),
             r"2 states y, v of chart .* shape \(3, 1\)",
         ),
+        (
+            lambda: hj.flow(ball(), hj.Guess("main", jnp.ones((0, 2))), 1.0),
+            "`start` has no states",
+        ),
         (lambda: hj.flow(ball(), (1.0, 0.0), 1.0), "`start` must be a Guess or a Flow"),
     ],
 )
 def test_bad_arguments(call, message):
     with pytest.raises(DefinitionError, match=message):
         call()
+
+
+def test_a_longest_duration_that_is_far_too_long():
+    """The advice helps."""
+    with pytest.raises(ComputationError, match=r"than `within` \(1e\+09\).* shorter"):
+        hj.flow(ball(), DROP, "bounce", within=1e9)
+    assert_allclose(hj.flow(ball(), DROP, "bounce", within=1e3).t, FIRST, rtol=1e-12)
 
 
 def test_a_section_that_is_not_reached():

@@ -48,6 +48,16 @@ def test_a_constant_of_the_notebook_is_changed(monkeypatch):
         assert_allclose(end - start, np.exp(-value), rtol=1e-7)
 
 
+def test_a_constant_of_functions_of_which_a_system_is_made_is_changed(monkeypatch):
+    slowed = hj.HybridSystem.from_functions(("x",), lambda t, q, u, p: (-DRAG * q[0],))
+    start = hj.Guess("main", (1.0,))
+    for value in (0.7, 1.3, 0.7):
+        monkeypatch.setitem(globals(), "DRAG", value)
+        assert_allclose(hj.flow(slowed, start, 1.0).state, [np.exp(-value)], rtol=1e-9)
+        end = hj.simulate(slowed, start, 1.0).after[-1]
+        assert_allclose(end, [np.exp(-value)], rtol=1e-7)
+
+
 def test_functions_that_are_made_anew_have_traces_of_their_own(monkeypatch):
     def made():
         drag = jax.jit(lambda speed: -DRAG * speed)

@@ -30,6 +30,13 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
+# A guard that would turn within so many half rounding errors below zero is touched (grazing).
+# Higher: crossings whose derivatives are right to four digits are called grazing. Lower:
+# derivatives of crossings are made of rounding errors.
+_SHALLOW = 1e5
+# Only crossings slower than this part of the rate at the start of the step may be that shallow.
+# Higher: rounding errors are computed for more events. Lower: steps from nearer by hide a touch.
+_MAY_BE_SHALLOW = 0.1
 # The shortest step near t = 0, where times resolve any step, as a part of the time allowed. Larger:
 # events of states that are about to leave all bounds, as spikes of a neuron, are missed. Smaller:
 # more steps until a blow-up is reported.
@@ -170,6 +177,7 @@ def _after(
     speed = xp.abs(of_row(end.rate, aim.which))
     on = state.approach.on
     slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
+    slow = slow | _is_shallow(state, aim, new, verdict, t, task)
     passed = xp.where(accepted, step_length(aim, new), 0.0)
     pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span)
     falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
@@ -187,6 +195,31 @@ def _after(
     watched = _merge(accepted, end, state.watched)
     end = _reset(after, watched, ready[-1], fired, together, task)
     return *end, zeno, slow
+
+
+def _is_shallow(
+    state: State, aim: Aim, new: Attempt, verdict: Verdict, t: Times, task: Task
+) -> Mask:
+    """Test for lanes that land on a guard which would turn a few rounding errors below zero."""
+    s = task.s
+    if not s.transitions:
+        return verdict.lands & False
+    lanes = state.lanes
+    approach = state.approach
+    xp = namespace(t)
+    speed = xp.abs(of_row(new.watched.rate, aim.which))
+    before = xp.abs(of_row(state.watched.rate, aim.which))
+    rate = xp.where(approach.on, approach.rate, before)
+    length = xp.where(approach.on, approach.reach, step_length(aim, new))
+    slower = verdict.lands & (speed < _MAY_BE_SHALLOW * rate) & (length > 0)
+    at_guard = lanes._replace(t=t, q=new.q)
+
+    def rounding():
+        return of_row(guard_noise(s, at_guard, task.u, slower), aim.which)
+
+    error = cond(slower.any(), rounding, lambda: xp.zeros_like(t))
+    bend = rate / xp.where(slower, length, 1.0)
+    return slower & (speed**2 < _SHALLOW * error * bend)
 
 
 def _reset(
