@@ -6,6 +6,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py groups   # false alarms between maps of two groups
     python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
+    python benchmarks/strangers.py phase    # phase response curves from times of events
     python benchmarks/strangers.py study    # studies whose data support a lower order
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
@@ -15,6 +16,7 @@ import argparse
 import re
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +27,7 @@ import one_thread
 one_thread.pin()
 
 import numpy as np  # noqa: E402
+import strangers_beats as beats  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
 import strangers_truth as truth  # noqa: E402
 from scipy import stats  # noqa: E402
@@ -278,6 +281,86 @@ def _studied(multipliers: list[complex], order: int, noise: float, seed: int) ->
     return "not done after 6 blocks, says why" if "since" in repr(quest) else "not done"
 
 
+def phase(draws: int) -> None:
+    """Print how often bands of phase responses hold the curve, and what misses are named.
+
+    "5 off" counts draws whose curve is beyond five standard errors of the truth at some phase, and
+    "quiet" those of them without a finding.
+    """
+    print(
+        "rhythm, input, events                 n finite  in band  mean off  5 off  quiet  CPU s"
+    )
+    for size in (480, 2000):
+        for name, curve in beats.CURVES.items():
+            for kind, highest in beats.INPUTS.items():
+                made = [
+                    beats.phase_rhythm(seed, curve, highest, size)
+                    for seed in range(draws)
+                ]
+                _phase_row(f"{name}, {kind}, {size}", made, curve)
+        curve = beats.CURVES["one sign"]
+        for name, wander, forgotten in (
+            ("random walk", 0.02, np.inf),
+            ("autoregression", 0.03, 20.0),
+        ):
+            for kind, highest in beats.INPUTS.items():
+                made = [
+                    beats.phase_rhythm(
+                        seed, curve, highest, size, wander=wander, forgotten=forgotten
+                    )
+                    for seed in range(draws)
+                ]
+                _phase_row(f"{name}, {kind}, {size}", made, curve)
+        for name, neuron in beats.NEURONS.items():
+            curve = neuron.curve()
+            for kind, highest in beats.INPUTS.items():
+                made = [
+                    beats.neuron_beats(seed, neuron, curve, highest, size)
+                    for seed in range(draws)
+                ]
+                _phase_row(f"{name}, {kind}, {size}", made, curve)
+
+
+def _phase_row(name: str, draws: list[beats.Beats], truth: np.ndarray) -> None:
+    shares = []
+    means = []
+    causes: dict[str, int] = {}
+    finite = 0
+    wrong = 0
+    quiet = 0
+    start = time.process_time()
+    for made in draws:
+        found = _phase_response(made)
+        low, high = found.interval(beats.PHASE)
+        error = (high - low) / 4
+        finite += bool(np.isfinite(error).all())
+        shares.append(np.mean((low <= truth) & (truth <= high)))
+        size = np.sqrt(found.covariance[0, 0])
+        means.append((found.values.mean() - truth.mean()) / size)
+        said = [x.cause for x in found.findings if x.cause != "resolution"]
+        off = bool((np.abs((low + high) / 2 - truth) > _WRONG * error).any())
+        wrong += off
+        quiet += off and not said
+        for cause in said:
+            causes[cause] = causes.get(cause, 0) + 1
+    seconds = (time.process_time() - start) / len(draws)
+    off = float(np.sqrt(np.mean(np.square(means))))
+    print(
+        f"{name:34} {len(draws):4} {finite:6} {np.mean(shares):8.3f} {off:9.1f} {wrong:6} "
+        f"{quiet:6} {seconds:6.2f}  {causes}",
+        flush=True,
+    )
+
+
+def _phase_response(made: beats.Beats) -> hj.recordings.PhaseResponse:
+    trials = [
+        hj.Recording(made.time, {"u": u}, events={"beat": events}, name=f"trial {k}")
+        for k, (u, events) in enumerate(zip(made.force, made.events, strict=True))
+    ]
+    recording = hj.Recording.join(trials)
+    return hj.recordings.phase_response(recording, hj.AtEvent("beat"), input="u")
+
+
 # Each row with its usual number of draws.
 ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "files": (files, 5),
@@ -285,6 +368,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "bands": (bands, 200),
     "series": (series, 60),
     "study": (study, 12),
+    "phase": (phase, 30),
 }
 
 
