@@ -7,6 +7,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
     python benchmarks/strangers.py phase    # phase response curves from times of events
+    python benchmarks/strangers.py phase-long  # the same of four times as many
     python benchmarks/strangers.py study    # studies whose data support a lower order
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
@@ -281,8 +282,9 @@ def _studied(multipliers: list[complex], order: int, noise: float, seed: int) ->
     return "not done after 6 blocks, says why" if "since" in repr(quest) else "not done"
 
 
-def phase(draws: int) -> None:
-    """Print how often bands of phase responses hold the curve, and what misses are named.
+def phase(draws: int, size: int = 480) -> None:
+    """Print how often bands of phase responses of so many events hold the curve, and what misses
+    are named.
 
     "5 off" counts draws whose curve is beyond five standard errors of the truth at some phase, and
     "quiet" those of them without a finding.
@@ -290,35 +292,38 @@ def phase(draws: int) -> None:
     print(
         "rhythm, input, events                 n finite  in band  mean off  5 off  quiet  CPU s"
     )
-    for size in (480, 2000):
-        for name, curve in beats.CURVES.items():
-            for kind, highest in beats.INPUTS.items():
-                made = [
-                    beats.phase_rhythm(seed, curve, highest, size)
-                    for seed in range(draws)
-                ]
-                _phase_row(f"{name}, {kind}, {size}", made, curve)
-        curve = beats.CURVES["one sign"]
-        for name, wander, forgotten in (
-            ("random walk", 0.02, np.inf),
-            ("autoregression", 0.03, 20.0),
-        ):
-            for kind, highest in beats.INPUTS.items():
-                made = [
-                    beats.phase_rhythm(
-                        seed, curve, highest, size, wander=wander, forgotten=forgotten
-                    )
-                    for seed in range(draws)
-                ]
-                _phase_row(f"{name}, {kind}, {size}", made, curve)
-        for name, neuron in beats.NEURONS.items():
-            curve = neuron.curve()
-            for kind, highest in beats.INPUTS.items():
-                made = [
-                    beats.neuron_beats(seed, neuron, curve, highest, size)
-                    for seed in range(draws)
-                ]
-                _phase_row(f"{name}, {kind}, {size}", made, curve)
+    for name, curve in beats.CURVES.items():
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.phase_rhythm(seed, curve, highest, size) for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+    curve = beats.CURVES["one sign"]
+    for name, wander, forgotten in (
+        ("random walk", 0.02, np.inf),
+        ("autoregression", 0.03, 20.0),
+    ):
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.phase_rhythm(
+                    seed, curve, highest, size, wander=wander, forgotten=forgotten
+                )
+                for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+    for name, neuron in beats.NEURONS.items():
+        curve = neuron.curve()
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.neuron_beats(seed, neuron, curve, highest, size)
+                for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+
+
+def long_phase(draws: int) -> None:
+    """Print the same of 2000 events."""
+    phase(draws, 2000)
 
 
 def _phase_row(name: str, draws: list[beats.Beats], truth: np.ndarray) -> None:
@@ -369,6 +374,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "series": (series, 60),
     "study": (study, 12),
     "phase": (phase, 30),
+    "phase-long": (long_phase, 10),
 }
 
 

@@ -4,9 +4,10 @@ The phase at the end of an interval has the variance $s^2 w T$ (the jitter), so 
 has this variance divided by the square of the rate at which the phase reaches 1. The rate $w + e$
 of an interval may differ from that of its trial, by a stationary process with
 $\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an autoregression of order 1 for evenly
-spaced intervals, and a random walk if $\theta$ is longer than the trial. Its parameters maximize
-the restricted likelihood (Patterson and Thompson 1971), which a Kalman filter evaluates (Harvey,
-*Forecasting, Structural Time Series Models and the Kalman Filter*, 1989).
+spaced intervals, independent for $\theta = 0$, and a random walk if $\theta$ is longer than the
+trial. Its parameters maximize the restricted likelihood (Patterson and Thompson 1971), which a
+Kalman filter evaluates (Harvey, *Forecasting, Structural Time Series Models and the Kalman Filter*,
+1989).
 """
 
 from typing import NamedTuple
@@ -28,7 +29,7 @@ _MEMORIES = 2.0 * 4.0 ** np.arange(6)
 _CHANGES = 0.03 * 2.0 ** np.arange(7)
 # Twice the logarithm of the likelihood ratio from which on a rate wanders. Larger: errors of curves
 # under slow inputs are too small. Smaller: noise is taken for a wandering rate.
-_LEAST_GAIN = 4.0
+_LEAST_GAIN = 6.0
 
 
 class Wander(NamedTuple):
@@ -37,11 +38,11 @@ class Wander(NamedTuple):
     size: float
     """Standard deviation of the rate, in cycles per second and standard deviations of jitter."""
     memory: float
-    """Time after which it is forgotten, in s."""
+    """Time after which it is forgotten, in s; zero for a rate that every interval has anew."""
 
     @staticmethod
     def none() -> "Wander":
-        return Wander(0.0, 1.0)
+        return Wander(0.0, 0.0)
 
 
 class Whitening(NamedTuple):
@@ -74,6 +75,10 @@ class Whitening(NamedTuple):
         taken[1:] = self.learned[:-1, None] * y[:-1]
         rate = linalg.solve_banded((1, 0), bands, taken, check_finite=False)
         return (y - self.by_drift[:, None] * rate) / self.scale[:, None]
+
+    def missed(self, residual: Lanes) -> Lanes:
+        """Return by how much of a cycle forecasts miss that know all earlier intervals."""
+        return self(residual[:, None])[:, 0] * self.scale
 
     @property
     def log_determinant(self) -> float:
@@ -119,8 +124,10 @@ def whitening(
 
 def _left(intervals: Intervals, memory: float) -> Lanes:
     """Return the part of a rate that is left in the next interval; zero at the end of a trial."""
+    left = np.zeros(len(intervals.start))
+    if not memory:
+        return left
     middle = intervals.start + intervals.duration / 2
-    left = np.zeros(len(middle))
     left[:-1] = np.exp(-np.abs(np.diff(middle)) / memory)
     left[:-1][np.diff(intervals.trial) != 0] = 0.0
     return left
@@ -134,14 +141,13 @@ def estimate_wander(
     residual: Lanes,
     columns: Columns,
 ) -> Wander:
-    """Return the wandering rate of the largest restricted likelihood; none if it gains little.
+    """Return the rates of the largest restricted likelihood; wandering ones if they gain enough.
 
     **Arguments:** `residual` (L,): of the durations. `columns` (L, c): derivatives of the durations
     by what was fitted; the rates of trials are fitted, too.
     """
     period = float(np.median(intervals.duration))
     longest = float(intervals.sums(intervals.duration).max())
-    plain = Wander.none()
 
     def improbable(wander: Wander) -> float:
         """Return minus twice the logarithm of the likelihood, with the best variance."""
@@ -160,15 +166,20 @@ def estimate_wander(
         fitted = np.log(values[determined]).sum() + np.log(square).sum()
         return dof * np.log(left / dof) + white.log_determinant + float(fitted)
 
-    candidates = []
+    # Rates that every interval has anew make some intervals noisier than others: without them, a
+    # wandering rate would explain that, too.
+    changes = (_CHANGES / period).tolist()
+    anew = [Wander.none()] + [Wander(change, 0.0) for change in changes]
+    independent = min((improbable(x), x) for x in anew)
+    wandering = []
     for memory in (_MEMORIES * period).tolist():
         if memory > 4 * longest:
             break
         forgotten = 1 - np.exp(-2 * period / memory)
-        for change in _CHANGES / period:
+        for change in changes:
             wander = Wander(float(change / np.sqrt(forgotten)), memory)
-            candidates.append((improbable(wander), wander))
-    least, best = min(candidates)
-    if improbable(plain) - least < _LEAST_GAIN:
-        return plain
-    return best
+            wandering.append((improbable(wander), wander))
+    correlated = min(wandering, default=independent)
+    if independent[0] - correlated[0] < _LEAST_GAIN:
+        return independent[1]
+    return correlated[1]

@@ -41,6 +41,9 @@ _BLOCKS = 30
 _SHORTEST_BLOCK = 10
 
 
+# Half waves whose coefficients may be as large as that of the first one. More: bands are wider.
+# Fewer: where the data determine little, bands are those of a curve that hardly turns in a cycle.
+_COARSE = 3.0
 # Logarithms of tau^2 that are compared, beyond that of the mean of its prior. Wider or finer: time.
 # Narrower: curves that are flatter than e^-8 of the prior's mean keep that shape.
 _LOG_SIZES = np.arange(-16.0, 4.5, 0.5)
@@ -89,7 +92,7 @@ class CurveFit(NamedTuple):
     coefficients: Curve
     rates: Float[np.ndarray, " trials"]
     jitter: float
-    """Standard deviation of the phase at the end of a cycle."""
+    """Standard deviation of the phase at the end of a cycle, as forecast from earlier ones."""
     used: Bool[np.ndarray, " L"]
     """Intervals that are not miscounted."""
     residual: Lanes
@@ -140,8 +143,8 @@ def fit_curve(
         fit = _minimize(intervals, table, fit)
         fit = fit._replace(used=fit.counted())
         fit = fit._replace(wander=_wander(intervals, fit))
-        errors = whitened(intervals, fit)(fit.residual[:, None])
-        fit = fit._replace(jitter=float(errors[fit.used].std()))
+        missed = whitened(intervals, fit).missed(fit.residual)
+        fit = fit._replace(jitter=float(missed[fit.used].std()))
         if _is_settled(before, fit):
             break
     return fit
@@ -294,7 +297,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     errors = projected(intervals, fit, whitened(intervals, fit))
     across = errors.across
     noise, excess = _noise(intervals, fit, errors)
-    weight = np.arange(1.0, across.shape[1]) ** 4
+    half_waves = np.arange(1.0, across.shape[1])
+    weight = ((_COARSE**2 + half_waves**2) / (_COARSE**2 + 1)) ** 2
     curvature = across.T @ across
     score = across.T @ errors.residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.

@@ -321,7 +321,7 @@ def phase_response(
         memory=_memory(intervals, fit),
         carried=carried.part,
         carried_error=carried.error,
-        wander=fit.wander.size * fit.jitter / float(np.median(fit.rates)),
+        wander=_wander(fit),
         wander_time=fit.wander.memory,
         within=_within(intervals),
         input=Signal(input, recording.unit(input)),
@@ -346,6 +346,14 @@ def _code(fit: CurveFit) -> Result:
 def _errors(waves: Waves, covariance: Float[np.ndarray, "p p"]) -> Series:
     """Return standard errors of a curve at the phases of some waves."""
     return np.sqrt(np.einsum("ni,ij,nj->n", waves, covariance, waves))
+
+
+def _wander(fit: CurveFit) -> float:
+    """Return the standard deviation of a wandering rate, as part of the rate."""
+    if not fit.wander.memory:
+        return 0.0
+    jitter = np.sqrt(fit.smoothness.noise / fit.smoothness.excess)
+    return float(fit.wander.size * jitter / np.median(fit.rates))
 
 
 def _within(intervals: Intervals) -> float:
