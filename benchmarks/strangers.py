@@ -8,6 +8,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
     python benchmarks/strangers.py phase    # phase response curves from times of events
     python benchmarks/strangers.py phase-long  # the same of four times as many
+    python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
     python benchmarks/strangers.py study    # studies whose data support a lower order
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
@@ -366,6 +367,61 @@ def _phase_response(made: beats.Beats) -> hj.recordings.PhaseResponse:
     return hj.recordings.phase_response(recording, hj.AtEvent("beat"), input="u")
 
 
+def loops(draws: int) -> None:
+    """Print errors of `fit_series(references=)` relative to those of `fit_ldtp`, and refusals."""
+    print(
+        "multipliers, noise      n  refused  names fit_ldtp  ldtp refuses  ratio of rms errors"
+    )
+    ratios = []
+    for noise in (0.0, 1.0):
+        for kind, multipliers in enumerate(truth.REFERENCED):
+            pairs = []
+            refusals = []
+            without = 0
+            for seed in range(draws):
+                loop, r, u, y = truth.referenced_series(kind, seed, noise)
+                data = [
+                    hj.experiments.SectionSeries(
+                        np.concatenate([a, b], axis=1),
+                        c,
+                        inputs=("u", "r"),
+                        n_sections=4,
+                    )
+                    for a, b, c in zip(u, r, y, strict=True)
+                ]
+                d = len(loop.multipliers)
+                true = loop.multipliers[0]
+                try:
+                    one = hj.fit_series(data, d, references="r").multipliers
+                except hj.errors.DefinitionError as error:
+                    refusals.append(str(error))
+                    continue
+                try:
+                    other = hj.fit_ldtp(data, d, references="r").multipliers
+                except hj.errors.DefinitionError:
+                    without += 1
+                    continue
+                pairs.append([_nearest(one, true), _nearest(other, true)])
+            named = sum("fit_ldtp" in text for text in refusals)
+            ratio = np.nan
+            if pairs:
+                rms = np.sqrt(np.mean(np.square(pairs), axis=0))
+                ratio = rms[0] / rms[1]
+                ratios.append(ratio)
+            print(
+                f"{multipliers!s:18} {noise:4.1f} {draws:4} {len(refusals):8} {named:15} "
+                f"{without:12} {ratio:9.1f}",
+                flush=True,
+            )
+    low, middle, high = np.quantile(ratios, (0, 0.5, 1))
+    print(f"ratios from {low:.1f} to {high:.1f}, median {middle:.1f}")
+
+
+def _nearest(multipliers: np.ndarray, true: complex) -> float:
+    """Return the distance of the nearest multiplier."""
+    return float(np.abs(multipliers - true).min())
+
+
 # Each row with its usual number of draws.
 ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "files": (files, 5),
@@ -373,6 +429,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "bands": (bands, 200),
     "series": (series, 60),
     "study": (study, 12),
+    "loops": (loops, 10),
     "phase": (phase, 30),
     "phase-long": (long_phase, 10),
 }
