@@ -9,6 +9,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py phase    # phase response curves from times of events
     python benchmarks/strangers.py phase-long  # the same of four times as many
     python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
+    python benchmarks/strangers.py weak     # fit_series of a pair beside a weak multiplier
     python benchmarks/strangers.py study    # studies whose data support a lower order
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
@@ -367,6 +368,45 @@ def _phase_response(made: beats.Beats) -> hj.recordings.PhaseResponse:
     return hj.recordings.phase_response(recording, hj.AtEvent("beat"), input="u")
 
 
+def weak(draws: int) -> None:
+    """Print how `fit_series` of a pair goes whose data have another, weak multiplier.
+
+    "off" is the rms error of the pair in standard errors; "quiet" counts misses of more than three
+    of them without a finding.
+    """
+    print("weak multiplier, size    held  rms off  3 off  quiet     n  findings")
+    pair = [0.7 * np.exp(0.9j)]
+    for size in (0.0, 0.1, 0.3, 1.0):
+        fits = []
+        counts: dict[str, int] = {}
+        for seed in range(draws):
+            loop, u, y = truth.weak_series(pair, 0.4, size, seed)
+            records = [
+                hj.experiments.SectionSeries(a, b, n_sections=3)
+                for a, b in zip(u, y, strict=True)
+            ]
+            try:
+                fit = hj.fit_series(records, 2)
+            except hj.errors.DefinitionError:
+                counts["refused"] = counts.get("refused", 0) + 1
+                continue
+            true = loop.multipliers[:2]
+            error = _nearest(fit.multipliers, true[0]) / fit.standard_errors.max()
+            causes = [finding.cause for finding in fit.findings]
+            fits.append((bool(fit.contains(true).all()), error, bool(causes)))
+            for cause in causes:
+                counts[cause] = counts.get(cause, 0) + 1
+        held, errors, said = np.array(fits, float).reshape(-1, 3).T
+        off = errors > 3
+        quiet = int((off & (said == 0)).sum())
+        rms = np.sqrt(np.mean(errors**2))
+        print(
+            f"0.4, {size:3.1f} {int(held.sum()):19} {rms:8.1f} {int(off.sum()):6} {quiet:6} "
+            f"{len(fits):5}  {counts}",
+            flush=True,
+        )
+
+
 def loops(draws: int) -> None:
     """Print errors of `fit_series(references=)` relative to those of `fit_ldtp`, and refusals."""
     print(
@@ -429,6 +469,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "bands": (bands, 200),
     "series": (series, 60),
     "study": (study, 12),
+    "weak": (weak, 60),
     "loops": (loops, 10),
     "phase": (phase, 30),
     "phase-long": (long_phase, 10),

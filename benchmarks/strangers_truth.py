@@ -239,3 +239,33 @@ def referenced_series(
         acts = u[:, i] + noise * rng.normal(size=(S, 1))
         x = x @ loop.A[n].T + acts @ loop.B[n].T
     return loop, r, u, y
+
+
+def weak_series(
+    multipliers: list[complex], weak: complex, size: float, seed: int
+) -> tuple[Loop, np.ndarray, np.ndarray]:
+    """Return a random loop with three sections, and inputs and outputs of three records.
+
+    **Arguments:** `weak`: a further multiplier, real, that inputs excite by `size` relative to the
+    others.
+    """
+    rng = np.random.default_rng((seed, 11))
+    loop = loop_with([*multipliers, weak], 3, 2, rng)
+    product = loop.A[2] @ loop.A[1] @ loop.A[0]
+    values, modes = np.linalg.eig(product)
+    weakest = int(np.argmin(np.abs(values - weak)))
+    scales = np.ones(len(values))
+    scales[weakest] = size
+    shrink = (modes * scales @ np.linalg.inv(modes)).real
+    # In the frame of each section, the part of its input along the weak mode is smaller.
+    to_next = [loop.A[0], loop.A[1] @ loop.A[0], product]
+    B = np.array(
+        [
+            way @ shrink @ np.linalg.inv(way) @ b
+            for way, b in zip(to_next, loop.B, strict=True)
+        ]
+    )
+    loop = loop._replace(B=B)
+    u = rng.normal(size=(3, 450, 1))
+    y = loop.response(u)
+    return loop, u, y + 0.1 * y.std(axis=(0, 1)) * rng.normal(size=y.shape)
