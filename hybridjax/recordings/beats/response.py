@@ -216,7 +216,7 @@ class PhaseResponse(PhaseCurve):
         if not self.wander:
             return ""
         return (
-            f"; they wander by {100 * self.wander:.2g} %, forgotten after "
+            f"\n  wander       of the rate in a trial {100 * self.wander:.2g} %, forgotten after "
             f"{self.wander_time:.2g} s"
         )
 
