@@ -202,6 +202,7 @@ UNCHECKED = {
         "Impulse",
         "ImpulseResponses",
         "Inspection",
+        "IntervalForecast",
         "LDTPFit",
         "LimitCycle",
         "LimitCycles",

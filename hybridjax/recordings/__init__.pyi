@@ -1,5 +1,6 @@
 from ..apps.subjects import SubjectStudy as SubjectStudy
 from .beats.response import (
+    IntervalForecast as IntervalForecast,
     PhaseResponse as PhaseResponse,
     phase_response as phase_response,
 )
