@@ -7,6 +7,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
     python benchmarks/strangers.py study    # studies whose data support a lower order
+    python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -26,6 +27,7 @@ one_thread.pin()
 
 import numpy as np  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
+import strangers_plants  # noqa: E402
 import strangers_truth as truth  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -285,6 +287,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "bands": (bands, 200),
     "series": (series, 60),
     "study": (study, 12),
+    "plants": (strangers_plants.plants, 40),
 }
 
 
