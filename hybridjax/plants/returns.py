@@ -509,7 +509,7 @@ def _doubts(resolved: _Resolved, map: ReturnMap) -> list[Finding]:
         findings.append(
             Finding(
                 "hidden multipliers",
-                f"noise of the returns may hide multipliers up to {resolved.bound:.1g}, so that "
+                f"noise of the returns may hide multipliers up to {resolved.bound:.2g}, so that "
                 "one of those that are not listed may be the largest. Contacts that begin at the "
                 "ends of time steps are such noise: take a shorter time step, or a contact force "
                 "that begins at zero.",
