@@ -22,10 +22,15 @@ from .drive import At
 # narrow and wide steps hardly differ; of 8: the widest ones leave the linear range. Equal ones: no
 # scatter, where the grid of time is not moved.
 _STEPS = np.array([1.0, 1.2, 2.0, 2.4, 3.3, 4.0])
-# Slopes between two of them lie on J + c step^2. Those of wide steps have less noise. The noise is
-# their scatter about J + c step^2 + e step^4: about two terms, curvature would count as noise.
-_WEIGHTS = _STEPS**2
-_DOF = len(_STEPS) - 3
+# The first four are narrow, the last four wide.
+_NARROW = _STEPS <= _STEPS[3]
+_WIDE = _STEPS >= _STEPS[2]
+# Even powers of the step, with the constant, by which slopes are fitted. Their scatter about this
+# fit is the noise: with fewer, curvature counts as noise; with more, few degrees of freedom remain.
+_POWERS = 3
+# Number of coordinates times repetitions of all steps. Smaller: the noise of one coordinate is
+# known from six pairs only. Larger: more time for few coordinates.
+_COLUMNS = 4
 # Smallest step in units of the range of a coordinate, at most. Larger: the widest steps, four times
 # as long, leave the linear range. Smaller: contacts of simulators with fixed time steps begin at
 # the same step for all of them, so that their noise hides.
@@ -33,6 +38,8 @@ _LARGEST_STEP = 0.01
 # Steps of time by which the grid of a simulator is moved, one for each pair: multiples of the
 # golden ratio fill the unit interval evenly, also after a multiplication by any integer.
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
+# Phases of the grid at which its noise is measured. Fewer: stairs between them hide. More: time.
+_GRIDS = 8
 # Part of the range by which a return may differ if the grid is moved. Larger: controllers that
 # count time steps are disturbed. Smaller: errors of integration count as a disturbance.
 _GRID_ERROR = 0.03
@@ -160,7 +167,7 @@ class ReturnMap:
 
     def measure(self) -> None:
         """Measure the ranges of the coordinates and the noise of returns, and find the coordinates
-        that travel, in about 50 cycles."""
+        that travel, in about 70 cycles."""
         points = list[At]()
         self(self.x, points)
         rows = np.array([x.state for x in points], float)[:, self.columns]
@@ -171,15 +178,32 @@ class ReturnMap:
         self.size = np.where(size > 1e-9 * largest, size, rest)
         self.tolerance, self.noise = self._noise()
         self._find_travelling()
-        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives.
-        step = (self.noise / self.size).max() ** 0.2 / 2
-        self.h = self.size * min(step, _LARGEST_STEP)
         plain = self(self.x)
         moved = [self(self.x, first=part) for part in (_GOLDEN, 1 - _GOLDEN)]
         change = np.abs(np.array(moved) - plain)
         allowed = np.maximum(_GRID_ERROR * self.size, 10 * self.noise)
         self.moves_grid = bool((change <= allowed).all())
+        if self.moves_grid:
+            self.noise = np.maximum(self.noise, self._noise_of_grid())
+        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
+        # derivatives.
+        step = (self.noise / self.size).max() ** 0.2 / 2
+        self.h = self.size * min(step, _LARGEST_STEP)
+
+    def _noise_of_grid(self) -> Float[np.ndarray, " d"]:
+        """Return the standard deviation of returns over the phases of the grid of time.
+
+        Between the stairs of a simulator, returns from nearly equal states have no noise.
+        """
+        rng = np.random.default_rng(1)
+        move = 2 * _LARGEST_STEP * self.size * rng.choice([-1, 1], len(self.x))
+        changes = []
+        for pair in range(1, _GRIDS + 1):
+            first = pair * _GOLDEN % 1.0
+            above = self(self.x + move, first=first)
+            below = self(self.x - move, first=first)
+            changes.append(above - below)
+        return np.std(changes, axis=0, ddof=1) / np.sqrt(2)
 
     def _find_travelling(self) -> None:
         """Find coordinates that grow in each cycle, as the distance walked does.
@@ -253,12 +277,16 @@ class ReturnMap:
         at the ends of time steps, the differences then scatter as over many steps of the grid.
         """
         d = len(self.x)
-        slopes = np.empty((len(_STEPS), d, d))
+        repeats = max(1, _COLUMNS // d)
+        slopes = np.empty((repeats, len(_STEPS), d, d))
+        pair = 0
         for k in counted(range(d), "coordinates", d):
-            for j, step in enumerate(_STEPS):
-                part = (1 + k * len(_STEPS) + j) * _GOLDEN % 1.0
-                first = part if self.moves_grid else 0.0
-                slopes[j, :, k] = self._slope(k, step, first)
+            for r in range(repeats):
+                for j, step in enumerate(_STEPS):
+                    pair += 1
+                    first = pair * _GOLDEN % 1.0 if self.moves_grid else 0.0
+                    slopes[r, j, :, k] = self._slope(k, step, first)
+        slopes = slopes.reshape(-1, d, d)
         return slopes * self.size / self.size[:, None]
 
     def _slope(self, k: int, step: float, first: float) -> Float[np.ndarray, " d"]:
@@ -314,6 +342,10 @@ def measured_returns(map: ReturnMap) -> Returns:
     residual = map.solve()
     map.require_on_cycle(residual)
     resolved = _resolved(_slopes_of(map))
+    longest = _LARGEST_STEP * map.size
+    if _hides(resolved) and (map.h < longest).any():
+        map.h = longest
+        resolved = _resolved(_slopes_of(map))
     if _is_curved(resolved):
         map.h = map.h / _STEPS.max()
         closer = _resolved(_slopes_of(map))
@@ -340,6 +372,11 @@ def _slopes_of(map: ReturnMap) -> "_Jacobian":
     """Return the Jacobian of a map and its errors, in units of the ranges."""
     tolerance = map.tolerance[:, None] / map.h * map.size / map.size[:, None]
     return _fitted(map.all_slopes(), tolerance)
+
+
+def _hides(resolved: "_Resolved") -> bool:
+    """Return whether a multiplier that is not listed may be the largest."""
+    return resolved.bound > np.abs(resolved.multipliers).max(initial=_SMALL)
 
 
 def _is_curved(resolved: "_Resolved") -> bool:
@@ -380,19 +417,25 @@ def _fitted(
     slopes: Float[np.ndarray, "pairs d d"], tolerance: Float[np.ndarray, "d d"]
 ) -> _Jacobian:
     """Fit slopes, which the tolerances of the plant change by `tolerance`, by J + c step^2."""
-    coefficients = np.tensordot(_solution(_STEPS, 3), slopes, (1, 0))
-    residuals = slopes - np.tensordot(_powers(_STEPS, 3), coefficients, (1, 0))
+    repeats = len(slopes) // len(_STEPS)
+    steps = np.tile(_STEPS, repeats)
+    weights = steps**2
+    coefficients = np.tensordot(_solution(steps, _POWERS), slopes, (1, 0))
+    residuals = slopes - np.tensordot(_powers(steps, _POWERS), coefficients, (1, 0))
     # (Of unit weight.)
-    residuals = residuals * np.sqrt(_WEIGHTS)[:, None, None]
-    constant = _solution(_STEPS, 2)[0]
-    variance = (constant**2 / _WEIGHTS).sum()
-    between = np.zeros_like(_STEPS)
-    between[:4] += _solution(_STEPS[:4], 2)[0]
-    between[2:] -= _solution(_STEPS[2:], 2)[0]
-    apart_variance = (between**2 / _WEIGHTS).sum()
+    residuals = residuals * np.sqrt(weights)[:, None, None]
+    constant = _solution(steps, 2)[0]
+    variance = (constant**2 / weights).sum()
+    between = np.zeros_like(steps)
+    narrow = np.tile(_NARROW, repeats)
+    wide = np.tile(_WIDE, repeats)
+    between[narrow] += _solution(steps[narrow], 2)[0]
+    between[wide] -= _solution(steps[wide], 2)[0]
+    apart_variance = (between**2 / weights).sum()
+    dof = len(steps) - _POWERS
     return _Jacobian(
         value=np.tensordot(constant, slopes, (0, 0)),
-        errors=np.sqrt(variance / _DOF) * residuals,
+        errors=np.sqrt(variance / dof) * residuals,
         tolerance=np.sqrt(variance / 2) * tolerance,
         apart=np.tensordot(between, slopes, (0, 0)),
         apart_noise=float(np.sqrt(apart_variance / variance)),
@@ -429,7 +472,8 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
     # (The product is 0 for eigenvalues that coincide.)
     with np.errstate(all="ignore"):
         left = left / product.conj()
-    noise = np.zeros((len(_STEPS), d, d), complex)
+    pairs = len(jacobian.errors)
+    noise = np.zeros((pairs, d, d), complex)
     for j, error in enumerate(jacobian.errors):
         noise[j] = (left.conj().T @ error) * right.T
     # (Of pair j and eigenvalue i, the share of column k.)
@@ -453,7 +497,7 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
     rng = np.random.default_rng(0)
     draws = np.einsum(
         "bjk,jik->bik",
-        rng.standard_normal((_DRAWS, len(_STEPS), d)),
+        rng.standard_normal((_DRAWS, pairs, d)),
         jacobian.errors,
     )
     draws += jacobian.tolerance * rng.standard_normal((_DRAWS, d, d))
@@ -476,7 +520,7 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
         multipliers=values[rows],
         coefficients=polynomials[0],
         covariance=covariance,
-        dof=_degrees(variance[rows], error[rows]),
+        dof=_degrees(variance[rows], error[rows], pairs - _POWERS),
         bound=float(bound),
         apart=apart[rows],
     )
@@ -487,15 +531,15 @@ def _polynomial(roots: Complex[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
 
 
 def _degrees(
-    variance: Float[np.ndarray, "k d"], error: Float[np.ndarray, " k"]
+    variance: Float[np.ndarray, "k d"], error: Float[np.ndarray, " k"], own: int
 ) -> float:
     """Return the smallest number of degrees of freedom of the errors (Satterthwaite 1946).
 
-    **Arguments:** `variance`: noise of each multiplier by column, each with those of one fit.
+    **Arguments:** `variance`: noise of each multiplier by column, each with `own` degrees.
     """
     degrees = [np.inf]
     for parts, total in zip(variance, error**2, strict=True):
-        square = (parts**2).sum() / _DOF
+        square = (parts**2).sum() / own
         if square > 0:
             degrees.append(total**2 / square)
     return float(min(degrees))
@@ -505,7 +549,7 @@ def _doubts(resolved: _Resolved, map: ReturnMap) -> list[Finding]:
     """Return findings about multipliers that noise hides, and about steps that disagree."""
     findings = []
     moduli = np.abs(resolved.multipliers)
-    if resolved.bound > moduli.max(initial=_SMALL):
+    if _hides(resolved):
         findings.append(
             Finding(
                 "hidden multipliers",
