@@ -8,6 +8,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
     python benchmarks/strangers.py study    # studies whose data support a lower order
     python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
+    python benchmarks/strangers.py pushes   # experiments on them, with four sizes of inputs
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -288,6 +289,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "series": (series, 60),
     "study": (study, 12),
     "plants": (strangers_plants.plants, 40),
+    "pushes": (strangers_plants.pushes, 12),
 }
 
 

@@ -92,6 +92,47 @@ def returns_of(setting: truth.Setting, true: truth.Truth) -> dict[str, Any]:
     }
 
 
+def experiments_of(
+    setting: truth.Setting, true: truth.Truth, amplitude: float
+) -> dict[str, Any]:
+    """Return how a fit to experiments fares whose order is that of the multipliers above 0.02."""
+    order = int((np.abs(true.multipliers) > 0.02).sum())
+    says = []
+    try:
+        cycle = hj.plants.find_cycle(
+            plant_of(setting), hj.ClockPhase(8), ("x_rate", "pitch"), cycles=60
+        )
+        design = hj.multisine(n_sections=8, periods=16, amplitude=amplitude)
+        data = cycle.run_experiments(design, processes=0)
+        says = [repr(finding) for finding in data.findings]
+        fit = hj.fit_multipliers(hj.estimate_htf(data), order=order)
+    except hj.errors.HybridJaxError as refusal:
+        return {"outcome": "said", "says": [*says, str(refusal)], "rows": []}
+    says += [repr(finding) for finding in fit.findings]
+    rows = compared(fit, true)
+    held = all(row["held"] for row in rows)
+    outcome = "held" if held else ("said" if says else "SILENT")
+    return {"outcome": outcome, "says": says, "rows": rows}
+
+
+def pushes(draws: int) -> None:
+    """Print how the regions of experiments with four sizes of inputs fare in so many settings."""
+    totals: dict[str, int] = {}
+    default = [truth.Setting(machine) for machine in truth.MACHINES]
+    for setting in [*default, *truth.settings(draws)][:draws]:
+        try:
+            true = truth.truth_of(setting)
+        except ValueError as fall:
+            print(json.dumps({"setting": repr(setting), "no truth": str(fall)}))
+            continue
+        for amplitude in (0.3, 0.1, 0.03, 0.01):
+            found = experiments_of(setting, true, amplitude)
+            totals[found["outcome"]] = totals.get(found["outcome"], 0) + 1
+            found |= {"setting": repr(setting), "amplitude": amplitude}
+            print(json.dumps(found), flush=True)
+    print(f"{sum(totals.values())} fits: {totals}", flush=True)
+
+
 def plants(draws: int) -> None:
     """Print how the regions of perturbed returns fare in so many settings."""
     totals: dict[str, int] = {}

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked, checked_methods
@@ -15,6 +15,7 @@ from .._core.boundary.containers import Names
 from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames, Vector
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
+from .._core.findings import Finding, warn_of
 from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -30,10 +31,14 @@ from ..orbits.crossing import Crossing
 from ..sections import families
 from ..systems import chart, system
 from ..systems.structure import Structure
+from .amplitude import doubts_about_inputs
 from .drive import At, Drive, Plant, PlantPhase, Trial, resume, run_all
 from .returns import ReturnMap, Returns, measured_returns
 
 
+# Fewest experiments whose inputs are tested, by one experiment more. Fewer: single records, which
+# are no estimates, take twice the time.
+_FEWEST = 4
 Draw = Callable[[Any], Any]
 Inputs = Annotated[Numbers, Reals("n inputs")]
 
@@ -139,13 +144,22 @@ class PlantCycle(Showable):
             if cause:
                 failed_at[s] = len(values)
         causes = tuple(cause for _, cause in trials)
+        at_rest = np.tile(self.cycle_outputs, (u.shape[1] // N, 1))
+        responses = rows[..., :-1] - at_rest
+        findings = self._doubts_about(u, responses, failed_at)
+        warn_of(findings)
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
-            failed_at, None, self.sections.label, rows[..., -1], causes
+            failed_at,
+            None,
+            self.sections.label,
+            rows[..., -1],
+            causes,
+            tuple(findings),
         )
         return ExperimentData(
             u,
-            rows[..., :-1] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
+            responses,
             n_sections=N,
             periods=inputs.periods,
             inputs=self.inputs,
@@ -154,6 +168,27 @@ class PlantCycle(Showable):
             cycle_outputs=self.cycle_outputs,
             simulated=simulated,
         )
+
+    def _doubts_about(
+        self,
+        u: Float[np.ndarray, "S n nu"],
+        responses: Float[np.ndarray, "S n ny"],
+        failed_at: Int[np.ndarray, " S"],
+    ) -> list[Finding]:
+        """Return findings about the size of the inputs, of which the first experiment is repeated
+        with half of its input."""
+        whole = np.flatnonzero(failed_at < 0)
+        if len(whole) < _FEWEST or not responses[whole[0]].any():
+            return []
+        s = int(whole[0])
+        values, cause = self.drive.run(self.seed + 1 + s, (u[s] / 2).tolist())
+        if cause:
+            return []
+        at_rest = np.tile(
+            self.cycle_outputs, (u.shape[1] // len(self.cycle_outputs), 1)
+        )
+        half = np.array(values)[:, :-1] - at_rest
+        return doubts_about_inputs(self, responses[s], half)
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.

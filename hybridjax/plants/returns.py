@@ -111,7 +111,7 @@ class ReturnMap:
     `travelling`: names of coordinates on which nothing depends. `size`: ranges on the cycle.
     `noise`: of returns; `tolerance`: of those of states that are nearly equal, which is rounding
     and the tolerances of the plant. `h`: the smallest steps of differences. The last five are known
-    after `measure`.
+    after `measure`. `signals`: of the plant, after the last return.
     """
 
     def __init__(self, cycle: Any, names: SignalNames | None = None):
@@ -138,6 +138,7 @@ class ReturnMap:
             turns = round(cycle.period / period)
             self.shift[names.index("time")] = turns * period
         self.x = self.base[self.columns]
+        self.signals = np.array(cycle.drive.start.z, float)
         self.n = cycle.sections.n_sections
         self.moves_grid = False
         # (A perturbed state before a crossing must not return to it at once.)
@@ -163,11 +164,27 @@ class ReturnMap:
         if points is None:
             drive.pass_time(self.free)
         drive.advance(drive.zero, self.n, points)
+        self.signals = np.array(drive.z, float)
         return np.array(drive.here().state, float)[self.columns] - self.shift
 
     def measure(self) -> None:
         """Measure the ranges of the coordinates and the noise of returns, and find the coordinates
         that travel, in about 70 cycles."""
+        self.measure_ranges()
+        self.tolerance, self.noise = self._noise()
+        self._find_travelling()
+        self.moves_grid = self.grid_may_move()
+        if self.moves_grid:
+            changes, _ = self.changes_over_grids()
+            noise = np.std(changes, axis=0, ddof=1) / np.sqrt(2)
+            self.noise = np.maximum(self.noise, noise)
+        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
+        # derivatives.
+        step = (self.noise / self.size).max() ** 0.2 / 2
+        self.h = self.size * min(step, _LARGEST_STEP)
+
+    def measure_ranges(self) -> None:
+        """Measure the ranges of the coordinates, in one cycle."""
         points = list[At]()
         self(self.x, points)
         rows = np.array([x.state for x in points], float)[:, self.columns]
@@ -176,34 +193,35 @@ class ReturnMap:
         # (A coordinate that does not move has the size of its value.)
         rest = np.where(self.x, np.abs(self.x), 1.0)
         self.size = np.where(size > 1e-9 * largest, size, rest)
-        self.tolerance, self.noise = self._noise()
-        self._find_travelling()
+
+    def grid_may_move(self) -> bool:
+        """Return whether the plant may begin with a shorter time step. (A controller that counts
+        time steps is disturbed by it.)"""
         plain = self(self.x)
         moved = [self(self.x, first=part) for part in (_GOLDEN, 1 - _GOLDEN)]
         change = np.abs(np.array(moved) - plain)
-        allowed = np.maximum(_GRID_ERROR * self.size, 10 * self.noise)
-        self.moves_grid = bool((change <= allowed).all())
-        if self.moves_grid:
-            self.noise = np.maximum(self.noise, self._noise_of_grid())
-        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives.
-        step = (self.noise / self.size).max() ** 0.2 / 2
-        self.h = self.size * min(step, _LARGEST_STEP)
+        return bool((change <= _GRID_ERROR * self.size).all())
 
-    def _noise_of_grid(self) -> Float[np.ndarray, " d"]:
-        """Return the standard deviation of returns over the phases of the grid of time.
+    def changes_over_grids(
+        self,
+    ) -> tuple[Float[np.ndarray, "grids d"], Float[np.ndarray, "grids signals"]]:
+        """Return differences between the returns of two states, and between the signals there, for
+        several phases of the grid of time.
 
-        Between the stairs of a simulator, returns from nearly equal states have no noise.
+        Within a stair of a simulator, returns from nearly equal states have no noise: these have.
         """
         rng = np.random.default_rng(1)
         move = 2 * _LARGEST_STEP * self.size * rng.choice([-1, 1], len(self.x))
-        changes = []
+        states = []
+        signals = []
         for pair in range(1, _GRIDS + 1):
             first = pair * _GOLDEN % 1.0
             above = self(self.x + move, first=first)
+            signals_above = self.signals
             below = self(self.x - move, first=first)
-            changes.append(above - below)
-        return np.std(changes, axis=0, ddof=1) / np.sqrt(2)
+            states.append(above - below)
+            signals.append(signals_above - self.signals)
+        return np.array(states), np.array(signals)
 
     def _find_travelling(self) -> None:
         """Find coordinates that grow in each cycle, as the distance walked does.

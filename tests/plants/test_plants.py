@@ -1,6 +1,7 @@
 """Plants: closed forms, the paper's hopper against its exact model, and plants that fail."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -171,6 +172,7 @@ class Stairs:
     def step(self, u, duration):
         a, b, c, d = self.numbers
         self.t += duration
+        self.v += duration * u[0]
         time = (self.t + 1e-9) % 1.0
         if self.fired and time < c / 2:
             self.v = -self.v
@@ -200,6 +202,36 @@ def test_errors_contain_the_stairs_of_time_steps():
     # (Fewer than 17 once in 70 times, if the regions are right.)
     assert sum(held) >= 17
     assert sum(flat) < 10
+
+
+@pytest.mark.parametrize(("size", "cause"), [(1e-6, "stairs"), (0.1, None)])
+def test_inputs_that_stay_on_one_stair_are_named(size, cause):
+    plant = Stairs(0.4, 0.4, 0.3, 0.4, 0.005)
+    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+    u = size * np.random.default_rng(0).normal(size=(4, 60, 1))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        data = cycle.run_experiments(u, processes=0)
+    causes = [finding.cause for finding in data.findings]
+    assert causes == ([cause] if cause else [])
+    assert len(said) == len(causes)
+
+
+def test_inputs_beyond_the_linear_range_are_named():
+    """A push acts by its value and its square."""
+
+    class Curved(Circle):
+        def step(self, u, duration):
+            return super().step([u[0] + 0.1 * u[0] ** 2], duration)
+
+    cycle = hj.plants.find_cycle(Curved(), ANGLE, "x", cycles=20)
+    u = np.random.default_rng(0).normal(size=(4, 32, 1))
+    small = cycle.run_experiments(1e-3 * u, discard=0, processes=0)
+    assert not small.findings
+    with pytest.warns(hj.errors.FindingWarning, match="not linear"):
+        data = cycle.run_experiments(0.1 * u, discard=0, processes=0)
+    assert [finding.cause for finding in data.findings] == ["amplitude"]
+    assert "Amplitude" in repr(data)
 
 
 def test_an_unstable_cycle_is_found_from_a_guess():
@@ -260,7 +292,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
-    assert seeds == [*range(1, 10), 9, 10]
+    # (The last one has half of the first input, which tests the size of the inputs.)
+    assert seeds == [*range(1, 10), 9, 10, 1]
     assert np.array_equal(data.y, whole.y)
     assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(
