@@ -213,6 +213,7 @@ UNCHECKED = {
         "Motion",
         "MultiplierComparison",
         "MultiplierEstimate",
+        "NaturalIdentification",
         "NaturalMultipliers",
         "OptimalDesign",
         "OrderSelection",
