@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from matplotlib import pyplot
 from scipy import linalg, stats
