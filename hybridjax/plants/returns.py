@@ -578,8 +578,9 @@ def _doubts(resolved: _Resolved, map: ReturnMap) -> list[Finding]:
             )
         )
     apart = np.abs(resolved.apart)
-    k = int(np.argmax(apart / np.maximum(moduli, 1e-9))) if len(apart) else 0
-    if len(apart) and apart[k] > _APART * moduli[k]:
+    relative = apart / np.maximum(moduli, _SMALL)
+    k = int(np.argmax(relative)) if len(apart) else 0
+    if len(apart) and relative[k] > _APART:
         step = float((map.h / map.size).max())
         findings.append(
             Finding(
