@@ -11,6 +11,8 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
     python benchmarks/strangers.py weak     # fit_series of a pair beside a weak multiplier
     python benchmarks/strangers.py study    # studies whose data support a lower order
+    python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
+    python benchmarks/strangers.py pushes   # experiments on them, with four sizes of inputs
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -32,6 +34,7 @@ one_thread.pin()
 import numpy as np  # noqa: E402
 import strangers_beats as beats  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
+import strangers_plants  # noqa: E402
 import strangers_truth as truth  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -473,6 +476,8 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "loops": (loops, 10),
     "phase": (phase, 30),
     "phase-long": (long_phase, 10),
+    "plants": (strangers_plants.plants, 40),
+    "pushes": (strangers_plants.pushes, 12),
 }
 
 

@@ -214,6 +214,7 @@ UNCHECKED = {
         "Motion",
         "MultiplierComparison",
         "MultiplierEstimate",
+        "NaturalIdentification",
         "NaturalMultipliers",
         "OptimalDesign",
         "OrderSelection",
