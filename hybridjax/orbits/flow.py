@@ -507,7 +507,7 @@ def _in_parts(request: _Request, times: Float[Array, " K"]) -> Passage:
 
     def joined(x):
         x = jnp.moveaxis(x, 0, -2)
-        return x.reshape(*x.shape[:-2], -1)[..., :L]
+        return x.reshape(*x.shape[:-2], parts.size)[..., :L]
 
     return jax.tree_util.tree_map(joined, passages)
 

@@ -58,7 +58,7 @@ def flow_along(
     states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
     at_once = np.zeros(len(h), bool)
     rival = np.full(len(h), -1)
-    events = ends.events
+    events = np.cumsum(code >= 0)
     ways = states, walk.q[:, 1:]
     rows = h, code, walk.t[1:], *ways, chart[1:], at_once, rival, events
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
