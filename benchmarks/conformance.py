@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from peers import flows
+from peers import flows, jaxonomy_flows
 from peers.c_peer import bounces
 from peers.errors import Unavailable
 from scipy.integrate import solve_ivp
@@ -300,32 +300,17 @@ def orders(function, point) -> dict:
     )
 
 
-def peers(_) -> None:
+def peers(options) -> None:
     """Errors of gradients by the parameters, and CPU seconds of the first call and of later ones:
-    of `flow` inside of `jit`, of scipy with differences, and of heyoka with variational equations
-    and saltation matrices; and the ramp by diffrax."""
+    of `flow` inside of `jit`, of scipy with differences, of heyoka with variational equations and
+    saltation matrices, and of jaxonomy; and the ramp by diffrax."""
     for name in flows.ROWS:
-        row = flows.ROWS[name]
-        flow, exact, given = PEER_ROWS[name]
-        every = tuple(range(len(given)))
-        true = np.array(jax.grad(exact, every)(*given))
-        point = np.array(given)
-
-        count = len(given)
-
-        def own(flow=flow, every=every):
-            program = jax.jit(jax.grad(flow, every))
-            return lambda p: program(*p)
-
-        makers = {
-            "hybridjax": own,
-            "scipy": lambda row=row: flows.scipy_gradient(row),
-            "heyoka": lambda row=row, n=count: flows.heyoka_gradient(row, n),
-        }
-        for peer, make in makers.items():
+        _, exact, given = PEER_ROWS[name]
+        true = np.array(jax.grad(exact, tuple(range(len(given))))(*given))
+        for peer, run in _runs(name, options.jaxonomy).items():
             label = f"peers.{name}.{peer}"
             try:
-                found, first, later = flows.timed(make, point)
+                found, first, later = run()
             except Unavailable as problem:
                 show(label, problem)
                 continue
@@ -334,6 +319,30 @@ def peers(_) -> None:
             show(f"{label}.again", later)
     show("peers.ramp.diffrax_two_fields", diffrax_ramp(switched=False))
     show("peers.ramp.diffrax_switched_field", diffrax_ramp(switched=True))
+
+
+def _runs(name: str, jaxonomy: str) -> dict:
+    """For each library, a function that measures the gradient of a row, as `flows.timed`."""
+    row = flows.ROWS[name]
+    flow, _, given = PEER_ROWS[name]
+    point = np.array(given)
+
+    def own():
+        program = jax.jit(jax.grad(flow, tuple(range(len(given)))))
+        return lambda p: program(*p)
+
+    def by_scipy():
+        return flows.scipy_gradient(row)
+
+    def by_heyoka():
+        return flows.heyoka_gradient(row, len(given))
+
+    return {
+        "hybridjax": lambda: flows.timed(own, point),
+        "scipy": lambda: flows.timed(by_scipy, point),
+        "heyoka": lambda: flows.timed(by_heyoka, point),
+        "jaxonomy": lambda: jaxonomy_flows.run(name, given, jaxonomy),
+    }
 
 
 def diffrax_ramp(switched: bool) -> float:
@@ -732,6 +741,7 @@ def main() -> None:
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jaxonomy", default="python", help="its interpreter")
     parser.add_argument("--starts", type=int, default=100_000)
     parser.add_argument("--tolerance", type=float, default=1e-12)
     options = parser.parse_args()
