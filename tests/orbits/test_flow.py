@@ -327,6 +327,22 @@ def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
     assert_allclose(jitted(height), exact / (2 * height), rtol=1e-11)
 
 
+def test_steps_after_events_are_not_tried_with_the_length_of_the_first_one():
+    """That one is a guess, a tenth of the longest duration, and would be rejected each time."""
+
+    def fall(t, q, u, p):
+        return q[1], -9.81 - 0.1 * q[1]
+
+    def bounce(t, q, u, p):
+        return q[0], -0.9 * q[1]
+
+    events = [("bounce", lambda t, q, u, p: q[0], bounce)]
+    dragged = hj.HybridSystem.from_functions(("y", "v"), fall, events, inputs=())
+    few = hj.orbits.Settings(rtol=1e-10, max_steps=40)
+    found = hj.flow(dragged, DROP, events=10, within=20.0, settings=few, max_steps=40)
+    assert found.count == 10
+
+
 def test_a_flow_until_its_start_stays_there():
     """It moves on with the end, at the rate of the field."""
     assert_allclose(hj.flow(ball(), DROP, 0.0).state, (1.0, 0.0), rtol=1e-15)
