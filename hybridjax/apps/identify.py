@@ -187,8 +187,11 @@ def write_results(folder: Path, result: Results, formats: Sequence[Format]) -> N
         average.append((n, n / data.n_sections, *row))
     _write_table(folder / "cycle.csv", ["section", "phase (cycles)", *header], average)
     (folder / "summary.json").write_text(json.dumps(summarize(result), indent=1) + "\n")
-    page = _natural_page if isinstance(result, NaturalIdentification) else _page
-    (folder / PAGE).write_text(page(result, images), encoding="utf-8")
+    if isinstance(result, NaturalIdentification):
+        page = _natural_page(result, images)
+    else:
+        page = _page(result, images)
+    (folder / PAGE).write_text(page, encoding="utf-8")
 
 
 def _samples(result: Results) -> Iterator[tuple]:
@@ -234,12 +237,12 @@ def summarize(result: Results) -> dict[str, Any]:
     }
     if isinstance(result, NaturalIdentification):
         return numbers | {
-            "multipliers_of_plain_regression": complex_pairs(fit.plain),
+            "multipliers_of_plain_regression": complex_pairs(result.fit.plain),
             "warnings": list(map(repr, result.findings)),
         }
     held = result.held_out
     return numbers | {
-        "references": list(fit.references),
+        "references": list(result.fit.references),
         "multipliers_of_plain_regression": complex_pairs(result.diagnosis.plain),
         "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
         "held_out_fit_percent": held.validation.fit.tolist(),
