@@ -59,7 +59,7 @@ class ObservedTrajectory(AbstractObservation):
     times: Float[Array, " K"]
     outputs: tuple[str, ...] = eqx.field(static=True)
     values: Float[Array, "K ny"]
-    known: tuple[int, ...] = eqx.field(static=True)
+    known: tuple[int, ...] = eqx.field(static=True, repr=False)
     """Places of the values that are no NaN."""
     scale: Float[Array, " ny"]
     events: tuple[str, ...] = eqx.field(static=True)

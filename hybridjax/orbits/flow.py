@@ -71,7 +71,7 @@ class Flow(Showable, eqx.Module):
     a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and
     indices of their transitions (-1 for none). `before`, `after` (E, d): the states before and
     after their resets. `count`: number of all events. `trajectory`: steps and dense states, of a
-    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start.
+    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start and end.
     """
 
     t: Float[Array, "*L"]
@@ -383,6 +383,10 @@ def _target_of(
                 f"{float(np.max(lanes.t)):.9g}: give a later `until`."
             )
         return until_time(time), _only_chart(s)
+    name = until.name if isinstance(until, AtEvent) else until
+    if isinstance(name, str):
+        # (A misspelled event is named before the missing `within`.)
+        g = s.transition_index(name)
     if within is None:
         raise DefinitionError(
             "flow to an event or a section needs the longest duration to wait for it: "
@@ -397,8 +401,6 @@ def _target_of(
     if isinstance(until, Crossing):
         until.check(s)
         return to_section(toward(never, -1, limit), until), _only_chart(s, until)
-    name = until.name if isinstance(until, AtEvent) else until
-    g = s.transition_index(name)
     return toward(never, g, limit), s.chart_index(s.transitions[g].target)
 
 
@@ -470,10 +472,16 @@ def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
         begin,
     )
     moved, events, _ = passage
-    result = update_result(
-        moved.result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
-    )
+    late = _is_late(target, lanes, moved.lanes)
+    result = update_result(moved.result, late, Result.SECTION_MISSED)
+    coincide = _coincide(s, lanes, target, events)
+    result = update_result(result, coincide, Result.SIMULTANEOUS)
     return passage._replace(moved=moved._replace(result=result))
+
+
+def _is_late(target: Target, begin: Lanes, end: Lanes) -> Bool[Array, " L"]:
+    """Test whether lanes ended later than they may: the last step can go on beyond the limit."""
+    return end.t > target.limit + SAME_TIME * (target.limit - begin.t)
 
 
 def _coincide(
@@ -545,9 +553,11 @@ def _on_host(request: _Request) -> Flow:
         request.new_input,
     )
     span = float(request.target.limit[0] - lanes.t[0])
+    if path.result == Result.OK and _is_late(request.target, lanes, end)[0]:
+        path = dataclasses.replace(path, result=Result.SECTION_MISSED)
     if path.result == Result.OK and _orders_differ(path, span):
         path = dataclasses.replace(path, result=Result.SIMULTANEOUS)
-    if np.isfinite(request.target.time[0]):
+    if path.result == Result.OK and np.isfinite(request.target.time[0]):
         doubts = tuple(_ends_at_an_event(path, s, end, np.asarray(request.u), span))
         warn_of(doubts)
         path = dataclasses.replace(path, findings=path.findings + doubts)
@@ -595,6 +605,27 @@ def _ends_at_an_event(
         yield Finding("ends at an event", text)
 
 
+def _about_missed(found: Flow, k: int) -> str:
+    """The end that flow k did not reach."""
+    target = found.request.target
+    begin = float(found.request.lanes.t[k])
+    limit = float(target.limit[k])
+    within = f"within {limit - begin:.6g}"
+    if target.count is not None:
+        times = np.atleast_2d(found.event_times)[k]
+        happened = int(np.sum(times <= limit))
+        if happened == len(times):
+            # (The times of later events are not kept.)
+            happened = int(np.atleast_1d(found.count)[k])
+        wanted = int(np.broadcast_to(target.count, target.limit.shape)[k])
+        return f"{happened} of {wanted} events happened {within}"
+    g = int(np.broadcast_to(target.event, target.limit.shape)[k])
+    if g >= 0:
+        event = found.structure.transitions[g].name
+        return f"the event '{event}' did not happen {within}"
+    return f"the section was not crossed {within}"
+
+
 def _require_ends(found: Flow) -> None:
     """**Raises:** `ComputationError` for the first flow that did not reach its end."""
     codes = np.atleast_1d(np.asarray(found.result))
@@ -603,12 +634,20 @@ def _require_ends(found: Flow) -> None:
         return
     k = int(failed[0])
     message = Result(int(codes[k])).message
+    if codes[k] == Result.SECTION_MISSED:
+        message = _about_missed(found, k)
     if found.request.many:
         raise ComputationError(
             f"{len(failed)} of {len(codes)} flows did not reach their end, first start {k}: "
             f"{message}. `throw=False` returns the others."
         )
     lanes = found.lanes
+    if codes[k] == Result.SECTION_MISSED:
+        causes = "".join(f" One cause may be that {x.text}" for x in found.findings)
+        raise ComputationError(
+            f"{message}: give a longer `within`, or another end.{causes} `throw=False` returns the "
+            "flow."
+        )
     if codes[k] == Result.SIMULTANEOUS:
         raise ComputationError(
             f"{message}, and its derivatives depend on the order. `throw=False` returns the "
