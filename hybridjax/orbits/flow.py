@@ -20,7 +20,7 @@ from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
-from .._core.text import folded, number, signal_values
+from .._core.text import folded, how_many, number, signal_values
 from ..engine.flow import Events, Passage, Samples, pass_through
 from ..engine.lanes import Lanes, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
@@ -155,7 +155,7 @@ class Flow(Showable, eqx.Module):
         chart = self.structure.names[int(self.chart)]
         states = self.structure.by_name(int(self.chart), np.asarray(self.state))
         count = int(self.count)
-        many = "1 event" if count == 1 else f"{count} events"
+        many = how_many(count, "event", "events")
         text = folded(
             f"Flow({name}: to t = {end} in {chart}, {signal_values(states, states.values())}; "
             f"{many}: {Result(int(self.result)).message})"
