@@ -610,7 +610,7 @@ def _about_missed(found: Flow, k: int) -> str:
     target = found.request.target
     begin = float(found.request.lanes.t[k])
     limit = float(target.limit[k])
-    within = f"within {limit - begin:.6g}"
+    within = f"within {number(limit - begin, unit=found.system.time_unit)}"
     if target.count is not None:
         times = np.atleast_2d(found.event_times)[k]
         happened = int(np.sum(times <= limit))
