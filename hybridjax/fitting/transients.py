@@ -86,7 +86,8 @@ class ObservedTrajectory(AbstractObservation):
         """**Arguments:**
 
         - `start`: chart, state and time at which the flow begins.
-        - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing.
+        - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing. Those of
+          one output are a column, too: `heights[:, None]`.
         - `std`: their standard deviation, one number or one for each output.
         - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
           `events_std`: their standard deviation, one number.
