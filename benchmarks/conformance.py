@@ -1,7 +1,8 @@
 """Derivatives of flows through events, against closed forms and scipy's own event loop.
 
     python benchmarks/conformance.py rows            systems on which libraries fail, closed forms
-    python benchmarks/conformance.py peers           the first row by diffrax, and by differences
+    python benchmarks/conformance.py peers           rows by scipy, heyoka and diffrax, with times
+    python benchmarks/conformance.py many            many bouncing balls beside DOP853 in C
     python benchmarks/conformance.py random          random piecewise systems against scipy
     python benchmarks/conformance.py random --count 100
     python benchmarks/conformance.py speed           a gradient after ten bounces
@@ -19,6 +20,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from peers import flows, jaxonomy_flows
+from peers.c_peer import bounces
+from peers.errors import Unavailable
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -90,6 +94,29 @@ class Ball(hj.HybridSystem):
 
     def charts(self):
         return {"air": Chart(lambda t, q: (q[1], -self.g), ("y", "v"))}
+
+    def transitions(self):
+        def bounce(t, q, u):
+            return 0.0 * q[0], -self.e * q[1]
+
+        return [
+            hj.Transition("bounce", "air", "air", lambda t, q, u: q[0], reset=bounce)
+        ]
+
+
+class Dragged(hj.HybridSystem):
+    """A ball that bounces with drag."""
+
+    inputs = ()
+    g: hj.Parameter = hj.parameter(9.81)
+    e: hj.Parameter = hj.parameter(0.9)
+    drag: hj.Parameter = hj.parameter(0.1)
+
+    def charts(self):
+        def fall(t, q):
+            return q[1], -self.g - self.drag * q[1]
+
+        return {"air": Chart(fall, ("y", "v"))}
 
     def transitions(self):
         def bounce(t, q, u):
@@ -234,6 +261,21 @@ ROWS = (
 )
 
 
+PEER_ROWS = {
+    "ramp": (ramp, lambda tau: tau, (0.6,)),
+    "after_eleven_resets": (saw, lambda p: 1.0 - 11 * p, (0.09,)),
+    "third_bounce": (
+        lambda g, e: third_bounce(1.0, g, e),
+        lambda g, e: third_bounce_exactly(1.0, g, e),
+        (9.81, 0.7),
+    ),
+    "stop": (swing, swing_exactly, (2.0, 0.5, 0.8)),
+    "thermostat": (fifth_switch, fifth_switch_exactly, (0.5, 18.0, 22.0, 30.0)),
+    "moving_guard": (after_meeting, after_meeting_exactly, (0.5,)),
+}
+"""Rows by their parameters alone, as `peers.flows.ROWS` has them."""
+
+
 def rows(_) -> None:
     """Errors of values, first derivatives (forward and reverse) and second ones."""
     for name, flow, exact, point in ROWS:
@@ -258,13 +300,49 @@ def orders(function, point) -> dict:
     )
 
 
-def peers(_) -> None:
-    """The derivative of the ramp by its end, which is 1."""
-    show("peers.ramp.hybridjax", float(jax.grad(ramp)(0.6)))
+def peers(options) -> None:
+    """Errors of gradients by the parameters, and CPU seconds of the first call and of later ones:
+    of `flow` inside of `jit`, of scipy with differences, of heyoka with variational equations and
+    saltation matrices, and of jaxonomy; and the ramp by diffrax."""
+    for name in flows.ROWS:
+        _, exact, given = PEER_ROWS[name]
+        true = np.array(jax.grad(exact, tuple(range(len(given))))(*given))
+        for peer, run in _runs(name, options.jaxonomy).items():
+            label = f"peers.{name}.{peer}"
+            try:
+                found, first, later = run()
+            except Unavailable as problem:
+                show(label, problem)
+                continue
+            show(f"{label}.error", float(np.abs(found - true).max()))
+            show(f"{label}.first", first)
+            show(f"{label}.again", later)
     show("peers.ramp.diffrax_two_fields", diffrax_ramp(switched=False))
     show("peers.ramp.diffrax_switched_field", diffrax_ramp(switched=True))
-    higher, lower = scipy_ramp(0.6 + 1e-6), scipy_ramp(0.6 - 1e-6)
-    show("peers.ramp.differences", (higher - lower) / 2e-6)
+
+
+def _runs(name: str, jaxonomy: str) -> dict:
+    """For each library, a function that measures the gradient of a row, as `flows.timed`."""
+    row = flows.ROWS[name]
+    flow, _, given = PEER_ROWS[name]
+    point = np.array(given)
+
+    def own():
+        program = jax.jit(jax.grad(flow, tuple(range(len(given)))))
+        return lambda p: program(*p)
+
+    def by_scipy():
+        return flows.scipy_gradient(row)
+
+    def by_heyoka():
+        return flows.heyoka_gradient(row, len(given))
+
+    return {
+        "hybridjax": lambda: flows.timed(own, point),
+        "scipy": lambda: flows.timed(by_scipy, point),
+        "heyoka": lambda: flows.timed(by_heyoka, point),
+        "jaxonomy": lambda: jaxonomy_flows.run(name, given, jaxonomy),
+    }
 
 
 def diffrax_ramp(switched: bool) -> float:
@@ -299,13 +377,45 @@ def diffrax_ramp(switched: bool) -> float:
     return float(jax.grad(value)(0.6))
 
 
-def scipy_ramp(tau: float) -> float:
-    def end(t, y):
-        return tau - t
+def many(options) -> None:
+    """Balls that bounce ten times: CPU seconds of `flow`, and of its reverse mode inside of `jit`,
+    by those of DOP853 in C at the same tolerance, and errors of the times."""
+    loop = bounces.setup()
+    heights = np.linspace(0.5, 2.0, options.starts)
+    starts = np.stack([heights, 0 * heights], axis=1)
+    numbers = 9.81, 0.9, 0.1
+    settings = hj.orbits.Settings(rtol=options.tolerance)
+    ten = dict(events=10, within=20.0, settings=settings)
 
-    end.terminal = True
-    found = solve_ivp(lambda t, y: [1.0], (0.0, 2.0), [0.0], events=end, rtol=1e-10)
-    return float(found.y[0, -1])
+    def flow():
+        found = hj.flow(Dragged(*numbers), hj.Guess("air", starts), **ten)
+        return jax.block_until_ready(found.t)
+
+    @jax.jit
+    def gradient(starts, numbers):
+        def loss(starts, numbers):
+            found = hj.flow(
+                Dragged(*numbers), hj.Guess("air", starts), max_steps=256, **ten
+            )
+            return jnp.sum(found.t**2 + found.state[:, 1] ** 2)
+
+        return jax.grad(loss, (0, 1))(starts, numbers)
+
+    def reverse():
+        return jax.block_until_ready(gradient(starts, jnp.array(numbers)))
+
+    def in_c(tolerance=options.tolerance):
+        return bounces.run(heights, 10, numbers, tolerance, loop)
+
+    accurate, *_ = in_c(1e-14)
+    show("many.flow.first", again(flow, 1))
+    show("many.reverse.first", again(reverse, 1))
+    seconds = again(in_c, 5)
+    show("many.c.seconds", seconds)
+    show("many.c.error", float(np.abs(in_c()[0] - accurate).max()))
+    show("many.flow.error", float(np.abs(np.asarray(flow()) - accurate).max()))
+    show("many.flow.by_c", again(flow, 2) / seconds)
+    show("many.reverse.by_c", again(reverse, 2) / seconds)
 
 
 # Random systems.
@@ -623,11 +733,17 @@ def scipy_bounces(height: float) -> float:
     return t
 
 
+PARTS = ("rows", "peers", "many", "random", "speed")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("part", choices=("rows", "peers", "random", "speed"))
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jaxonomy", default="python", help="its interpreter")
+    parser.add_argument("--starts", type=int, default=100_000)
+    parser.add_argument("--tolerance", type=float, default=1e-12)
     options = parser.parse_args()
     hj.enable_x64()
     globals()[options.part](options)

@@ -12,7 +12,7 @@ from scipy import stats
 
 import hybridjax as hj
 from hybridjax.recordings.beats.estimation import WAVES, fit_curve
-from hybridjax.recordings.beats.model import basis, forecast, intervals_of, tabulated
+from hybridjax.recordings.beats.model import basis, intervals_of
 
 
 DATA = pathlib.Path(__file__).parents[1] / "notebooks/data"
@@ -92,9 +92,11 @@ def plain_curve(recording, phase, name):
         phase = k * intervals.step / 2 / intervals.duration
         acting = np.where(phase < 1, u, 0.0) * intervals.step / 2
         across += acting[:, None] * basis(phase, WAVES)
-    across *= (-1 / fit.rates)[intervals.trial, None] * fit.used[:, None]
+    # In cycles, as errors of `phase_response` are.
+    across *= -1.0 * fit.used[:, None]
+    duration = intervals.duration * fit.rates[intervals.trial]
     count = np.maximum(intervals.sums(1.0 * fit.used), 1.0)
-    both = np.column_stack([across, intervals.duration * fit.used])
+    both = np.column_stack([across, duration * fit.used])
     mean = np.stack([intervals.sums(x) for x in both.T], axis=1) / count[:, None]
     both -= mean[intervals.trial] * fit.used[:, None]
     across, deviation = both[:, :-1], both[:, -1]
@@ -136,9 +138,10 @@ def neurons(every=2):
             f"R2 of intervals left out: {found.left_out:.3f}; flat: {found.left_out_flat:.3f}"
         )
         both, _ = neuron(cell)
-        print(
-            f"R2 of the trials that were not fitted: {explained(found, both, every):.3f}"
-        )
+        others = tuple(x for k, x in enumerate(both.trials) if k % every)
+        left_out = eqx.tree_at(lambda r: r.trials, both, others)
+        ahead = found.forecast(left_out, hj.AtEvent("spike"))
+        print(f"R2 of the trials that were not fitted: {ahead.explained:.3f}")
         for first, last in ((0, 5), (10, 20), (40, 70)):
             some = eqx.tree_at(lambda r: r.trials, both, both.trials[first:last])
             part = hj.recordings.phase_response(
@@ -148,28 +151,6 @@ def neurons(every=2):
             print(
                 f"mean of Z, {first + 1} to {last} Hz: {part.coefficients[0]:.3f} ± {error:.3f}"
             )
-
-
-def explained(curve, recording, every):
-    """R2 of the other trials, whose rates alone are fitted."""
-    others = tuple(x for k, x in enumerate(recording.trials) if k % every)
-    recording = eqx.tree_at(lambda r: r.trials, recording, others)
-    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("spike"))
-    intervals = intervals_of(recording, phase, "current")
-    count = intervals.sums(np.ones(len(intervals.start)))
-    rates = count / intervals.sums(intervals.duration)
-    for _ in range(12):
-        ahead = forecast(
-            intervals, tabulated(WAVES, curve.jitter), curve.coefficients, rates
-        )
-        left, slope = intervals.duration - ahead.duration, ahead.slopes[:, -1]
-        used = np.abs(left * ahead.rate) < 0.5
-        rates = rates + intervals.sums(left * slope * used) / intervals.sums(
-            slope**2 * used
-        )
-    mean = intervals.sums(intervals.duration * used) / intervals.sums(1.0 * used)
-    whole = (intervals.duration - mean[intervals.trial])[used]
-    return 1 - (left[used] ** 2).sum() / (whole**2).sum()
 
 
 def robots():

@@ -6,7 +6,13 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py groups   # false alarms between maps of two groups
     python benchmarks/strangers.py bands    # simultaneous bands of means of skewed maps
     python benchmarks/strangers.py series   # fit_ldtp of series with other noise than its model
+    python benchmarks/strangers.py phase    # phase response curves from times of events
+    python benchmarks/strangers.py phase-long  # the same of four times as many
+    python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
+    python benchmarks/strangers.py weak     # fit_series of a pair beside a weak multiplier
     python benchmarks/strangers.py study    # studies whose data support a lower order
+    python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
+    python benchmarks/strangers.py pushes   # experiments on them, with four sizes of inputs
 
 `--draws` sets the number of draws, `--short` a tenth of it (about a minute for each row).
 """
@@ -15,6 +21,7 @@ import argparse
 import re
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +32,9 @@ import one_thread
 one_thread.pin()
 
 import numpy as np  # noqa: E402
+import strangers_beats as beats  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
+import strangers_plants  # noqa: E402
 import strangers_truth as truth  # noqa: E402
 from scipy import stats  # noqa: E402
 
@@ -278,6 +287,184 @@ def _studied(multipliers: list[complex], order: int, noise: float, seed: int) ->
     return "not done after 6 blocks, says why" if "since" in repr(quest) else "not done"
 
 
+def phase(draws: int, size: int = 480) -> None:
+    """Print how often bands of phase responses of so many events hold the curve, and what misses
+    are named.
+
+    "5 off" counts draws whose curve is beyond five standard errors of the truth at some phase, and
+    "quiet" those of them without a finding.
+    """
+    print(
+        "rhythm, input, events                 n finite  in band  mean off  5 off  quiet  CPU s"
+    )
+    for name, curve in beats.CURVES.items():
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.phase_rhythm(seed, curve, highest, size) for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+    curve = beats.CURVES["one sign"]
+    for name, wander, forgotten in (
+        ("random walk", 0.02, np.inf),
+        ("autoregression", 0.03, 20.0),
+    ):
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.phase_rhythm(
+                    seed, curve, highest, size, wander=wander, forgotten=forgotten
+                )
+                for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+    for name, neuron in beats.NEURONS.items():
+        curve = neuron.curve()
+        for kind, highest in beats.INPUTS.items():
+            made = [
+                beats.neuron_beats(seed, neuron, curve, highest, size)
+                for seed in range(draws)
+            ]
+            _phase_row(f"{name}, {kind}, {size}", made, curve)
+
+
+def long_phase(draws: int) -> None:
+    """Print the same of 2000 events."""
+    phase(draws, 2000)
+
+
+def _phase_row(name: str, draws: list[beats.Beats], truth: np.ndarray) -> None:
+    shares = []
+    means = []
+    causes: dict[str, int] = {}
+    finite = 0
+    wrong = 0
+    quiet = 0
+    start = time.process_time()
+    for made in draws:
+        found = _phase_response(made)
+        low, high = found.interval(beats.PHASE)
+        error = (high - low) / 4
+        finite += bool(np.isfinite(error).all())
+        shares.append(np.mean((low <= truth) & (truth <= high)))
+        size = np.sqrt(found.covariance[0, 0])
+        means.append((found.values.mean() - truth.mean()) / size)
+        said = [x.cause for x in found.findings if x.cause != "resolution"]
+        off = bool((np.abs((low + high) / 2 - truth) > _WRONG * error).any())
+        wrong += off
+        quiet += off and not said
+        for cause in said:
+            causes[cause] = causes.get(cause, 0) + 1
+    seconds = (time.process_time() - start) / len(draws)
+    off = float(np.sqrt(np.mean(np.square(means))))
+    print(
+        f"{name:34} {len(draws):4} {finite:6} {np.mean(shares):8.3f} {off:9.1f} {wrong:6} "
+        f"{quiet:6} {seconds:6.2f}  {causes}",
+        flush=True,
+    )
+
+
+def _phase_response(made: beats.Beats) -> hj.recordings.PhaseResponse:
+    trials = [
+        hj.Recording(made.time, {"u": u}, events={"beat": events}, name=f"trial {k}")
+        for k, (u, events) in enumerate(zip(made.force, made.events, strict=True))
+    ]
+    recording = hj.Recording.join(trials)
+    return hj.recordings.phase_response(recording, hj.AtEvent("beat"), input="u")
+
+
+def weak(draws: int) -> None:
+    """Print how `fit_series` of a pair goes whose data have another, weak multiplier.
+
+    "off" is the rms error of the pair in standard errors; "quiet" counts misses of more than three
+    of them without a finding.
+    """
+    print("weak multiplier, size    held  rms off  3 off  quiet     n  findings")
+    pair = [0.7 * np.exp(0.9j)]
+    for size in (0.0, 0.1, 0.3, 1.0):
+        fits = []
+        counts: dict[str, int] = {}
+        for seed in range(draws):
+            loop, u, y = truth.weak_series(pair, 0.4, size, seed)
+            records = [
+                hj.experiments.SectionSeries(a, b, n_sections=3)
+                for a, b in zip(u, y, strict=True)
+            ]
+            try:
+                fit = hj.fit_series(records, 2)
+            except hj.errors.DefinitionError:
+                counts["refused"] = counts.get("refused", 0) + 1
+                continue
+            true = loop.multipliers[:2]
+            error = _nearest(fit.multipliers, true[0]) / fit.standard_errors.max()
+            causes = [finding.cause for finding in fit.findings]
+            fits.append((bool(fit.contains(true).all()), error, bool(causes)))
+            for cause in causes:
+                counts[cause] = counts.get(cause, 0) + 1
+        held, errors, said = np.array(fits, float).reshape(-1, 3).T
+        off = errors > 3
+        quiet = int((off & (said == 0)).sum())
+        rms = np.sqrt(np.mean(errors**2))
+        print(
+            f"0.4, {size:3.1f} {int(held.sum()):19} {rms:8.1f} {int(off.sum()):6} {quiet:6} "
+            f"{len(fits):5}  {counts}",
+            flush=True,
+        )
+
+
+def loops(draws: int) -> None:
+    """Print errors of `fit_series(references=)` relative to those of `fit_ldtp`, and refusals."""
+    print(
+        "multipliers, noise      n  refused  names fit_ldtp  ldtp refuses  ratio of rms errors"
+    )
+    ratios = []
+    for noise in (0.0, 1.0):
+        for kind, multipliers in enumerate(truth.REFERENCED):
+            pairs = []
+            refusals = []
+            without = 0
+            for seed in range(draws):
+                loop, r, u, y = truth.referenced_series(kind, seed, noise)
+                data = [
+                    hj.experiments.SectionSeries(
+                        np.concatenate([a, b], axis=1),
+                        c,
+                        inputs=("u", "r"),
+                        n_sections=4,
+                    )
+                    for a, b, c in zip(u, r, y, strict=True)
+                ]
+                d = len(loop.multipliers)
+                true = loop.multipliers[0]
+                try:
+                    one = hj.fit_series(data, d, references="r").multipliers
+                except hj.errors.DefinitionError as error:
+                    refusals.append(str(error))
+                    continue
+                try:
+                    other = hj.fit_ldtp(data, d, references="r").multipliers
+                except hj.errors.DefinitionError:
+                    without += 1
+                    continue
+                pairs.append([_nearest(one, true), _nearest(other, true)])
+            named = sum("fit_ldtp" in text for text in refusals)
+            ratio = np.nan
+            if pairs:
+                rms = np.sqrt(np.mean(np.square(pairs), axis=0))
+                ratio = rms[0] / rms[1]
+                ratios.append(ratio)
+            print(
+                f"{multipliers!s:18} {noise:4.1f} {draws:4} {len(refusals):8} {named:15} "
+                f"{without:12} {ratio:9.1f}",
+                flush=True,
+            )
+    low, middle, high = np.quantile(ratios, (0, 0.5, 1))
+    print(f"ratios from {low:.1f} to {high:.1f}, median {middle:.1f}")
+
+
+def _nearest(multipliers: np.ndarray, true: complex) -> float:
+    """Return the distance of the nearest multiplier."""
+    return float(np.abs(multipliers - true).min())
+
+
 # Each row with its usual number of draws.
 ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "files": (files, 5),
@@ -285,6 +472,12 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "bands": (bands, 200),
     "series": (series, 60),
     "study": (study, 12),
+    "weak": (weak, 60),
+    "loops": (loops, 10),
+    "phase": (phase, 30),
+    "phase-long": (long_phase, 10),
+    "plants": (strangers_plants.plants, 40),
+    "pushes": (strangers_plants.pushes, 12),
 }
 
 

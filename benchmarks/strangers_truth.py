@@ -195,3 +195,77 @@ def controlled_series(seed: int) -> tuple[Loop, np.ndarray, np.ndarray]:
             x = np.clip(x, -1e3, 1e3)
         if np.abs(x).max() < 1e2:
             return loop, u, y
+
+
+# Multipliers of loops whose reference is recorded (of a pair the upper one).
+REFERENCED: list[list[complex]] = [
+    [0.7],
+    [0.5 + 0.45j],
+    [0.8, 0.3],
+    [0.3 + 0.6j],
+    [0.6, -0.4],
+    [0.75, 0.5],
+]
+
+
+def referenced_series(
+    kind: int, seed: int, noise: float
+) -> tuple[Loop, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a random loop of four sections under u = r - K y, and r, u and y of two records.
+
+    **Arguments:** `kind`: index of `REFERENCED`; one loop and controller each. `noise`: of the
+    input, relative to r.
+    """
+    rng = np.random.default_rng((kind, 7))
+    while True:
+        loop = loop_with(REFERENCED[kind], 4, 2, rng)
+        gain = 0.15 * rng.normal(size=(2, 1))
+        product = np.eye(loop.A.shape[1])
+        for A, B, C in zip(loop.A, loop.B, loop.C, strict=True):
+            product = (A - B @ gain.T @ C) @ product
+        if np.abs(np.linalg.eigvals(product)).max() < 0.9:
+            break
+    rng = np.random.default_rng((kind, seed))
+    S, cycles, N, d = 2, 200, 4, loop.A.shape[1]
+    size = loop.response(rng.normal(size=(1, 400, 1))).std()
+    x = np.zeros((S, d))
+    r = rng.normal(size=(S, cycles * N, 1))
+    u = np.zeros_like(r)
+    y = np.zeros((S, cycles * N, 2))
+    for i in range(cycles * N):
+        n = i % N
+        y[:, i] = x @ loop.C[n].T + 0.1 * size * rng.normal(size=(S, 2))
+        u[:, i] = r[:, i] - y[:, i] @ gain
+        acts = u[:, i] + noise * rng.normal(size=(S, 1))
+        x = x @ loop.A[n].T + acts @ loop.B[n].T
+    return loop, r, u, y
+
+
+def weak_series(
+    multipliers: list[complex], weak: complex, size: float, seed: int
+) -> tuple[Loop, np.ndarray, np.ndarray]:
+    """Return a random loop with three sections, and inputs and outputs of three records.
+
+    **Arguments:** `weak`: a further multiplier, real, that inputs excite by `size` relative to the
+    others.
+    """
+    rng = np.random.default_rng((seed, 11))
+    loop = loop_with([*multipliers, weak], 3, 2, rng)
+    product = loop.A[2] @ loop.A[1] @ loop.A[0]
+    values, modes = np.linalg.eig(product)
+    weakest = int(np.argmin(np.abs(values - weak)))
+    scales = np.ones(len(values))
+    scales[weakest] = size
+    shrink = (modes * scales @ np.linalg.inv(modes)).real
+    # In the frame of each section, the part of its input along the weak mode is smaller.
+    to_next = [loop.A[0], loop.A[1] @ loop.A[0], product]
+    B = np.array(
+        [
+            way @ shrink @ np.linalg.inv(way) @ b
+            for way, b in zip(to_next, loop.B, strict=True)
+        ]
+    )
+    loop = loop._replace(B=B)
+    u = rng.normal(size=(3, 450, 1))
+    y = loop.response(u)
+    return loop, u, y + 0.1 * y.std(axis=(0, 1)) * rng.normal(size=y.shape)

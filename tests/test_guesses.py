@@ -184,7 +184,7 @@ hj.read_mot("walk.mot")                                 -> hj.read_recording
 hj.lyapunov_exponent(rec)                               -> multipliers
 fit.half_life                                           -> result.modulus
 cycle.stance_duration                                   -> event_sequence
-hj.identify_recording(rec, apex, outputs="yM")          -> natural_multipliers
+hj.identify_recording(rec, apex, references="yM")       -> name `inputs`, too
 hj.identify_recording(rec, apex, inputs="u", outputs="yM", n_strides=9) -> all cycles
 hj.identify_recording(rec, "vM", inputs="u", outputs="yM") -> hj.Crossing(
 hj.identify_recording(rec, sections, inputs="u", outputs="yM") -> its `anchor`

@@ -138,8 +138,8 @@ def test_claims_name_tests_that_exist():
 PAGES = ["docs/index.md", "docs/experiments.md"]
 PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
 long_or_not = lambda x: [pytest.mark.long] * (Path(x).stem in LONG)  # noqa: E731
-LONG = """experiments figures fit-parameters fmu identify-from-recordings models mujoco
-populations scale sweep unperturbed-gait""".split()
+LONG = """experiments figures fit-parameters fmu identify-from-recordings learn-a-policy models
+mujoco populations scale sweep unperturbed-gait""".split()
 
 
 @pytest.mark.slow

@@ -173,7 +173,8 @@ def _add_identify(commands) -> None:
         "identify",
         help="find the multipliers of a recorded rhythm",
         description="From recorded signals, a trial in each file, to Floquet "
-        "multipliers, harmonic transfer functions and impulse responses, with a report.",
+        "multipliers, harmonic transfer functions and impulse responses, with a report. Without "
+        "inputs, to multipliers from variability.",
     )
     add = identify.add_argument
     add(
@@ -200,10 +201,10 @@ def _add_identify(commands) -> None:
     )
     add(
         "--inputs",
-        required=True,
+        default=(),
         type=_names,
         metavar="NAMES",
-        help="measured perturbations",
+        help="measured perturbations; by default none: multipliers from variability",
     )
     add(
         "--references",
@@ -357,6 +358,10 @@ def _identify(options) -> int:
     if beside:
         options.parser.error(
             f"{', '.join(beside)} is an input: define the phase by another signal"
+        )
+    if options.references and not options.inputs:
+        options.parser.error(
+            "--references act on a controller that makes the inputs: name --inputs, too"
         )
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")

@@ -22,6 +22,7 @@ from .. import __version__, plot
 from .._core import html
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath
+from .._core.findings import Finding
 from .._core.results import Result
 from .._core.signal import with_unit
 from .._core.text import listed
@@ -30,12 +31,19 @@ from ..io import save
 from ..linear.htf import HTF
 from ..orbits.crossing import AtEvent, Crossing
 from ..plot import look
-from ..recordings.identification import MEANING, Identification, identify_recording
+from ..recordings.identification import (
+    MEANING,
+    Identification,
+    NaturalIdentification,
+    identify_recording,
+)
 from ..recordings.read import read_recording
 from ..recordings.recording import Recording
 from ..sections.families import KinematicPhase
 from .paper_report import complex_pairs
 
+
+Results = Identification | NaturalIdentification
 
 PAGE = "report.html"
 _STYLE = """
@@ -71,12 +79,18 @@ def run(options: Any) -> bool:
         print(result)
         write_results(folder, result, options.formats)
     print(os.path.join(options.out, PAGE))
-    return result.fit.result == Result.OK
+    return converged(result)
+
+
+def converged(result: Results) -> bool:
+    """Return whether the fit is a minimum. (Multipliers from variability follow without
+    iterations.)"""
+    return isinstance(result, NaturalIdentification) or result.fit.result == Result.OK
 
 
 def steps_of(
     options: Any,
-) -> tuple[tuple[str, ...], Callable[[Recording], Identification]]:
+) -> tuple[tuple[str, ...], Callable[[Recording], Results]]:
     """Return the names of the signals to be read, and the function that identifies a recording."""
     named = (*options.inputs, *options.references, *options.outputs)
     named += options.phase or (options.crossing or ())[:1]
@@ -106,7 +120,7 @@ def steps_of(
 
 @checked
 def write_report(
-    folder: FilePath, result: Identification, formats: Sequence[Format] = ("png",)
+    folder: FilePath, result: Results, formats: Sequence[Format] = ("png",)
 ) -> Path:
     """Write all results of a recording into a folder, see `Identification.write_report`."""
     with report_folder(folder, result.data.inputs, formats) as new:
@@ -147,21 +161,23 @@ def _suffixes(inputs: Sequence[str]) -> list[str]:
     return [f"_{x.replace('/', '-')}" for x in inputs]
 
 
-def write_results(
-    folder: Path, result: Identification, formats: Sequence[Format]
-) -> None:
+def write_results(folder: Path, result: Results, formats: Sequence[Format]) -> None:
     """Write all results into a folder that is new."""
     (folder / "figures").mkdir()
     data = result.data
-    # 240 frequencies, up to the edge of the band that the inputs excited.
-    edge = min(max(result.diagnosis.bandwidths), data.n_sections / 2)
-    htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
+    if isinstance(result, NaturalIdentification):
+        figures = _natural_figures(result)
+    else:
+        # 240 frequencies, up to the edge of the band that the inputs excited.
+        edge = min(max(result.diagnosis.bandwidths), data.n_sections / 2)
+        htf = result.fit.htf(np.linspace(0, edge, 241)[1:])
+        save(folder / "htf.npz", htf)
+        figures = _figures(result, htf)
     images = {}
-    for name, drawn in _figures(result, htf):
+    for name, drawn in figures:
         path = folder / "figures" / name
         image, *_ = look.save_and_close(path, drawn, with_png(formats))
         images[name] = base64.b64encode(image.read_bytes()).decode()
-    save(folder / "htf.npz", htf)
     save(folder / "fit.npz", result.fit)
     header = list(map(with_unit, data.signals, data.units))
     first = ["trial", "record", "cycle", "section", "time (s)"]
@@ -171,10 +187,14 @@ def write_results(
         average.append((n, n / data.n_sections, *row))
     _write_table(folder / "cycle.csv", ["section", "phase (cycles)", *header], average)
     (folder / "summary.json").write_text(json.dumps(summarize(result), indent=1) + "\n")
-    (folder / PAGE).write_text(_page(result, images), encoding="utf-8")
+    if isinstance(result, NaturalIdentification):
+        page = _natural_page(result, images)
+    else:
+        page = _page(result, images)
+    (folder / PAGE).write_text(page, encoding="utf-8")
 
 
-def _samples(result: Identification) -> Iterator[tuple]:
+def _samples(result: Results) -> Iterator[tuple]:
     """The rows of `sections.csv`."""
     data = result.data
     records = zip(data.records, data.times, data.trials, strict=True)
@@ -207,11 +227,33 @@ def _write_table(path: Path, header: list[str], rows: Iterable[Sequence]) -> Non
         csv.writer(file).writerows([header, *rows])
 
 
-def summarize(result: Identification) -> dict[str, Any]:
+def summarize(result: Results) -> dict[str, Any]:
     """Return the numbers of the report, ready for JSON."""
-    data = result.data
     fit = result.fit
+    numbers = _summary_of_data(result) | {
+        "multipliers": complex_pairs(fit.multipliers),
+        "standard_errors": fit.standard_errors.tolist(),
+        "covariance_of_coefficients": fit.covariance.tolist(),
+    }
+    if isinstance(result, NaturalIdentification):
+        return numbers | {
+            "multipliers_of_plain_regression": complex_pairs(result.fit.plain),
+            "warnings": list(map(repr, result.findings)),
+        }
     held = result.held_out
+    return numbers | {
+        "references": list(result.fit.references),
+        "multipliers_of_plain_regression": complex_pairs(result.diagnosis.plain),
+        "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
+        "held_out_fit_percent": held.validation.fit.tolist(),
+        "input_band": list(result.diagnosis.bandwidths),
+        "warnings": list(map(repr, result.diagnosis.findings)),
+    }
+
+
+def _summary_of_data(result: Results) -> dict[str, Any]:
+    """Return the numbers of the recording, its phase and its data."""
+    data = result.data
     periods = np.concatenate(result.phase.periods)
     return {
         "version": __version__,
@@ -223,7 +265,6 @@ def summarize(result: Identification) -> dict[str, Any]:
         "notes": [finding.text for finding in result.recording.findings],
         "units": {"time": "s"} | dict(zip(data.signals, data.units, strict=True)),
         "inputs": list(data.inputs),
-        "references": list(fit.references),
         "outputs": list(data.outputs),
         "sections": data.n_sections,
         "cycles": round(data.cycles, 2),
@@ -235,14 +276,6 @@ def summarize(result: Identification) -> dict[str, Any]:
             periods.std() / np.sqrt(max(len(periods) - 1, 1))
         ),
         "period_drift_per_cycle": result.phase.drift,
-        "multipliers": complex_pairs(fit.multipliers),
-        "standard_errors": fit.standard_errors.tolist(),
-        "covariance_of_coefficients": fit.covariance.tolist(),
-        "multipliers_of_plain_regression": complex_pairs(result.diagnosis.plain),
-        "multipliers_of_held_out_fit": complex_pairs(held.fit.multipliers),
-        "held_out_fit_percent": held.validation.fit.tolist(),
-        "input_band": list(result.diagnosis.bandwidths),
-        "warnings": list(map(repr, result.diagnosis.findings)),
     }
 
 
@@ -267,19 +300,80 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
         yield "curve", plot.phase_response(result.curve)
 
 
+def _natural_figures(
+    result: NaturalIdentification,
+) -> Iterable[tuple[str, look.Plot]]:
+    """Yield names and figures of multipliers from variability."""
+    fit = result.fit
+    yield (
+        "multipliers",
+        plot.multipliers(fit.multipliers, {"plain regression": fit.plain}),
+    )
+    yield "phase", plot.phase(result.phase)
+    yield "sections", plot.section_data(result.data)
+
+
+def _natural_page(result: NaturalIdentification, images: dict[str, str]) -> str:
+    """Return the page of multipliers from variability."""
+    data = result.data
+    trials = escape(", ".join(t.name for t in result.recording.trials))
+    parts = [
+        f"<p>{trials}: variability of {escape(listed(data.outputs))} without a measured input, "
+        f"{data.n_sections} sections per cycle.</p>",
+        html.card("Multipliers", "from variability", html.text(repr(result.fit))),
+        *_doubts(result.findings),
+        *_about_data(result),
+        f"<p>{MEANING[0]}</p>",
+        *_shown(images),
+        f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
+        f"{data.bandwidth:.3g} Hz; return maps by instrumental variables, intervals by a block "
+        "bootstrap. Disturbances are taken as independent from cycle to cycle.</p>",
+    ]
+    return page_of("Floquet multipliers from a recording", parts)
+
+
+def _doubts(findings: Sequence[Finding]) -> list[str]:
+    """Return the paragraphs about the reasons to doubt, or one that there are none."""
+    if not findings:
+        return ['<p class="fine">No reason to doubt the multipliers was found.</p>']
+    return [f'<p class="warn">{_sentence(repr(x))}</p>' for x in findings]
+
+
+def _about_data(result: Results) -> list[str]:
+    """Return the parts of a page about data that were left out, the phase and the sections."""
+    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
+    notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in result.recording.findings)
+    parts = [html.card("Left out", "" if left_out else "nothing", html.facts(left_out))]
+    if notes:
+        parts.append(f"<ul>{notes}</ul>")
+    parts.append(html.card("Phase", "", html.text(repr(result.phase))))
+    parts.append(result.data._repr_html_())
+    return parts
+
+
+def _shown(images: dict[str, str]) -> list[str]:
+    """Return the figures, given as PNG in base 64, with their captions."""
+    shown = []
+    for name, image in images.items():
+        for figure, caption in _CAPTIONS.items():
+            if name.startswith(figure):
+                shown.append(
+                    f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
+                    f"<figcaption>{escape(caption)}</figcaption></figure>"
+                )
+    return shown
+
+
 def _page(result: Identification, images: dict[str, str]) -> str:
     """Return the page, with the figures given as PNG in base 64."""
     data = result.data
     recording = result.recording
-    warnings = result.diagnosis.findings
     trials = escape(", ".join(t.name for t in recording.trials))
     loop = result.fit.references
     if loop:
         method = f"instrumental variables of {escape(listed(loop))}"
     else:
         method = "output-error fit"
-    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
-    notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in recording.findings)
     expected = zip(result.diagnosis.cycles, result.diagnosis.expected, strict=True)
     parts = [
         f"<p>{trials}: from {escape(listed(data.inputs))} to {escape(listed(data.outputs))}, "
@@ -287,16 +381,8 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         f"<p>A controller makes {escape(listed(data.inputs))}. These are the dynamics without it, "
         f"as {escape(listed(loop))} tells, which acts from outside.</p>" * bool(loop),
         result.fit._repr_html_(),
-        *(f'<p class="warn">{_sentence(repr(w))}</p>' for w in warnings),
-        *(
-            []
-            if warnings
-            else ['<p class="fine">No reason to doubt the multipliers was found.</p>']
-        ),
-        html.card("Left out", "" if left_out else "nothing", html.facts(left_out)),
-        f"<ul>{notes}</ul>" if notes else "",
-        html.card("Phase", "", html.text(repr(result.phase))),
-        data._repr_html_(),
+        *_doubts(result.diagnosis.findings),
+        *_about_data(result),
         html.card(
             "Standard errors to be expected from more strides",
             "",
@@ -311,13 +397,7 @@ def _page(result: Identification, images: dict[str, str]) -> str:
         ),
         *(f"<p>{text}</p>" for text in MEANING),
         result.held_out.validation._repr_html_(),
-        *(
-            f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{image}">'
-            f"<figcaption>{escape(caption)}</figcaption></figure>"
-            for name, image in images.items()
-            for figure, caption in _CAPTIONS.items()
-            if name.startswith(figure)
-        ),
+        *_shown(images),
         f"<p>hybridjax {__version__}. Deviations are smoothed with a bandwidth of "
         f"{data.bandwidth:.3g} Hz; {method} with {result.fit.numerators.shape[1]} lags; "
         "regions from the residuals, cycle by cycle.</p>",
@@ -325,15 +405,18 @@ def _page(result: Identification, images: dict[str, str]) -> str:
     return page_of("Floquet multipliers from a recording", parts)
 
 
-def _left_out(result: Identification) -> dict[str, Any]:
+def _left_out(result: Results) -> dict[str, Any]:
     """Return the amounts of data that were not used, by their causes."""
-    return {
+    amounts = {
         "doubled events (less than half a period after the one before)": result.phase.dropped,
         "cycles whose beginning or end is unknown (a missed event, a gap)": result.phase.missed,
         "fraction of the samples at sections (gaps longer than a section)": result.data.missing,
         "fraction of the samples whose phase ran backwards (replaced)": result.phase.backwards,
-        "stretches too short to validate (used in the fit)": result.held_out.validation.left_out,
     }
+    if isinstance(result, Identification):
+        short = "stretches too short to validate (used in the fit)"
+        amounts[short] = result.held_out.validation.left_out
+    return amounts
 
 
 def _sentence(message: str) -> str:

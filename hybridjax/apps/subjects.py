@@ -23,7 +23,6 @@ from .._core.pieces.description import digest_of
 from .._core.pieces.run import DaskClient
 from .._core.precision import enable_x64
 from .._core.progress import counted, working
-from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import folded
 from .._core.writing import Format, results_folder
@@ -32,10 +31,19 @@ from ..identify.series.fit import SeriesFit
 from ..io import load
 from ..plot.look import AxesLike, Plot, save_and_close
 from ..plot.subjects import forest
+from ..recordings.natural import NaturalMultipliers
 from ..recordings.population.population import Population
 from ..recordings.population.tables import factors_of, table_of
 from ..recordings.read import read_recording
-from .identify import PAGE, page_of, report_folder, steps_of, with_png, write_results
+from .identify import (
+    PAGE,
+    converged,
+    page_of,
+    report_folder,
+    steps_of,
+    with_png,
+    write_results,
+)
 
 
 # Columns of the table of a study, and their names in the summaries.
@@ -44,14 +52,21 @@ _COLUMNS = {
     "period": "period",
     "period_error": "period_standard_error",
 }
+# Columns of the results that are printed. (The file has all.)
+_SHOWN = ["effect", "subjects", "estimate", "standard_error", "low", "high", "p"]
 _FILES = ("subjects.csv", "population.csv", "population.html")
+_TESTS = (
+    "The p value of each difference is that of one test: with several quantities, groups or "
+    "conditions, some are small by chance."
+)
 # The file of a report that says of which files and options it was made.
 _JOB = "job.json"
-_FOREST = (
-    '<figure><img alt="Modulus of the leading multiplier" src="forest.png">'
-    "<figcaption>Modulus of the leading multiplier of each subject, with 95 % intervals."
-    "</figcaption></figure>"
-)
+# The quantities that have a figure, each with its caption.
+_FOREST = {
+    "modulus": "Modulus of the leading multiplier",
+    "angle": "Angle of the leading multiplier, if it is complex",
+    "half_life": "Strides after which half of a deviation is left",
+}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -61,11 +76,12 @@ class SubjectStudy(Showable):
     **Fields:** `population` of the subjects that were identified; its table also has `report`,
     `strides`, `period` and `period_error` (s). `fits`, one for each row; `failures`: sentences by
     name of the report, and of "population" if a mean has too few subjects; `results`: data frame of
-    means, and differences of all pairs of groups and conditions; `folder`.
+    means, and differences of all pairs of groups and conditions, of each quantity of the
+    population; `folder`.
     """
 
     population: Population
-    fits: tuple[SeriesFit, ...]
+    fits: tuple[SeriesFit | NaturalMultipliers, ...]
     failures: dict[str, str]
     results: Any
     folder: Path
@@ -94,9 +110,8 @@ class SubjectStudy(Showable):
         ]
         lines += [folded(f"  {text}", "  ") for text in self.remarks]
         if len(self.results):
-            lines.append(
-                self.results.T.to_string(header=False, float_format="{:.4g}".format)
-            )
+            shown = self.results[["quantity", *_SHOWN]]
+            lines.append(shown.to_string(index=False, float_format="{:.4g}".format))
         return "\n".join(lines)
 
 
@@ -131,11 +146,11 @@ def _report(
         return ""
     enable_x64()
     result = identify(read_recording(*files, **reading))
-    converged = result.fit.result == Result.OK
+    is_minimum = converged(result)
     with report_folder(folder, result.data.inputs, formats) as new:
         write_results(new, result, formats)
-        (new / _JOB).write_text(job if converged else "")
-    return "" if converged else "the fit did not converge."
+        (new / _JOB).write_text(job if is_minimum else "")
+    return "" if is_minimum else "the fit did not converge."
 
 
 def run(options: Any) -> int:
@@ -190,7 +205,8 @@ def identify_subjects(
       `SubjectStudy.population.table`.
     - `folder`: folder of the results, which is made if it does not exist.
     - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
-      `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`.
+      `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`; without
+      `inputs`, multipliers are those of variability.
     - `time`: name of the column with the times. Default: "time".
     - `signals`: names of the signals to be read. Default: all.
     - `formats`: formats of the figures. Default: PNG.
@@ -198,7 +214,8 @@ def identify_subjects(
       work and can read the same files. Default: this process.
 
     **Returns:** `hj.recordings.SubjectStudy`: the `population`, one `SeriesFit` per subject in
-    `fits`, data frames of means and differences in `results`, and sentences in `failures`.
+    `fits` (`NaturalMultipliers` without inputs), data frames of means and differences in `results`,
+    and sentences in `failures`.
 
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
     groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
@@ -241,19 +258,34 @@ def identify_subjects(
         raise ComputationError(f"all subjects fail: {causes}")
     population, fits = _population(frame, root)
     parts = []
-    try:
-        parts.append(population.mean("modulus"))
-        for factor in factors_of(frame):
-            pairs = itertools.combinations(frame[factor].unique()[::-1], 2)
-            parts += [population.difference("modulus", a, b) for a, b in pairs]
-    except DefinitionError as error:  # too few subjects: the report shows its text
-        failures["population"] = str(error)
+    lacking = []
+    for quantity in population.values:
+        try:
+            parts += _effects(population, quantity)
+        except DefinitionError as error:  # too few subjects: the report shows its text
+            if quantity == "modulus":
+                failures["population"] = str(error)
+            else:
+                lacking.append(f"Not compared: {quantity} ({error})")
     pandas = package("pandas")
     results = pandas.concat([pandas.DataFrame(), *parts], ignore_index=True)
     study = SubjectStudy(population, fits, failures, results, root)
     methods = dict.fromkeys(part.attrs["methods"] for part in parts)
-    _write(study, methods, formats)
+    _write(study, [*methods, _TESTS, *lacking], formats)
     return study
+
+
+def _effects(population: Population, quantity: str) -> list[Any]:
+    """Return the means of a quantity, and its differences of all pairs of groups and conditions.
+
+    **Raises:** `DefinitionError` for too few subjects.
+    """
+    table = population.table
+    parts = [population.mean(quantity)]
+    for factor in factors_of(table):
+        pairs = itertools.combinations(table[factor].unique()[::-1], 2)
+        parts += [population.difference(quantity, a, b) for a, b in pairs]
+    return parts
 
 
 def _failures(jobs: Mapping[str, Callable[[], str]], client: Any) -> dict[str, str]:
@@ -315,20 +347,25 @@ def _write(
     names = [escape(name) for name in population.table["report"]]
     links = [f'<li><a href="{name}/{PAGE}">{name}</a></li>' for name in names]
     errors = {f"{name}_error": error for name, error in population.errors.items()}
-    columns = results.T.to_html(
-        header=False, border=0, float_format="{:.4g}".format, na_rep=""
+    columns = results.to_html(
+        index=False, border=0, float_format="{:.4g}".format, na_rep=""
     )
     parts = [
         *(f'<p class="warn">{escape(x)}</p>' for x in study.remarks),
-        html.card("Means and differences", "of the leading modulus", columns),
+        html.card("Means and differences", "of the leading multiplier", columns),
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
     subjects = population.table.assign(**population.values, **errors)
     with results_folder(study.folder, "population", _FILES) as new:
-        with contextlib.suppress(DefinitionError):  # for too few subjects
-            figure = plot.forest(population, "modulus")
-            save_and_close(new / "forest", figure, with_png(formats))
-            parts.append(_FOREST)
+        for quantity, caption in _FOREST.items():
+            with contextlib.suppress(DefinitionError):  # for too few subjects
+                figure = plot.forest(population, quantity)
+                name = f"forest_{quantity}"
+                save_and_close(new / name, figure, with_png(formats))
+                parts.append(
+                    f'<figure><img alt="{caption}" src="{name}.png"><figcaption>{caption}, of '
+                    "each subject, with 95 % intervals.</figcaption></figure>"
+                )
         parts.append(html.card("Reports", "", f"<ul>{''.join(links)}</ul>"))
         subjects.to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)

@@ -32,7 +32,7 @@ from ..orbits.responses import PhaseCurve
 from ..orbits.sensitivity import Sensitivity
 from ..plants.cycle import PlantCycle
 from ..recordings.data import SectionData
-from ..recordings.identification import Identification
+from ..recordings.identification import Identification, NaturalIdentification
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.natural import NaturalMultipliers
 from ..recordings.population.population import Population
@@ -184,7 +184,8 @@ def _(thing: RationalFit) -> Any:
 
 @_columns.register(Identification)
 @_columns.register(ModelIdentification)
-def _(thing: Identification | ModelIdentification) -> Any:
+@_columns.register(NaturalIdentification)
+def _(thing: Identification | ModelIdentification | NaturalIdentification) -> Any:
     return _columns(thing.fit)
 
 

@@ -1,11 +1,11 @@
 """Flow of many lanes to their targets with the events on the way, differentiable."""
 
+import functools as ft
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._core.lanes import lane_jvp
@@ -207,12 +207,12 @@ def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Ta
 
 def _events(tape: Tape, ways: Ways, most: int) -> Events:
     """The first events on a tape, with times and states from the ends of its moves."""
-    happened = tape.code >= 0
-    count = jnp.cumsum(happened, axis=0)
-    number = np.arange(1, most + 1)[:, None]
-    # The row in which the count reaches each number.
-    row = jnp.argmax(count[None] >= number[:, None], axis=1)
-    exists = count[-1] >= number
+    number = jnp.arange(1, most + 1, dtype=jnp.int32)
+    # The row in which the count of events reaches each number.
+    first = ft.partial(jnp.searchsorted, v=number)
+    row = jax.vmap(first, in_axes=1, out_axes=1)(tape.events)
+    row = jnp.minimum(row, len(tape.events) - 1)
+    exists = jnp.take_along_axis(tape.events, row, axis=0) == number[:, None]
 
     def times(x):
         return jnp.take_along_axis(x, row, axis=0)

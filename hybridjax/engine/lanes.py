@@ -164,6 +164,8 @@ def side_by_side(tree):
 
 # Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
 IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = range(-4, 0)
+# More events than any flow has.
+MANY = np.iinfo(np.int32).max
 
 
 class Tape(NamedTuple):
@@ -187,6 +189,8 @@ class Tape(NamedTuple):
     rival: Int[Array, "R L"]
     """Another transition (by index; negative: none) whose armed guard is at zero, too, where the
     move ends in an event: neighbors may meet it first."""
+    events: Int[Array, "R L"]
+    """Number of the lane's events so far; `MANY` in rows that have not been written."""
 
 
 def blank_tape(rows: int, lanes: Lanes) -> Tape:
@@ -204,7 +208,9 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
     chart = xp.zeros((rows, L), xp.int32)
     at_once = xp.zeros((rows, L), bool)
     rival = xp.full((rows, L), -1, xp.int32)
-    return Tape(times(), code, times(), states(), states(), chart, at_once, rival)
+    events = xp.full((rows, L), MANY, xp.int32)
+    ends = states(), states()
+    return Tape(times(), code, times(), *ends, chart, at_once, rival, events)
 
 
 def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:

@@ -16,6 +16,7 @@ from .._core.arguments import (
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Index, NewNames, PeriodCount, SectionCount
 from .._core.boundary.values import Integers, Reals
+from .._core.findings import Finding, print_findings
 from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import fields, folded, listed
@@ -40,6 +41,7 @@ class Simulated(eqx.Module):
     - `label`: name of the section family.
     - `late`: (S, n) times by which steps of a plant ended after its sections, or None.
     - `causes`: for each experiment on a plant, the cause of its end; "" if it ran to its end.
+    - `findings`: reasons to doubt what is estimated from experiments on a plant.
     """
 
     failed_at: Int[np.ndarray, " S"]
@@ -47,6 +49,7 @@ class Simulated(eqx.Module):
     label: str = eqx.field(static=True, default="")
     late: Float[np.ndarray, "S n"] | None = None
     causes: tuple[str, ...] = eqx.field(static=True, default=())
+    findings: tuple[Finding, ...] = ()
 
     __repr__ = fields
 
@@ -63,7 +66,7 @@ class ExperimentData(Showable, eqx.Module):
       `u[:, i]` acts. NaN from the failure on where an experiment failed.
     - `result`: (S,) codes of `Result`.
     - `simulated`: results that only a simulation has, or None; also available as `failed_at`,
-      `error` and `label`.
+      `error`, `label` and `findings`.
     - `cycle_outputs`: (N, ny) the outputs on the limit cycle, or None if not known.
     - `n_sections`: N. `periods`: P; estimates use the last P periods (P * N samples).
     - `inputs`, `outputs`: names, or units by name.
@@ -212,6 +215,11 @@ class ExperimentData(Showable, eqx.Module):
         return np.full(len(self.u), np.nan) if error is None else error
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Reasons to doubt what is estimated from a simulation."""
+        return () if self.simulated is None else self.simulated.findings
+
+    @property
     def label(self) -> str:
         """Name of the section family of a simulation, else ""."""
         return "" if self.simulated is None else self.simulated.label
@@ -249,11 +257,12 @@ class ExperimentData(Showable, eqx.Module):
         state = self.summary()
         if self.label:
             state = f"{self.label}, {state}"
-        return folded(
+        text = folded(
             f"ExperimentData({state}; {n // self.n_sections} cycles of "
             f"{self.n_sections} sections each, window P = {self.periods} periods; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
+        return "\n".join(filter(None, [text, print_findings(self.findings, "  ")]))
 
     def odd_part(self) -> "ExperimentData":
         """Return half the difference of each pair of experiments with opposite inputs.
@@ -291,7 +300,7 @@ class ExperimentData(Showable, eqx.Module):
             u=plus,
             y=(self.y[::2] - self.y[1::2]) / 2,
             result=np.where(broken, first, second),
-            simulated=Simulated(failed_at, error, self.label),
+            simulated=Simulated(failed_at, error, self.label, findings=self.findings),
         )
 
 

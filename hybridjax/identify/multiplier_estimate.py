@@ -24,6 +24,12 @@ from .descent import Coefficients, positive
 from .fit import Fit
 
 
+# Level of the test whether a fit needs one more multiplier. Larger: process noise, whose errors are
+# estimated from few blocks, makes fits of the right order doubtful. Smaller: weak multipliers that
+# move the others pass.
+_NEEDED = 1e-4
+
+
 Multipliers = Annotated[Numbers, Complexes()]
 """Supposed or true multipliers, one or several."""
 
@@ -470,3 +476,25 @@ def order_doubts(
     # (No numbers: those of a few iterations may be far from those of a fit.)
     text = f"`order` may be too low: order {order} gives other multipliers; compare both fits."
     return [Finding("order", text)]
+
+
+def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
+    """Return a finding if a fit of one more multiplier, begun at a fit, needs it.
+
+    Without more numerators, the fit is the one with a zero last coefficient of the denominator: a
+    coefficient that differs from zero (Wald's test) belongs to a multiplier that the fit left out.
+    If there is none, nothing moves the coefficient from zero.
+    """
+    with suppress(DefinitionError):
+        coefficients, covariance = higher()
+        matrix, dof = covariance()
+        distance = float(coefficients[-1] ** 2 / matrix[-1, -1])
+        if _tail(distance, 1, dof) < _NEEDED:
+            order = len(coefficients)
+            text = (
+                "`order` may be too low: the data determine one more multiplier. It may be too "
+                "weak to be fitted well, and still move the others by several of their standard "
+                f"errors; compare order {order} with check=False, or record longer."
+            )
+            return [Finding("order", text)]
+    return []

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
-from .._core.compilation import quick_jit
+from .._core.compilation import Program, quick_jit
 from .._core.executor import Array, is_traced, namespace
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
@@ -22,7 +22,7 @@ from .._core.results import Result, update_result
 from .._core.showable import Showable
 from .._core.text import folded, how_many, number, signal_values
 from ..engine.flow import Events, Passage, Samples, pass_through
-from ..engine.lanes import Lanes, lane_at, nan_where, start_lanes
+from ..engine.lanes import Lanes, blank_tape, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until as until_time
@@ -54,9 +54,12 @@ MOST_STEPS = 1024
 # which is relative to this duration. Larger: users are sent to `within` where a guard is touched.
 # Smaller: they are told of a touch where there is none.
 _MUCH_SHORTER = 1e-4
-# Lanes of a program that JAX does not trace. More: records of many steps take gigabytes. Fewer:
-# more calls.
-_PART = 1024
+# Bytes of the record of a flow's moves. More: gigabytes in reverse mode. Fewer: many flows are
+# computed in more parts, and reverse mode searches them again.
+_RECORD = 64e6
+# Rows of the record with which many flows begin. More: flows of few steps fill rows in vain. Fewer:
+# flows of many steps are computed twice, and another program is compiled.
+_ROWS = 128
 
 
 @checked_methods
@@ -415,21 +418,52 @@ def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
 
 def _flows(request: _Request) -> Flow:
     """The flows of all lanes by one program, which gets many lanes part by part."""
-    L = len(request.lanes.t)
-    if is_traced(request) or L <= _PART:
+    parts = _parts(request)
+    if is_traced(request) or len(parts) == 1:
         return _result(request, _program(request), None)
-    parts = []
-    for first in range(0, L, _PART):
-        # (The last part is filled up, so that no other program is compiled.)
-        lanes = np.minimum(np.arange(first, first + _PART), L - 1)
-        passage = _program(_some(request, lanes))
-        left = min(_PART, L - first)
-        parts.append(jax.tree_util.tree_map(lambda x, n=left: x[..., :n], passage))
-    joined = jax.tree_util.tree_map(lambda *x: jnp.concatenate(x, axis=-1), *parts)
-    return _result(request, joined, None)
+    passages = _one_by_one(request, parts)
+    joined = jax.tree_util.tree_map(lambda *x: jnp.concatenate(x, axis=-1), *passages)
+    L = len(request.lanes.t)
+    passage = jax.tree_util.tree_map(lambda x: x[..., :L], joined)
+    return _result(request, passage, None)
 
 
-def _some(request: _Request, lanes: Int[np.ndarray, " L"]) -> _Request:
+def _one_by_one(
+    request: _Request, parts: Int[np.ndarray, "parts l"]
+) -> Iterator[Passage]:
+    """The passages of parts. The record has few rows as long as these suffice, because rows without
+    moves take time, too."""
+    most = request.settings.max_steps
+    rows = min(_ROWS, most)
+    for lanes in parts:
+        asked = _some(request, lanes)
+        passage = _MANY(_with_rows(asked, rows))
+        while rows < most and np.any(passage.moved.result == Result.STEP_LIMIT):
+            rows = min(4 * rows, most)
+            passage = _MANY(_with_rows(asked, rows))
+        yield passage
+
+
+def _with_rows(request: _Request, rows: int) -> _Request:
+    """What is asked for, with a record of so many rows."""
+    old = request.settings
+    settings = Settings(old.rtol, old.atol, rows, old.scale)
+    return dataclasses.replace(request, settings=settings)
+
+
+def _parts(request: _Request) -> Int[np.ndarray, "parts l"]:
+    """The lanes of each part of a flow, such that its record is not too large. The last part is
+    filled up with the last lane, so that all parts are of one size."""
+    lanes = request.lanes
+    L = len(lanes.t)
+    record = jax.eval_shape(lambda: blank_tape(request.settings.max_steps, lanes))
+    in_bytes = sum(x.size * x.dtype.itemsize for x in record)
+    count = max(1, min(L, int(np.ceil(in_bytes / _RECORD))))
+    size = -(-L // count)
+    return np.minimum(np.arange(count * size), L - 1).reshape(count, size)
+
+
+def _some(request: _Request, lanes: Int[Array, " L"]) -> _Request:
     """What is asked for of some lanes. (Arrays of one entry are for all lanes.)"""
 
     def of(x):
@@ -449,34 +483,66 @@ def sampled(request: _Request, times: Float[Array, " K"]) -> tuple[Flow, Samples
     return _result(request, passage, None), passage.samples
 
 
-@quick_jit
-def _program(request: _Request, times: Float[Array, " K"] | None = None) -> Passage:
+def _passage(request: _Request, times: Float[Array, " K"] | None = None) -> Passage:
     """The flow of all lanes, with samples at some times."""
     s = Structure(request.system)
     target = request.target
     lanes = request.lanes._replace(events=request.lanes.events * 0)
+    request = dataclasses.replace(request, lanes=lanes)
     times = jnp.zeros(0) if times is None else times
     early = jnp.isfinite(target.time) & (target.time < lanes.t)
     # (A time that is infinite or NaN is the limit, too.)
     bad = early | ~jnp.isfinite(target.limit)
     begin = update_result(request.result, bad, Result.BAD_INPUT)
-    passage = pass_through(
-        s,
-        lanes,
-        request.u,
-        target,
-        request.settings,
-        request.most_events,
-        request.new_input,
-        jnp.broadcast_to(times[:, None], (len(times), len(lanes.t))),
-        begin,
-    )
+    request = dataclasses.replace(request, result=begin)
+    passage = _in_parts(request, times)
     moved, events, _ = passage
     late = _is_late(target, lanes, moved.lanes)
     result = update_result(moved.result, late, Result.SECTION_MISSED)
     coincide = _coincide(s, lanes, target, events)
     result = update_result(result, coincide, Result.SIMULTANEOUS)
     return passage._replace(moved=moved._replace(result=result))
+
+
+_program = quick_jit(_passage)
+# The same for many lanes, whose program runs longer than it compiles.
+_MANY = Program(_passage, loops=True)
+
+
+def _in_parts(request: _Request, times: Float[Array, " K"]) -> Passage:
+    """The passage of all lanes, part by part if their record would be too large. Reverse mode keeps
+    where each part starts, and searches and records it again."""
+    parts = _parts(request)
+    if len(parts) == 1:
+        return _part(request, times)
+
+    @jax.checkpoint
+    def part(lanes):
+        return _part(_some(request, lanes), times)
+
+    L = len(request.lanes.t)
+    passages = jax.lax.map(part, jnp.asarray(parts))
+
+    def joined(x):
+        x = jnp.moveaxis(x, 0, -2)
+        return x.reshape(*x.shape[:-2], parts.size)[..., :L]
+
+    return jax.tree_util.tree_map(joined, passages)
+
+
+def _part(request: _Request, times: Float[Array, " K"]) -> Passage:
+    """The passage of lanes whose record is small enough."""
+    return pass_through(
+        Structure(request.system),
+        request.lanes,
+        request.u,
+        request.target,
+        request.settings,
+        request.most_events,
+        request.new_input,
+        jnp.broadcast_to(times[:, None], (len(times), len(request.lanes.t))),
+        request.result,
+    )
 
 
 def _is_late(target: Target, begin: Lanes, end: Lanes) -> Bool[Array, " L"]:

@@ -43,12 +43,13 @@ MOST_TURNS = 10
 # Size of a Newton step, relative to the accuracy of a step of the flow, at which no further turn is
 # taken. Larger: residuals stay near the tolerance. Smaller: one turn more for most lanes.
 _SMALL = 0.5
-# Steps of an itinerary for each one that the search took, first for all systems, then for those
-# whose errors are too large. More: turns last longer. Fewer: more systems need the second.
-_DENSITY, _FINER = 0.9, 2.0
-# The same of implicit methods. More: turns last longer. Fewer: where fast phases lie in other parts
-# of the period, as beside relaxation oscillators, most systems need finer steps.
-_IMPLICIT_DENSITY = 3.0
+# Steps of an itinerary for each one that the search took: first for all systems, then for those
+# whose errors are too large, and in programs, which cannot divide steps later. More: turns last
+# longer. Fewer: more systems need the second, and fewer keep their itinerary in programs. Implicit
+# steps differ much in length, and the fast phases of relaxation oscillators lie in other parts of
+# the period beside the known cycle.
+_DENSITIES = 0.9, 1.35
+_IMPLICIT_DENSITIES = 3.0, 6.0
 # Steps of the second integration for each one of the first: they share no node.
 _OTHER = 0.83
 # Largest distance, in sizes of the states, of the end of the second integration from its beginning,
@@ -153,8 +154,8 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     map = to_host(map)
     pieces = side_by_side(to_host(map.pieces())) if turn is None else turn
     s, levels = map.structure, levels_of(map)
-    density = _IMPLICIT_DENSITY if has_implicit(s) else _DENSITY
-    densities = density, density * _FINER, density * _OTHER
+    densities = _IMPLICIT_DENSITIES if has_implicit(s) else _DENSITIES
+    densities = *densities, densities[0] * _OTHER
     first, finer, other = (recorded(s, pieces, levels, x) for x in densities)
     begin = map.anchor.t[0]
     ends = begin + first.ends

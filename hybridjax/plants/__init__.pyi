@@ -5,7 +5,7 @@ from .adapters import (
 )
 from .cycle import (
     PlantCycle as PlantCycle,
-    Returns as Returns,
     find_cycle as find_cycle,
 )
 from .drive import Plant as Plant
+from .returns import Returns as Returns

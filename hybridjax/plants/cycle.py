@@ -3,11 +3,11 @@
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from itertools import starmap
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core.arguments import Numbers, require_among
 from .._core.boundary.checked import checked, checked_methods
@@ -15,6 +15,7 @@ from .._core.boundary.containers import Names
 from .._core.boundary.kinds import FilePath, Index, Positive, Seed, SignalNames, Vector
 from .._core.boundary.values import Reals, Whole
 from .._core.execution import core_count
+from .._core.findings import Finding, warn_of
 from .._core.pieces.description import digest_of
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -26,46 +27,20 @@ from ..errors import ComputationError, DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.design import DISCARD
 from ..experiments.run import DesignLike, check_inputs
-from ..identify.multiplier_estimate import MultiplierFit
 from ..orbits.crossing import Crossing
 from ..sections import families
 from ..systems import chart, system
 from ..systems.structure import Structure
+from .amplitude import doubts_about_inputs
 from .drive import At, Drive, Plant, PlantPhase, Trial, resume, run_all
+from .returns import ReturnMap, Returns, measured_returns
 
 
+# Fewest experiments whose inputs are tested, by one experiment more. Fewer: single records, which
+# are no estimates, take twice the time.
+_FEWEST = 4
 Draw = Callable[[Any], Any]
 Inputs = Annotated[Numbers, Reals("n inputs")]
-
-
-class Returns(MultiplierFit):
-    """Multipliers from returns of perturbed states to section 0.
-
-    **Fields** beside those of all fits of multipliers:
-
-    - `coordinates`: names of the numbers that were perturbed.
-    - `noise` (d,): standard deviation of returns from nearly equal states.
-    - `residual`: largest distance between state and return, in units of the range of the
-      coordinate on the cycle.
-    - `bound`: multipliers that are not listed cannot be told from 0; this is the largest modulus
-      that they may have (0 if all are listed).
-    """
-
-    noise: Float[np.ndarray, " d"]
-    coordinates: tuple[str, ...] = eqx.field(static=True)
-    residual: float = eqx.field(static=True)
-    bound: float = eqx.field(static=True)
-
-    @property
-    def model(self) -> None:
-        return None
-
-    def _about(self) -> str:
-        count = len(self.coordinates)
-        return (
-            f"{count - len(self.multipliers)} more below {self.bound:.1g}; {count} coordinates, "
-            f"residual {self.residual:.1g}"
-        )
 
 
 class Recorded(system.HybridSystem):
@@ -81,140 +56,6 @@ class Recorded(system.HybridSystem):
 
     def draw(self, chart, t, q):
         return None if self.picture is None else self.picture(q)
-
-
-class _ReturnMap:
-    """The return map of some coordinates of a plant on section 0, and its fixed point.
-
-    **Fields:** `names`: of the coordinates. `x`: their values, first those of the settled state.
-    `size`: their ranges on the cycle. `noise`: of returns. `h`: steps of differences. The last
-    three are known after `measure`.
-    """
-
-    def __init__(self, cycle: "PlantCycle", names: SignalNames | None = None):
-        plant = cycle.plant
-        self.drive = cycle.drive
-        if not self.drive.sets or self.drive.fixed:
-            raise DefinitionError(
-                "use a plant whose state can be set, with steps of any size."
-            )
-        self.base = np.array(cycle.state, float)
-        numbered = [f"x{i}" for i in range(self.base.size)]
-        states = tuple(getattr(plant, "states", numbered))
-        period = getattr(plant, "period", None)
-        if not names:
-            timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
-            names = tuple(x for x in states if not (timeless and x == "time"))
-        require_among("coordinate", names, states, "perturbed_returns: ")
-        self.names = tuple(names)
-        self.columns = [states.index(x) for x in names]
-        self.shift = np.zeros(len(names))
-        if period is not None and "time" in names:
-            turns = round(cycle.period / period)
-            self.shift[names.index("time")] = turns * period
-        self.x = self.base[self.columns]
-        self.n = cycle.sections.n_sections
-        # (A perturbed state before a crossing must not return to it at once.)
-        self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
-
-    def __call__(
-        self, x: Float[np.ndarray, " d"], points: list[At] | None = None
-    ) -> Float[np.ndarray, " d"]:
-        """Return the coordinates after one cycle, and append the points of its steps."""
-        drive = self.drive
-        state = self.base.copy()
-        state[self.columns] = x
-        drive.restore(drive.start._replace(state=state))
-        drive.phase.begin(drive.t, drive.z, on_section=True)
-        if points is None:
-            drive.pass_time(self.free)
-        drive.advance(drive.zero, self.n, points)
-        return np.array(drive.here().state, float)[self.columns] - self.shift
-
-    def measure(self) -> None:
-        """Measure the ranges of the coordinates and the noise of returns, in 46 cycles."""
-        points = list[At]()
-        self(self.x, points)
-        rows = np.array([x.state for x in points], float)[:, self.columns]
-        size = np.ptp(rows, axis=0)
-        largest = np.abs(rows).max(axis=0)
-        # (A coordinate that does not move has the size of its value.)
-        rest = np.where(self.x, np.abs(self.x), 1.0)
-        self.size = np.where(size > 1e-9 * largest, size, rest)
-        self.noise = self._noise()
-        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives; at most one percent of the range.
-        step = (self.noise / self.size).max() ** 0.2 / 2
-        self.h = self.size * min(step, 0.01)
-
-    def _noise(self) -> Float[np.ndarray, " d"]:
-        """Return the standard deviation of returns from nearly equal states.
-
-        Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
-        2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
-        spacing the events that move through the time steps of a simulator.
-        """
-        noise = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
-        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
-        for spacing, sign in zip([1e-6, 1e-4, 1e-3], signs, strict=True):
-            along = spacing * self.size * sign
-            line = [self(self.x + j * along) for j in range(-7, 8)]
-            differences = np.diff(line, 4, axis=0)
-            noise = np.maximum(noise, np.sqrt((differences**2 / 70).mean(axis=0)))
-        return noise
-
-    def slopes(self, steps: float) -> Float[np.ndarray, "d d"]:
-        """Return central differences of second order with so many steps."""
-        columns = []
-        for k in counted(range(len(self.x)), "coordinates", len(self.x)):
-            move = np.zeros(len(self.x))
-            move[k] = steps * self.h[k]
-            change = self(self.x + move) - self(self.x - move)
-            columns.append(change / (2 * move[k]))
-        return np.stack(columns, axis=1)
-
-    def solve(self) -> float:
-        """Move x to the fixed point by Newton's method, and return the largest residual, in units
-        of the sizes. The plant is then on section 0."""
-        for k in range(9):
-            residual = (self(self.x) - self.x) / self.size
-            if k == 8 or (np.abs(residual) <= 3 * self.noise / self.size).all():
-                break
-            J = self.slopes(1) - np.eye(len(self.x))
-            J = J * self.size / self.size[:, None]
-            # (A multiplier of 1 leaves its direction as it is.)
-            step = np.linalg.lstsq(J, residual, rcond=1e-6)[0]
-            self.x = self.x - self.size * step
-        return float(np.abs(residual).max())
-
-
-class _Resolved(NamedTuple):
-    """Multipliers (k,) that differ from 0, the coefficients (k,) of their polynomial, the
-    covariance of these, and the largest modulus that the other multipliers may have."""
-
-    multipliers: np.ndarray
-    coefficients: np.ndarray
-    covariance: np.ndarray
-    bound: float
-
-
-def _resolved(
-    J: Float[np.ndarray, "d d"], error: Float[np.ndarray, "d d"]
-) -> _Resolved:
-    """Eigenvalues that differ from 0 by three standard errors, by draws within the errors."""
-    draws = error * np.random.default_rng(0).standard_normal((1000, *J.shape))
-    each = np.linalg.eigvals(np.concatenate([J[None], J + draws])).astype(complex)
-    each = np.take_along_axis(each, np.argsort(-np.abs(each), axis=1), axis=1)
-    values = each[0]
-    sizes = np.abs(each)
-    spread = np.sqrt(((sizes - sizes[0]) ** 2).mean(axis=0))
-    count = int(np.cumprod(sizes[0] > 3 * spread).sum())
-    if 0 < count < len(values) and values[count - 1].imag > 0 > values[count].imag:
-        count -= 1  # (both of a pair, or none)
-    polynomials = [np.atleast_1d(np.poly(x[:count])).real[1:] for x in each]
-    covariance = np.cov(polynomials[1:], rowvar=False).reshape(count, count)
-    largest = (sizes[0] + 3 * spread)[count:].max(initial=0)
-    return _Resolved(values[:count], polynomials[0], covariance, float(largest))
 
 
 @checked_methods
@@ -303,13 +144,22 @@ class PlantCycle(Showable):
             if cause:
                 failed_at[s] = len(values)
         causes = tuple(cause for _, cause in trials)
+        at_rest = np.tile(self.cycle_outputs, (u.shape[1] // N, 1))
+        responses = rows[..., :-1] - at_rest
+        findings = self._doubts_about(u, responses, failed_at)
+        warn_of(findings)
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
-            failed_at, None, self.sections.label, rows[..., -1], causes
+            failed_at,
+            None,
+            self.sections.label,
+            rows[..., -1],
+            causes,
+            tuple(findings),
         )
         return ExperimentData(
             u,
-            rows[..., :-1] - np.tile(self.cycle_outputs, (u.shape[1] // N, 1)),
+            responses,
             n_sections=N,
             periods=inputs.periods,
             inputs=self.inputs,
@@ -319,48 +169,49 @@ class PlantCycle(Showable):
             simulated=simulated,
         )
 
+    def _doubts_about(
+        self,
+        u: Float[np.ndarray, "S n nu"],
+        responses: Float[np.ndarray, "S n ny"],
+        failed_at: Int[np.ndarray, " S"],
+    ) -> list[Finding]:
+        """Return findings about the size of the inputs, of which the first experiment is repeated
+        with half of its input."""
+        whole = np.flatnonzero(failed_at < 0)
+        if len(whole) < _FEWEST or not responses[whole[0]].any():
+            return []
+        s = int(whole[0])
+        values, cause = self.drive.run(self.seed + 1 + s, (u[s] / 2).tolist())
+        if cause:
+            return []
+        at_rest = np.tile(
+            self.cycle_outputs, (u.shape[1] // len(self.cycle_outputs), 1)
+        )
+        half = np.array(values)[:, :-1] - at_rest
+        return doubts_about_inputs(self, responses[s], half)
+
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
-        Newton's method moves the state onto the cycle. Central differences of fourth order give the
-        Jacobian of the return map, with steps that the scatter of returns from nearly equal states
-        determines (measured by differences along lines: Moré and Wild 2011).
+        Central differences with steps of three sizes give the Jacobian of the return map. The
+        scatter of returns from nearly equal states determines the steps (measured by differences
+        along lines: Moré and Wild 2011). In each pair of perturbed states, the first time step has
+        another length: contacts that begin at the ends of time steps then scatter at random, and
+        the errors contain them. A state that is not on the cycle is moved there by Newton's method.
 
         **Arguments:**
 
-        - `coordinates`: names among `plant.states` to perturb. Others keep their values. Leave out
-          those on which nothing depends, such as the distance walked. Default: all; at
-          clock sections all but `time`.
+        - `coordinates`: names among `plant.states` to perturb. Others keep their values. Default:
+          all that do not travel (see `Returns.travelling`); at clock sections all but `time`.
 
         **Returns:** `Returns`, a `Fit`.
 
         **Raises:** `DefinitionError` for a plant whose state cannot be set, or unknown names;
-        `ComputationError` if a perturbed state does not return.
+        `ComputationError` if a perturbed state does not return, or the state is not on a cycle.
         """
-        map = _ReturnMap(self, coordinates)
+        map = ReturnMap(self, coordinates)
         map.measure()
-        residual = map.solve()
-        fine = map.slopes(1)
-        middle = map.slopes(2)
-        wide = map.slopes(4)
-        J = (4 * fine - middle) / 3
-        coarse = (4 * middle - wide) / 3
-        # (Weights 8/12 and -1/12 of four returns, each with this noise.)
-        noise = np.sqrt(2 * (8**2 + 1)) / 12 * map.noise[:, None] / map.h
-        # (A jump of the second derivative leaves in J an error as large as this difference.)
-        error = np.hypot(noise, J - coarse)
-        scale = map.size / map.size[:, None]
-        resolved = _resolved(J * scale, error * scale)
-        return Returns(
-            resolved.multipliers,
-            resolved.coefficients,
-            resolved.covariance,
-            10.0,  # (eleven differences in each line)
-            map.noise,
-            map.names,
-            residual,
-            resolved.bound,
-        )
+        return measured_returns(map)
 
     def trajectory(
         self, draw: Draw | None = None, u: Inputs | None = None
@@ -485,9 +336,10 @@ def find_cycle(
         drive.advance(drive.zero, k * family.n_sections)
     if guess is None:
         return _measure(drive, family, max(cycles // 4, 2), seed)
-    returns = _ReturnMap(_measure(drive, family, 1, seed))
+    returns = ReturnMap(_measure(drive, family, 1, seed))
     returns.measure()
-    returns.solve()
+    returns.require_on_cycle(returns.solve())
+    returns(returns.x)
     return _measure(drive, family, 2, seed)
 
 

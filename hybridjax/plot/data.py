@@ -78,7 +78,7 @@ def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
 
 @checked
 def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
-    """Draw for each signal the average cycle, the deviations from it, and the input's spectrum.
+    """Draw for each signal the average cycle, the deviations from it, and the spectra of inputs.
 
     Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
     deviation. Right: for an input, its power against frequency; for an output, its deviations in
@@ -110,7 +110,6 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     samples = [r.first_section + np.arange(len(r.u)) for r in data.records]
     at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
-    f, power = input_spectrum(data)
     phase = np.arange(N) / N
     with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
         for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
@@ -127,6 +126,7 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
+                f, power = input_spectrum(data)
                 floor = 1e-12 * power[:, i].max()
                 last.semilogy(f, np.maximum(power[:, i], floor), color=CYCLE[1])
                 last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))

@@ -32,7 +32,7 @@ from ..orbits.limit_cycles import LimitCycles
 from ..orbits.responses import Coupling, PhaseCurve, Responses
 from ..plants.cycle import PlantCycle
 from ..recordings.data import SectionData
-from ..recordings.identification import Identification
+from ..recordings.identification import Identification, NaturalIdentification
 from ..recordings.impulse import ImpulseResponses
 from ..recordings.natural import NaturalMultipliers
 from ..recordings.phase import Phase
@@ -99,8 +99,9 @@ def _(result: LimitCycles, **options: Any) -> Plot:
     return plane.multipliers(found, **options)
 
 
-@draw.register
-def _(result: Identification, **options: Any) -> Plot:
+@draw.register(Identification)
+@draw.register(NaturalIdentification)
+def _(result: Identification | NaturalIdentification, **options: Any) -> Plot:
     return draw(result.fit, **options)
 
 

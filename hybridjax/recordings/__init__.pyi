@@ -1,5 +1,6 @@
 from ..apps.subjects import SubjectStudy as SubjectStudy
 from .beats.response import (
+    IntervalForecast as IntervalForecast,
     PhaseResponse as PhaseResponse,
     phase_response as phase_response,
 )
@@ -12,7 +13,10 @@ from .held_out import (
     HeldOutOrders as HeldOutOrders,
     hold_out as hold_out,
 )
-from .identification import Identification as Identification
+from .identification import (
+    Identification as Identification,
+    NaturalIdentification as NaturalIdentification,
+)
 from .impulse import (
     ImpulseResponses as ImpulseResponses,
     impulse_responses as impulse_responses,

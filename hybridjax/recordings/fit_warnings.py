@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy import stats
 
 from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings, warn_of
@@ -45,6 +46,9 @@ _FEW_CYCLES = 50
 # comes with warnings.
 _MEMORY = 0.2
 _LEVEL = 0.01
+# Part of an input's variance that lies within intervals, below which a wide band comes from a slow
+# input. Larger: other causes of wide bands get this name. Smaller: slow inputs are not named.
+_FAST = 0.2
 
 
 Multipliers = Complex[np.ndarray, " d"]
@@ -334,12 +338,20 @@ def about_phase_response(curve: Any) -> Iterator[Finding]:
         )
     low, high = curve.interval(curve.phase)
     half = (high - low) / 2
-    if half.max() > abs(curve.coefficients[0]) / 2:
-        worst = int(np.argmax(half))
+    wide = half.max() > abs(curve.coefficients[0]) / 2
+    worst = int(np.argmax(half))
+    if wide:
         yield Finding(
             "wide",
             f"at phase {curve.phase[worst]:.2f} the 95 % interval reaches {half[worst]:.2g} to "
             "either side, more than half of the mean.",
+        )
+    if wide and curve.within < _FAST:
+        yield Finding(
+            "slow input",
+            f"only {100 * curve.within:.2g} % of the variance of {curve.input} lie within "
+            "intervals, so that the data determine the mean of the curve, but hardly its shape: "
+            "add input that changes within a cycle, up to twice the frequency of the rhythm.",
         )
     finest = max(1, round(1 / (np.pi * max(curve.jitter, 1e-6))))
     yield Finding(
@@ -353,11 +365,20 @@ def about_phase_response(curve: Any) -> Iterator[Finding]:
             f"residuals of a block of intervals add up to {curve.excess:.1f} times the variance of "
             "independent errors: the phase model lacks something.",
         )
-    if abs(curve.memory) > _MEMORY:
+    carried = curve.carried / curve.carried_error
+    if 2 * stats.t.sf(abs(carried), curve.dof) < _LEVEL:
         yield Finding(
             "memory",
-            f"residuals of neighboring intervals are correlated by {curve.memory:.2f}: the curve "
-            "shows the effect of a push on its own interval, not later.",
+            f"a push changes the next interval, too: by {curve.carried:.2f} ± "
+            f"{curve.carried_error:.2g} (standard error) times the change of its own. The curve "
+            "shows the change of its own interval; the shift that stays is another. "
+            "`hj.identify_recording` with `outputs=()` fits durations with their memory.",
+        )
+    elif abs(curve.memory) > _MEMORY:
+        yield Finding(
+            "memory",
+            f"residuals of neighboring intervals are correlated by {curve.memory:.2f}: an interval "
+            "depends on the one before, and the curve shows the effect of a push on its own.",
         )
     if curve.miscounted:
         yield Finding(

@@ -1,5 +1,6 @@
 """All steps from a recording to multipliers, in one call."""
 
+import dataclasses
 import importlib
 import itertools
 import textwrap
@@ -19,7 +20,7 @@ from .._core.boundary.kinds import (
     SectionCount,
     SignalNames,
 )
-from .._core.findings import Finding, refuse, warn_of
+from .._core.findings import Finding, print_findings, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.showable import WithMultipliers
@@ -35,6 +36,7 @@ from .fit_warnings import Diagnosis, diagnosis_of, slow_sampling, undamped
 from .held_out import HeldOut, Split, split
 from .impulse import ImpulseResponses, impulse_responses
 from .inspection.inspect import check_recording, inspect_cycles
+from .natural import NaturalMultipliers, natural_multipliers
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
 from .recording import Recording
@@ -50,6 +52,11 @@ MEANING = (
     "Small p-values show that the model leaves something unexplained (process noise, nonlinearity, "
     "smoothing), not that the multipliers are wrong.",
 )
+
+
+# Most multipliers that are tried without inputs. More: noise of four numbers and more hides in the
+# largest modulus. Fewer: gait with two pairs is doubted.
+_MOST_NATURAL = 4
 
 
 class Identification(WithMultipliers, eqx.Module):
@@ -112,13 +119,55 @@ class Identification(WithMultipliers, eqx.Module):
         return "\n".join(results)
 
 
+class NaturalIdentification(WithMultipliers, eqx.Module):
+    """The results of `identify_recording` without inputs, step by step.
+
+    **Fields:** `recording`, without the samples that `check_recording` leaves out; `phase`; `data`,
+    at the sections; `fit`, the `NaturalMultipliers`; `findings` of all steps.
+    """
+
+    recording: Recording
+    phase: Phase
+    data: SectionData
+    fit: NaturalMultipliers
+    findings: tuple[Finding, ...] = eqx.field()
+
+    @checked
+    def write_report(self, folder: FilePath, formats: Sequence[str] = ("png",)) -> Path:
+        """Write all results into a folder, as `Identification.write_report` does, without the
+        files of transfer functions.
+
+        **Returns:** the path of the page.
+
+        **Raises:** `DefinitionError` as `Identification.write_report`.
+        """
+        report = importlib.import_module("hybridjax.apps.identify")
+        return report.write_report(folder, self, formats)
+
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        """Those of the fit."""
+        return self.fit.multipliers
+
+    def __repr__(self) -> str:
+        findings = [x for x in self.findings if x not in self.fit.findings]
+        results = [
+            repr(self.phase),
+            repr(self.data),
+            repr(self.fit),
+            textwrap.fill(MEANING[0], 100),
+            print_findings(findings),
+        ]
+        return "\n".join(filter(None, results))
+
+
 @checked
 @working("identify_recording")
 def identify_recording(
     recording: Recording,
     sections: Phase | PhaseDefinition,
-    inputs: SignalNames,
-    outputs: OptionalNames,
+    inputs: OptionalNames = (),
+    outputs: OptionalNames = (),
     *,
     order: Order | None = None,
     n_sections: SectionCount | None = None,
@@ -126,17 +175,21 @@ def identify_recording(
     timing: Literal["clock", "duration"] | None = None,
     drift: DriftCycles | None = None,
     references: SignalNames | None = None,
-) -> Identification:
+) -> Identification | NaturalIdentification:
     """Identify multipliers, transfer functions and impulse responses from a recording, and list the
     reasons to doubt them. The recording is inspected first (`hj.recordings.check_recording`).
 
+    Without inputs, multipliers are estimated from the variability from cycle to cycle
+    (`hj.recordings.natural_multipliers`).
+
     **Arguments:**
 
-    - `recording`: the recording, perturbed by the inputs.
+    - `recording`: the recording, perturbed by the inputs, if there are any.
     - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
       `sample_sections`, with the same defaults.
     - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
-      that the reference determines, up to 4.
+      that the reference determines, up to 4; without inputs, the first of 1 to 4 of which the
+      largest modulus agrees with that of one multiplier more.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
@@ -145,10 +198,12 @@ def identify_recording(
 
     **Returns:** `hj.recordings.Identification` with the results of all steps: `phase`, `data`,
     `fit` (a `SeriesFit` with `multipliers` (d,)), `held_out`, `responses` and `diagnosis`. Its
-    method `write_report` writes a page.
+    method `write_report` writes a page. Without inputs, `hj.recordings.NaturalIdentification` with
+    `phase`, `data`, `fit` (`NaturalMultipliers`) and `findings`.
 
-    **Raises:** `DefinitionError` for errors that the inspection finds, and as `estimate_phase`,
-    `sample_sections` and `fit_series`; `PrecisionError` in single precision.
+    **Raises:** `DefinitionError` for errors that the inspection finds, for `references` without
+    inputs, and as `estimate_phase`, `sample_sections`, `fit_series` and `natural_multipliers`;
+    `PrecisionError` in single precision.
 
     **Example:**
 
@@ -163,6 +218,10 @@ def identify_recording(
     require_x64()
     say("inspection")
     outside = None if references is None else tuple(references)
+    if outside and not inputs:
+        raise DefinitionError(
+            "`references` act on a controller that makes the inputs: name `inputs`, too."
+        )
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
     inspection = check_recording(recording, inputs=signals, outputs=outputs)
@@ -181,6 +240,11 @@ def identify_recording(
         bandwidth=bandwidth,
         timing=timing,
     )
+    if not inputs:
+        natural = _natural(recording, phase, whole, order)
+        warn_of(natural.findings)
+        findings = (*inspection.findings, *natural.findings)
+        return dataclasses.replace(natural, findings=findings)
     if drift is not None:
         whole = whole.with_drift(drift)
     data = whole.of_inputs(inputs)
@@ -221,6 +285,44 @@ def identify_recording(
         curve=curve,
         diagnosis=diagnosis.with_earlier([*findings, *slow_sampling(data)]),
     )
+
+
+def _natural(
+    recording: Recording, phase: Phase, data: SectionData, order: int | None
+) -> NaturalIdentification:
+    """Return the multipliers from variability, and what there is to doubt.
+
+    **Raises:** `DefinitionError` for a number of multipliers that is given and too large, and for
+    too few cycles.
+    """
+    findings = inspect_cycles(recording, phase, data)
+    refuse(findings)
+    say("multipliers from variability")
+    if order is not None:
+        fit = natural_multipliers(data, order)
+    else:
+        fit = _first_that_agrees(data)
+    return NaturalIdentification(
+        recording=recording,
+        phase=phase,
+        data=data,
+        fit=fit,
+        findings=tuple(dict.fromkeys([*findings, *fit.findings])),
+    )
+
+
+def _first_that_agrees(data: SectionData) -> NaturalMultipliers:
+    """Return the fewest multipliers, up to 4, of which the largest agrees with that of one more.
+    If none do, return the most that the data allow."""
+    fit = natural_multipliers(data, 1)
+    for order in range(2, _MOST_NATURAL + 1):
+        if not any(finding.cause == "order" for finding in fit.findings):
+            break
+        try:
+            fit = natural_multipliers(data, order)
+        except DefinitionError:
+            break
+    return fit
 
 
 def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:

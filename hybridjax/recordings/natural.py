@@ -59,7 +59,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     - `multipliers` (d,): by instruments, without the bias of measurement noise, and with that of
       few cycles corrected.
     - `plain` (d,): by least squares on the return map, as is usual; with both biases.
-    - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles.
+    - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles, each beside its
+      nearest of `multipliers` and `plain`.
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
@@ -80,7 +81,37 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
         """Standard deviation of each modulus over the resamplings."""
-        return np.abs(self.draws).std(axis=0)
+        return _moduli(self.multipliers, self.draws).std(axis=0)
+
+    @property
+    def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:
+        """Covariance of (Re, Im) of each multiplier over the resamplings. The imaginary part of a
+        real multiplier has no variance."""
+        covariances = np.zeros((len(self.multipliers), 2, 2))
+        for k, z in enumerate(self.multipliers):
+            drawn = self.draws[:, k]
+            if z.imag:
+                covariances[k] = np.cov(drawn.real, drawn.imag)
+            else:
+                covariances[k, 0, 0] = drawn.real.var()
+        return covariances
+
+    @property
+    def coefficients(self) -> Float[np.ndarray, " d"]:
+        """Coefficients of the polynomial of the multipliers, without the leading 1."""
+        return np.atleast_1d(np.poly(self.multipliers)).real[1:]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "d d"]:
+        """That of the coefficients, over the resamplings."""
+        polynomials = [np.atleast_1d(np.poly(x)).real[1:] for x in self.draws]
+        d = len(self.multipliers)
+        return np.cov(polynomials, rowvar=False).reshape(d, d)
+
+    @property
+    def covariance_dof(self) -> float:
+        """Degrees of freedom of the covariances: the number of blocks less one."""
+        return max(self.cycles / self.block, 2.0) - 1
 
     def contains(
         self, true: Truth, level: Probability = 0.95
@@ -120,10 +151,11 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         plain: bool = False,
     ) -> Float[np.ndarray, "d 2"]:
         """Return bounds that hold the modulus of each multiplier with this probability, in the
-        order of moduli; `plain`: those of least squares.
+        order of moduli; `plain`: those of least squares. A complex pair has one modulus, and one
+        interval.
 
         They are percentiles of the bootstrap, widened by the ratio of Student's distribution for so
-        many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015).
+        many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015), and contain the estimate.
 
         **Example:**
 
@@ -135,8 +167,13 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         blocks = max(self.cycles / self.block, 2.0)
         wider = np.sqrt(blocks / (blocks - 1))
         reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
+        values = self.plain if plain else self.multipliers
         draws = self.plain_draws if plain else self.draws
-        return np.quantile(np.abs(draws), stats.norm.cdf([-reach, reach]), axis=0).T
+        moduli = _moduli(values, draws)
+        low, high = np.quantile(moduli, stats.norm.cdf([-reach, reach]), axis=0)
+        # (The correction of the bias may bring the estimate to the edge of its draws.)
+        modulus = np.abs(values)
+        return np.stack([np.minimum(low, modulus), np.maximum(high, modulus)], axis=1)
 
     def __repr__(self) -> str:
         lines = [
@@ -149,9 +186,36 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         return "\n".join(lines).rstrip()
 
 
+def _moduli(
+    values: Complex[np.ndarray, " d"], draws: Draws
+) -> Float[np.ndarray, "B d"]:
+    """Return the moduli of draws. Where the estimates are a complex pair, both have the root of the
+    product: draws may be two real numbers, one larger and one smaller than the modulus."""
+    moduli = np.abs(draws)
+    for k in np.flatnonzero(values.imag > 0):
+        twin = int(np.argmin(np.abs(values - values[k].conj())))
+        moduli[:, [k, twin]] = np.sqrt(moduli[:, k] * moduli[:, twin])[:, None]
+    return moduli
+
+
+def _beside(values: Complex[np.ndarray, " d"], draws: Draws) -> Draws:
+    """Return draws in the order in which the sum of their distances from the values is smallest."""
+    from scipy.optimize import linear_sum_assignment  # (a third of a second)
+
+    ordered = np.empty_like(draws)
+    for row, drawn in enumerate(draws):
+        _, columns = linear_sum_assignment(np.abs(values[:, None] - drawn))
+        ordered[row] = drawn[columns]
+    return ordered
+
+
 def _printed(name: str, multipliers: Draws, bounds: np.ndarray) -> Iterator[str]:
     for z, (low, high) in zip(multipliers, bounds, strict=True):
-        value = f"{z.real:.3f}" if abs(z.imag) < 1e-12 else f"{z:.3f}"
+        if z.imag < 0:
+            continue
+        value = f"{z.real:.3f}"
+        if z.imag > 0:
+            value += f"±{z.imag:.3f}j"
         yield (
             f"  {name:15s} {value:>15s}   modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
         )
@@ -255,8 +319,8 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     return NaturalMultipliers(
         multipliers=multipliers[0],
         plain=plain[0],
-        draws=multipliers[1:],
-        plain_draws=plain[1:],
+        draws=_beside(multipliers[0], multipliers[1:]),
+        plain_draws=_beside(plain[0], plain[1:]),
         strength=float(shares.mean()),
         cycles=K,
         records=len(counts),

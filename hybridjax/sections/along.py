@@ -58,7 +58,9 @@ def flow_along(
     states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
     at_once = np.zeros(len(h), bool)
     rival = np.full(len(h), -1)
-    rows = h, code, walk.t[1:], states, walk.q[:, 1:], chart[1:], at_once, rival
+    events = np.cumsum(code >= 0)
+    ways = states, walk.q[:, 1:]
+    rows = h, code, walk.t[1:], *ways, chart[1:], at_once, rival, events
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
     none = np.zeros(len(event), np.int32)
     flow = pieces, Moved(ends, none, none, none), tape

@@ -63,3 +63,33 @@ def test_exact_htfs_have_no_more_multipliers(small):
     assert (
         hj.select_order(scaled(12, (1, 1), 1, 1).htf(np.arange(1, 46) / 46)).order == 1
     )
+
+
+@pytest.mark.parametrize("size", [0.0, 0.3])
+def test_a_weak_multiplier_that_was_left_out_is_named(size):
+    """A pair of modulus 0.7, and a multiplier of 0.4 that the input excites by `size` as much."""
+    real, imaginary = 0.7 * np.cos(0.9), 0.7 * np.sin(0.9)
+    A = np.array([[real, imaginary, 0], [-imaginary, real, 0], [0, 0, 0.4]])
+    named = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        # Three sections; the states change after the last one.
+        B = rng.normal(size=(3, 3)) * [1, 1, size]
+        C = rng.normal(size=(3, 2, 3))
+        u = rng.normal(size=1350)
+        y = np.zeros((1350, 2))
+        x = np.zeros(3)
+        for i in range(1350):
+            n = i % 3
+            y[i] = C[n] @ x
+            x = x + B[n] * u[i]
+            if n == 2:
+                x = A @ x
+        y += 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
+        data = hj.experiments.SectionSeries(u[:, None], y, n_sections=3)
+        fit = hj.fit_series(data, 2)
+        named += "order" in [finding.cause for finding in fit.findings]
+    if size:
+        assert named >= 5
+    else:
+        assert named <= 1  # (A test of 95 % doubts some right orders.)

@@ -408,11 +408,46 @@ def test_a_guard_that_is_touched():
     assert_allclose(jax.grad(end)(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
 
 
-def test_so_many_flows_that_they_are_computed_part_by_part():
-    height = np.linspace(0.5, 2.0, 1030)
-    states = np.stack([height, 0 * height], axis=1)
-    found = hj.flow(ball(), hj.Guess("main", states), events=2, within=3.0)
-    assert_allclose(found.t, np.sqrt(2 * height / 9.81) * 2.4, rtol=1e-11)
+def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
+    """The last part is filled up; reverse mode of a program searches the parts again."""
+    monkeypatch.setattr("hybridjax.orbits.flow._RECORD", 4e5)
+    height = np.linspace(0.5, 2.0, 14)
+
+    def times(height):
+        states = jnp.stack([height, 0.0 * height], axis=1)
+        start = hj.Guess("main", states)
+        # (5 to 21 rows of the record: the first 4 do not suffice.)
+        return hj.flow(ball(), start, events=2, within=3.0).t
+
+    monkeypatch.setattr("hybridjax.orbits.flow._ROWS", 4)
+    exact = np.sqrt(2 * height / 9.81) * 2.4
+    assert_allclose(times(height), exact, rtol=1e-11)
+    jitted = jax.jit(lambda x: jax.vjp(times, x)[1](jnp.ones(14))[0])
+    assert_allclose(jitted(height), exact / (2 * height), rtol=1e-11)
+
+
+def test_steps_after_events_are_not_tried_with_the_length_of_the_first_one():
+    """That one is a guess, a tenth of the longest duration, and would be rejected each time."""
+
+    def fall(t, q, u, p):
+        return q[1], -9.81 - 0.1 * q[1]
+
+    def bounce(t, q, u, p):
+        return q[0], -0.9 * q[1]
+
+    events = [("bounce", lambda t, q, u, p: q[0], bounce)]
+    dragged = hj.HybridSystem.from_functions(("y", "v"), fall, events, inputs=())
+    few = hj.orbits.Settings(rtol=1e-10, max_steps=40)
+    found = hj.flow(dragged, DROP, events=10, within=20.0, settings=few, max_steps=40)
+    assert found.count == 10
+
+
+def test_a_flow_until_its_start_stays_there():
+    """It moves on with the end, at the rate of the field."""
+    assert_allclose(hj.flow(ball(), DROP, 0.0).state, (1.0, 0.0), rtol=1e-15)
+    program = jax.jit(lambda end: hj.flow(ball(), DROP, end).state)
+    assert_allclose(program(0.0), (1.0, 0.0), rtol=1e-15)
+    assert_allclose(jax.jit(jax.jacrev(program))(0.0), (0.0, -9.81), atol=1e-12)
 
 
 def test_an_end_before_the_start_is_a_code_in_programs():

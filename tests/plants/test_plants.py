@@ -1,6 +1,7 @@
 """Plants: closed forms, the paper's hopper against its exact model, and plants that fail."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -111,6 +112,128 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
         cycle.trajectory(u=[[3.0]])
 
 
+class Travelling(Circle):
+    """A circle that also rolls: the distance grows by 2 pi in each turn, and by the radius."""
+
+    states = ("x", "y", "distance")
+
+    def reset(self, seed):
+        self.distance = 0.0
+        return super().reset(seed)
+
+    def get_state(self):
+        return (*self.q, self.distance)
+
+    def set_state(self, q):
+        self.distance = float(q[2]) if len(q) > 2 else self.distance
+        return super().set_state(q[:2]) | {"distance": self.distance}
+
+    def step(self, u, duration):
+        self.distance += duration * math.hypot(*self.q)
+        return super().step(u, duration)
+
+
+def test_coordinates_that_travel_are_found_and_the_settled_state_stays():
+    cycle = hj.plants.find_cycle(Travelling(), ANGLE, "x", cycles=20)
+    returns = cycle.perturbed_returns()
+    assert returns.travelling == ("distance",)
+    assert returns.coordinates == ("x", "y")
+    assert "they travel: distance" in repr(returns)
+    assert_allclose(returns.multipliers, [MULTIPLIER], rtol=0, atol=1e-7)
+    # Perturbed on demand, it has the multiplier 1.
+    chosen = cycle.perturbed_returns(("x", "y", "distance"))
+    assert_allclose(chosen.multipliers, [1, MULTIPLIER], rtol=0, atol=1e-7)
+    assert chosen.residual < 1e-9
+
+
+class Stairs:
+    """A value v that an event changes once in each period: v becomes -(a v + b t) at the time t = c
+    + d v, and changes its sign at the end of the period. The simulator detects the event at the end
+    of a time step, so that the return map is a staircase of mean slope a + b d."""
+
+    inputs = ("u",)
+    period = 1.0
+    states = ("time", "v", "fired")
+
+    def __init__(self, a, b, c, d, dt):
+        self.numbers = a, b, c, d
+        self.dt = dt
+
+    def reset(self, seed):
+        return self.set_state((0.0, 0.1, 0.0))
+
+    def get_state(self):
+        return (self.t, self.v, self.fired)
+
+    def set_state(self, q):
+        self.t, self.v, self.fired = map(float, q)
+        return {"v": self.v}
+
+    def step(self, u, duration):
+        a, b, c, d = self.numbers
+        self.t += duration
+        self.v += duration * u[0]
+        time = (self.t + 1e-9) % 1.0
+        if self.fired and time < c / 2:
+            self.v = -self.v
+            self.fired = 0.0
+        elif not self.fired and time >= c + d * self.v:
+            self.v = -(a * self.v + b * time)
+            self.fired = 1.0
+        return {"v": self.v}
+
+
+def test_errors_contain_the_stairs_of_time_steps():
+    """The mean slope lies in 95 % of the regions; the slope of one step does not, where the stairs
+    are resolved."""
+    rng = np.random.default_rng(0)
+    held = []
+    flat = []
+    for _ in range(20):
+        a = rng.uniform(0.2, 0.5)
+        b = rng.uniform(0.3, 0.5)
+        c = rng.uniform(0.25, 0.4)
+        d = rng.uniform(0.3, 0.5)
+        plant = Stairs(a, b, c, d, float(1 / rng.integers(100, 300)))
+        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        returns = cycle.perturbed_returns("v")
+        held.append(bool(returns.contains(a + b * d).all()))
+        flat.append(bool(returns.contains(a).all()))
+    # (Fewer than 17 once in 70 times, if the regions are right.)
+    assert sum(held) >= 17
+    assert sum(flat) < 10
+
+
+@pytest.mark.parametrize(("size", "cause"), [(1e-6, "stairs"), (0.1, None)])
+def test_inputs_that_stay_on_one_stair_are_named(size, cause):
+    plant = Stairs(0.4, 0.4, 0.3, 0.4, 0.005)
+    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+    u = size * np.random.default_rng(0).normal(size=(4, 60, 1))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        data = cycle.run_experiments(u, processes=0)
+    causes = [finding.cause for finding in data.findings]
+    assert causes == ([cause] if cause else [])
+    assert len(said) == len(causes)
+
+
+def test_inputs_beyond_the_linear_range_are_named():
+    """A push acts by its value and its square."""
+
+    class Curved(Circle):
+        def step(self, u, duration):
+            return super().step([u[0] + 0.1 * u[0] ** 2], duration)
+
+    cycle = hj.plants.find_cycle(Curved(), ANGLE, "x", cycles=20)
+    u = np.random.default_rng(0).normal(size=(4, 32, 1))
+    small = cycle.run_experiments(1e-3 * u, discard=0, processes=0)
+    assert not small.findings
+    with pytest.warns(hj.errors.FindingWarning, match="not linear"):
+        data = cycle.run_experiments(0.1 * u, discard=0, processes=0)
+    assert [finding.cause for finding in data.findings] == ["amplitude"]
+    assert "Amplitude" in repr(data)
+
+
 def test_an_unstable_cycle_is_found_from_a_guess():
     class Unstable(Circle):
         rate = -0.2
@@ -169,7 +292,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
-    assert seeds == [*range(1, 10), 9, 10]
+    # (The last one has half of the first input, which tests the size of the inputs.)
+    assert seeds == [*range(1, 10), 9, 10, 1]
     assert np.array_equal(data.y, whole.y)
     assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(

@@ -82,6 +82,45 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
         hj.plot.phase_response(other[0], model=other[1])
 
 
+def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
+    """Of trials that were left out: with the curve, with its mean, and with no jitter."""
+    others = beats(0.05, trials=8, seed=7)
+    ahead = found.forecast(others, BEAT)
+    assert ahead.result == 0 and ahead.counted.all()
+    assert found.left_out_flat + 0.01 < ahead.explained < 1
+    missed = (ahead.measured - ahead.duration) * 10
+    assert missed.std() == pytest.approx(0.05, rel=0.2)
+    np.testing.assert_allclose(ahead.rates, 10, rtol=0.03)
+    # The averaged curve varies less, most at the end of the cycle.
+    assert np.ptp(found.with_jitter(X)) < np.ptp(found(X))
+    np.testing.assert_allclose(found.with_jitter([0.0]), found([0.0]))
+    assert "free of jitter" in repr(found)
+
+
+def test_a_rate_that_wanders_is_no_memory():
+    """The rate makes a random walk, 2 % from a cycle to the next, under a slow input."""
+    rng = np.random.default_rng(0)
+    force = 2 * slow_noise(rng, trials=1, samples=2501, highest=0.5 * 10 / 100)[0]
+    walk = np.cumsum(0.2 * np.sqrt(0.1) * rng.normal(size=2501))
+    phase = 0.0
+    events = []
+    for k in range(2500):
+        rate = max(10 + walk[k], 2.0) + CURVE[int(200 * phase)] * force[k]
+        step = max(rate, 0.0) * 0.01 + 0.05 * np.sqrt(0.1) * rng.normal()
+        phase = max(phase + step, 0.0)
+        if phase >= 1:
+            phase -= 1
+            events.append((k + 1 - phase / step) * 0.01)
+    wandering = hj.Recording(
+        np.arange(2501) * 0.01, {"u": force}, events={"beat": np.array(events)}
+    )
+    found = hj.recordings.phase_response(wandering, BEAT, input="u")
+    assert found.wander > 0.01
+    assert "memory" not in [x.cause for x in found.findings]
+    error = np.sqrt(found.covariance[0, 0])
+    assert abs(found.coefficients[0] - CURVE.mean()) < 3 * error
+
+
 def rms(values):
     return np.sqrt(np.mean(values**2))
 
@@ -123,6 +162,85 @@ def test_events_alone_are_identified(noisy, tmp_path):
     )
     assert (found.write_report(tmp_path).parent / "figures" / "curve.png").exists()
     assert any("Resolution: the jitter" in repr(x) for x in found.diagnosis.findings)
+
+
+def slow_noise(rng, trials, samples, highest):
+    """Noise of variance 1 up to `highest` cycles per sample."""
+    spectrum = np.fft.rfft(rng.normal(size=(trials, samples)))
+    spectrum[:, np.fft.rfftfreq(samples) > highest] = 0
+    noise = np.fft.irfft(spectrum, samples)
+    return noise / noise.std()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_of_a_slow_input_the_band_is_wide_and_holds_the_curve(seed):
+    """An input far slower than the rhythm says little of the shape, and does not exclude one."""
+    rng = np.random.default_rng(seed)
+    force = slow_noise(rng, trials=4, samples=1201, highest=0.2 * 10 / 100)
+    slow = hj.testing.simulate_beats(
+        CURVE, 2 * force, rate=100, rhythm=10.0, jitter=0.05, seed=seed
+    )
+    found = hj.recordings.phase_response(slow, BEAT, input="u")
+    low, high = found.interval(X)
+    assert np.isfinite(found.errors).all()
+    assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
+    assert "slow input" in [x.cause for x in found.findings]
+
+
+def spikes_of_izhikevich(current, noise, adapts, step=0.05):
+    """Spikes, in ms, of v' = 0.04 v^2 + 5 v + 140 - w + I, w' = a (0.2 v - w), with a = 0.1 and
+    w + 2 after a spike, or with a constant w = -10: one state, and no memory."""
+    a, jump = (0.1, 2.0) if adapts else (0.0, 0.0)
+    trials = len(current)
+    v = np.full(trials, -65.0)
+    w = np.full(trials, -6.6 if adapts else -10.0)
+    spikes = [[] for _ in range(trials)]
+    for i in range(current.shape[1]):
+        before = v
+        rate_v = 0.04 * v**2 + 5 * v + 140 - w + current[:, i]
+        rate_w = a * (0.2 * v - w)
+        middle_v = v + step / 2 * rate_v
+        middle_w = w + step / 2 * rate_w
+        rate_v = 0.04 * middle_v**2 + 5 * middle_v + 140 - middle_w + current[:, i]
+        v = v + step * rate_v + noise[:, i]
+        w = w + step * a * (0.2 * middle_v - middle_w)
+        fires = v >= 30
+        for k in np.flatnonzero(fires):
+            spikes[k].append((i + (30 - before[k]) / (v[k] - before[k])) * step)
+        v = np.where(fires, -65.0, v)
+        w = np.where(fires, w + jump, w)
+    return [np.array(x) for x in spikes]
+
+
+@pytest.mark.parametrize("adapts", [True, False])
+def test_a_push_that_changes_the_next_interval_is_named(adapts):
+    """The mean of a curve is the change of the rate by a constant current, unless the neuron
+    adapts: then the intervals after a push take a part of its effect back."""
+    rng = np.random.default_rng(1)
+    n = 20_000
+    still = np.zeros((2, n))
+    steady = spikes_of_izhikevich(np.array([[9.0], [11.0]]) + still, still, adapts)
+    slower, faster = [1e3 / np.diff(x)[20:].mean() for x in steady]
+    truth = (faster - slower) / 2
+    period = 2e-3 / (slower + faster) * 1e3
+    push = 0.4 * slow_noise(rng, trials=4, samples=n + 1, highest=0.05e-3 / period)
+    kicks = 0.5 * np.sqrt(0.05) * rng.normal(size=(4, n))
+    spikes = spikes_of_izhikevich(10 + (push[:, 1:] + push[:, :-1]) / 2, kicks, adapts)
+    time = np.arange(n + 1) * 0.05e-3
+    trials = [
+        hj.Recording(time, {"u": u}, events={"beat": 1e-3 * x}, name=f"trial {k}")
+        for k, (u, x) in enumerate(zip(push, spikes, strict=True))
+    ]
+    found = hj.recordings.phase_response(hj.Recording.join(trials), BEAT, input="u")
+    error = np.sqrt(found.covariance[0, 0])
+    off = (found.coefficients[0] - truth) / error
+    causes = [x.cause for x in found.findings]
+    if adapts:
+        assert off > 5 and found.carried < -0.3
+        assert "memory" in causes
+    else:
+        assert abs(off) < 3
+        assert "memory" not in causes
 
 
 def test_what_is_refused(noisy):

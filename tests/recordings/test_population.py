@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from matplotlib import pyplot
 from scipy import linalg, stats
@@ -388,10 +389,15 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
         "b - a", "a - b"
     )
     assert "S0-a is doubtful: odd." in printed
-    assert Path("out/forest.png").exists() and not pyplot.get_fignums()
+    for quantity in ("modulus", "half_life"):
+        assert Path(f"out/forest_{quantity}.png").exists()
+    assert not pyplot.get_fignums()
+    compared = pandas.read_csv("out/population.csv")
+    assert {"modulus", "half_life", "c1"} == set(compared["quantity"])
     page, table = (
         (tmp_path / "out" / x).read_text() for x in ("population.html", "subjects.csv")
     )
+    assert "Not compared: angle" in page
     assert (
         page.count("report.html") == 6 and "Hartung" in page and "S9-a failed" in page
     )

@@ -11,6 +11,18 @@ N = 8
 
 
 def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
+    """The sections of a rhythm that nobody perturbs."""
+    recording = recorded(noise, strides, multiplier, seed, drift)
+    options = {
+        "inputs": (),
+        "outputs": recording.signals,
+        "n_sections": N,
+        "bandwidth": np.inf,
+    }
+    return hj.recordings.sample_sections(recording, hj.AtEvent("e"), **options)
+
+
+def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
     rng, gains = (
         np.random.default_rng(seed),
@@ -28,14 +40,47 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
         t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
         trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
-    recording = hj.Recording.join(trials)
-    options = {
-        "inputs": (),
-        "outputs": recording.signals,
-        "n_sections": N,
-        "bandwidth": np.inf,
-    }
-    return hj.recordings.sample_sections(recording, hj.AtEvent("e"), **options)
+    return hj.Recording.join(trials)
+
+
+def test_a_recording_without_inputs_is_identified_by_its_variability(tmp_path):
+    recording = recorded(0.2, strides=(120,))
+    options = {"outputs": recording.signals, "n_sections": N, "bandwidth": np.inf}
+    result = hj.identify_recording(recording, hj.AtEvent("e"), order=1, **options)
+    low, high = result.fit.interval()[0]
+    assert low < 0.6 < high
+    assert abs(result.multipliers[0] - 0.6) < 0.15
+    result.write_report(tmp_path / "report")
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "without a measured input" in page
+    fit = hj.load(tmp_path / "report" / "fit.npz")
+    population = hj.recordings.Population.from_fits([fit], {"subject": ["S1"]})
+    modulus = result.fit.modulus[0]
+    half_life = population.values["half_life"][0]
+    assert modulus**half_life == pytest.approx(0.5)
+    with pytest.raises(hj.errors.DefinitionError, match="name `inputs`, too"):
+        hj.identify_recording(recording, hj.AtEvent("e"), references="y0", **options)
+
+
+def test_a_pair_has_one_interval_that_contains_the_estimate():
+    """Half of the draws are pairs of modulus 0.5, the others two real numbers with the product
+    0.25: the modulus of the pair is 0.5 in each of them."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0.2, 0.6, 500)
+    ratio = rng.uniform(1.1, 1.8, 500)
+    pairs = 0.5 * np.exp(1j * np.stack([angle, -angle], axis=1))
+    both_real = 0.5 * np.stack([1 / ratio, ratio], axis=1)
+    draws = np.concatenate([pairs, both_real])
+    noise = 1 + 0.1 * rng.normal(size=(1000, 1))
+    estimate = 0.5 * np.exp(np.array([0.4j, -0.4j]))
+    found = hj.recordings.NaturalMultipliers(
+        estimate, estimate, draws * noise, draws * noise, 0.9, 200, 1, 5
+    )
+    first, second = found.interval()
+    assert first.tolist() == second.tolist()
+    assert 0.38 < first[0] < 0.42
+    assert 0.58 < first[1] < 0.62
+    assert found.standard_errors == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.slow

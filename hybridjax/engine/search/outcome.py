@@ -75,7 +75,8 @@ def without_events(
     )
     at_once = xp.zeros_like(active)
     rival = xp.full(active.shape, -1, xp.int32)
-    return end, Tape(moved, code, t, new.q, new.q, lanes.chart, at_once, rival)
+    states = new.q, new.q
+    return end, Tape(moved, code, t, *states, lanes.chart, at_once, rival, lanes.events)
 
 
 def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State, Tape]:
@@ -150,7 +151,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     at_once = aim.at_once & (fired >= 0)
     before = lanes._replace(t=t, q=new.q)
     rival = rival_of(s, before, new.watched, task.u, fired, task.span)
-    return end, Tape(moved, code, t, new.q, after.q, after.chart, at_once, rival)
+    states = new.q, after.q
+    return end, Tape(moved, code, t, *states, after.chart, at_once, rival, after.events)
 
 
 def _after(
@@ -323,7 +325,10 @@ def _next_step(
     too_long = verdict.too_long
     adapted = next_step(state.h, aim, new.error, state.lanes, task)
     h = xp.where(plain | too_long, adapted, state.h)
-    h = xp.where(fired >= 0, xp.maximum(h, task.stride.h), h)
+    # After an event the step may be as long as the first one of the flow. (Without usual sizes of
+    # states that one is a guess, which would be rejected after every event.)
+    restart = adapted if task.settings.scale is None else task.stride.h
+    h = xp.where(fired >= 0, xp.maximum(h, restart), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
     instant = INSTANT * task.span

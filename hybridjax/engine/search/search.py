@@ -117,7 +117,9 @@ def take_aim(state: State, task: Task) -> Aim:
     due, schedule, at_once = _known_time(state, task)
     # The step is cut so that it ends on known times exactly, in equal pieces.
     left = xp.maximum(due - state.lanes.t, 0.0)
-    pieces = xp.ceil(xp.where(xp.isfinite(left), left / state.h, 2.0) - SAME_TIME)
+    # (A flow of no duration has a first step of none.)
+    h = xp.where(left > 0, state.h, 1.0)
+    pieces = xp.ceil(xp.where(xp.isfinite(left), left / h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -49,6 +49,7 @@ from ..multiplier_estimate import (
     MultiplierFit,
     RoughFit,
     contradicted_by,
+    left_out,
     order_doubts,
     undetermined,
 )
@@ -366,9 +367,10 @@ def _fit_open_loop(
     if not doubts:
         # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
         higher = [
-            partial(_of_order, order + k, records, fit, free_start) for k in (1, 2)
+            cache(partial(_of_order, order + k, records, fit, free_start))
+            for k in (1, 2)
         ]
-        doubts = order_doubts(fit, higher)
+        doubts = order_doubts(fit, higher) or left_out(higher[0])
     changes = [_CHANGES] if p_steady < _STEADY else []
     return dataclasses.replace(
         fit, findings=(*fit.findings, *doubts, *changes, *answers)

@@ -252,8 +252,9 @@ class LoopEquations:
         d = self.order
         if check and determined < d:
             raise DefinitionError(
-                f"the reference determines {determined} multipliers, not {d}: lower `order`, "
-                "record longer, excite more, or pass check=False."
+                f"the reference determines {determined} multipliers, not {d}: try "
+                f"`hj.fit_ldtp(data, {d}, references=...)`, whose errors are smaller, lower "
+                "`order`, record longer, excite more, or pass check=False."
             )
         if determined < d:
             return c, Covariance.unknown(d), scale

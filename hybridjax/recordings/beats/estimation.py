@@ -1,10 +1,15 @@
 r"""Phase response curves from intervals: penalized least squares on durations.
 
 The coefficients of a curve have prior variances $\tau^2 / k^4$, as those of a smoothing spline do
-(Wahba, *Spline Models for Observational Data*, 1990), and $\tau$ maximizes the marginal likelihood
-of the durations. Residuals of intervals of one block may add up to more than independent errors
-would: the likelihood is that of errors with as much variance as sums over blocks have
-(quasi-likelihood: McCullagh 1983).
+(Wahba, *Spline Models for Observational Data*, 1990). $\tau$ maximizes its posterior density. Its
+exponential prior has as mean the curve under which the standard deviation of the input would double
+or stop the rhythm (a penalty of complexity: Simpson et al., Statistical Science 32, 2017). Other
+probable values contribute to the covariance of the curve (Kass and Steffey 1989): where the data
+hardly determine a shape, the errors of one value would be far too small.
+
+Errors of intervals are independent after a wandering rate is taken out (`errors.py`). Those of a
+block may still add up to more than independent errors would: the likelihood is that of errors with
+as much variance as sums over blocks have (quasi-likelihood: McCullagh 1983).
 """
 
 from typing import NamedTuple
@@ -14,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import optimize
 
 from ...identify.denominator import Covariance, sandwich
+from .errors import Wander, Whitening, estimate_wander, whitening
 from .model import Forecast, Intervals, Table, forecast, tabulated
 
 
@@ -35,6 +41,14 @@ _BLOCKS = 30
 _SHORTEST_BLOCK = 10
 
 
+# Half waves whose coefficients may be as large as that of the first one. More: bands are wider.
+# Fewer: where the data determine little, bands are those of a curve that hardly turns in a cycle.
+_COARSE = 3.0
+# Logarithms of tau^2 that are compared, beyond that of the mean of its prior. Wider or finer: time.
+# Narrower: curves that are flatter than e^-8 of the prior's mean keep that shape.
+_LOG_SIZES = np.arange(-16.0, 4.5, 0.5)
+
+
 _TINY = np.finfo(float).tiny
 
 Curve = Float[np.ndarray, " p"]
@@ -50,15 +64,26 @@ class Smoothness(NamedTuple):
     penalty: Curve
     """Addition to the curvature of the sum of squares; zero for the mean."""
     noise: float
-    """Variance of the residual of an interval, s^2, times the excess."""
+    """Variance of the phase at the end of a cycle, s^2, times the excess."""
     excess: float
     """Variance of sums over blocks relative to that of independent errors; at least 1."""
     evidence: float
     """Twice the logarithm of the likelihood ratio to a flat curve."""
+    others: Float[np.ndarray, "T p"]
+    """Penalties of other values of tau."""
+    probability: Float[np.ndarray, " T"]
+    """Posterior probability of each."""
 
     @staticmethod
     def none(waves: int) -> "Smoothness":
-        return Smoothness(np.zeros(waves + 1), noise=0.0, excess=1.0, evidence=0.0)
+        return Smoothness(
+            penalty=np.zeros(waves + 1),
+            noise=0.0,
+            excess=1.0,
+            evidence=0.0,
+            others=np.zeros((1, waves + 1)),
+            probability=np.ones(1),
+        )
 
 
 class CurveFit(NamedTuple):
@@ -67,13 +92,14 @@ class CurveFit(NamedTuple):
     coefficients: Curve
     rates: Float[np.ndarray, " trials"]
     jitter: float
-    """Standard deviation of the phase at the end of a cycle."""
+    """Standard deviation of the phase at the end of a cycle, as forecast from earlier ones."""
     used: Bool[np.ndarray, " L"]
     """Intervals that are not miscounted."""
     residual: Lanes
     """Residuals of the durations, in s."""
     forecast: Forecast
     smoothness: Smoothness
+    wander: Wander
     converged: bool
 
     @property
@@ -108,16 +134,17 @@ def fit_curve(
     `start`: a fit with as many half waves or fewer.
     """
     fit = _start(intervals, waves, start)
-    rough = fit.smoothness
     for _ in range(_ROUNDS):
         before = fit
         table = tabulated(waves, fit.jitter)
+        fit = _look(intervals, table, fit)
         if waves:
-            without = _look(intervals, table, fit._replace(smoothness=rough))
-            fit = fit._replace(smoothness=_smoothness(intervals, without))
-        fit = _minimize(intervals, table, _look(intervals, table, fit))
-        used = fit.counted()
-        fit = fit._replace(jitter=float(fit.missed[used].std()), used=used)
+            fit = fit._replace(smoothness=_smoothness(intervals, fit))
+        fit = _minimize(intervals, table, fit)
+        fit = fit._replace(used=fit.counted())
+        fit = fit._replace(wander=_wander(intervals, fit))
+        missed = whitened(intervals, fit).missed(fit.residual)
+        fit = fit._replace(jitter=float(missed[fit.used].std()))
         if _is_settled(before, fit):
             break
     return fit
@@ -143,17 +170,37 @@ def _start(intervals: Intervals, waves: int, start: CurveFit | None) -> CurveFit
         residual=np.zeros(L),
         forecast=Forecast(np.zeros(L), np.zeros(L), np.zeros((L, waves + 2))),
         smoothness=smoothness,
+        wander=Wander.none(),
         converged=True,
     )
 
 
+def _wander(intervals: Intervals, fit: CurveFit) -> Wander:
+    """Return the wandering rate that the residuals of a fit show."""
+    return estimate_wander(
+        intervals,
+        fit.forecast,
+        fit.rates[intervals.trial],
+        fit.used,
+        fit.residual,
+        fit.forecast.slopes[:, :-1],
+    )
+
+
+def whitened(intervals: Intervals, fit: CurveFit) -> Whitening:
+    """Return how the residuals of a fit become independent errors."""
+    rates = fit.rates[intervals.trial]
+    return whitening(intervals, fit.forecast, rates, fit.used, fit.wander)
+
+
 def _is_settled(before: CurveFit, fit: CurveFit) -> bool:
-    """Return whether a round changed neither jitter, nor smoothness, nor the used intervals."""
+    """Return whether a round changed neither jitter, smoothness, wander, nor the used intervals."""
     stiffness = fit.penalty[-1]
     change = abs(before.penalty[-1] - stiffness)
     return (
         abs(fit.jitter - before.jitter) < _SAME * fit.jitter
         and change <= 10 * _SAME * stiffness
+        and before.wander == fit.wander
         and bool((fit.used == before.used).all())
     )
 
@@ -172,13 +219,14 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
     Rates are eliminated from each step. (In scipy's `least_squares`, those of hundreds of trials
     would be most of the unknowns.)
     """
-    cost = _cost(fit)
+    white = whitened(intervals, fit)
+    cost = _cost(fit, white)
     for _ in range(_STEPS):
-        across, along = projected(intervals, fit)
-        curvature = across.T @ across + np.diag(fit.penalty)
-        downhill = across.T @ fit.residual - fit.penalty * fit.coefficients
+        errors = projected(intervals, fit, white)
+        curvature = errors.across.T @ errors.across + np.diag(fit.penalty)
+        downhill = errors.across.T @ errors.residual - fit.penalty * fit.coefficients
         step = np.linalg.lstsq(curvature, downhill)[0]
-        faster = along @ np.append(1.0, -step)
+        faster = errors.along @ np.append(1.0, -step)
         for halving in range(_ROUNDS):
             part = 0.5**halving
             rates = fit.rates + part * faster
@@ -187,40 +235,48 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
                 rates=np.maximum(rates, fit.rates / 2),  # (never zero)
             )
             trial = _look(intervals, table, trial)
-            if _cost(trial) < cost:
+            if _cost(trial, white) < cost:
                 break
         else:
             return fit
-        gain = 1 - _cost(trial) / cost
+        after = _cost(trial, white)
+        gain = 1 - after / cost
         fit = trial
-        cost = _cost(fit)
+        cost = after
         if gain < _SETTLED:
             return fit
     return fit._replace(converged=False)
 
 
-def _cost(fit: CurveFit) -> float:
+def _cost(fit: CurveFit, white: Whitening) -> float:
     """Return the penalized sum of squares."""
-    squares = fit.residual[fit.used] ** 2
+    errors = white(fit.residual[:, None])
     roughness = fit.coefficients @ (fit.penalty * fit.coefficients)
-    return float(squares.sum() + roughness)
+    return float((errors**2).sum() + roughness)
 
 
-def projected(
-    intervals: Intervals,
-    fit: CurveFit,
-) -> tuple[Slopes, Float[np.ndarray, "trials p1"]]:
-    """Return derivatives with respect to the coefficients, without the part that the rates of the
-    trials explain (zero for miscounted intervals), and what rates explain of the residuals, and of
-    these derivatives."""
-    slopes = fit.forecast.slopes[:, :-1]
-    by_rate = fit.by_rate
-    square = np.maximum(intervals.sums(by_rate**2 * fit.used), _TINY)
-    columns = np.column_stack([fit.residual, slopes]) * (by_rate * fit.used)[:, None]
-    products = np.stack([intervals.sums(x) for x in columns.T], axis=1)
+class Projected(NamedTuple):
+    """Independent errors of intervals without what the rates of the trials explain."""
+
+    residual: Lanes
+    across: Slopes
+    """Derivatives with respect to the coefficients."""
+    along: Float[np.ndarray, "trials p1"]
+    """What rates explain of the residuals, and of the derivatives."""
+
+
+def projected(intervals: Intervals, fit: CurveFit, white: Whitening) -> Projected:
+    """Return residuals and derivatives of a fit as independent errors (zero for miscounted
+    intervals), without what the rates of the trials explain."""
+    columns = np.column_stack([fit.residual, fit.forecast.slopes])
+    columns = white(columns)
+    by_rate = columns[:, -1]
+    others = columns[:, :-1]
+    square = np.maximum(intervals.sums(by_rate**2), _TINY)
+    products = np.stack([intervals.sums(by_rate * x) for x in others.T], axis=1)
     along = products / square[:, None]
-    across = slopes - by_rate[:, None] * along[intervals.trial, 1:]
-    return across * fit.used[:, None], along
+    rest = others - by_rate[:, None] * along[intervals.trial]
+    return Projected(rest[:, 0], rest[:, 1:], along)
 
 
 def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
@@ -237,54 +293,65 @@ def _blocks(intervals: Intervals) -> Int[np.ndarray, " L"]:
 
 
 def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
-    """Maximize the marginal likelihood of the durations near a fit."""
-    across, along = projected(intervals, fit)
-    by_rates = fit.by_rate * along[intervals.trial, 0]
-    residual = (fit.residual - by_rates) * fit.used
-    noise, excess = _noise(intervals, fit, across, residual)
-    weight = np.arange(1.0, across.shape[1]) ** 4
+    """Return the posterior of the smoothness near a fit, with the largest density as penalty."""
+    errors = projected(intervals, fit, whitened(intervals, fit))
+    across = errors.across
+    noise, excess = _noise(intervals, fit, errors)
+    half_waves = np.arange(1.0, across.shape[1])
+    weight = ((_COARSE**2 + half_waves**2) / (_COARSE**2 + 1)) ** 2
     curvature = across.T @ across
-    score = across.T @ residual + curvature @ fit.coefficients
+    score = across.T @ errors.residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
-    share = curvature[1:, 0] / curvature[0, 0]
+    share = curvature[1:, 0] / max(curvature[0, 0], _TINY)
     inner = curvature[1:, 1:] - np.outer(share, curvature[0, 1:])
     pull = score[1:] - share * score[0]
     gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
     unit = max(noise, _TINY)
     gain = np.maximum(gain, 0.0) / unit
     power = (axes.T @ (pull / np.sqrt(weight)) / unit) ** 2
+    largest = float(np.median(fit.rates) / intervals.inputs.std())
 
     def improbable(log_size: float) -> float:
         """Return minus twice the logarithm of the likelihood of tau^2."""
         size = np.exp(log_size)
         return float((np.log1p(size * gain) - size * power / (1 + size * gain)).sum())
 
-    # Logarithms of tau^2, around that at which the best direction is half noise.
-    grid = np.arange(-24.0, 24.5, 0.5) - np.log(max(gain[-1], _TINY))
-    best = grid[np.argmin([improbable(x) for x in grid])]
+    def unlikely(log_size: float) -> float:
+        """Return minus twice the logarithm of the posterior density of the logarithm of tau."""
+        log_tau = log_size / 2
+        return improbable(log_size) + 2 * (np.exp(log_tau) / largest - log_tau)
+
+    grid = _LOG_SIZES + 2 * np.log(largest)
+    posterior = np.array([unlikely(x) for x in grid])
+    best = grid[posterior.argmin()]
     top = optimize.minimize_scalar(
-        improbable,
+        unlikely,
         bounds=(best - 0.5, best + 0.5),
         method="bounded",
     )
+    probability = np.exp(-(posterior - posterior.min()) / 2)
+    penalty = noise * weight
     return Smoothness(
-        penalty=np.append(0.0, noise * weight / np.exp(top.x)),
+        penalty=np.append(0.0, penalty / np.exp(top.x)),
         noise=noise,
         excess=excess,
-        evidence=max(-float(top.fun), 0.0),
+        evidence=max(-min(improbable(x) for x in grid), 0.0),
+        others=np.pad(penalty / np.exp(grid)[:, None], ((0, 0), (1, 0))),
+        probability=probability / probability.sum(),
     )
 
 
 def _noise(
     intervals: Intervals,
     fit: CurveFit,
-    across: Slopes,
-    residual: Lanes,
+    errors: Projected,
 ) -> tuple[float, float]:
     """Return the variance of noise, and its excess in sums over blocks.
 
     Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
     """
+    across = errors.across
+    residual = errors.residual
     curvature = across.T @ across
     noise = residual - across @ np.linalg.lstsq(curvature, across.T @ residual)[0]
     dof = int(fit.used.sum()) - len(fit.rates) - across.shape[1]
@@ -310,7 +377,11 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     whose expected square is added (Nychka 1988: such intervals hold the curve at as many phases as
     they claim).
     """
-    across, _ = projected(intervals, fit)
+    errors = projected(intervals, fit, whitened(intervals, fit))
+    across = errors.across
+    # The same of durations: differences to forecasts, in s.
+    by_rates = errors.along[intervals.trial, 1:] * fit.by_rate[:, None]
+    in_seconds = fit.forecast.slopes[:, :-1] - by_rates
     data = across.T @ across
     smooth = np.diag(fit.penalty)
     curvature = data + smooth
@@ -321,16 +392,116 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     for k in range(int(block.max()) + 1):
         rows = (block == k) & fit.used
         x = across[rows]
-        error = fit.residual[rows]
+        error = errors.residual[rows]
         share = x.T @ x
         by_others = np.linalg.lstsq(curvature - share, x.T @ error)[0]
-        error = error + x @ by_others
         shares.append(share)
-        score.append(x.T @ error)
-        left_out += float(error @ error)
+        score.append(x.T @ (error + x @ by_others))
+        missed = fit.residual[rows] + in_seconds[rows] @ by_others
+        left_out += float(missed @ missed)
     scores = np.array(score)
-    meat = scores.T @ scores + fit.smoothness.noise * smooth
+    meat = scores.T @ scores
     parts = np.array(shares) + smooth / len(shares)
-    covariance = sandwich(curvature, meat, parts)
+    dof = sandwich(curvature, meat, parts).dof
+    covariance = Covariance(_covariance(fit, data, meat), dof)
     detail = float(np.trace(np.linalg.lstsq(curvature, data)[0]))
     return covariance, left_out, detail
+
+
+def _covariance(fit: CurveFit, data: Square, meat: Square) -> Square:
+    """Return the covariance of a curve over all probable values of its smoothness.
+
+    **Arguments:** `data`: the curvature of the sum of squares. `meat`: the covariance of its
+    gradient.
+    """
+    smoothness = fit.smoothness
+    toward = (data + np.diag(fit.penalty)) @ fit.coefficients
+    total = np.zeros_like(data)
+    for penalty, probability in zip(
+        smoothness.others, smoothness.probability, strict=True
+    ):
+        smooth = np.diag(penalty)
+        inverse = np.linalg.pinv(data + smooth, hermitian=True)
+        apart = inverse @ toward - fit.coefficients
+        spread = inverse @ (meat + smoothness.noise * smooth) @ inverse
+        total += probability * (spread + np.outer(apart, apart))
+    return total
+
+
+def fit_rates(intervals: Intervals, coefficients: Curve, jitter: float) -> CurveFit:
+    """Return the rate of each trial under a known curve, with the durations that both forecast."""
+    fit = _start(intervals, len(coefficients) - 1, None)
+    fit = fit._replace(coefficients=coefficients, jitter=jitter)
+    table = tabulated(len(coefficients) - 1, jitter)
+    for _ in range(_STEPS):
+        before = fit.rates
+        fit = _look(intervals, table, fit)
+        fit = fit._replace(used=fit.counted())
+        faster = projected(intervals, fit, whitened(intervals, fit)).along[:, 0]
+        rates = np.clip(before + faster, before / 2, before * 2)
+        fit = fit._replace(rates=rates)
+        if np.allclose(rates, before, rtol=_SETTLED, atol=0.0):
+            return fit
+    return fit._replace(converged=False)
+
+
+def explained(intervals: Intervals, used: Bool[np.ndarray, " L"], left: float) -> float:
+    """Return R2: the explained fraction of the variance of durations within trials.
+
+    **Arguments:** `left`: the sum of squared errors of the used intervals.
+    """
+    count = np.maximum(intervals.sums(1.0 * used), 1)
+    mean = intervals.sums(intervals.duration * used) / count
+    deviation = intervals.duration - mean[intervals.trial]
+    whole = (deviation[used] ** 2).sum()
+    return float(1 - left / whole) if whole > 0 else 0.0
+
+
+class Carried(NamedTuple):
+    """What a push does to the interval after its own, as part of the effect on its own."""
+
+    part: float
+    error: float
+    """Standard error; infinite if no two intervals follow each other."""
+
+    @property
+    def significance(self) -> float:
+        """Number of standard errors."""
+        return abs(self.part) / self.error
+
+
+def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:
+    """Return which intervals after the first begin where the one before ends, both used."""
+    end = intervals.start + intervals.duration
+    pause = np.abs(intervals.start[1:] - end[:-1])
+    same = np.diff(intervals.trial) == 0
+    both = fit.used[1:] & fit.used[:-1]
+    return both & same & (pause < 1e-6 * intervals.duration[1:])
+
+
+def carried_over(intervals: Intervals, fit: CurveFit) -> Carried:
+    """Regress the residual of each interval on the fitted response of the interval before.
+
+    If a push acts in its own interval alone, the slope is zero (Lagrange multiplier test:
+    Breusch and Pagan 1980). The column is taken as what curve and rates do not explain.
+    """
+    white = whitened(intervals, fit)
+    response = fit.forecast.duration - 1 / fit.rates[intervals.trial]
+    before = np.zeros(len(response))
+    before[1:] = np.where(follows(intervals, fit), response[:-1], 0.0)
+    errors = projected(intervals, fit, white)
+    column = white(before[:, None])[:, 0]
+    by_rate = white(fit.forecast.slopes[:, -1:])[:, 0]
+    square = np.maximum(intervals.sums(by_rate**2), _TINY)
+    along = intervals.sums(by_rate * column) / square
+    column = column - by_rate * along[intervals.trial]
+    across = errors.across
+    curvature = across.T @ across + np.diag(fit.penalty)
+    taken = np.linalg.lstsq(curvature, across.T @ column)[0]
+    rest = column - across @ taken
+    power = float(rest @ column)
+    if not power > 1e-9 * float(column @ column):
+        return Carried(0.0, np.inf)
+    part = float(rest @ errors.residual) / power
+    scores = np.bincount(_blocks(intervals), rest * (errors.residual - part * column))
+    return Carried(part, float(np.linalg.norm(scores)) / power)

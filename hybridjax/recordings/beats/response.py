@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from ..._core.boundary.checked import checked, checked_methods
@@ -10,6 +10,7 @@ from ..._core.boundary.kinds import Probability, Vector
 from ..._core.findings import Finding, print_findings
 from ..._core.progress import say, working
 from ..._core.results import Result
+from ..._core.showable import Showable
 from ..._core.signal import Signal, with_unit
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
@@ -19,11 +20,50 @@ from ..phase import Phase
 from ..phase_estimation import estimate_phase
 from ..recording import Recording
 from ..smoothing import Series
-from .estimation import WAVES, CurveFit, accuracy_of, fit_curve
+from .estimation import (
+    WAVES,
+    CurveFit,
+    accuracy_of,
+    carried_over,
+    explained,
+    fit_curve,
+    fit_rates,
+    follows,
+    whitened,
+)
 from .model import Intervals, basis, intervals_of
 
 
 Waves = Float[np.ndarray, "n p"]
+
+
+class IntervalForecast(Showable, eqx.Module):
+    """Intervals of a recording as a phase response curve forecasts them.
+
+    **Fields:**
+
+    - `start` (L,), `measured` (L,), `duration` (L,): start, duration and forecast of each interval,
+      in s. `trial` (L,): its number among the trials that have intervals.
+    - `rates` (trials,): of the trials without input, in cycles per second, fitted to `measured`.
+    - `counted` (L,): False where a forecast is off by half a cycle or more (a miscounted event).
+    - `explained`: fraction of the variance of durations within trials (R2) that is forecast.
+    - `result`: `Result.OK` if the fit of the rates converged.
+    """
+
+    start: Series
+    measured: Series
+    duration: Series
+    trial: Int[np.ndarray, " L"]
+    rates: Float[np.ndarray, " trials"]
+    counted: Bool[np.ndarray, " L"]
+    explained: float = eqx.field(static=True)
+    result: Result = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return (
+            f"IntervalForecast({len(self.start)} intervals of {len(self.rates)} trials, "
+            f"{int((~self.counted).sum())} of them miscounted; R2 {self.explained:.3f})"
+        )
 
 
 @checked_methods
@@ -31,7 +71,9 @@ class PhaseResponse(PhaseCurve):
     r"""The curve Z of the phase model $\dot\varphi = w + Z(\varphi)\,I(t)$, with its accuracy.
 
     Z is in cycles per second and unit of the input; $\varphi$ is 0 at an event, and the next event
-    happens where it is 1.
+    happens where it is 1. The curve is free of jitter: it is that of the rhythm without noise.
+    Noise spreads the phase, so that a mean phase follows an average of the curve (`with_jitter`),
+    which `forecast` uses.
 
     **Fields:**
 
@@ -49,7 +91,12 @@ class PhaseResponse(PhaseCurve):
     - `excess`: variance of sums of residuals over blocks relative to that of independent errors.
     - `intervals`: number of intervals. `miscounted`: number of those whose forecast is off by half
       a cycle or more (an event was missed, or one was none); they are not used.
-    - `memory`: correlation of the residuals of neighboring intervals.
+    - `memory`: correlation of the residuals of neighboring intervals, beyond a wandering rate.
+    - `carried`: effect of a push on the next interval, as part of the effect on its own, which the
+      curve shows; `carried_error` is its standard error.
+    - `wander`: standard deviation of the rate within a trial, as part of the rate, beyond jitter.
+      `wander_time`: time after which it is forgotten, in s.
+    - `within`: fraction of the input's variance that lies within intervals; small if it is slow.
     - `result`: `Result.OK` if the fit converged.
     """
 
@@ -67,6 +114,11 @@ class PhaseResponse(PhaseCurve):
     intervals: int = eqx.field(static=True)
     miscounted: int = eqx.field(static=True)
     memory: float = eqx.field(static=True)
+    carried: float = eqx.field(static=True)
+    carried_error: float = eqx.field(static=True)
+    wander: float = eqx.field(static=True)
+    wander_time: float = eqx.field(static=True)
+    within: float = eqx.field(static=True)
     result: Result = eqx.field(static=True)
 
     @property
@@ -102,8 +154,71 @@ class PhaseResponse(PhaseCurve):
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
+    def with_jitter(self, phase: Vector) -> Series:
+        """Return the curve averaged over the jitter at some phases, in cycles: the one with which
+        the phase model forecasts the mean of many noisy cycles. `self(phase)` is free of jitter.
+
+        **Example:**
+
+        ```python
+        force = hj.experiments.random_input(100, 100, bandwidth=8)
+        z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
+        beats = hj.testing.simulate_beats(z, force.T, rate=100, jitter=0.1)
+        curve = hj.recordings.phase_response(beats, hj.AtEvent("beat"), input="u")
+        print(curve.with_jitter([0.25, 0.75]), curve([0.25, 0.75]))
+        ```
+        """
+        x = np.asarray(phase, float) % 1.0
+        return basis(x, len(self.coefficients) - 1, self.jitter) @ self.coefficients
+
+    def forecast(
+        self, recording: Recording, sections: Phase | AtEvent | Crossing
+    ) -> IntervalForecast:
+        """Forecast the intervals of a recording, such as one to which the curve was not fitted.
+
+        Each interval is forecast from its own start. Only the rate of each trial is fitted.
+
+        **Arguments:** as those of `phase_response`. The recording must have the same input.
+
+        **Returns:** `hj.recordings.IntervalForecast`.
+
+        **Raises:** `DefinitionError` as `phase_response`.
+
+        **Example:**
+
+        ```python
+        force = hj.experiments.random_input(100, 100, bandwidth=8)
+        z = 0.2 * np.sin(2 * np.pi * np.arange(50) / 50)
+        fitted = hj.testing.simulate_beats(z, force.T, rate=100, jitter=0.05)
+        other = hj.testing.simulate_beats(z, force.T, rate=100, jitter=0.05, seed=1)
+        curve = hj.recordings.phase_response(fitted, hj.AtEvent("beat"), input="u")
+        print(curve.forecast(other, hj.AtEvent("beat")).explained)
+        ```
+        """
+        intervals = _intervals(recording, sections, str(self.input))
+        fit = fit_rates(intervals, self.coefficients, self.jitter)
+        left = float((fit.residual[fit.used] ** 2).sum())
+        return IntervalForecast(
+            start=intervals.start,
+            measured=intervals.duration,
+            duration=fit.forecast.duration,
+            trial=intervals.trial,
+            rates=fit.rates,
+            counted=fit.used,
+            explained=explained(intervals, fit.used, left),
+            result=_code(fit),
+        )
+
     def _waves(self, phase: Vector) -> Waves:
         return basis(np.asarray(phase, float) % 1.0, len(self.coefficients) - 1)
+
+    def _about_wander(self) -> str:
+        if not self.wander:
+            return ""
+        return (
+            f"\n  wander       of the rate in a trial {100 * self.wander:.2g} %, forgotten after "
+            f"{self.wander_time:.2g} s"
+        )
 
     def __repr__(self) -> str:
         mean = self.coefficients[0]
@@ -114,8 +229,9 @@ class PhaseResponse(PhaseCurve):
             f"  mean {with_unit('Z', self.unit)}  {mean:.4g} ± {error:.2g} (standard error); from "
             f"{self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
-            f"{100 * self.jitter:.2g} % of a cycle\n"
+            f"{100 * self.jitter:.2g} % of a cycle{self._about_wander()}\n"
             f"  R2 left out  {self.left_out:.3f}; of a flat curve {self.left_out_flat:.3f}\n"
+            "  free of jitter: `forecast` and `with_jitter` average the curve over the jitter\n"
             + print_findings(self.findings, "  ")
         )
 
@@ -132,10 +248,14 @@ def phase_response(
 
     The phase model is integrated from each event until its phase is 1, and the resulting durations
     are fitted to the measured ones by least squares. The unknowns are the curve and the rate of
-    each trial. The smoothness of the curve maximizes the marginal likelihood of the data; the curve
-    may be discontinuous at an event. The end of an interval depends on the input, so that a
-    regression of measured intervals on the input at a linear phase is biased; this estimate is not.
-    The averaging of the curve by the jitter of the rhythm is undone: see `docs/mathematics.md`.
+    each trial. The smoothness of the curve maximizes its posterior density given the data; the
+    errors of the curve contain its uncertainty. The curve may be discontinuous at an event. The end
+    of an interval depends on the input, so that a regression of measured intervals on the input at
+    a linear phase is biased; this estimate is not. The averaging of the curve by the jitter of the
+    rhythm is undone: see `docs/mathematics.md`.
+
+    The rate may wander within a trial: fast, or slowly as a random walk does. Such errors are
+    correlated from interval to interval, and weighted accordingly (generalized least squares).
 
     Standard errors come from blocks of intervals, whose errors may depend on each other: trials if
     there are thirty or more, else parts of them.
@@ -167,10 +287,7 @@ def phase_response(
 
     **Before:** `hj.read_recording`. **After:** `hj.plot.phase_response`.
     """
-    phase = sections
-    if not isinstance(phase, Phase):
-        phase = estimate_phase(recording, phase)
-    intervals = intervals_of(recording, phase, input)
+    intervals = _intervals(recording, sections, input)
     total = len(intervals.start)
     if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
         raise DefinitionError(
@@ -182,6 +299,7 @@ def phase_response(
     say("smooth")
     fit = fit_curve(intervals, WAVES, flat)
     covariance, left, detail = accuracy_of(intervals, fit)
+    carried = carried_over(intervals, fit)
     x = np.arange(200) / 200
     waves = basis(x, WAVES)
     return PhaseResponse(
@@ -194,16 +312,35 @@ def phase_response(
         errors=_errors(waves, covariance.matrix),
         rates=fit.rates,
         jitter=fit.jitter,
-        left_out=_explained(intervals, fit, left),
-        left_out_flat=_explained(intervals, flat, left_flat),
+        left_out=explained(intervals, fit.used, left),
+        left_out_flat=explained(intervals, flat.used, left_flat),
         p_flat=float(stats.chi2.sf(fit.smoothness.evidence, 1) / 2),
         excess=fit.smoothness.excess,
         intervals=total,
         miscounted=int((~fit.used).sum()),
         memory=_memory(intervals, fit),
+        carried=carried.part,
+        carried_error=carried.error,
+        wander=_wander(fit),
+        wander_time=fit.wander.memory,
+        within=_within(intervals),
         input=Signal(input, recording.unit(input)),
-        result=Result.OK if fit.converged else Result.NOT_CONVERGED,
+        result=_code(fit),
     )
+
+
+def _intervals(
+    recording: Recording, sections: Phase | AtEvent | Crossing, name: str
+) -> Intervals:
+    """Return the intervals between events, with the input of that name."""
+    phase = sections
+    if not isinstance(phase, Phase):
+        phase = estimate_phase(recording, phase)
+    return intervals_of(recording, phase, name)
+
+
+def _code(fit: CurveFit) -> Result:
+    return Result.OK if fit.converged else Result.NOT_CONVERGED
 
 
 def _errors(waves: Waves, covariance: Float[np.ndarray, "p p"]) -> Series:
@@ -211,23 +348,29 @@ def _errors(waves: Waves, covariance: Float[np.ndarray, "p p"]) -> Series:
     return np.sqrt(np.einsum("ni,ij,nj->n", waves, covariance, waves))
 
 
-def _explained(intervals: Intervals, fit: CurveFit, left: float) -> float:
-    """Return R2: the explained fraction of the variance of durations within trials."""
-    count = np.maximum(intervals.sums(1.0 * fit.used), 1)
-    mean = intervals.sums(intervals.duration * fit.used) / count
-    deviation = intervals.duration - mean[intervals.trial]
-    whole = (deviation[fit.used] ** 2).sum()
-    return float(1 - left / whole) if whole > 0 else 0.0
+def _wander(fit: CurveFit) -> float:
+    """Return the standard deviation of a wandering rate, as part of the rate."""
+    if not fit.wander.memory:
+        return 0.0
+    jitter = np.sqrt(fit.smoothness.noise / fit.smoothness.excess)
+    return float(fit.wander.size * jitter / np.median(fit.rates))
+
+
+def _within(intervals: Intervals) -> float:
+    """Return the fraction of the input's variance that lies within intervals."""
+    nodes = np.arange(len(intervals.inputs))[:, None]
+    inside = nodes * intervals.step / 2 < intervals.duration
+    count = inside.sum(axis=0)
+    mean = (intervals.inputs * inside).sum(axis=0) / count
+    apart = ((intervals.inputs - mean) ** 2 * inside).sum()
+    whole = (intervals.inputs**2 * inside).sum()
+    return float(apart / whole)
 
 
 def _memory(intervals: Intervals, fit: CurveFit) -> float:
-    """Return the correlation of the residuals of successive intervals."""
-    end = intervals.start + intervals.duration
-    pause = np.abs(intervals.start[1:] - end[:-1])
-    follows = fit.used[1:] & fit.used[:-1] & (np.diff(intervals.trial) == 0)
-    follows &= pause < 1e-6 * intervals.duration[1:]
-    if follows.sum() < 3:
+    """Return the correlation of the residuals of successive intervals, without a wandering rate."""
+    after = follows(intervals, fit)
+    if after.sum() < 3:
         return 0.0
-    later = fit.missed[1:][follows]
-    earlier = fit.missed[:-1][follows]
-    return float(np.corrcoef(later, earlier)[0, 1])
+    errors = whitened(intervals, fit)(fit.residual[:, None])[:, 0]
+    return float(np.corrcoef(errors[1:][after], errors[:-1][after])[0, 1])

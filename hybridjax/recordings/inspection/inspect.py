@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ..._core.arguments import require_apart
 from ..._core.boundary.checked import checked
-from ..._core.boundary.kinds import OptionalNames, SignalNames
+from ..._core.boundary.kinds import OptionalNames
 from ..._core.findings import Finding, warn_of
 from ..data import SectionData
 from ..findings import Inspection, places
@@ -35,7 +35,7 @@ _TEXTS = {
 def check_recording(
     recording: Recording,
     *,
-    inputs: SignalNames,
+    inputs: OptionalNames = (),
     outputs: OptionalNames,
     phase: Phase | None = None,
     data: SectionData | None = None,
@@ -51,7 +51,7 @@ def check_recording(
     **Arguments:**
 
     - `recording`: the recording.
-    - `inputs`, `outputs`: names of signals; others are not inspected.
+    - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none.
     - `phase`, `data`: phase and data at the sections, of this recording or of the one that an
       inspection returned. Default: None.
 

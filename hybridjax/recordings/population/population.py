@@ -16,6 +16,7 @@ from ..._core.text import folded, p_value
 from ...errors import DefinitionError
 from ...identify.multiplier_estimate import MultiplierFit
 from ...scale.draws import monte_carlo
+from ..natural import NaturalMultipliers
 from .reml import Mixed, meta, mixed, moderated, spread_interval
 from .tables import Columns, cells_of, factors_of, require, rows_with, signed, table_of
 
@@ -103,14 +104,15 @@ class Population(Showable):
     @classmethod
     def from_fits(
         cls,
-        fits: Sequence[MultiplierFit],
+        fits: Sequence[MultiplierFit | NaturalMultipliers],
         table: Columns,
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
-        Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, and
-        the coefficients `c1`, `c2`, ... of the characteristic polynomial (missing in fits of lower
-        order).
+        Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, its
+        `half_life`, after which half of a deviation is left (strides; missing if it does not
+        decay), and the coefficients `c1`, `c2`, ... of the characteristic polynomial (missing in
+        fits of lower order).
 
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
@@ -118,18 +120,21 @@ class Population(Showable):
         frame = table_of(table, len(fits))
         _require_comparable(fits, frame["subject"])
         most = max((len(fit.coefficients) for fit in fits), default=0)
-        kinds = ["modulus", "angle", *(f"c{k}" for k in range(1, most + 1))]
+        kinds = ["modulus", "angle", "half_life"]
+        kinds += [f"c{k}" for k in range(1, most + 1)]
         values = {kind: np.full(len(fits), np.nan) for kind in kinds}
         errors = {kind: np.full(len(fits), np.nan) for kind in kinds}
         for row, fit in enumerate(fits):
             modulus, angle, squares = _polar(fit)
-            numbers = (modulus, angle, *fit.coefficients)
-            squares = (*squares, *np.diag(fit.covariance))
+            life, life_square = _half_life(modulus, squares[0])
+            numbers = (modulus, angle, life, *fit.coefficients)
+            squares = (*squares, life_square, *np.diag(fit.covariance))
             for kind, number, square in zip(kinds, numbers, squares, strict=False):
                 values[kind][row] = number
                 errors[kind][row] = np.sqrt(square)
         dof = [fit.covariance_dof for fit in fits]
-        return cls(frame, values, errors, {"angle": "rad"}, dof)
+        units = {"angle": "rad", "half_life": "strides"}
+        return cls(frame, values, errors, units, dof)
 
     def __repr__(self) -> str:
         cells = self.table.assign(cell=cells_of(self.table)).groupby("cell", sort=False)
@@ -467,7 +472,17 @@ class Population(Showable):
         return frame
 
 
-def _polar(fit: MultiplierFit) -> tuple[float, float, list[float]]:
+def _half_life(modulus: float, variance: float) -> tuple[float, float]:
+    """Return the number of strides after which half of a deviation is left, and its variance; NaN
+    for a modulus that does not decay, or at once."""
+    if not 0 < modulus < 1:
+        return np.nan, np.nan
+    logarithm = np.log(modulus)
+    slope = np.log(2) / (modulus * logarithm**2)
+    return float(-np.log(2) / logarithm), float(slope**2 * variance)
+
+
+def _polar(fit: MultiplierFit | NaturalMultipliers) -> tuple[float, float, list[float]]:
     """Return modulus and angle of the leading multiplier, and their variances. The angle of a real
     one is NaN."""
     z = complex(fit.multipliers[0])
@@ -481,7 +496,7 @@ def _polar(fit: MultiplierFit) -> tuple[float, float, list[float]]:
 
 
 def _require_comparable(
-    fits: Sequence[MultiplierFit],
+    fits: Sequence[MultiplierFit | NaturalMultipliers],
     subjects: Sequence[str],
 ) -> None:
     """**Raises:** `DefinitionError` for a fit without covariance, and other outputs."""

@@ -18,7 +18,8 @@ ATTRIBUTES = {
         "`print(result)` shows a summary": "summary",
         "`result.findings` lists reasons to doubt it": "success converged ok valid",
     },
-    "LimitCycle LDTP Fit Identification ModelIdentification NaturalMultipliers PlantCycle": {
+    "LimitCycle LDTP Fit Identification ModelIdentification NaturalIdentification "
+    "NaturalMultipliers PlantCycle": {
         DECAY: (
             "half_life time_constant decay_rate settling settling_time half_time relaxation"
         ),

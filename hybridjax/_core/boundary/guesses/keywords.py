@@ -212,9 +212,6 @@ NEEDS = {
     "estimate_phase.sections": "an event that happens once a cycle, such as "
     "`hj.Crossing('y', 'falling')` of a signal 'y'",
     "signals": "`hj.Recording(time, {'name': samples})`, or `hj.Recording.from_frame(table)`",
-    "identify_recording.inputs": "the signals that perturb; without any, "
-    "`hj.recordings.natural_multipliers(hj.recordings.sample_sections(recording, sections, "
-    "inputs=(), outputs=...))` estimates multipliers from variability",
     "identify_recording.sections": "an event that happens once a cycle, such as "
     "`hj.Crossing('y', 'falling')` of a signal 'y'",
 }

@@ -137,6 +137,7 @@ OBJECTS = {
     "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",
     "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
     "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
+    "save.NaturalIdentification": "save its `fit`, or write `result.write_report(folder)`",
     "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
     "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
     "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",

@@ -1,0 +1,593 @@
+"""Multipliers of a plant from returns of perturbed states to section 0."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from .._core.arguments import require_among
+from .._core.boundary.kinds import SignalNames
+from .._core.findings import Finding
+from .._core.progress import counted
+from .._core.text import listed
+from ..errors import ComputationError, DefinitionError
+from ..identify.multiplier_estimate import MultiplierFit
+from ..sections import families
+from .drive import At
+
+
+# Steps of the pairs of perturbed states of one coordinate, in units of the smallest. Fewer: noise
+# cannot be told from curvature. More: time. A ratio of 2 between the largest and the smallest:
+# narrow and wide steps hardly differ; of 8: the widest ones leave the linear range. Equal ones: no
+# scatter, where the grid of time is not moved.
+_STEPS = np.array([1.0, 1.2, 2.0, 2.4, 3.3, 4.0])
+# The first four are narrow, the last four wide.
+_NARROW = _STEPS <= _STEPS[3]
+_WIDE = _STEPS >= _STEPS[2]
+# Even powers of the step, with the constant, by which slopes are fitted. Their scatter about this
+# fit is the noise: with fewer, curvature counts as noise; with more, few degrees of freedom remain.
+_POWERS = 3
+# Number of coordinates times repetitions of all steps. Smaller: the noise of one coordinate is
+# known from six pairs only. Larger: more time for few coordinates.
+_COLUMNS = 4
+# Smallest step in units of the range of a coordinate, at most. Larger: the widest steps, four times
+# as long, leave the linear range. Smaller: contacts of simulators with fixed time steps begin at
+# the same step for all of them, so that their noise hides.
+_LARGEST_STEP = 0.01
+# Steps of time by which the grid of a simulator is moved, one for each pair: multiples of the
+# golden ratio fill the unit interval evenly, also after a multiplication by any integer.
+_GOLDEN = (np.sqrt(5.0) - 1) / 2
+# Phases of the grid at which its noise is measured. Fewer: stairs between them hide. More: time.
+_GRIDS = 8
+# Part of the range by which a return may differ if the grid is moved. Larger: controllers that
+# count time steps are disturbed. Smaller: errors of integration count as a disturbance.
+_GRID_ERROR = 0.03
+# Bias of J in units of the difference between narrow and wide steps: 1.8 for a jump of the second
+# derivative, 0.8 for a fifth derivative. Smaller: regions miss such a jump.
+_BIAS = 1.8
+# Standard errors by which a multiplier differs from 0, and narrow from wide steps. Smaller: noise
+# is listed. Larger: multipliers hide.
+_RESOLVED = 3.0
+# Difference between narrow and wide steps, in units of the multiplier, that is reported. Smaller:
+# harmless curvature, which the errors contain, is reported.
+_APART = 0.1
+# The same in units of the largest multiplier, with which shorter steps are tried. Smaller: twice
+# the time for a few digits. Larger: wide regions.
+_CURVED = 0.01
+# Rounding of an eigenvalue of condition 1, in units of the norm of the Jacobian. Smaller: rounding
+# is listed as multipliers. Larger: small multipliers of smooth plants hide.
+_ROUNDING = 1e-13
+# Residual of a state on the cycle, in units of the range, below which it is no doubt. Smaller:
+# tolerances of integrators are doubted. Larger: multipliers of another orbit.
+_RESIDUAL = 1e-5
+# Modulus of multipliers that are no doubt if they hide. Smaller: plants that forget everything in
+# one cycle are doubted. Larger: what matters hides.
+_SMALL = 0.05
+_DRAWS = 1000
+
+
+class Returns(MultiplierFit):
+    """Multipliers from returns of perturbed states to section 0.
+
+    **Fields** beside those of all fits of multipliers:
+
+    - `coordinates`: names of the numbers that were perturbed.
+    - `travelling`: names of those that grow in each cycle and on which nothing depends, such as the
+      distance walked. Their multipliers are 1 and are not listed.
+    - `noise` (d,): standard deviation of each coordinate in returns from nearly equal states.
+    - `residual`: largest distance between state and return, in units of the range of the
+      coordinate on the cycle.
+    - `bound`: multipliers that are not listed cannot be told from 0; this is the largest modulus
+      that they may have (0 if all are listed).
+    - `findings`: multipliers that noise may hide, and steps that give different multipliers.
+    """
+
+    noise: Float[np.ndarray, " d"]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    residual: float = eqx.field(static=True)
+    bound: float = eqx.field(static=True)
+    travelling: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def model(self) -> None:
+        return None
+
+    def _about(self) -> str:
+        count = len(self.coordinates)
+        about = (
+            f"{count - len(self.multipliers)} more below {self.bound:.1g}; {count} coordinates, "
+            f"residual {self.residual:.1g}"
+        )
+        if self.travelling:
+            about += f"; left out, because they travel: {listed(self.travelling)}"
+        return about
+
+
+class ReturnMap:
+    """The return map of some coordinates of a plant on section 0, and its fixed point.
+
+    **Fields:** `names`: of the coordinates. `x`: their values, first those of the settled state.
+    `travelling`: names of coordinates on which nothing depends. `size`: ranges on the cycle.
+    `noise`: of returns; `tolerance`: of those of states that are nearly equal, which is rounding
+    and the tolerances of the plant. `h`: the smallest steps of differences. The last five are known
+    after `measure`. `signals`: of the plant, after the last return.
+    """
+
+    def __init__(self, cycle: Any, names: SignalNames | None = None):
+        plant = cycle.plant
+        self.drive = cycle.drive
+        if not self.drive.sets or self.drive.fixed:
+            raise DefinitionError(
+                "use a plant whose state can be set, with steps of any size."
+            )
+        self.base = np.array(cycle.state, float)
+        numbered = [f"x{i}" for i in range(self.base.size)]
+        states = tuple(getattr(plant, "states", numbered))
+        period = getattr(plant, "period", None)
+        self.chosen = bool(names)
+        if not names:
+            timeless = period is None or isinstance(cycle.sections, families.ClockPhase)
+            names = tuple(x for x in states if not (timeless and x == "time"))
+        require_among("coordinate", names, states, "perturbed_returns: ")
+        self.names = tuple(names)
+        self.columns = [states.index(x) for x in names]
+        self.travelling = tuple[str, ...]()
+        self.shift = np.zeros(len(names))
+        if period is not None and "time" in names:
+            turns = round(cycle.period / period)
+            self.shift[names.index("time")] = turns * period
+        self.x = self.base[self.columns]
+        self.signals = np.array(cycle.drive.start.z, float)
+        self.n = cycle.sections.n_sections
+        self.moves_grid = False
+        # (A perturbed state before a crossing must not return to it at once.)
+        self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
+
+    def __call__(
+        self,
+        x: Float[np.ndarray, " d"],
+        points: list[At] | None = None,
+        first: float = 0.0,
+    ) -> Float[np.ndarray, " d"]:
+        """Return the coordinates after one cycle, and append the points of its steps.
+
+        **Arguments:** `first`: length of a first, shorter step, in units of the plant's steps.
+        """
+        drive = self.drive
+        state = self.base.copy()
+        state[self.columns] = x
+        drive.restore(drive.start._replace(state=state))
+        drive.phase.begin(drive.t, drive.z, on_section=True)
+        if first > 0:
+            drive.step(drive.zero, first * drive.dt)
+        if points is None:
+            drive.pass_time(self.free)
+        drive.advance(drive.zero, self.n, points)
+        self.signals = np.array(drive.z, float)
+        return np.array(drive.here().state, float)[self.columns] - self.shift
+
+    def measure(self) -> None:
+        """Measure the ranges of the coordinates and the noise of returns, and find the coordinates
+        that travel, in about 70 cycles."""
+        self.measure_ranges()
+        self.tolerance, self.noise = self._noise()
+        self._find_travelling()
+        self.moves_grid = self.grid_may_move()
+        if self.moves_grid:
+            changes, _ = self.changes_over_grids()
+            noise = np.std(changes, axis=0, ddof=1) / np.sqrt(2)
+            self.noise = np.maximum(self.noise, noise)
+        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
+        # derivatives.
+        step = (self.noise / self.size).max() ** 0.2 / 2
+        self.h = self.size * min(step, _LARGEST_STEP)
+
+    def measure_ranges(self) -> None:
+        """Measure the ranges of the coordinates, in one cycle."""
+        points = list[At]()
+        self(self.x, points)
+        rows = np.array([x.state for x in points], float)[:, self.columns]
+        size = np.ptp(rows, axis=0)
+        largest = np.abs(rows).max(axis=0)
+        # (A coordinate that does not move has the size of its value.)
+        rest = np.where(self.x, np.abs(self.x), 1.0)
+        self.size = np.where(size > 1e-9 * largest, size, rest)
+
+    def grid_may_move(self) -> bool:
+        """Return whether the plant may begin with a shorter time step. (A controller that counts
+        time steps is disturbed by it.)"""
+        plain = self(self.x)
+        moved = [self(self.x, first=part) for part in (_GOLDEN, 1 - _GOLDEN)]
+        change = np.abs(np.array(moved) - plain)
+        return bool((change <= _GRID_ERROR * self.size).all())
+
+    def changes_over_grids(
+        self,
+    ) -> tuple[Float[np.ndarray, "grids d"], Float[np.ndarray, "grids signals"]]:
+        """Return differences between the returns of two states, and between the signals there, for
+        several phases of the grid of time.
+
+        Within a stair of a simulator, returns from nearly equal states have no noise: these have.
+        """
+        rng = np.random.default_rng(1)
+        move = 2 * _LARGEST_STEP * self.size * rng.choice([-1, 1], len(self.x))
+        states = []
+        signals = []
+        for pair in range(1, _GRIDS + 1):
+            first = pair * _GOLDEN % 1.0
+            above = self(self.x + move, first=first)
+            signals_above = self.signals
+            below = self(self.x - move, first=first)
+            states.append(above - below)
+            signals.append(signals_above - self.signals)
+        return np.array(states), np.array(signals)
+
+    def _find_travelling(self) -> None:
+        """Find coordinates that grow in each cycle, as the distance walked does.
+
+        If nothing depends on one, it is left out, unless the user chose it. Angles that make whole
+        turns stay, and their returns are counted from the turn before.
+        """
+        first = self(self.x)
+        second = self(first)
+        advance = first - self.x
+        again = second - first
+        steady = np.abs(again - advance) <= np.maximum(
+            10 * self.noise, 0.01 * np.abs(advance)
+        )
+        grows = np.abs(advance) > np.maximum(10 * self.noise, 1e-6 * self.size)
+        tolerance = 10 * self.noise + 1e-6 * self.size
+        travels = np.zeros(len(self.x), bool)
+        for k in np.flatnonzero(grows):
+            move = np.zeros(len(self.x))
+            move[k] = self.size[k]
+            change = np.abs(self(self.x + move) - first - move)
+            travels[k] = bool((change <= tolerance).all())
+        turns = steady & (np.abs(advance) > self.size / 2)
+        self.shift = self.shift + np.where(travels | turns, advance, 0.0)
+        self.travelling = tuple(
+            name for name, x in zip(self.names, travels, strict=True) if x
+        )
+        if not self.chosen:
+            self._keep(np.flatnonzero(~travels))
+
+    def _keep(self, rows: np.ndarray) -> None:
+        """Leave out all other coordinates."""
+        self.names = tuple(self.names[k] for k in rows)
+        self.columns = [self.columns[k] for k in rows]
+        self.shift = self.shift[rows]
+        self.x = self.x[rows]
+        self.size = self.size[rows]
+        self.noise = self.noise[rows]
+        self.tolerance = self.tolerance[rows]
+
+    def _noise(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """Return standard deviations of returns from nearly equal states: those of the narrowest
+        spacing, and the largest.
+
+        Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
+        2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
+        spacing the events that move through the time steps of a simulator.
+        """
+        rounding = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
+        levels = []
+        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
+        for spacing, sign in zip([1e-6, 1e-4, 1e-3], signs, strict=True):
+            along = spacing * self.size * sign
+            line = [self(self.x + j * along) for j in range(-7, 8)]
+            differences = np.diff(line, 4, axis=0)
+            level = np.sqrt((differences**2 / 70).mean(axis=0))
+            levels.append(np.maximum(level, rounding))
+        return levels[0], np.max(levels, axis=0)
+
+    def slopes(self) -> Float[np.ndarray, "d d"]:
+        """Return central differences of second order with the smallest steps."""
+        columns = []
+        for k in counted(range(len(self.x)), "coordinates", len(self.x)):
+            columns.append(self._slope(k, 1.0, 0.0))
+        return np.stack(columns, axis=1)
+
+    def all_slopes(self) -> Float[np.ndarray, "pairs d d"]:
+        """Return central differences with all steps, in units of the ranges of the coordinates.
+
+        The time grid of the simulator begins at another phase in each pair. Where contacts begin
+        at the ends of time steps, the differences then scatter as over many steps of the grid.
+        """
+        d = len(self.x)
+        repeats = max(1, _COLUMNS // d)
+        slopes = np.empty((repeats, len(_STEPS), d, d))
+        pair = 0
+        for k in counted(range(d), "coordinates", d):
+            for r in range(repeats):
+                for j, step in enumerate(_STEPS):
+                    pair += 1
+                    first = pair * _GOLDEN % 1.0 if self.moves_grid else 0.0
+                    slopes[r, j, :, k] = self._slope(k, step, first)
+        slopes = slopes.reshape(-1, d, d)
+        return slopes * self.size / self.size[:, None]
+
+    def _slope(self, k: int, step: float, first: float) -> Float[np.ndarray, " d"]:
+        move = np.zeros(len(self.x))
+        move[k] = step * self.h[k]
+        above = self(self.x + move, first=first)
+        below = self(self.x - move, first=first)
+        return (above - below) / (2 * move[k])
+
+    def residual(self) -> Float[np.ndarray, " d"]:
+        """Return the distance between return and state, in units of the ranges."""
+        return (self(self.x) - self.x) / self.size
+
+    def solve(self) -> Float[np.ndarray, " d"]:
+        """Move x to the fixed point by Newton's method, as long as the residual falls, and return
+        the residual. A state whose residual is noise stays as it is."""
+        residual = self.residual()
+        for _ in range(8):
+            if (np.abs(residual) <= 3 * self.noise / self.size).all():
+                break
+            J = self.slopes() - np.eye(len(self.x))
+            J = J * self.size / self.size[:, None]
+            # (A multiplier of 1 leaves its direction as it is.)
+            step = np.linalg.lstsq(J, residual, rcond=1e-6)[0]
+            before = self.x
+            self.x = before - self.size * step
+            moved = self.residual()
+            if not np.abs(moved).max() < np.abs(residual).max():
+                self.x = before
+                break
+            residual = moved
+        return residual
+
+    def require_on_cycle(self, residual: Float[np.ndarray, " d"]) -> None:
+        """**Raises:** `ComputationError` for a state that is not on a cycle."""
+        noise = self.noise / self.size
+        beyond = np.abs(residual) / np.maximum(10 * noise, _RESIDUAL)
+        k = int(np.argmax(beyond))
+        if beyond[k] <= 1:
+            return
+        raise ComputationError(
+            f"the plant is not on its cycle: after one cycle `{self.names[k]}` differs by "
+            f"{abs(residual[k]):.1g} of its range, and noise is {noise[k]:.1g}. Give `find_cycle` "
+            "more `cycles`, or a `guess` nearer to the cycle."
+        )
+
+
+def measured_returns(map: ReturnMap) -> Returns:
+    """Return the multipliers of a map that is measured.
+
+    **Raises:** `ComputationError` for a state that is not on a cycle.
+    """
+    residual = map.solve()
+    map.require_on_cycle(residual)
+    resolved = _resolved(_slopes_of(map))
+    longest = _LARGEST_STEP * map.size
+    if _hides(resolved) and (map.h < longest).any():
+        map.h = longest
+        resolved = _resolved(_slopes_of(map))
+    if _is_curved(resolved):
+        map.h = map.h / _STEPS.max()
+        closer = _resolved(_slopes_of(map))
+        # (Noise may hide with short steps what wide ones showed.)
+        if closer.bound < np.abs(resolved.multipliers).max():
+            resolved = closer
+        else:
+            map.h = map.h * _STEPS.max()
+    return Returns(
+        resolved.multipliers,
+        resolved.coefficients,
+        resolved.covariance,
+        resolved.dof,
+        map.noise,
+        map.names,
+        float(np.abs(residual).max(initial=0)),
+        resolved.bound,
+        map.travelling,
+        findings=tuple(_doubts(resolved, map)),
+    )
+
+
+def _slopes_of(map: ReturnMap) -> "_Jacobian":
+    """Return the Jacobian of a map and its errors, in units of the ranges."""
+    tolerance = map.tolerance[:, None] / map.h * map.size / map.size[:, None]
+    return _fitted(map.all_slopes(), tolerance)
+
+
+def _hides(resolved: "_Resolved") -> bool:
+    """Return whether a multiplier that is not listed may be the largest."""
+    return resolved.bound > np.abs(resolved.multipliers).max(initial=_SMALL)
+
+
+def _is_curved(resolved: "_Resolved") -> bool:
+    """Return whether narrow and wide steps give clearly different multipliers."""
+    moduli = np.abs(resolved.multipliers)
+    return bool((np.abs(resolved.apart) > _CURVED * moduli.max(initial=0)).any())
+
+
+class _Jacobian(NamedTuple):
+    """A Jacobian in units of the ranges of the coordinates, and its errors."""
+
+    value: Float[np.ndarray, "d d"]
+    errors: Float[np.ndarray, "pairs d d"]
+    """Their sum, each times a random number of variance 1 for each column, has the covariance of
+    the noise of `value`. (Outputs have errors in common: those of a contact that begins one time
+    step later.)"""
+    tolerance: Float[np.ndarray, "d d"]
+    """Standard deviations of errors that pairs may have in common, as those of tolerances."""
+    apart: Float[np.ndarray, "d d"]
+    """Jacobian by narrow steps less that by wide ones."""
+    apart_noise: float
+    """Standard deviation of the noise of `apart` in units of that of `value`."""
+
+
+def _powers(steps: np.ndarray, count: int) -> np.ndarray:
+    """Return even powers (n, count) of steps, the constant first."""
+    return steps[:, None] ** (2.0 * np.arange(count))
+
+
+def _solution(steps: np.ndarray, count: int) -> np.ndarray:
+    """Return the matrix (count, n) from slopes to the coefficients of their weighted fit."""
+    powers = _powers(steps, count)
+    weighted = (powers * steps[:, None] ** 2).T
+    return np.linalg.solve(weighted @ powers, weighted)
+
+
+def _fitted(
+    slopes: Float[np.ndarray, "pairs d d"], tolerance: Float[np.ndarray, "d d"]
+) -> _Jacobian:
+    """Fit slopes, which the tolerances of the plant change by `tolerance`, by J + c step^2."""
+    repeats = len(slopes) // len(_STEPS)
+    steps = np.tile(_STEPS, repeats)
+    weights = steps**2
+    coefficients = np.tensordot(_solution(steps, _POWERS), slopes, (1, 0))
+    residuals = slopes - np.tensordot(_powers(steps, _POWERS), coefficients, (1, 0))
+    # (Of unit weight.)
+    residuals = residuals * np.sqrt(weights)[:, None, None]
+    constant = _solution(steps, 2)[0]
+    variance = (constant**2 / weights).sum()
+    between = np.zeros_like(steps)
+    narrow = np.tile(_NARROW, repeats)
+    wide = np.tile(_WIDE, repeats)
+    between[narrow] += _solution(steps[narrow], 2)[0]
+    between[wide] -= _solution(steps[wide], 2)[0]
+    apart_variance = (between**2 / weights).sum()
+    dof = len(steps) - _POWERS
+    return _Jacobian(
+        value=np.tensordot(constant, slopes, (0, 0)),
+        errors=np.sqrt(variance / dof) * residuals,
+        tolerance=np.sqrt(variance / 2) * tolerance,
+        apart=np.tensordot(between, slopes, (0, 0)),
+        apart_noise=float(np.sqrt(apart_variance / variance)),
+    )
+
+
+class _Resolved(NamedTuple):
+    """Multipliers that differ from 0."""
+
+    multipliers: Complex[np.ndarray, " k"]
+    coefficients: Float[np.ndarray, " k"]
+    """Of their polynomial."""
+    covariance: Float[np.ndarray, "k k"]
+    dof: float
+    bound: float
+    """Largest modulus that the other multipliers may have."""
+    apart: Complex[np.ndarray, " k"]
+    """Each by narrow steps less that by wide ones; 0 where the difference may be noise."""
+
+
+def _resolved(jacobian: _Jacobian) -> _Resolved:
+    """Return the eigenvalues that differ from 0 by three standard errors.
+
+    To first order, the error of an eigenvalue is w E v, with its eigenvectors w (left) and v and
+    the error E of the Jacobian: a coordinate with large errors spoils only the eigenvalues that
+    depend on it.
+    """
+    from scipy import linalg  # (a fifth of a second)
+
+    J = jacobian.value
+    d = len(J)
+    values, left, right = linalg.eig(J, left=True, right=True)
+    product = np.einsum("ij,ij->j", left.conj(), right)
+    # (The product is 0 for eigenvalues that coincide.)
+    with np.errstate(all="ignore"):
+        left = left / product.conj()
+    pairs = len(jacobian.errors)
+    noise = np.zeros((pairs, d, d), complex)
+    for j, error in enumerate(jacobian.errors):
+        noise[j] = (left.conj().T @ error) * right.T
+    # (Of pair j and eigenvalue i, the share of column k.)
+    variance = (np.abs(noise) ** 2).sum(axis=0)
+    common = np.abs(left.conj().T) ** 2 @ jacobian.tolerance**2 @ np.abs(right) ** 2
+    common = np.diagonal(common)
+    apart = np.einsum("ji,jk,ki->i", left.conj(), jacobian.apart, right)
+    scatter = np.sqrt(variance.sum(axis=1) + common)
+    is_noise = np.abs(apart) <= 2 * jacobian.apart_noise * scatter
+    apart = np.where(is_noise, 0.0, apart)
+    condition = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
+    rounding = _ROUNDING * np.linalg.norm(J) * condition
+    error = np.hypot(scatter + rounding, _BIAS * np.abs(apart))
+    listed_ones = np.abs(values) > _RESOLVED * error
+    # (Both of a pair, or none.)
+    for i in np.flatnonzero(listed_ones):
+        twin = int(np.argmin(np.abs(values - values[i].conj())))
+        listed_ones[i] = listed_ones[i] and listed_ones[twin]
+    rows = np.flatnonzero(listed_ones)
+    rows = rows[np.lexsort((-values[rows].imag, -np.abs(values[rows])))]
+    rng = np.random.default_rng(0)
+    draws = np.einsum(
+        "bjk,jik->bik",
+        rng.standard_normal((_DRAWS, pairs, d)),
+        jacobian.errors,
+    )
+    draws += jacobian.tolerance * rng.standard_normal((_DRAWS, d, d))
+    v = right[:, rows]
+    w = left[:, rows].conj().T
+    if len(rows):
+        # (Eigenvectors of eigenvalues that nearly coincide.)
+        w = np.linalg.solve(w @ v, w)
+    biases = _BIAS * np.diag(apart[rows]) * rng.standard_normal((_DRAWS, 1, 1))
+    blocks = np.diag(values[rows]) + w @ draws @ v + biases
+    polynomials = [_polynomial(values[rows])]
+    polynomials += [_polynomial(np.linalg.eigvals(block)) for block in blocks]
+    k = len(rows)
+    covariance = np.cov(polynomials[1:], rowvar=False).reshape(k, k)
+    rest = np.eye(d) - (v @ w).real
+    others = np.linalg.eigvals(rest @ (J + draws) @ rest)
+    largest = np.abs(others).max(axis=1, initial=0)
+    bound = np.quantile(largest, 0.975) if k < d else 0.0
+    return _Resolved(
+        multipliers=values[rows],
+        coefficients=polynomials[0],
+        covariance=covariance,
+        dof=_degrees(variance[rows], error[rows], pairs - _POWERS),
+        bound=float(bound),
+        apart=apart[rows],
+    )
+
+
+def _polynomial(roots: Complex[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    return np.atleast_1d(np.poly(roots)).real[1:]
+
+
+def _degrees(
+    variance: Float[np.ndarray, "k d"], error: Float[np.ndarray, " k"], own: int
+) -> float:
+    """Return the smallest number of degrees of freedom of the errors (Satterthwaite 1946).
+
+    **Arguments:** `variance`: noise of each multiplier by column, each with `own` degrees.
+    """
+    degrees = [np.inf]
+    for parts, total in zip(variance, error**2, strict=True):
+        square = (parts**2).sum() / own
+        if square > 0:
+            degrees.append(total**2 / square)
+    return float(min(degrees))
+
+
+def _doubts(resolved: _Resolved, map: ReturnMap) -> list[Finding]:
+    """Return findings about multipliers that noise hides, and about steps that disagree."""
+    findings = []
+    moduli = np.abs(resolved.multipliers)
+    if _hides(resolved):
+        findings.append(
+            Finding(
+                "hidden multipliers",
+                f"noise of the returns may hide multipliers up to {resolved.bound:.2g}, so that "
+                "one of those that are not listed may be the largest. Contacts that begin at the "
+                "ends of time steps are such noise: take a shorter time step, or a contact force "
+                "that begins at zero.",
+            )
+        )
+    apart = np.abs(resolved.apart)
+    relative = apart / np.maximum(moduli, _SMALL)
+    k = int(np.argmax(relative)) if len(apart) else 0
+    if len(apart) and relative[k] > _APART:
+        step = float((map.h / map.size).max())
+        findings.append(
+            Finding(
+                "amplitude",
+                f"steps up to {2 * step:.1g} and {4 * step:.1g} of the ranges give moduli of "
+                f"{moduli[k]:.3g} that differ by {apart[k]:.1g}: the plant is not linear there. "
+                "Compare another time step, and multipliers at another section.",
+            )
+        )
+    return findings

@@ -1,0 +1,185 @@
+r"""Errors of intervals: the jitter of each, and a rate that wanders.
+
+The phase at the end of an interval has the variance $s^2 w T$ (the jitter), so that the duration
+has this variance divided by the square of the rate at which the phase reaches 1. The rate $w + e$
+of an interval may differ from that of its trial, by a stationary process with
+$\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an autoregression of order 1 for evenly
+spaced intervals, independent for $\theta = 0$, and a random walk if $\theta$ is longer than the
+trial. Its parameters maximize the restricted likelihood (Patterson and Thompson 1971), which a
+Kalman filter evaluates (Harvey, *Forecasting, Structural Time Series Models and the Kalman Filter*,
+1989).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import linalg
+
+from .model import Forecast, Intervals
+
+
+Lanes = Float[np.ndarray, " L"]
+Columns = Float[np.ndarray, "L c"]
+
+# Times after which a rate is forgotten, in median intervals, and standard deviations of its change
+# from an interval to the next, in units in which the jitter of an interval is 1, that are compared.
+# Finer or wider: time. Coarser: errors of curves are those of the nearest pair, up to 20 % off.
+_MEMORIES = 2.0 * 4.0 ** np.arange(6)
+_CHANGES = 0.03 * 2.0 ** np.arange(7)
+# Twice the logarithm of the likelihood ratio from which on a rate wanders. Larger: errors of curves
+# under slow inputs are too small. Smaller: noise is taken for a wandering rate.
+_LEAST_GAIN = 6.0
+
+
+class Wander(NamedTuple):
+    """A rate that wanders within trials."""
+
+    size: float
+    """Standard deviation of the rate, in cycles per second and standard deviations of jitter."""
+    memory: float
+    """Time after which it is forgotten, in s; zero for a rate that every interval has anew."""
+
+    @staticmethod
+    def none() -> "Wander":
+        return Wander(0.0, 0.0)
+
+
+class Whitening(NamedTuple):
+    """What turns deviations of durations into independent errors of one variance.
+
+    The errors of successive intervals obey a recursion of first order, which a banded matrix
+    undoes for many columns at once.
+    """
+
+    weight: Lanes
+    """Standard deviation of a cycle's jitter over that of the duration; zero if not used."""
+    by_drift: Lanes
+    """Derivatives of weighted durations by the wandering rate."""
+    kept: Lanes
+    """Part of the forecast of the rate that the next one keeps."""
+    learned: Lanes
+    """Part of a deviation that the next forecast of the rate takes."""
+    scale: Lanes
+    """Standard deviations of the deviations from forecasts."""
+
+    def __call__(self, columns: Columns) -> Columns:
+        """Return columns (L, c) of independent errors, in standard deviations of jitter."""
+        y = columns * self.weight[:, None]
+        if not self.by_drift.any():
+            return y
+        # m[k + 1] = kept[k] m[k] + learned[k] y[k]: the forecast of the rate.
+        bands = np.ones((2, len(y)))
+        bands[1] = -self.kept
+        taken = np.zeros_like(y)
+        taken[1:] = self.learned[:-1, None] * y[:-1]
+        rate = linalg.solve_banded((1, 0), bands, taken, check_finite=False)
+        return (y - self.by_drift[:, None] * rate) / self.scale[:, None]
+
+    def missed(self, residual: Lanes) -> Lanes:
+        """Return by how much of a cycle forecasts miss that know all earlier intervals."""
+        return self(residual[:, None])[:, 0] * self.scale
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the covariance, less that of the jitter alone."""
+        return 2 * float(np.log(self.scale).sum())
+
+
+def whitening(
+    intervals: Intervals,
+    ahead: Forecast,
+    rates: Lanes,
+    used: Bool[np.ndarray, " L"],
+    wander: Wander,
+) -> Whitening:
+    """Return how errors about a forecast become independent.
+
+    **Arguments:** `ahead`: the forecast. `rates` (L,): of the trial of each interval. `used`: the
+    intervals that are not miscounted.
+    """
+    L = len(rates)
+    cycles = np.maximum(rates * ahead.duration, 1e-6)
+    weight = np.where(used, np.maximum(ahead.rate, 0.0) / np.sqrt(cycles), 0.0)
+    by_drift = weight * ahead.slopes[:, -1]
+    nothing = np.zeros(L)
+    if not wander.size:
+        return Whitening(weight, nothing, nothing, nothing, np.ones(L))
+    left = _left(intervals, wander.memory)
+    kept = np.zeros(L)
+    learned = np.zeros(L)
+    scale = np.ones(L)
+    stationary = wander.size**2
+    variance = stationary
+    # (Lists: items of arrays take three times as long.)
+    for k, (g, a) in enumerate(zip(by_drift.tolist(), left.tolist(), strict=True)):
+        square = 1.0 + g * g * variance
+        gain = variance * g / square
+        kept[k] = a * (1 - gain * g)
+        learned[k] = a * gain
+        scale[k] = square**0.5
+        variance = a * a * variance * (1 - gain * g) + (1 - a * a) * stationary
+    return Whitening(weight, by_drift, kept, learned, scale)
+
+
+def _left(intervals: Intervals, memory: float) -> Lanes:
+    """Return the part of a rate that is left in the next interval; zero at the end of a trial."""
+    left = np.zeros(len(intervals.start))
+    if not memory:
+        return left
+    middle = intervals.start + intervals.duration / 2
+    left[:-1] = np.exp(-np.abs(np.diff(middle)) / memory)
+    left[:-1][np.diff(intervals.trial) != 0] = 0.0
+    return left
+
+
+def estimate_wander(
+    intervals: Intervals,
+    ahead: Forecast,
+    rates: Lanes,
+    used: Bool[np.ndarray, " L"],
+    residual: Lanes,
+    columns: Columns,
+) -> Wander:
+    """Return the rates of the largest restricted likelihood; wandering ones if they gain enough.
+
+    **Arguments:** `residual` (L,): of the durations. `columns` (L, c): derivatives of the durations
+    by what was fitted; the rates of trials are fitted, too.
+    """
+    period = float(np.median(intervals.duration))
+    longest = float(intervals.sums(intervals.duration).max())
+
+    def improbable(wander: Wander) -> float:
+        """Return minus twice the logarithm of the likelihood, with the best variance."""
+        white = whitening(intervals, ahead, rates, used, wander)
+        by_rate = white(ahead.slopes[:, -1:])[:, 0]
+        y = white(np.column_stack([residual, columns]))
+        square = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
+        sums = np.stack([intervals.sums(by_rate * x) for x in y.T], axis=1)
+        y -= by_rate[:, None] * (sums / square[:, None])[intervals.trial]
+        x = y[:, 1:]
+        values, axes = np.linalg.eigh(x.T @ x)
+        determined = values > 1e-9 * values[-1]
+        pull = (axes.T @ (x.T @ y[:, 0]))[determined] / np.sqrt(values[determined])
+        dof = int(used.sum()) - len(square) - int(determined.sum())
+        left = float(y[:, 0] @ y[:, 0] - pull @ pull)
+        fitted = np.log(values[determined]).sum() + np.log(square).sum()
+        return dof * np.log(left / dof) + white.log_determinant + float(fitted)
+
+    # Rates that every interval has anew make some intervals noisier than others: without them, a
+    # wandering rate would explain that, too.
+    changes = (_CHANGES / period).tolist()
+    anew = [Wander.none()] + [Wander(change, 0.0) for change in changes]
+    independent = min((improbable(x), x) for x in anew)
+    wandering = []
+    for memory in (_MEMORIES * period).tolist():
+        if memory > 4 * longest:
+            break
+        forgotten = 1 - np.exp(-2 * period / memory)
+        for change in changes:
+            wander = Wander(float(change / np.sqrt(forgotten)), memory)
+            wandering.append((improbable(wander), wander))
+    correlated = min(wandering, default=independent)
+    if independent[0] - correlated[0] < _LEAST_GAIN:
+        return independent[1]
+    return correlated[1]
