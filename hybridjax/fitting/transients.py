@@ -294,7 +294,11 @@ def _sizes(
         return jnp.broadcast_to(sizes, (ny,))
     if not ny:
         return jnp.ones(0)
-    size = np.sqrt(np.nanmean(samples**2, axis=0))
+    known = np.isfinite(samples)
+    mean_square = np.where(known, samples**2, 0.0).sum(axis=0) / np.maximum(
+        known.sum(axis=0), 1
+    )
+    size = np.sqrt(mean_square)
     if not (size > 0).all():
         raise DefinitionError(
             f"`{name}` of an output are zero throughout, or all missing: leave it out, or give "

@@ -722,10 +722,13 @@ def _require_ends(found: Flow) -> None:
     begin = found.request.lanes.t[0]
     longest = found.request.target.limit[0] - begin
     if codes[k] == Result.GRAZING and lanes.t[0] - begin < _MUCH_SHORTER * longest:
+        remedy = "give a shorter `within`"
+        if np.isfinite(found.request.target.time[0]):
+            remedy = "end at an earlier time, and go on from that flow"
         raise ComputationError(
-            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than `within` "
-            f"({float(longest):.3g}), by which times are rounded: give a shorter `within`, or a "
-            "guard or section is touched tangentially there (grazing)."
+            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than after its longest "
+            f"duration ({float(longest):.3g}), by which times are rounded: {remedy}, or a guard or "
+            "section is touched tangentially there (grazing)."
         )
     where = ""
     if not is_traced(lanes):
