@@ -466,6 +466,13 @@ def test_an_error_in_a_field_has_the_hint_that_fits():
     assert "write `p.k`" in error_of(lambda t, q, u, p: -p["damping"] * q[0])
     assert "write `y, v = q`" in error_of(lambda t, q, u, p: -q["x"])
     assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
+    assert "from_functions` take (t, q, u, p)" in error_of(lambda t, q, p: -q)
+
+
+def test_a_namespace_is_no_function_that_may_take_an_object():
+    with pytest.raises(AttributeError) as caught:
+        print(hj.Crossing("y", "falling").plot)
+    assert "may take" not in str(caught.value)
 
 
 def test_a_misspelt_method_of_a_system_is_refused():

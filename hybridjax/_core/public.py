@@ -163,6 +163,11 @@ def place_of(name: str) -> str | None:
     return places().get(name)
 
 
+def is_namespace(name: str) -> bool:
+    """Test whether a public name is a module of functions, such as `plot`."""
+    return (_ROOT / name / "__init__.pyi").exists()
+
+
 @functools.cache
 def places() -> dict[str, str]:
     """The place of each public name: the package's before those of its namespaces, and names of

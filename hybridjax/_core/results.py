@@ -23,7 +23,11 @@ class Result(enum.IntEnum):
     SECTION_MISSED = 1, "the section was not crossed within the time allowed"
     EVENT_ORDER = 3, "events came in another order or number than on the limit cycle"
     GRAZING = 4, "a guard or section was touched tangentially (grazing)"
-    ZENO = 5, "events accumulate in finite time (Zeno)"
+    ZENO = (
+        5,
+        "events accumulate in finite time (Zeno): what comes to rest or slides there needs a chart "
+        "of its own",
+    )
     BLOW_UP = 6, "the state left all bounds"
     STEP_LIMIT = (
         7,

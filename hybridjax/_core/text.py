@@ -87,6 +87,11 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
+def how_many(count: int, one: str, several: str) -> str:
+    """A number with its noun: `how_many(1, "trial", "trials")`."""
+    return f"{count} {one if count == 1 else several}"
+
+
 def signal_values(names: Iterable[str], values: Iterable[Any]) -> str:
     """Numbers of three digits after the names of signals, in their units."""
     words = []

@@ -65,7 +65,7 @@ _JOB = "job.json"
 _FOREST = {
     "modulus": "Modulus of the leading multiplier",
     "angle": "Angle of the leading multiplier, if it is complex",
-    "half_life": "Strides after which half of a deviation is left",
+    "decay": "Decay of a deviation per stride (half of it is left after 0.69 / decay strides)",
 }
 
 

@@ -320,7 +320,7 @@ def integrate(
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     if new_input:
-        path = dataclasses.replace(path, findings=tuple(_begins_beyond(s, begin, u)))
+        path = dataclasses.replace(path, findings=tuple(begins_beyond(s, begin, u)))
     warn_of(path.findings)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
@@ -407,7 +407,7 @@ def constant_input(system: HybridSystem, input: Any) -> Any:
     return namespace(value).broadcast_to(value, (nu,))
 
 
-def _begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
+def begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
     """Doubts about a start at which guards are beyond zero, or at zero and fall."""
     for g, value, is_due in guards_reached(s, begin, u):
         transition = s.transitions[g]

@@ -59,7 +59,7 @@ class ObservedTrajectory(AbstractObservation):
     times: Float[Array, " K"]
     outputs: tuple[str, ...] = eqx.field(static=True)
     values: Float[Array, "K ny"]
-    known: tuple[int, ...] = eqx.field(static=True)
+    known: tuple[int, ...] = eqx.field(static=True, repr=False)
     """Places of the values that are no NaN."""
     scale: Float[Array, " ny"]
     events: tuple[str, ...] = eqx.field(static=True)
@@ -86,7 +86,8 @@ class ObservedTrajectory(AbstractObservation):
         """**Arguments:**
 
         - `start`: chart, state and time at which the flow begins.
-        - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing.
+        - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing. Those of
+          one output are a column, too: `heights[:, None]`.
         - `std`: their standard deviation, one number or one for each output.
         - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
           `events_std`: their standard deviation, one number.
@@ -293,7 +294,11 @@ def _sizes(
         return jnp.broadcast_to(sizes, (ny,))
     if not ny:
         return jnp.ones(0)
-    size = np.sqrt(np.nanmean(samples**2, axis=0))
+    known = np.isfinite(samples)
+    mean_square = np.where(known, samples**2, 0.0).sum(axis=0) / np.maximum(
+        known.sum(axis=0), 1
+    )
+    size = np.sqrt(mean_square)
     if not (size > 0).all():
         raise DefinitionError(
             f"`{name}` of an output are zero throughout, or all missing: leave it out, or give "

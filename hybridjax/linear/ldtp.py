@@ -17,7 +17,7 @@ from .._core.html import card, facts, multiplier_table, unit_circle
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.showable import WithMultipliers
-from .._core.text import folded, listed
+from .._core.text import folded, how_many, listed
 from ..errors import DefinitionError
 from . import algebra, time_response
 from .frequency_response import (
@@ -196,9 +196,8 @@ class LDTP(WithMultipliers, eqx.Module):
 
     def __repr__(self) -> str:
         ports = f"{listed(self.inputs)} -> {listed(self.outputs)}"
-        return folded(
-            f"LDTP({self.n_sections} sections, dimension {self._dimension()}: {ports})"
-        )
+        sections = how_many(self.n_sections, "section", "sections")
+        return folded(f"LDTP({sections}, dimension {self._dimension()}: {ports})")
 
     def _dimension(self) -> str:
         if is_traced(self.dims):

@@ -20,7 +20,7 @@ from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
-from .._core.text import folded, number, signal_values
+from .._core.text import folded, how_many, number, signal_values
 from ..engine.flow import Events, Passage, Samples, pass_through
 from ..engine.lanes import Lanes, blank_tape, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
@@ -74,7 +74,7 @@ class Flow(Showable, eqx.Module):
     a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and
     indices of their transitions (-1 for none). `before`, `after` (E, d): the states before and
     after their resets. `count`: number of all events. `trajectory`: steps and dense states, of a
-    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start.
+    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start and end.
     """
 
     t: Float[Array, "*L"]
@@ -158,7 +158,7 @@ class Flow(Showable, eqx.Module):
         chart = self.structure.names[int(self.chart)]
         states = self.structure.by_name(int(self.chart), np.asarray(self.state))
         count = int(self.count)
-        many = "1 event" if count == 1 else f"{count} events"
+        many = how_many(count, "event", "events")
         text = folded(
             f"Flow({name}: to t = {end} in {chart}, {signal_values(states, states.values())}; "
             f"{many}: {Result(int(self.result)).message})"
@@ -386,6 +386,10 @@ def _target_of(
                 f"{float(np.max(lanes.t)):.9g}: give a later `until`."
             )
         return until_time(time), _only_chart(s)
+    name = until.name if isinstance(until, AtEvent) else until
+    if isinstance(name, str):
+        # (A misspelled event is named before the missing `within`.)
+        g = s.transition_index(name)
     if within is None:
         raise DefinitionError(
             "flow to an event or a section needs the longest duration to wait for it: "
@@ -400,8 +404,6 @@ def _target_of(
     if isinstance(until, Crossing):
         until.check(s)
         return to_section(toward(never, -1, limit), until), _only_chart(s, until)
-    name = until.name if isinstance(until, AtEvent) else until
-    g = s.transition_index(name)
     return toward(never, g, limit), s.chart_index(s.transitions[g].target)
 
 
@@ -495,9 +497,10 @@ def _passage(request: _Request, times: Float[Array, " K"] | None = None) -> Pass
     request = dataclasses.replace(request, result=begin)
     passage = _in_parts(request, times)
     moved, events, _ = passage
-    result = update_result(
-        moved.result, _coincide(s, lanes, target, events), Result.SIMULTANEOUS
-    )
+    late = _is_late(target, lanes, moved.lanes)
+    result = update_result(moved.result, late, Result.SECTION_MISSED)
+    coincide = _coincide(s, lanes, target, events)
+    result = update_result(result, coincide, Result.SIMULTANEOUS)
     return passage._replace(moved=moved._replace(result=result))
 
 
@@ -540,6 +543,11 @@ def _part(request: _Request, times: Float[Array, " K"]) -> Passage:
         jnp.broadcast_to(times[:, None], (len(times), len(request.lanes.t))),
         request.result,
     )
+
+
+def _is_late(target: Target, begin: Lanes, end: Lanes) -> Bool[Array, " L"]:
+    """Test whether lanes ended later than they may: the last step can go on beyond the limit."""
+    return end.t > target.limit + SAME_TIME * (target.limit - begin.t)
 
 
 def _coincide(
@@ -611,9 +619,11 @@ def _on_host(request: _Request) -> Flow:
         request.new_input,
     )
     span = float(request.target.limit[0] - lanes.t[0])
+    if path.result == Result.OK and _is_late(request.target, lanes, end)[0]:
+        path = dataclasses.replace(path, result=Result.SECTION_MISSED)
     if path.result == Result.OK and _orders_differ(path, span):
         path = dataclasses.replace(path, result=Result.SIMULTANEOUS)
-    if np.isfinite(request.target.time[0]):
+    if path.result == Result.OK and np.isfinite(request.target.time[0]):
         doubts = tuple(_ends_at_an_event(path, s, end, np.asarray(request.u), span))
         warn_of(doubts)
         path = dataclasses.replace(path, findings=path.findings + doubts)
@@ -661,6 +671,27 @@ def _ends_at_an_event(
         yield Finding("ends at an event", text)
 
 
+def _about_missed(found: Flow, k: int) -> str:
+    """The end that flow k did not reach."""
+    target = found.request.target
+    begin = float(found.request.lanes.t[k])
+    limit = float(target.limit[k])
+    within = f"within {number(limit - begin, unit=found.system.time_unit)}"
+    if target.count is not None:
+        times = np.atleast_2d(found.event_times)[k]
+        happened = int(np.sum(times <= limit))
+        if happened == len(times):
+            # (The times of later events are not kept.)
+            happened = int(np.atleast_1d(found.count)[k])
+        wanted = int(np.broadcast_to(target.count, target.limit.shape)[k])
+        return f"{happened} of {wanted} events happened {within}"
+    g = int(np.broadcast_to(target.event, target.limit.shape)[k])
+    if g >= 0:
+        event = found.structure.transitions[g].name
+        return f"the event '{event}' did not happen {within}"
+    return f"the section was not crossed {within}"
+
+
 def _require_ends(found: Flow) -> None:
     """**Raises:** `ComputationError` for the first flow that did not reach its end."""
     codes = np.atleast_1d(np.asarray(found.result))
@@ -669,12 +700,20 @@ def _require_ends(found: Flow) -> None:
         return
     k = int(failed[0])
     message = Result(int(codes[k])).message
+    if codes[k] == Result.SECTION_MISSED:
+        message = _about_missed(found, k)
     if found.request.many:
         raise ComputationError(
             f"{len(failed)} of {len(codes)} flows did not reach their end, first start {k}: "
             f"{message}. `throw=False` returns the others."
         )
     lanes = found.lanes
+    if codes[k] == Result.SECTION_MISSED:
+        causes = "".join(f" One cause may be that {x.text}" for x in found.findings)
+        raise ComputationError(
+            f"{message}: give a longer `within`, or another end.{causes} `throw=False` returns the "
+            "flow."
+        )
     if codes[k] == Result.SIMULTANEOUS:
         raise ComputationError(
             f"{message}, and its derivatives depend on the order. `throw=False` returns the "
@@ -683,10 +722,13 @@ def _require_ends(found: Flow) -> None:
     begin = found.request.lanes.t[0]
     longest = found.request.target.limit[0] - begin
     if codes[k] == Result.GRAZING and lanes.t[0] - begin < _MUCH_SHORTER * longest:
+        remedy = "give a shorter `within`"
+        if np.isfinite(found.request.target.time[0]):
+            remedy = "end at an earlier time, and go on from that flow"
         raise ComputationError(
-            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than `within` "
-            f"({float(longest):.3g}), by which times are rounded: give a shorter `within`, or a "
-            "guard or section is touched tangentially there (grazing)."
+            f"the flow stopped at t = {float(lanes.t[0]):.6g}, much sooner than after its longest "
+            f"duration ({float(longest):.3g}), by which times are rounded: {remedy}, or a guard or "
+            "section is touched tangentially there (grazing)."
         )
     where = ""
     if not is_traced(lanes):

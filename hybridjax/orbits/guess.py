@@ -23,6 +23,7 @@ from ..engine.replay import recorded_moves
 from ..engine.search.state import Moved
 from ..engine.settings import TRANSIENT, Settings
 from ..engine.target import Target, toward, until
+from ..engine.trajectory import begins_beyond
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
@@ -305,12 +306,16 @@ def _next_crossing(
         wait = max(_patience(map, lanes), unmoved) - waited
         if wait <= 0 or not _decays(map, lanes):
             break
-    if _misses(moved):
-        _require_motion(map, moved.lanes)
     late = (
         f"Allow more time than {waited:.3g}, by `max_period`, or for the slow modes of a stiff "
         'system, take `settings=Settings(solver="auto")`. '
     )
+    if _misses(moved):
+        _require_motion(map, moved.lanes)
+        s = map.structure
+        doubts = begins_beyond(s, to_host(map.anchor), np.zeros((s.nu, 1)))
+        causes = [f"One cause may be that {x.text} " for x in doubts]
+        late = "".join(causes) or late
     return moved, late
 
 

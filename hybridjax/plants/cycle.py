@@ -176,24 +176,29 @@ class PlantCycle(Showable):
         failed_at: Int[np.ndarray, " S"],
     ) -> list[Finding]:
         """Return findings about the size of the inputs, of which the first experiment is repeated
-        with half of its input."""
+        with half of its input and without any: noise with the same seed, and what is left of a
+        transient, are in all of them."""
         whole = np.flatnonzero(failed_at < 0)
         if len(whole) < _FEWEST or not responses[whole[0]].any():
             return []
         s = int(whole[0])
-        values, cause = self.drive.run(self.seed + 1 + s, (u[s] / 2).tolist())
-        if cause:
-            return []
+        rows = []
+        for part in (0.5, 0.0):
+            values, cause = self.drive.run(self.seed + 1 + s, (part * u[s]).tolist())
+            if cause:
+                return []
+            rows.append(np.array(values)[:, :-1])
+        half, without = rows
         at_rest = np.tile(
             self.cycle_outputs, (u.shape[1] // len(self.cycle_outputs), 1)
         )
-        half = np.array(values)[:, :-1] - at_rest
-        return doubts_about_inputs(self, responses[s], half)
+        full = responses[s] - (without - at_rest)
+        return doubts_about_inputs(self, full, half - without)
 
     def perturbed_returns(self, coordinates: SignalNames | None = None) -> Returns:
         """Estimate the multipliers from returns of perturbed states to section 0.
 
-        Central differences with steps of three sizes give the Jacobian of the return map. The
+        Central differences with steps of six sizes give the Jacobian of the return map. The
         scatter of returns from nearly equal states determines the steps (measured by differences
         along lines: Moré and Wild 2011). In each pair of perturbed states, the first time step has
         another length: contacts that begin at the ends of time steps then scatter at random, and

@@ -236,19 +236,29 @@ class ReturnMap:
         steady = np.abs(again - advance) <= np.maximum(
             10 * self.noise, 0.01 * np.abs(advance)
         )
+        # (A state that is still settling does not advance at one rate.)
         grows = np.abs(advance) > np.maximum(10 * self.noise, 1e-6 * self.size)
+        grows = grows & steady
         tolerance = 10 * self.noise + 1e-6 * self.size
         travels = np.zeros(len(self.x), bool)
         for k in np.flatnonzero(grows):
             move = np.zeros(len(self.x))
             move[k] = self.size[k]
-            change = np.abs(self(self.x + move) - first - move)
+            try:
+                change = np.abs(self(self.x + move) - first - move)
+            except ComputationError:  # (where the plant falls, something depends on it)
+                continue
             travels[k] = bool((change <= tolerance).all())
         turns = steady & (np.abs(advance) > self.size / 2)
         self.shift = self.shift + np.where(travels | turns, advance, 0.0)
         self.travelling = tuple(
             name for name, x in zip(self.names, travels, strict=True) if x
         )
+        if travels.all():
+            raise DefinitionError(
+                f"all coordinates of the plant travel ({listed(self.names)}), and nothing depends "
+                "on them: there is no cycle whose multipliers could be estimated."
+            )
         if not self.chosen:
             self._keep(np.flatnonzero(~travels))
 

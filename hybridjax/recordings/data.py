@@ -14,7 +14,7 @@ from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
-from .._core.text import folded
+from .._core.text import folded, how_many
 from ..experiments.data import ExperimentData
 from ..experiments.record import SectionSeries, uninterrupted_records
 
@@ -157,7 +157,7 @@ class SectionData(Showable, eqx.Module):
             sizes.append(f"{name} {x:.3g} {unit}".rstrip())
         summary = (
             f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
-            f"{len(self.records)} records"
+            f"{how_many(len(self.records), 'record', 'records')}"
         )
         if self.missing:
             summary += f", {100 * self.missing:.2g} % missing"

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from .._core.arguments import require_equal
 from .._core.memo import remembered
 from .._core.showable import Showable
-from .._core.text import folded
+from .._core.text import folded, how_many
 from ..errors import DefinitionError
 from .recording import Recording, Trial
 from .smoothing import Series
@@ -144,8 +144,10 @@ class Phase(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         pieces = sum(len(s) for s in self.stretches)
+        stretches = how_many(pieces, "stretch", "stretches")
+        trials = how_many(len(self.stretches), "trial", "trials")
         text = (
-            f"Phase({self.cycles} cycles in {pieces} stretches of {len(self.stretches)} trials; "
+            f"Phase({self.cycles} cycles in {stretches} of {trials}; "
             f"period {self.period:.6g} s, jitter {100 * self.jitter:.2g} %, drift "
             f"{100 * self.drift:.2g} % per cycle"
         )

@@ -16,7 +16,7 @@ from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings
 from .._core.showable import Showable
 from .._core.signal import with_unit
-from .._core.text import folded
+from .._core.text import folded, how_many
 from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
 from .formats.columns import (
@@ -314,7 +314,8 @@ class Recording(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         names = ", ".join(map(with_unit, self.signals, self.units))
-        lines = [folded(f"Recording({len(self.trials)} trials: {names})")]
+        trials = how_many(len(self.trials), "trial", "trials")
+        lines = [folded(f"Recording({trials}: {names})")]
         lines += [_summary(trial) for trial in self.trials]
         if self.findings:
             lines.append(print_findings(self.findings, "  "))

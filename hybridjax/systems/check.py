@@ -36,7 +36,8 @@ _passed: dict[Hashable, tuple[str, ...]] = {}
 
 _ARGUMENTS = (
     " (fields, guards, resets and outputs take (t, q, u), after `self` in a class; functions of "
-    "`Crossing`, `filippov` and `half_period` take (t, q))"
+    "`HybridSystem.from_functions` take (t, q, u, p); functions of `Crossing`, `filippov` and "
+    "`half_period` take (t, q))"
 )
 
 

@@ -1,5 +1,7 @@
 """Fits to trajectories that are no cycles: drops of a ball with drag."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +87,13 @@ def test_times_of_events_alone_identify_the_restitution():
     assert_allclose(fit.values, TRUE["e"], atol=1e-7)
     seen = hj.fitting.identifiability(ball(), data, ("e", "drag", "g"))
     assert seen.rank == 2
+
+
+def test_prints_have_the_digits_that_errors_leave():
+    data = observed(1.0, seed=0)
+    assert " known=" not in repr(data)  # (It would list the place of each sample.)
+    table = repr(hj.fit_model(ball(), data, ("e", "drag")))
+    assert re.search(r"e  +0\.\d{5} +± 0\.00\d\d\n", table)
 
 
 @pytest.mark.slow

@@ -352,6 +352,7 @@ def files(t):
     yield hj.save, dict(path="missing/thing.npz", thing=t.model)
     yield hj.load, dict(path="thing.npz")
     yield t.found.write_report, dict(folder="report")
+    yield t.found_without_push.write_report, dict(folder="report")
 
 
 def conversions(t):
@@ -405,6 +406,9 @@ def rhythms(t):
     at = dict(phase=[0.1, 0.2])
     yield t.beats, at
     yield t.beats.interval, at
+    yield t.beats.with_jitter, at
+    on = dict(recording=t.recording, sections=hj.AtEvent("strike"))
+    yield t.beats.forecast, on
     yield hj.recordings.natural_multipliers, dict(data=t.variability)
     natural = hj.recordings.natural_multipliers(t.variability)
     yield natural.compare, dict(true=[0.5])

@@ -103,6 +103,7 @@ SLOW = {
     "sweep",
     "monte_carlo",
     "Identification.write_report",
+    "NaturalIdentification.write_report",
     "ObservedCycle.prepare",
     "ObservedCycle.residuals",
     "ObservedHTF.prepare",

@@ -182,6 +182,9 @@ MAKE = {
     "found": lambda t: hj.identify_recording(
         t.recording, t.phase, inputs="f", outputs=("x",), order=1, n_sections=2
     ),
+    "found_without_push": lambda t: hj.identify_recording(
+        t.recording, t.phase, outputs=("x",), order=1, n_sections=2
+    ),
     "htf": lambda t: hj.linearize(t.cycle, PHASE, NAMES).htf([0.1, 0.2], (0,)),
     "series": lambda t: hj.experiments.simulate_experiments(
         hj.linearize(t.cycle, PHASE, NAMES), t.one_input

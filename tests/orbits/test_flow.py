@@ -595,6 +595,7 @@ def test_events_at_the_start_and_at_the_end():
             "ends at t = -1, before its start at t = 0",
         ),
         (lambda: hj.flow(ball(), DROP, "bonce", within=1.0), "no event 'bonce'"),
+        (lambda: hj.flow(ball(), DROP, "1.0"), "no event '1.0'"),
         (lambda: hj.flow(ball(), hj.Guess("air", (1.0,)), 1.0), "no chart 'air'"),
         (
             lambda: hj.flow(ball(), hj.Guess("main", (1.0,)), 1.0),
@@ -618,12 +619,51 @@ def test_bad_arguments(call, message):
 
 def test_a_longest_duration_that_is_far_too_long():
     """The advice helps."""
-    with pytest.raises(ComputationError, match=r"than `within` \(1e\+09\).* shorter"):
+    with pytest.raises(ComputationError, match=r"duration \(1e\+09\).* shorter"):
         hj.flow(ball(), DROP, "bounce", within=1e9)
     assert_allclose(hj.flow(ball(), DROP, "bounce", within=1e3).t, FIRST, rtol=1e-12)
 
 
-def test_a_section_that_is_not_reached():
+def test_ends_that_are_not_reached():
+    """Errors name the end, and a guard that the start lies beyond."""
     high = hj.Crossing("y", "rising", 3.0)
-    with pytest.raises(ComputationError, match="was not crossed within the time"):
+    with pytest.raises(ComputationError, match="section was not crossed within 1: "):
         hj.flow(ball(), DROP, high, within=1.0)
+    with pytest.raises(ComputationError, match="1 of 3 events happened within 0.5"):
+        hj.flow(ball(), DROP, events=3, within=0.5)
+    with pytest.raises(ComputationError, match="'bounce' did not happen within 0.2"):
+        hj.flow(ball(), DROP, "bounce", within=0.2)
+    starts = hj.Guess("main", jnp.array([(0.1, 0.0), (1.0, 0.0)]))
+    with pytest.raises(ComputationError, match="start 1: the event 'bounce' did not"):
+        hj.flow(ball(), starts, "bounce", within=0.2)
+    below = hj.Guess("main", (-0.1, 0.0))
+    with pytest.raises(ComputationError, match="beyond the guard of 'bounce'"):
+        hj.flow(ball(), below, "bounce", within=1.0)
+
+
+@pytest.mark.parametrize(
+    "end, time",
+    [
+        ({"until": "bounce"}, FIRST),
+        ({"events": 2}, SECOND),
+        ({"until": hj.Crossing("v", "falling", -3.0)}, 3.0 / 9.81),
+    ],
+)
+def test_no_end_later_than_within(end, time):
+    """The last step may go on beyond `within`."""
+
+    early = 0.999 * time
+    found = hj.flow(ball(), DROP, **end, within=early, throw=False)
+    assert found.result == Result.SECTION_MISSED
+    assert np.isnan(found.t)
+    assert_allclose(hj.flow(ball(), DROP, **end, within=time).t, time, rtol=1e-12)
+    starts = hj.Guess("main", jnp.array([DROP.state]))
+    for within, code in ((early, Result.SECTION_MISSED), (time, Result.OK)):
+        program = hj.flow(ball(), starts, **end, within=within, throw=False)
+        assert program.result == code
+
+
+def test_a_flow_that_failed_does_not_end_at_an_event():
+    rests = hj.flow(ball(), DROP, 5.0, throw=False)
+    assert rests.result == Result.ZENO
+    assert rests.findings == ()

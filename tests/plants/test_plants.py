@@ -292,8 +292,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
-    # (The last one has half of the first input, which tests the size of the inputs.)
-    assert seeds == [*range(1, 10), 9, 10, 1]
+    # (The last two have half of the first input and none, which test the size of the inputs.)
+    assert seeds == [*range(1, 10), 9, 10, 1, 1]
     assert np.array_equal(data.y, whole.y)
     assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(

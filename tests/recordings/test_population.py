@@ -389,11 +389,11 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
         "b - a", "a - b"
     )
     assert "S0-a is doubtful: odd." in printed
-    for quantity in ("modulus", "half_life"):
+    for quantity in ("modulus", "decay"):
         assert Path(f"out/forest_{quantity}.png").exists()
     assert not pyplot.get_fignums()
     compared = pandas.read_csv("out/population.csv")
-    assert {"modulus", "half_life", "c1"} == set(compared["quantity"])
+    assert {"modulus", "decay", "c1"} == set(compared["quantity"])
     page, table = (
         (tmp_path / "out" / x).read_text() for x in ("population.html", "subjects.csv")
     )

@@ -60,7 +60,7 @@ def test_a_circle(wave):
                 match="`bandwidth` removes the rhythm of 1 Hz",
             ):
                 call(wave, phase, bandwidth=0.9)
-    assert "SectionData(19.75 cycles of 8 sections in 1 records;" in repr(data)
+    assert "SectionData(19.75 cycles of 8 sections in 1 record;" in repr(data)
 
 
 def test_outputs_that_repeat_and_few_samples_are_named(rhythm):

@@ -56,7 +56,7 @@ def test_a_recording_without_inputs_is_identified_by_its_variability(tmp_path):
     fit = hj.load(tmp_path / "report" / "fit.npz")
     population = hj.recordings.Population.from_fits([fit], {"subject": ["S1"]})
     modulus = result.fit.modulus[0]
-    half_life = population.values["half_life"][0]
+    half_life = np.log(2) / population.values["decay"][0]
     assert modulus**half_life == pytest.approx(0.5)
     with pytest.raises(hj.errors.DefinitionError, match="name `inputs`, too"):
         hj.identify_recording(recording, hj.AtEvent("e"), references="y0", **options)

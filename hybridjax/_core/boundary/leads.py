@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from ..public import about_word, place_of
+from ..public import about_word, is_namespace, place_of
 from . import words
 from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
@@ -153,7 +153,7 @@ def _leads_of_attribute(
         yield _use(words.with_part(part, attributes))
     yield _use(_spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
-    if function is not None:
+    if function is not None and not is_namespace(name):
         yield f"`{function}` is a function that may take it"
 
 

@@ -139,8 +139,9 @@ class OutputErrorProblem(NamedTuple):
         free = order + -(-extra_lags // N) if free_start else 0
         if lags > records.cycles * N:
             raise DefinitionError(
-                f"{lags} lags reach beyond the longest record, of {records.cycles * N} samples: "
-                "record longer, take fewer sections, or lower `order`."
+                f"{lags} lags, of one section each, reach beyond the longest record, of "
+                f"{records.cycles} cycles of {N} sections: record longer, take fewer sections, or "
+                "lower `order`."
             )
 
         def triangle(n: int):

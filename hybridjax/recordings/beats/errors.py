@@ -30,6 +30,9 @@ _CHANGES = 0.03 * 2.0 ** np.arange(7)
 # Twice the logarithm of the likelihood ratio from which on a rate wanders. Larger: errors of curves
 # under slow inputs are too small. Smaller: noise is taken for a wandering rate.
 _LEAST_GAIN = 6.0
+# Degrees of freedom that must be left for a test of wandering rates. Fewer: their variance is zero
+# or unknown. More: short recordings never show one.
+_FEWEST_LEFT = 3
 
 
 class Wander(NamedTuple):
@@ -148,6 +151,9 @@ def estimate_wander(
     """
     period = float(np.median(intervals.duration))
     longest = float(intervals.sums(intervals.duration).max())
+    trials = len(intervals.sums(intervals.duration))
+    if int(used.sum()) - trials - columns.shape[1] < _FEWEST_LEFT:
+        return Wander.none()
 
     def improbable(wander: Wander) -> float:
         """Return minus twice the logarithm of the likelihood, with the best variance."""

@@ -110,9 +110,9 @@ class Population(Showable):
         """Return the population of some fits, with a row of the table for each.
 
         Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, its
-        `half_life`, after which half of a deviation is left (strides; missing if it does not
-        decay), and the coefficients `c1`, `c2`, ... of the characteristic polynomial (missing in
-        fits of lower order).
+        `decay` (the rate -ln(modulus) per stride: half of a deviation is left after
+        ln(2) / decay strides; negative if it grows), and the coefficients `c1`, `c2`, ... of the
+        characteristic polynomial (missing in fits of lower order).
 
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
@@ -120,20 +120,20 @@ class Population(Showable):
         frame = table_of(table, len(fits))
         _require_comparable(fits, frame["subject"])
         most = max((len(fit.coefficients) for fit in fits), default=0)
-        kinds = ["modulus", "angle", "half_life"]
+        kinds = ["modulus", "angle", "decay"]
         kinds += [f"c{k}" for k in range(1, most + 1)]
         values = {kind: np.full(len(fits), np.nan) for kind in kinds}
         errors = {kind: np.full(len(fits), np.nan) for kind in kinds}
         for row, fit in enumerate(fits):
             modulus, angle, squares = _polar(fit)
-            life, life_square = _half_life(modulus, squares[0])
-            numbers = (modulus, angle, life, *fit.coefficients)
-            squares = (*squares, life_square, *np.diag(fit.covariance))
+            decay, decay_square = _decay(modulus, squares[0])
+            numbers = (modulus, angle, decay, *fit.coefficients)
+            squares = (*squares, decay_square, *np.diag(fit.covariance))
             for kind, number, square in zip(kinds, numbers, squares, strict=False):
                 values[kind][row] = number
                 errors[kind][row] = np.sqrt(square)
         dof = [fit.covariance_dof for fit in fits]
-        units = {"angle": "rad", "half_life": "strides"}
+        units = {"angle": "rad", "decay": "1/stride"}
         return cls(frame, values, errors, units, dof)
 
     def __repr__(self) -> str:
@@ -472,14 +472,16 @@ class Population(Showable):
         return frame
 
 
-def _half_life(modulus: float, variance: float) -> tuple[float, float]:
-    """Return the number of strides after which half of a deviation is left, and its variance; NaN
-    for a modulus that does not decay, or at once."""
-    if not 0 < modulus < 1:
+def _decay(modulus: float, variance: float) -> tuple[float, float]:
+    """Return the rate at which a deviation decays per stride, and its variance; NaN for a modulus
+    of zero.
+
+    (A half-life is no quantity to take means of: its error grows with it, so that weights by errors
+    favor the short ones, and it has no value where nothing decays.)
+    """
+    if modulus == 0:
         return np.nan, np.nan
-    logarithm = np.log(modulus)
-    slope = np.log(2) / (modulus * logarithm**2)
-    return float(-np.log(2) / logarithm), float(slope**2 * variance)
+    return float(-np.log(modulus)), variance / modulus**2
 
 
 def _polar(fit: MultiplierFit | NaturalMultipliers) -> tuple[float, float, list[float]]:
