@@ -11,7 +11,7 @@ from .._core.arguments import require_among, require_index
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
-from ..identify.denominator import chi, multipliers_of
+from ..identify.denominator import chi, coefficients_of, multipliers_of
 from ..identify.periodic import characteristic_slopes
 from ..identify.variable_projection import grouped
 from .candidates import Candidates, Measured, Model, Noise, Powers, measured_htfs
@@ -82,7 +82,7 @@ def _multipliers(
             goal = dataclasses.replace(goal, which=int(np.argmin(apart)))
         wanted, names, part = wanted_parts(goal, minimal, c)
         return matrices.criterion(wanted @ slopes, names, part)
-    c = np.poly(multipliers).real[1:]
+    c = coefficients_of(multipliers)
     htfs = measured_htfs(model, cosines, goal.fitted_harmonics, noise)
     channels = list[Channel]()
     for measured in htfs:

@@ -13,11 +13,6 @@ from ..systems.structure import Structure
 from .arrays import Array
 
 
-# A lane that ends at time 0 gives up at this time. Larger: it might end late. Smaller: a part of it
-# is zero in XLA, and a lane that begins there has no step to its end.
-_LATER = 1e-300
-
-
 class AbstractLevels(Definition):
     """Level functions of state-based sections, by section index."""
 
@@ -74,8 +69,7 @@ def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> 
     level that is filled in later), giving up at `limit`."""
     xp = namespace(time)
     shape = time.shape
-    last = stop_gradient(time)
-    later = xp.maximum(xp.nextafter(last, xp.inf), last + _LATER)
+    later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
         time,
         xp.zeros(shape, xp.int32),

@@ -108,26 +108,12 @@ class ObservedTrajectory(AbstractObservation):
         self.input = input
         self.settings = settings
         self.outputs = tuple(outputs)
-        if (values is None) != (not self.outputs) or (values is None) != (
-            times is None
-        ):
-            raise DefinitionError(
-                "ObservedTrajectory: give `times`, `outputs` and `values` together."
-            )
+        own_times, samples = _samples(times, self.outputs, values)
         if values is None and not events:
             raise DefinitionError(
                 "ObservedTrajectory: give samples (`times`, `outputs`, `values`) or `events`."
             )
-        own_times = np.zeros(0) if times is None else np.asarray(times, float)
-        samples = np.zeros((0, 0)) if values is None else np.asarray(values, float)
-        axes = {"times": len(own_times), "outputs": len(self.outputs)}
-        require_axes("`values`", samples, axes)
         missing = np.isnan(samples)
-        if samples.size and missing.all():
-            raise DefinitionError(
-                "ObservedTrajectory: `values` are all missing: leave them out, or give `events` "
-                "alone."
-            )
         self.known = tuple(np.flatnonzero(~missing).tolist())
         self.times = jnp.asarray(own_times)
         self.values = jnp.asarray(np.where(missing, 0.0, samples))
@@ -137,14 +123,17 @@ class ObservedTrajectory(AbstractObservation):
         _require_times(start, own_times, *lists)
         self.scale = _sizes("values", std, samples)
         self.event_scale = _event_size(events_std, lists, start)
-        given = {std is not None for _ in own_times[:1]} | {
-            events_std is not None for _ in lists[:1]
-        }
-        if len(given) > 1:
+        deviations = []
+        if len(own_times):
+            deviations.append(std)
+        if lists:
+            deviations.append(events_std)
+        given = [x is not None for x in deviations]
+        if any(given) and not all(given):
             raise DefinitionError(
                 "give standard deviations of the samples and of the events, or of neither."
             )
-        self.weighted = jnp.asarray(given.pop())
+        self.weighted = jnp.asarray(all(given))
 
     __repr__ = fields
 
@@ -273,6 +262,32 @@ def _require_times(start: Guess, *lists: np.ndarray) -> None:
             raise DefinitionError(
                 f"a time, {times[0]:.6g}, comes before the start at {float(start.time):.6g}."
             )
+
+
+def _samples(
+    times: Any, outputs: tuple[str, ...], values: Any
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ny"]]:
+    """Times and samples; of no outputs if there are none.
+
+    **Raises:** `DefinitionError` if one of the three lacks, for a shape that does not fit, and if
+    all samples are missing.
+    """
+    given = {times is not None, bool(outputs), values is not None}
+    if len(given) > 1:
+        raise DefinitionError(
+            "ObservedTrajectory: give `times`, `outputs` and `values` together."
+        )
+    if values is None:
+        return np.zeros(0), np.zeros((0, 0))
+    own_times = np.asarray(times, float)
+    samples = np.asarray(values, float)
+    axes = {"times": len(own_times), "outputs": len(outputs)}
+    require_axes("`values`", samples, axes)
+    if samples.size and np.isnan(samples).all():
+        raise DefinitionError(
+            "ObservedTrajectory: `values` are all missing: leave them out, or give `events` alone."
+        )
+    return own_times, samples
 
 
 def _sizes(

@@ -13,7 +13,7 @@ from ..errors import DefinitionError
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from . import variable_projection as varpro, weights
-from .denominator import multipliers_of
+from .denominator import coefficients_of, multipliers_of
 from .joint.frequency import FrequencyProblem
 from .multiplier_estimate import MultiplierEstimate
 from .periodic import PeriodicModel, characteristic_slopes, local_coordinates
@@ -69,7 +69,7 @@ def cramer_rao(
     if estimator == "fit_ldtp":
         return _with_matrices(model, exact)
     multipliers = model.multipliers
-    c = np.poly(multipliers).real[1:]
+    c = coefficients_of(multipliers)
     _, J = varpro.residuals_of(varpro.grouped(exact, len(c), extra_lags), c)
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
 

@@ -46,6 +46,11 @@ def divided_by_chi(
     return values / chi(delay**N, c)[:, None, None]
 
 
+def coefficients_of(multipliers: Complex[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """Return the coefficients of the polynomial with these roots, without the leading 1."""
+    return np.atleast_1d(np.poly(multipliers)).real[1:]
+
+
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by decreasing modulus, of each pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)

@@ -16,11 +16,13 @@ _NONLINEAR = 1e-3
 # Scatter of returns over the grid of time, relative to the returns, that is a staircase. Larger:
 # stairs that bias multipliers pass. Smaller: errors of integration are called stairs.
 _STAIRS = 1e-3
-# The difference in units of this scatter, below which no experiment met a stair. Larger: those that
-# met a few are doubted. Smaller: curvature of a stair counts as the next one.
+# A response differs from twice that to half of the input because of stairs or because of curvature.
+# Below this part of the scatter it differs so little that no contact moved to another time step.
+# Larger: experiments that met a few stairs are doubted. Smaller: curvature within a stair counts as
+# the next one.
 _ON_ONE_STAIR = 0.1
-# The same, up to which the difference may be that of stairs. Larger: curvature passes. Smaller:
-# stairs are called curvature, and smaller inputs make them worse.
+# Above this multiple of the scatter, curvature is the reason. Larger: curvature passes. Smaller:
+# stairs are called curvature, for which smaller inputs are advised, and these make stairs worse.
 _MANY_STAIRS = 3.0
 
 

@@ -146,7 +146,7 @@ class PlantCycle(Showable):
         causes = tuple(cause for _, cause in trials)
         at_rest = np.tile(self.cycle_outputs, (u.shape[1] // N, 1))
         responses = rows[..., :-1] - at_rest
-        findings = self._doubts_about(u, responses, failed_at)
+        findings = self._doubts_about(u, responses, failed_at, at_rest)
         warn_of(findings)
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
@@ -174,6 +174,7 @@ class PlantCycle(Showable):
         u: Float[np.ndarray, "S n nu"],
         responses: Float[np.ndarray, "S n ny"],
         failed_at: Int[np.ndarray, " S"],
+        at_rest: Float[np.ndarray, "n ny"],
     ) -> list[Finding]:
         """Return findings about the size of the inputs, of which the first experiment is repeated
         with half of its input and without any: noise with the same seed, and what is left of a
@@ -189,9 +190,6 @@ class PlantCycle(Showable):
                 return []
             rows.append(np.array(values)[:, :-1])
         half, without = rows
-        at_rest = np.tile(
-            self.cycle_outputs, (u.shape[1] // len(self.cycle_outputs), 1)
-        )
         full = responses[s] - (without - at_rest)
         return doubts_about_inputs(self, full, half - without)
 

@@ -1,10 +1,14 @@
-"""Multipliers of a plant from returns of perturbed states to section 0."""
+"""Multipliers of a plant from returns of perturbed states to section 0.
+
+Simulators with fixed time steps let contacts begin and end at the ends of steps. The return is then
+a staircase as a function of the state: within a stair it has no noise, and a wrong slope.
+"""
 
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from .._core.arguments import require_among
 from .._core.boundary.kinds import SignalNames
@@ -12,6 +16,7 @@ from .._core.findings import Finding
 from .._core.progress import counted
 from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
+from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import MultiplierFit
 from ..sections import families
 from .drive import At
@@ -28,8 +33,8 @@ _WIDE = _STEPS >= _STEPS[2]
 # Even powers of the step, with the constant, by which slopes are fitted. Their scatter about this
 # fit is the noise: with fewer, curvature counts as noise; with more, few degrees of freedom remain.
 _POWERS = 3
-# Number of coordinates times repetitions of all steps. Smaller: the noise of one coordinate is
-# known from six pairs only. Larger: more time for few coordinates.
+# All steps are repeated until coordinates times repetitions reach this number. Smaller: the noise
+# of one coordinate is known from six pairs only. Larger: more time for few coordinates.
 _COLUMNS = 4
 # Smallest step in units of the range of a coordinate, at most. Larger: the widest steps, four times
 # as long, leave the linear range. Smaller: contacts of simulators with fixed time steps begin at
@@ -444,7 +449,8 @@ def _solution(steps: np.ndarray, count: int) -> np.ndarray:
 def _fitted(
     slopes: Float[np.ndarray, "pairs d d"], tolerance: Float[np.ndarray, "d d"]
 ) -> _Jacobian:
-    """Fit slopes, which the tolerances of the plant change by `tolerance`, by J + c step^2."""
+    """Fit slopes, which the tolerances of the plant change by `tolerance`, by J + c step^2. Their
+    scatter is that about a fit with a further power, which does not count curvature as noise."""
     repeats = len(slopes) // len(_STEPS)
     steps = np.tile(_STEPS, repeats)
     weights = steps**2
@@ -484,44 +490,59 @@ class _Resolved(NamedTuple):
     """Each by narrow steps less that by wide ones; 0 where the difference may be noise."""
 
 
-def _resolved(jacobian: _Jacobian) -> _Resolved:
-    """Return the eigenvalues that differ from 0 by three standard errors.
+class _Eigenvalues(NamedTuple):
+    """The eigenvalues of a Jacobian, and their errors.
 
     To first order, the error of an eigenvalue is w E v, with its eigenvectors w (left) and v and
     the error E of the Jacobian: a coordinate with large errors spoils only the eigenvalues that
     depend on it.
     """
+
+    value: Complex[np.ndarray, " d"]
+    left: Complex[np.ndarray, "d d"]
+    """Left eigenvectors in columns, each with product 1 with the right one."""
+    right: Complex[np.ndarray, "d d"]
+    variance: Float[np.ndarray, "d d"]
+    """Variance of each eigenvalue by the noise of each column."""
+    apart: Complex[np.ndarray, " d"]
+    """Each by narrow steps less that by wide ones; 0 where the difference may be noise."""
+    error: Float[np.ndarray, " d"]
+    """Standard errors, with rounding and the bias of curvature."""
+
+
+def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
+    """Return the eigenvalues of a Jacobian with their errors."""
     from scipy import linalg  # (a fifth of a second)
 
     J = jacobian.value
-    d = len(J)
     values, left, right = linalg.eig(J, left=True, right=True)
     product = np.einsum("ij,ij->j", left.conj(), right)
     # (The product is 0 for eigenvalues that coincide.)
     with np.errstate(all="ignore"):
         left = left / product.conj()
-    pairs = len(jacobian.errors)
-    noise = np.zeros((pairs, d, d), complex)
-    for j, error in enumerate(jacobian.errors):
-        noise[j] = (left.conj().T @ error) * right.T
+    rows = left.conj().T
     # (Of pair j and eigenvalue i, the share of column k.)
+    noise = np.stack([(rows @ error) * right.T for error in jacobian.errors])
     variance = (np.abs(noise) ** 2).sum(axis=0)
-    common = np.abs(left.conj().T) ** 2 @ jacobian.tolerance**2 @ np.abs(right) ** 2
-    common = np.diagonal(common)
-    apart = np.einsum("ji,jk,ki->i", left.conj(), jacobian.apart, right)
-    scatter = np.sqrt(variance.sum(axis=1) + common)
+    common = np.abs(rows) ** 2 @ jacobian.tolerance**2 @ np.abs(right) ** 2
+    scatter = np.sqrt(variance.sum(axis=1) + np.diagonal(common))
+    apart = np.diagonal(rows @ jacobian.apart @ right)
     is_noise = np.abs(apart) <= 2 * jacobian.apart_noise * scatter
     apart = np.where(is_noise, 0.0, apart)
     condition = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
     rounding = _ROUNDING * np.linalg.norm(J) * condition
     error = np.hypot(scatter + rounding, _BIAS * np.abs(apart))
-    listed_ones = np.abs(values) > _RESOLVED * error
-    # (Both of a pair, or none.)
-    for i in np.flatnonzero(listed_ones):
-        twin = int(np.argmin(np.abs(values - values[i].conj())))
-        listed_ones[i] = listed_ones[i] and listed_ones[twin]
-    rows = np.flatnonzero(listed_ones)
-    rows = rows[np.lexsort((-values[rows].imag, -np.abs(values[rows])))]
+    return _Eigenvalues(values, left, right, variance, apart, error)
+
+
+def _resolved(jacobian: _Jacobian) -> _Resolved:
+    """Return the eigenvalues that differ from 0 by three standard errors, with the covariance of
+    their polynomial by draws of the errors of the Jacobian."""
+    found = _eigenvalues(jacobian)
+    rows = _that_differ(found)
+    J = jacobian.value
+    pairs, d, _ = jacobian.errors.shape
+    k = len(rows)
     rng = np.random.default_rng(0)
     draws = np.einsum(
         "bjk,jik->bik",
@@ -529,33 +550,46 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
         jacobian.errors,
     )
     draws += jacobian.tolerance * rng.standard_normal((_DRAWS, d, d))
-    v = right[:, rows]
-    w = left[:, rows].conj().T
-    if len(rows):
+    v = found.right[:, rows]
+    w = found.left[:, rows].conj().T
+    if k:
         # (Eigenvectors of eigenvalues that nearly coincide.)
         w = np.linalg.solve(w @ v, w)
-    biases = _BIAS * np.diag(apart[rows]) * rng.standard_normal((_DRAWS, 1, 1))
-    blocks = np.diag(values[rows]) + w @ draws @ v + biases
-    polynomials = [_polynomial(values[rows])]
-    polynomials += [_polynomial(np.linalg.eigvals(block)) for block in blocks]
-    k = len(rows)
-    covariance = np.cov(polynomials[1:], rowvar=False).reshape(k, k)
-    rest = np.eye(d) - (v @ w).real
-    others = np.linalg.eigvals(rest @ (J + draws) @ rest)
-    largest = np.abs(others).max(axis=1, initial=0)
-    bound = np.quantile(largest, 0.975) if k < d else 0.0
+    apart = found.apart[rows]
+    biases = _BIAS * np.diag(apart) * rng.standard_normal((_DRAWS, 1, 1))
+    multipliers = found.value[rows]
+    blocks = np.diag(multipliers) + w @ draws @ v + biases
+    drawn = [coefficients_of(np.linalg.eigvals(block)) for block in blocks]
     return _Resolved(
-        multipliers=values[rows],
-        coefficients=polynomials[0],
-        covariance=covariance,
-        dof=_degrees(variance[rows], error[rows], pairs - _POWERS),
-        bound=float(bound),
-        apart=apart[rows],
+        multipliers=multipliers,
+        coefficients=coefficients_of(multipliers),
+        covariance=np.cov(drawn, rowvar=False).reshape(k, k),
+        dof=_degrees(found.variance[rows], found.error[rows], pairs - _POWERS),
+        bound=_bound(J + draws, v @ w) if k < d else 0.0,
+        apart=apart,
     )
 
 
-def _polynomial(roots: Complex[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    return np.atleast_1d(np.poly(roots)).real[1:]
+def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
+    """Return the places of eigenvalues that differ from 0, the largest first: both of a pair, or
+    none."""
+    differs = np.abs(found.value) > _RESOLVED * found.error
+    for i in np.flatnonzero(differs):
+        twin = int(np.argmin(np.abs(found.value - found.value[i].conj())))
+        differs[i] = differs[i] and differs[twin]
+    rows = np.flatnonzero(differs)
+    chosen = found.value[rows]
+    return rows[np.lexsort((-chosen.imag, -np.abs(chosen)))]
+
+
+def _bound(
+    drawn: Float[np.ndarray, "draws d d"], projection: Complex[np.ndarray, "d d"]
+) -> float:
+    """Return the modulus below which 97.5 % of draws have their eigenvalues across a projection."""
+    rest = np.eye(len(projection)) - projection.real
+    others = np.linalg.eigvals(rest @ drawn @ rest)
+    largest = np.abs(others).max(axis=1, initial=0)
+    return float(np.quantile(largest, 0.975))
 
 
 def _degrees(

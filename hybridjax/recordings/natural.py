@@ -26,6 +26,7 @@ from .._core.findings import Finding, print_findings
 from .._core.progress import working
 from .._core.showable import WithMultipliers
 from ..errors import DefinitionError
+from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import (
     MultiplierComparison,
     Truth,
@@ -99,19 +100,24 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     @property
     def coefficients(self) -> Float[np.ndarray, " d"]:
         """Coefficients of the polynomial of the multipliers, without the leading 1."""
-        return np.atleast_1d(np.poly(self.multipliers)).real[1:]
+        return coefficients_of(self.multipliers)
 
     @property
     def covariance(self) -> Float[np.ndarray, "d d"]:
         """That of the coefficients, over the resamplings."""
-        polynomials = [np.atleast_1d(np.poly(x)).real[1:] for x in self.draws]
+        polynomials = [coefficients_of(x) for x in self.draws]
         d = len(self.multipliers)
         return np.cov(polynomials, rowvar=False).reshape(d, d)
 
     @property
     def covariance_dof(self) -> float:
         """Degrees of freedom of the covariances: the number of blocks less one."""
-        return max(self.cycles / self.block, 2.0) - 1
+        return self._blocks - 1
+
+    @property
+    def _blocks(self) -> float:
+        """Number of blocks that are drawn."""
+        return max(self.cycles / self.block, 2.0)
 
     def contains(
         self, true: Truth, level: Probability = 0.95
@@ -164,7 +170,7 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         (low, high), *_ = found.interval(0.9)
         ```
         """
-        blocks = max(self.cycles / self.block, 2.0)
+        blocks = self._blocks
         wider = np.sqrt(blocks / (blocks - 1))
         reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
         values = self.plain if plain else self.multipliers

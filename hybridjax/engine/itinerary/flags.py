@@ -111,8 +111,8 @@ def noted(
     if due.size:
         lost = lost & ~due[_fired(form, s, row)]
     left = flags.left | is_new | lost | _has_left(row, flags.before, now)
-    # (A guard that a reset has put on its zero is no more to fall than on the recorded trajectory,
-    # whichever sign rounding gives it.)
+    # (Where a reset puts the state on a guard, rounding gives this guard a sign. It does not fall
+    # through its zero there, as it did not on the recorded trajectory.)
     at_zero = jnp.abs(now.value) <= SAME_TIME * duration * jnp.abs(now.rate)
     value = jnp.where((row.signs == 0) & at_zero, 0.0, now.value)
     return flags._replace(before=now._replace(value=value), left=left), due

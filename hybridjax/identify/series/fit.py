@@ -36,6 +36,7 @@ from .. import denominator
 from ..denominator import (
     Covariance,
     chi,
+    coefficients_of,
     divided_by_chi,
     fading,
     in_blocks,
@@ -403,7 +404,7 @@ def _about_drift(
     may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
     if not may_be_one.any() or may_be_one.all():
         return []
-    fewer = np.poly(fit.multipliers[~may_be_one]).real[1:]
+    fewer = coefficients_of(fit.multipliers[~may_be_one])
     with suppress(DefinitionError):
         problem = _problem_like(fit, slow(), len(fewer), free_start)
         solution, _ = minimize(problem, fewer, rough=True)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Complex, Float
 from scipy import special
 
 from ...errors import DefinitionError
-from ..denominator import SLOWEST, multipliers_of
+from ..denominator import SLOWEST, coefficients_of, multipliers_of
 from ..descent import NO_LEADING_COEFFICIENT, Coefficients, positive
 from ..periodic import PeriodicModel
 from ..realization import default_horizon
@@ -281,7 +281,7 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
         return np.zeros(order)
     roots = np.roots(null / null[0])
     size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
-    return np.pad(np.poly(roots / size).real[1:], (0, order - len(roots)))
+    return np.pad(coefficients_of(roots / size), (0, order - len(roots)))
 
 
 def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:

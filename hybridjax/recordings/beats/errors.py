@@ -156,21 +156,10 @@ def estimate_wander(
         return Wander.none()
 
     def improbable(wander: Wander) -> float:
-        """Return minus twice the logarithm of the likelihood, with the best variance."""
         white = whitening(intervals, ahead, rates, used, wander)
         by_rate = white(ahead.slopes[:, -1:])[:, 0]
-        y = white(np.column_stack([residual, columns]))
-        square = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
-        sums = np.stack([intervals.sums(by_rate * x) for x in y.T], axis=1)
-        y -= by_rate[:, None] * (sums / square[:, None])[intervals.trial]
-        x = y[:, 1:]
-        values, axes = np.linalg.eigh(x.T @ x)
-        determined = values > 1e-9 * values[-1]
-        pull = (axes.T @ (x.T @ y[:, 0]))[determined] / np.sqrt(values[determined])
-        dof = int(used.sum()) - len(square) - int(determined.sum())
-        left = float(y[:, 0] @ y[:, 0] - pull @ pull)
-        fitted = np.log(values[determined]).sum() + np.log(square).sum()
-        return dof * np.log(left / dof) + white.log_determinant + float(fitted)
+        y = white(residual[:, None])
+        return _improbable(intervals, white, by_rate, y, white(columns))
 
     # Rates that every interval has anew make some intervals noisier than others: without them, a
     # wandering rate would explain that, too.
@@ -189,3 +178,49 @@ def estimate_wander(
     if independent[0] - correlated[0] < _LEAST_GAIN:
         return independent[1]
     return correlated[1]
+
+
+class WithoutRates(NamedTuple):
+    """Columns of independent errors without what the rates of the trials explain of them."""
+
+    rest: Columns
+    along: Float[np.ndarray, "trials c"]
+    """Change of each trial's rate that explains most."""
+    power: Float[np.ndarray, " trials"]
+    """Sum of the squares of the derivatives by each rate."""
+
+
+def without_rates(
+    intervals: Intervals, by_rate: Lanes, columns: Columns
+) -> WithoutRates:
+    """Return columns without what rates explain, whose derivatives are `by_rate`, by least
+    squares."""
+    power = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
+    products = np.stack([intervals.sums(by_rate * x) for x in columns.T], axis=1)
+    along = products / power[:, None]
+    explained = by_rate[:, None] * along[intervals.trial]
+    return WithoutRates(columns - explained, along, power)
+
+
+def _improbable(
+    intervals: Intervals,
+    white: Whitening,
+    by_rate: Lanes,
+    residual: Float[np.ndarray, "L 1"],
+    columns: Columns,
+) -> float:
+    """Return minus twice the logarithm of the restricted likelihood of independent errors, with the
+    variance at which it is largest."""
+    both = np.concatenate([residual, columns], axis=1)
+    rest, _, power = without_rates(intervals, by_rate, both)
+    y = rest[:, 0]
+    x = rest[:, 1:]
+    curvatures, axes = np.linalg.eigh(x.T @ x)
+    determined = curvatures > 1e-9 * curvatures[-1]
+    curvatures = curvatures[determined]
+    explained = (axes.T @ (x.T @ y))[determined] / np.sqrt(curvatures)
+    used = int(np.count_nonzero(white.weight))
+    dof = used - len(power) - len(curvatures)
+    left = float(y @ y - explained @ explained)
+    of_fit = float(np.log(curvatures).sum() + np.log(power).sum())
+    return dof * np.log(left / dof) + white.log_determinant + of_fit

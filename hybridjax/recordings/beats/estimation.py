@@ -19,7 +19,13 @@ from jaxtyping import Bool, Float, Int
 from scipy import optimize
 
 from ...identify.denominator import Covariance, sandwich
-from .errors import Wander, Whitening, estimate_wander, whitening
+from .errors import (
+    Wander,
+    Whitening,
+    estimate_wander,
+    whitening,
+    without_rates,
+)
 from .model import Forecast, Intervals, Table, forecast, tabulated
 
 
@@ -270,12 +276,7 @@ def projected(intervals: Intervals, fit: CurveFit, white: Whitening) -> Projecte
     intervals), without what the rates of the trials explain."""
     columns = np.column_stack([fit.residual, fit.forecast.slopes])
     columns = white(columns)
-    by_rate = columns[:, -1]
-    others = columns[:, :-1]
-    square = np.maximum(intervals.sums(by_rate**2), _TINY)
-    products = np.stack([intervals.sums(by_rate * x) for x in others.T], axis=1)
-    along = products / square[:, None]
-    rest = others - by_rate[:, None] * along[intervals.trial]
+    rest, along, _ = without_rates(intervals, columns[:, -1], columns[:, :-1])
     return Projected(rest[:, 0], rest[:, 1:], along)
 
 
@@ -490,11 +491,8 @@ def carried_over(intervals: Intervals, fit: CurveFit) -> Carried:
     before = np.zeros(len(response))
     before[1:] = np.where(follows(intervals, fit), response[:-1], 0.0)
     errors = projected(intervals, fit, white)
-    column = white(before[:, None])[:, 0]
     by_rate = white(fit.forecast.slopes[:, -1:])[:, 0]
-    square = np.maximum(intervals.sums(by_rate**2), _TINY)
-    along = intervals.sums(by_rate * column) / square
-    column = column - by_rate * along[intervals.trial]
+    column = without_rates(intervals, by_rate, white(before[:, None])).rest[:, 0]
     across = errors.across
     curvature = across.T @ across + np.diag(fit.penalty)
     taken = np.linalg.lstsq(curvature, across.T @ column)[0]
