@@ -62,12 +62,12 @@ KINDS: dict[str, type] = {kind.__name__: kind for kind in typing.get_args(Saved)
 def save(path: FilePath, thing: Written) -> None:
     """Write an object to an npz file; `load` gives back an equal one, bit by bit.
 
-    Files contain no code, hence no systems. A `ModelFit` is therefore written as its `estimate`,
-    which has its numbers.
+    Files contain no code, and therefore no systems. A `ModelFit` is therefore written as its
+    `estimate`: the numbers of the fit, without the system.
 
     The file appears complete or not at all: an old file of that name stays until then. With the
-    suffix `.mat` it is a MATLAB file of the same arrays, with `_` for `.` in their names, and of
-    the JSON text `header`; `load` does not read it.
+    suffix `.mat` it is a MATLAB file, which holds the same arrays, and a text `header` in JSON.
+    Names have `_` in place of `.` there. `load` does not read MATLAB files.
 
     **Arguments:**
 

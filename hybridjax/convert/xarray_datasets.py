@@ -103,8 +103,8 @@ def from_xarray(dataset: Any) -> Saved:
     """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit.
 
     **Arguments:** `dataset`: an `xarray.Dataset` that `to_xarray` has made of an object that
-    `hj.save` can write, or a selection of its harmonics, frequencies, experiments, signals, or of
-    samples that follow each other from section 0 on.
+    `hj.save` can write, or a part of it. A part may select harmonics, frequencies, experiments and
+    signals. Of the samples it must hold consecutive ones, of which the first is at section 0.
 
     **Returns:** an object of the type that `to_xarray` was given.
 

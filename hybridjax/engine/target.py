@@ -14,7 +14,8 @@ from .arrays import Array
 
 
 class AbstractLevels(Definition):
-    """Level functions of state-based sections, by section index."""
+    """The level functions of state-based sections: section i lies where its level falls through
+    zero."""
 
     @abc.abstractmethod
     def present(self, s: Structure, a: int) -> bool:

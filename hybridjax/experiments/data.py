@@ -31,7 +31,7 @@ _OPPOSITE = 1e-9
 
 @checked
 class Simulated(eqx.Module):
-    """Results of S experiments that only a simulation has.
+    """Results of S simulated experiments that measured experiments do not have.
 
     **Fields:**
 
@@ -39,7 +39,8 @@ class Simulated(eqx.Module):
     - `error`: (S,) estimates of the largest error of the states at any section, relative to their
       sizes (`LimitCycle.scale`), or None.
     - `label`: name of the section family.
-    - `late`: (S, n) times by which steps of a plant ended after its sections, or None.
+    - `late`: (S, n) delays of a plant: the time from a section to the end of the step that found
+      it, or None.
     - `causes`: for each experiment on a plant, the cause of its end; "" if it ran to its end.
     - `findings`: reasons to doubt what is estimated from experiments on a plant.
     """

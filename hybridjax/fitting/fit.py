@@ -72,10 +72,10 @@ def fit_model(
 ) -> ModelFit:
     r"""Fit parameters of a system to data by nonlinear least squares.
 
-    Each type of data converts a limit cycle to weighted residuals; the Levenberg-Marquardt
-    iteration changes the parameters, with the exact Jacobian
-    through the cycle, its events and its sections. Parameters do not move along combinations that
-    the data do not identify, and the result lists these.
+    Weighted residuals are computed from a limit cycle, in the way of each type of data. The
+    Levenberg-Marquardt iteration changes the parameters, with the exact Jacobian through the cycle,
+    its events and its sections. Parameters do not move along combinations that the data do not
+    identify, and the result lists these.
 
     **Arguments:**
 
@@ -83,15 +83,16 @@ def fit_model(
     - `data`: an `ObservedHTF`, `ObservedSeries` or `ObservedCycle`, or several of them; or a
         subclass of `AbstractObservation` for data of another type. One or several
         `ObservedTrajectory` need no limit cycle.
-    - `free`: names of parameters, which keep their signs, or `{name: (low, high)}` with bounds
-        (infinite where there are none; `None` in place of both keeps the sign). Names may have
-        dots. "input_delay" and "output_delay" are those of all `ObservedHTF` with a delay.
+    - `free`: names of the parameters to fit, which keep their signs; or `{name: (low, high)}` with
+        bounds. A bound may be infinite, and `{name: None}` keeps the sign. The name of a parameter
+        of a part has dots, as in "system.k". The names "input_delay" and "output_delay" stand for
+        the delays of all `ObservedHTF` that have a `delay`.
     - `guess`: guess of the limit cycle of `system`, or the cycle of a similar system; see
         `find_limit_cycle`.
     - `guesses`: largest number of guesses of the parameters: those of `system`, then random ones
-        with factors between exp(-0.2) and exp(0.2). The search stops at the first guess whose cost
-        is as expected from the standard deviations of the data (without these: 1e-12 of the squared
-        data). Default: 1. `seed`: seed of the random guesses. Default: 0.
+        with factors between exp(-0.2) and exp(0.2). The search stops at the first guess with a cost
+        that is not too large for the standard deviations of the data (without these, below 1e-12 of
+        the squared data). Default: 1. `seed`: seed of the random guesses. Default: 0.
 
     **Returns:** a `ModelFit`, the best of all guesses. Its `result` is a code of `Result`: no error
     is raised where a fit does not converge.

@@ -158,8 +158,8 @@ class ObservedHTF(AbstractObservation):
 class ObservedSeries(AbstractObservation):
     """Outputs at the sections in experiments that begin on the limit cycle.
 
-    If the data have the outputs on the cycle (`ExperimentData.cycle_outputs`), residuals are
-    differences of the outputs, otherwise of their deviations from the cycle. Residuals are in units
+    If the data hold the outputs on the cycle (`ExperimentData.cycle_outputs`), the outputs of data
+    and model are compared, otherwise only their deviations from the cycle. Residuals are in units
     of `std`, or relative to the rms of each output's deviations. Experiments that failed are left
     out.
 
@@ -239,11 +239,13 @@ class ObservedCycle(AbstractObservation):
     """Measurements of the limit cycle itself: outputs at sections, times, the period.
 
     Times of events are times of their sections: `ObservedCycle([hj.AtEvent("liftoff"),
-    hj.AtEvent("touchdown")], times=(0.5163, 1.3510))`. Times of a clocked system are its clock's,
-    modulo the period; those of an autonomous one count from any moment.
+    hj.AtEvent("touchdown")], times=(0.5163, 1.3510))`. In a system with a clock, times are those of
+    the clock, modulo the period. In an autonomous system, they may count from any moment, since
+    only their differences matter.
 
-    Residuals are in units of the standard deviations where these are given, otherwise relative to
-    the rms of each output, to the measured period, and for times to the period of the guess.
+    Residuals are in units of the standard deviations, if these are given. Otherwise they are
+    relative: those of values to the rms of the output, that of the period to the measured period,
+    those of times to the period of the guess.
 
     **Example:**
 

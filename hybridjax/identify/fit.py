@@ -23,13 +23,13 @@ class Fit(WithMultipliers, eqx.Module):
     **Fields** of all fits:
 
     - `multipliers` (d,): the Floquet multipliers, by decreasing modulus.
-    - `covariance` (p, p): that of the fitted numbers: coefficients of the multipliers' polynomial,
-      or parameters. `covariance_dof`: degrees of freedom with which it was estimated; infinite
-      where it is exact.
+    - `covariance` (p, p): covariance of the p fitted numbers, which are parameters, or the
+      coefficients of the polynomial whose roots are the multipliers. `covariance_dof`: degrees of
+      freedom with which it was estimated; infinite where it is exact.
     - `model`: the fitted system, which simulates: an `LDTP` or a `HybridSystem`; None where only
       multipliers and responses were fitted.
-    - `noise`: standard deviation of the noise of each output; None where the data themselves tell
-      their errors, or nothing does.
+    - `noise`: standard deviation of the noise of each output; None if the data come with variances,
+      or if nothing determines it.
     - `dof`: degrees of freedom of the residuals: numbers in the data less unknowns.
     - `result`: code of `Result`, OK or NOT_CONVERGED.
     - `findings`: the reasons to doubt the fit, as `Finding`s; empty if there are none.

@@ -36,19 +36,19 @@ def estimate_htf(
 ) -> HTF:
     """Estimate all harmonic transfer functions at all frequencies that the inputs excite.
 
-    `H_l(w_k) = Y[k + l P] / U[k]`, both DFTs over the same window of the last P whole periods. The
-    excited lines k are found from U itself, so that any experiments that obey the rules of a
-    `Design` can be used. Where a frequency was measured more than once the estimate is the
-    least-squares one. A line on a multiple of 1/2 (other than 0 and N/2) aliases with its own
-    conjugate, `Y[k + l P] = H_l(w) U[k] + H_{l + 2f}(-w) conj(U[k])`; two or more experiments with
-    different phases determine both unknowns. If m inputs excite the same line, at least m
-    experiments are needed to separate their responses. Failed experiments are left out. Frequencies
-    are left out if an input did not excite them, and multiples of 1/2 if all experiments have the
-    same phase there.
+    `H_l(w_k) = Y[k + l P] / U[k]`, both DFTs over the same window of the last P whole periods. A
+    line is an excited frequency f = k / P, in cycles per period. The lines are found from U itself,
+    so that any experiments that obey the rules of a `Design` can be used. Where a line was measured
+    more than once, the estimate is the least-squares one. If m inputs excite the same line, at
+    least m experiments are needed to separate their responses. Failed experiments are left out, and
+    so are lines that one of the inputs does not excite. At multiples of 1/2 (other than 0 and N/2)
+    a line and its complex conjugate have responses at the same frequencies: `Y[k + l P] = H_l(w)
+    U[k] + H_{l + 2f}(-w) conj(U[k])`. Two or more experiments with different phases determine both
+    unknowns; if all have the same phase, these lines are left out.
 
-    The estimate is that of the best linear approximation for signals of the class that was applied
-    (Pintelon and Schoukens 2012, ch. 3), with its `variance`. From several realizations of random
-    phases, `variance` contains noise and nonlinear distortion; from several windows (`repeats`),
+    For a nonlinear system, this estimates the best linear approximation, for inputs of the kind
+    that was applied (Pintelon and Schoukens 2012, ch. 3). With several realizations of random
+    phases, `variance` contains noise and nonlinear distortion. With several windows (`repeats`),
     `noise_variance` contains noise alone. Without realizations, `variance` itself is that of noise
     alone.
 
@@ -63,17 +63,17 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
-    - `references`: names of the inputs that enter a control loop from outside. The controller makes
-      the other inputs; the HTFs are those of the plant from these to the outputs, and noise that
-      the controller feeds back does not bias them (`identify/instrument.py`). References that
-      excite f must also excite f + m for all integers m, up to N/2. Default: None; there is no
-      controller.
+    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
+      those that the controller sets, and the HTFs are those of the plant, from these inputs to the
+      outputs. Noise that the controller feeds back does not bias them (`identify/instrument.py`).
+      References that excite f must also excite f + m for all integers m, up to N/2. Default: None;
+      there is no controller.
 
     **Returns:** `hj.linear.HTF`: `H` (M, F, ny, nu), complex, in units of the output per unit of
     the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.
     At a frequency that was measured in one realization only, `variance` is computed from the mean
-    residual of the other frequencies. If most frequencies were measured once, `variance` is that of
-    noise or None, and fits use `power` as weights.
+    residual of the other frequencies. If this is so at most frequencies, `variance` is that of
+    noise (None without `repeats`, and fits then use `power` as weights).
 
     **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
     one experiment disturb each other (the message lists the pair); for too few periods or

@@ -72,24 +72,26 @@ class Validation(Showable, eqx.Module):
     - `fit` (ny,): normalized root mean square error as a fit in percent,
       $100\,(1 - \|y - \hat y\| / \|y - \bar y\|)$: 100 is perfect, 0 as good as the mean.
     - `noise` (ny,): rms of the residuals.
-    - `no_better` (ny,): p-value of the hypothesis that squared residuals are on average no smaller,
-      from cycle to cycle, than deviations from the mean cycle of all other cycles. Where it is
-      large, the model explains nothing.
+    - `no_better` (ny,): p-value of the hypothesis that the model predicts a cycle no better than
+      the mean of all other cycles does: that squared residuals are on average no smaller than
+      squared deviations from this mean. Where it is large, the model explains nothing.
     - `whiteness` (ny,): p-value of the hypothesis that the residuals are white: they are not where
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
       input, or on the references of a loop: the model is wrong where it is small.
     - `alpha`: significance level of both tests, for all outputs together.
-    - `visible` (ny,): the smallest misfit that the test of independence would detect in four of
-      five such data: rms of the response to lagged inputs that the model lacks, relative to
-      the rms of the simulated output. Smaller errors of a model pass.
+    - `visible` (ny,): the smallest model error that the test of independence would detect in four
+      of five such records. The error is the response to lagged inputs that the model lacks: its
+      rms, relative to the rms of the simulated output. Smaller errors pass the test.
     - `autocorrelation` (N, lags, ny): of the residual at each section with those 1, 2, ... samples
       earlier. `cross_correlation` (N, lags, ny, nu): of the residual with these inputs 0, 1, ...
       samples earlier. Both in units of their standard deviation where there is no correlation.
     - `measured`, `simulated` (n, ny): the longest record, whose first sample lies on
       `first_section`.
-    - `left_out`: number of records that are too short to test more than their initial condition.
-    - `findings`: "harmonics" if the model lacks harmonics, whose responses count as residuals.
+    - `left_out`: number of records that are too short for a test: their unknown initial condition
+      explains nearly all of their samples.
+    - `findings`: "harmonics" if the model lacks some harmonics: the responses at these count as
+      residuals.
     - `n_sections`, `inputs`, `outputs`.
     """
 

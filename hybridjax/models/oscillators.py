@@ -30,8 +30,9 @@ def _block(
 class Duffing(HybridSystem):
     """x'' + delta x' + alpha x + beta x^3 = gamma cos(omega t) + u, smooth and clocked.
 
-    With a hardening spring (beta > 0) the resonance leans over to higher frequencies: between two
-    folds there are three responses to one `rate`, the middle one unstable.
+    With a hardening spring (beta > 0) the resonance leans over to higher frequencies: at each
+    driving frequency `rate` (omega) between two folds there are three responses, the middle one
+    unstable.
 
     G. Duffing, Erzwungene Schwingungen bei veränderlicher Eigenfrequenz, Vieweg 1918; A. H. Nayfeh,
     D. T. Mook, Nonlinear oscillations, Wiley 1979, Sec. 4.1.

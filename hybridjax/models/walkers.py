@@ -45,7 +45,8 @@ def _two_legs(
 
 
 class RimlessWheel(HybridSystem):
-    """An inverted pendulum about the spoke that stands, from one spoke to the next.
+    """Spokes without a rim, rolling downhill: an inverted pendulum about the spoke on the ground,
+    until the next spoke lands.
 
     States: angle `th` of that spoke from the vertical, positive downhill, and its rate `w`. Input
     `u` is a hip torque over the moment of inertia. The return map is linear in w^2, so that the

@@ -90,7 +90,8 @@ class Branch(Showable, eqx.Module):
 
     - `parameter`: its name. `values` (K,): its values.
     - `cycles`: the K cycles; `branch[k]` is one of them, with its system.
-    - `points`: points at which multipliers cross the unit circle, each a row of the branch.
+    - `points`: points at which multipliers cross the unit circle; each is also one of the K cycles
+      (its `index`).
     - `ends`: the two ends of the branch, with their reasons.
     """
 

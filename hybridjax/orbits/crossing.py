@@ -106,7 +106,7 @@ class Crossing(Definition):
 
 @checked
 class AtEvent(eqx.Module):
-    """A hybrid boundary as a section: the state right after the event `name` and its reset.
+    """A section at an event: the state right after the event `name` and its reset.
 
     In a recording (`hj.recordings.estimate_phase`) the event is the beginning of each cycle.
 

@@ -203,8 +203,8 @@ def flow(
     The result has exact derivatives of first and second order, in forward and reverse mode, with
     respect to the state and the time at the start, parameters, a constant input, the time of the
     end and the value of a `Crossing`. It works inside of `jax.jit`, `jax.vmap` and `jax.grad`. At
-    an event the derivative is that by the saltation matrix, which holds while neighbors meet the
-    same events in the same order.
+    an event the derivative follows from the saltation matrix: it is that of neighboring
+    trajectories that meet the same events in the same order.
 
     **Arguments:**
 
@@ -213,8 +213,9 @@ def flow(
       that ended there. A `Guess` with states (L, n) starts L flows.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
-    - `within`: the longest duration. It is needed for ends that are no times. Times are rounded to
-      1e-12 of it: one that is 1e5 times too long makes events fail.
+    - `within`: the longest duration, required for all ends other than a time. Do not make it much
+      longer than the flow: times are rounded to 1e-12 of it, and events fail if it is 1e5 times too
+      long.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0; after a
       `Flow`, its input.
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.

@@ -50,10 +50,11 @@ def linearize(
     end of the interval depends on the state. C[n] (ny, d) and D[n] (ny, nu) give the deviations of
     the outputs at section n.
 
-    The coordinates on a section are deviations of the chart's states; on a state-based section of a
-    clocked system the time of crossing comes first. On a section given by a level function, the
-    state that the flow changes fastest across the section is left out: of a chart with one state,
-    nothing remains, and the dimension there is 0. `ldtp.coordinates` lists them.
+    The coordinates on a section are deviations of the chart's states. On a section given by a level
+    function, one state is left out: the one that the flow changes fastest across the section. (Of a
+    chart with one state, none remains, and the dimension there is 0.) On a state-based section of a
+    system with a clock, the deviation of the time of crossing is the first coordinate.
+    `ldtp.coordinates` lists the coordinates.
 
     **Arguments:**
 
@@ -63,15 +64,16 @@ def linearize(
     - `inputs`: names. Default: all.
     - `delay`: pair of delays, of the inputs and of the outputs, in the unit of time, for
       `ClockPhase` sections. The input of section n begins to act one delay later; the outputs at
-      section n are those of one delay earlier. Coordinates are the states at that earlier time,
-      then past inputs whose effect has not ended. Default: none.
+      section n are those of one delay earlier. The coordinates are the states at that earlier time,
+      followed by past inputs that still act. Default: none.
 
     **Returns:** an `LDTP` with N sections: `A` (N, d, d), `B` (N, d, nu), `C` (N, ny, d),
     `D` (N, ny, nu), `dims` (N,) and the `multipliers` (d,).
 
-    **Raises:** `DefinitionError` for an output that is not defined in a chart where a section
-    lies, or uses the time without having the period of a clock, or an input that does not exist,
-    or for `delay` with other sections; `ComputationError` as `place_sections`.
+    **Raises:** `DefinitionError` for an output that is not defined in a chart where a section lies,
+    or that depends on the time without the period of a clock; for an input that does not exist; for
+    a `delay` with other sections than `ClockPhase`. `ComputationError` if the sections cannot be
+    placed on the cycle (see `place_sections`).
 
     **Example:**
 

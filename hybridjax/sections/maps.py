@@ -32,8 +32,8 @@ _PATIENCE = 100
 
 
 class Arrival(NamedTuple):
-    """The arrival of a section map. If it does not arrive, times, states and their derivatives are
-    NaN."""
+    """The time and the state at which a trajectory arrives on the second section of a section map.
+    If it does not arrive, these and their derivatives are NaN."""
 
     t: Float[Array, ""]
     """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""

@@ -33,10 +33,10 @@ class Symmetric(Derived):
     step = hj.find_limit_cycle(walker, section=hj.AtEvent("heelstrike"))
     ```
 
-    A transition into a chart that was left out leads into its mirror image, with the state
-    mirrored, so that a step is a cycle; two steps are a stride. With S the symmetry and P the map
-    of a step of `system`, the multipliers of a step are those of S P, and those of the stride,
-    (S P)^2, are their squares.
+    Of two charts that are mirror images of each other, one is left out. A transition into it leads
+    into the other chart, and mirrors the state. A step is therefore a cycle, and two steps are a
+    stride. With S the symmetry and P the map of a step of `system`, the multipliers of a step are
+    those of S P, and those of the stride, (S P)^2, are their squares.
 
     **Arguments:**
 
@@ -48,21 +48,23 @@ class Symmetric(Derived):
     - `translation`: states that have no effect on others, nor on outputs, such as the position
         along the floor. They are left out.
     - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. For a
-        system that is driven by a clock: True. Otherwise: the name of a state, or a function of
-        (t, q), that changes its sign under S and rises through zero once per half period. At this
-        zero, or after half a period of the clock, the transition "half period" (with several
-        charts, "half period (chart)") replaces the state by its mirror image. The multipliers of
-        the full cycle are the squares of those of this half map. All charts are kept; if one is its
-        own mirror image, its last transition is the image of its first. A clock becomes the state
-        `clock`, the time since the transition, so that the system is autonomous. Default: False.
+        system that is driven by a clock: True. Otherwise: the name of a state, or a function of (t,
+        q), that changes its sign under S and rises through zero once per half period. At this zero,
+        or after half a period of the clock, the transition "half period" (with several charts,
+        "half period (chart)") replaces the state by its mirror image. The multipliers of the full
+        cycle are the squares of those of this half map. All charts are kept. In a chart that is its
+        own mirror image, list the transitions such that the last is the image of the first, the
+        last but one that of the second, and so on. A clock becomes the state `clock`, the time
+        since the transition, so that the system is autonomous. Default: False.
 
-    Inputs are those of the charts that are kept; with `half_period`, they act on the mirror image
-    in every second half of a cycle.
+    Inputs act on the state in the charts that are kept, which is the mirrored one in every second
+    step. With `half_period`, they act on the mirrored state in every second half of a cycle.
 
     **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle or a
-    trajectory is computed, if a function does not have the symmetry; it names the function.
-    Derivatives by a parameter that breaks the symmetry (the stiffness of one leg) are refused, and
-    inside of `jit` a system that is made there with such a parameter.
+    trajectory is computed, if a function does not have the symmetry; it names the function. A
+    derivative with respect to a parameter that breaks the symmetry (the stiffness of one leg)
+    raises an error, and so does, inside of `jit`, a system that is made there with such a
+    parameter.
     """
 
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)

@@ -297,9 +297,9 @@ class HybridSystem(Definition):
     `guess` are optional. The class attribute `inputs` names the exogenous inputs û. A system
     without inputs has `inputs = ()`. `input_units` gives their units in the same order (none, or
     one for each), and `time_unit` the unit of time. States, inputs and outputs have different
-    names. If a class does not define `inputs`, there is one input `u`, or `input` if a state or an
-    output is called `u`. `solver`, a keyword of every constructor, is the method of integration of
-    all charts, or of some by name (`{"stance": hj.systems.Radau()}`); it overrides `Chart.solver`.
+    names. The default of `inputs` is one input `u` (or `input`, if a state or an output is called
+    `u`). `solver`, a keyword of every constructor, is the method of integration of all charts, or
+    of some by name (`{"stance": hj.systems.Radau()}`); it overrides `Chart.solver`.
     """
 
     inputs: ClassVar[tuple[str, ...]] = _DefaultInputs()  # type: ignore[assignment]

@@ -44,13 +44,14 @@ OFF_LINE = 1e-6
 class Design(Showable, eqx.Module):
     """Sums of cosines for a number of experiments on a system with N sections (eq. 15).
 
-    Experiment s applies, at section n counted from its start, `u[n] = sum_k a_k cos(2 pi j_k n / (N
-    P) + phi_k)` over its own cosines k, so that `f_k = j_k / P` is in cycles per period of the
-    limit cycle and all signals repeat after P periods. The amplitude is `a` (the paper divides it
-    by pi). The constructor enforces the rules of Sec. V (see `check`). The functions `multisine`
-    and `paper_design` make the usual designs, `Design.from_lines` any other.
+    At section n, counted from its start, an experiment applies `u[n] = sum_k a_k cos(2 pi j_k n /
+    (N P) + phi_k)`, a sum over its own cosines k. Their frequencies are `f_k = j_k / P`, in cycles
+    per period of the limit cycle, and all signals repeat after P periods. The amplitude is `a` (the
+    paper divides it by pi). The constructor enforces the rules of Sec. V (see `check`). The
+    functions `multisine` and `paper_design` make the usual designs, `Design.from_lines` any other.
 
-    **Fields:** one entry per cosine in the flat arrays, all on the host.
+    **Fields:** the first five are flat NumPy arrays, with one entry for each cosine of each
+    experiment.
 
     - `experiment`: the experiment it belongs to, 0..experiments-1, ascending.
     - `line`: j, so that f = j / periods.

@@ -74,27 +74,27 @@ class LDTPFit(WithCost, MultiplierFit):
       do not depend on them, and have standard errors.
     - `multipliers` (d,): by decreasing modulus, d the smallest dimension of any x[n].
       `coefficients` (d,): of their polynomial.
-    - `covariance` (d, d): covariance of the coefficients. `covariance_dof` is infinite if variances
-      were given. `standard_errors`, `contains` and `ellipse` follow from it. Infinite if the data
-      do not determine all coefficients.
-    - `unknowns`: number of unknowns, without the choice of coordinates.
+    - `covariance` (d, d): covariance of the coefficients, infinite if the data do not determine all
+      of them. `covariance_dof` is infinite if variances were given. `standard_errors`, `contains`
+      and `ellipse` follow from it.
+    - `unknowns`: number of unknowns, less those that only determine the coordinates of the states.
     - `cost`: sum of squares of the residuals in units of the errors' standard deviations, whose
       expectation is `dof`. A larger cost means too few dimensions, or a local minimum. Without
-      variances, as always for time series, the unit follows from the residuals, and the two are
-      equal: see `correlation`, and use `hj.validate`.
+      variances, as always for time series, the standard deviations are estimated from the
+      residuals, so that `cost` always equals `dof`: see `correlation`, and use `hj.validate`.
     - `correlation`: of the residuals of HTFs at neighboring frequencies; about 0 for enough
       dimensions. None for time series.
     - `harmonics` (M,): harmonics that were fitted; for time series, all N.
     - `noise_model`: an `LDTP` whose response to independent white inputs of variance one is the
       noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
       ahead.
-    - `findings`: "feedback" for inputs of time series that a controller makes, or may make (not
-      with a `references`); "drift" if drift of the outputs of time series (in the first 1000
-      cycles) gives multipliers outside of each other's confidence regions; "left over" if residuals
-      depend on the inputs, "process noise" or "colored noise" if they are correlated in time, or
-      "misfit" if they are larger than their variances, or alike at
-      neighboring frequencies: the dimensions are too few, or the iteration found a local minimum;
-      "order" if one dimension less explains the data; "undetermined"; "no convergence".
+    - `findings`: "feedback" if a controller sets the inputs of time series, or may do so (only
+      without `references`); "drift" if a fit to the first 1000 cycles of time series, in which
+      outputs may drift, has other multipliers (outside of each other's confidence regions); "left
+      over" if residuals depend on the inputs; "process noise" or "colored noise" if residuals are
+      correlated in time; "misfit" if residuals of HTFs are larger than their variances, or similar
+      at neighboring frequencies, because the dimensions are too few or the iteration found a local
+      minimum; "order" if one dimension less explains the data; "undetermined"; "no convergence".
     """
 
     model: LDTP

@@ -256,27 +256,29 @@ def fit_series(
     r"""Estimate multipliers and HTFs from time series with any input, with their uncertainty.
 
     The fit minimizes the output error: the sum of squares of measured minus simulated outputs, each
-    in units of its noise, which is taken as white with an unknown variance. The unknowns are the
-    numerators, the initial conditions and c, the coefficients of the polynomial whose roots are the
-    multipliers. All but c are eliminated (variable projection, Golub and Pereyra 1973). The
-    iteration starts from the periodic ARX problem, solved by total least squares. (Output error and
-    ARX: Ljung, *System Identification: Theory for the User*.)
+    in units of its noise, which is taken as white with an unknown variance. The responses have a
+    common denominator, with the coefficients c, whose roots are the multipliers, and a numerator
+    for each section, output and input. The unknowns are c, the numerators and the initial
+    conditions. All but c are eliminated (variable projection, Golub and Pereyra 1973). The
+    iteration starts from the solution of a linear problem (periodic ARX, by total least squares).
+    (Output error and ARX: Ljung, *System Identification: Theory for the User*.)
 
     **Arguments:**
 
     - `data`: `SectionSeries`, `ExperimentData` (all cycles of successful experiments), or
-      `SectionData`. If outputs drift or have offsets: `[dataclasses.replace(r, drift=20) for r in
-      data.records]`.
+      `SectionData`. If outputs drift or have offsets, pass `[dataclasses.replace(r, drift=20) for r
+      in data.records]`.
     - `order`: d, the number of non-zero multipliers, or an `LDTP` model that has this number.
-    - `extra_lags`: number of lags of the numerators beyond d N, with N sections. Default: N.
+    - `extra_lags`: number of lags of each numerator beyond d N, with N sections. Default: N.
     - `start`: initial condition of the records. "free": unknown. "cycle": on the limit cycle, with
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `findings` as warnings (`FindingWarning`). Default: True.
-    - `references`: names of the inputs that enter a control loop from outside. The controller makes
-      the other inputs; the plant from these to the outputs is fitted, stable or unstable, by
-      instrumental variables, which are consistent for any noise and controller. `start` has no
-      effect: the first cycles of each record are not used. Default: None.
+    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
+      those that the controller sets. The fit is that of the plant, stable or unstable, from these
+      inputs to the outputs, by instrumental variables, which are consistent for any noise and
+      controller. `start` has no effect: the first cycles of each record are not used. Default:
+      None.
 
     **Returns:** `hj.identify.SeriesFit`: `multipliers` (d,), complex, without unit, by decreasing
     modulus; `standard_errors` (d,); `noise` (ny,), standard deviations in units of the outputs;

@@ -248,17 +248,18 @@ def phase_response(
 
     The phase model is integrated from each event until its phase is 1, and the resulting durations
     are fitted to the measured ones by least squares. The unknowns are the curve and the rate of
-    each trial. The smoothness of the curve maximizes its posterior density given the data; the
-    errors of the curve contain its uncertainty. The curve may be discontinuous at an event. The end
-    of an interval depends on the input, so that a regression of measured intervals on the input at
-    a linear phase is biased; this estimate is not. The averaging of the curve by the jitter of the
-    rhythm is undone: see `docs/mathematics.md`.
+    each trial. The smoothness of the curve is the one with the largest posterior density given the
+    data, and the errors of the curve contain the uncertainty of this choice. The curve may be
+    discontinuous at an event. Since the end of an interval depends on the input, a regression of
+    the measured intervals on the input, with a phase that grows linearly in time, would be biased;
+    this estimate is not. Jitter of the rhythm averages the curve over neighboring phases. This is
+    corrected: see `docs/mathematics.md`.
 
     The rate may wander within a trial: fast, or slowly as a random walk does. Such errors are
     correlated from interval to interval, and weighted accordingly (generalized least squares).
 
-    Standard errors come from blocks of intervals, whose errors may depend on each other: trials if
-    there are thirty or more, else parts of them.
+    Standard errors are computed from blocks of intervals; errors within a block may depend on each
+    other. The blocks are the trials if there are thirty or more, otherwise parts of trials.
 
     **Arguments:**
 

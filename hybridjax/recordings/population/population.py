@@ -45,12 +45,12 @@ class Population(Showable):
       required. `condition` (each subject may have several) and `group` (each subject has one) are
       factors; other columns with numbers can be covariates. Rows with the same subject, group and
       condition are trials, averaged by their precision.
-    - `values`, `errors`: by name of a quantity, an estimate and its standard error in each row; NaN
-      where it is missing.
-    - `units`: by name of a quantity. Default: none.
-    - `dof`: degrees of freedom of the errors, in each row. Where they are few, errors are
-      moderated by those of the other subjects (Smyth 2004), with the trend of the column `strides`
-      if there is one. Default: infinite.
+    - `values`, `errors`: mappings from the name of a quantity to its estimates, and to their
+      standard errors: one for each row, NaN where it is missing.
+    - `units`: mapping from the name of a quantity to its unit. Default: none.
+    - `dof`: degrees of freedom of the errors, one number for each row. Where they are few, errors
+      are drawn towards those of the other subjects (Smyth 2004); if there is a column `strides`,
+      towards their trend over the strides. Default: infinite.
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
     subject in two groups, errors that are not positive, and if pandas is not installed.
