@@ -61,11 +61,13 @@ class OptimalDesign(Showable, eqx.Module):
     - `names` (g,) of the quantities of interest; `variances` (g,) with `design`, `usual_variances`
       with `usual`.
     - `criterion` and `usual_criterion`: the minimized function, in units of a variance.
-    - `certificate`: e, the largest sum of sensitivities of any design within the limits, relative
-      to that of this one; with one limit the largest sensitivity of a line per unit of the limit.
-      No design needs fewer cycles than 1/e of this one's. It is 1 at the optimum, except with
-      peaks, which are treated as no larger than rms values. With limited distortion it compares
-      with designs whose convex bound of the distortion is no larger than the limit, or this one's.
+    - `certificate`: a number e: no design within the limits needs fewer cycles than 1/e of this
+      one's, so that e is 1 at the optimum. It is the largest sum of sensitivities of any design
+      within the limits, relative to that of this one (with one limit, the largest sensitivity of a
+      line per unit of the limit). If peaks are limited, e may be larger at the optimum: peaks of
+      other designs are taken to be no larger than rms values. If distortion is limited, e compares
+      only with designs whose convex bound of the distortion is no larger than the limit, or than
+      that of this design.
     - `frequencies` (K,) and `channels` (K,) of all cosines; `power` and `usual_power` (K,),
       the mean square of each over all experiments; `sensitivity` (K,), the decrease of the
       criterion by more power in a cosine, divided by its price: 1 where the optimum has power, less

@@ -285,10 +285,10 @@ def response_function(
     **Arguments:** `cycle`, `sections`, `outputs` and `accuracy`: as for `run_experiments`. The
     cycle may be unstable if experiments are short.
 
-    **Returns:** a `ResponseFunction`. Called with inputs (S, n, nu), and with `system=` another
-    system of the same class, it returns a `Response` with the outputs `y` (S, n, ny), and a code
-    `result` (S,) for each experiment. The outputs are whole values. Those of data are deviations:
-    `data.cycle_outputs` has the outputs on the cycle.
+    **Returns:** a `ResponseFunction`. Call it with inputs (S, n, nu), and, if parameters change,
+    with `system=` another system of the same class. It returns a `Response` with the outputs `y`
+    (S, n, ny), and a code `result` (S,) for each experiment. These outputs are whole values, unlike
+    those of `ExperimentData`, which are deviations from the cycle (`data.cycle_outputs`).
 
     **Raises:** `DefinitionError` for outputs or sections that do not exist, or an accuracy out of
     range.

@@ -263,10 +263,10 @@ class OrderSelection(Showable, eqx.Module):
     - `mdl`: Rissanen's criterion, which penalizes each real coefficient, those of the numerators
       too, by the logarithm of the number of data. The smallest is best.
     - `by_rank`, `by_mdl`: the order that each criterion selects.
-    - `order`: `by_rank` where variances were given: a longer denominator adds many coefficients
-      of numerators, which `mdl` penalizes, so that it selects too few multipliers where
-      noise is strong; and for exact HTFs, of which `mdl` counts rounding. Without variances
-      `by_mdl`, which small errors that are not random do not mislead.
+    - `order`: `by_rank` for HTFs with variances and for exact ones, otherwise `by_mdl`. With strong
+      noise, `mdl` selects too few multipliers, because a longer denominator adds many coefficients
+      of numerators, which it penalizes; in exact HTFs it counts rounding as data. Where there are
+      no variances, small errors that are not random do not mislead it.
     """
 
     orders: Int[np.ndarray, " k"]

@@ -213,9 +213,9 @@ def validate(
     - `start`: "free" estimates the initial state of each record from the record; "cycle" takes it
       as zero. Declared drift of the records is estimated in either case. Default: "free".
     - `alpha`: significance level of the tests. Default: 0.01.
-    - `references`: names of the inputs that enter a control loop from outside. The controller makes
-      the other inputs, which respond to noise; `model` is that of the plant from these to the
-      outputs. Residuals are tested for independence of the references. Default: None.
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs, which therefore respond to noise; `model` is that of the plant, from these
+      inputs to the outputs. Residuals are tested for independence of the references. Default: None.
 
     **Returns:** `hj.identify.Validation`: for each output (ny,) the `fit` in percent, the `noise`
     in units of the output, and p-values, `whiteness` and `independence`. Printing it gives a

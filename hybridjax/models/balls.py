@@ -141,8 +141,8 @@ class BouncingChain(HybridSystem):
     States: heights `y1` to `yn` and speeds `v1` to `vn`. Input `u` is a force on the first mass.
     Impacts keep the share `restitution` of the speed relative to the table.
 
-    Each mass alone is the ball of `juggler.py` (P. J. Holmes, J. Sound and Vibration 84, 1982). Of
-    any size: 2n states, n events.
+    Each mass alone is the ball of `PaddleJuggler` (P. J. Holmes, J. Sound and Vibration 84, 1982).
+    The system has 2n states and n events, for any n.
     """
 
     input_units = ("N",)

@@ -119,9 +119,9 @@ def find_limit_cycle(
 
     - `system`: a `HybridSystem`: one of `hj.models`, or your own.
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
-        With a cycle, leave out `settle` and `max_period`; a clocked system begins at the same phase
-        of its own clock, or, if an event has passed this phase, far from events. Default: the
-        model's own guess.
+        With a cycle, leave out `settle` and `max_period`; the search begins at the same phase of
+        the clock as that cycle, or, if an event has passed this phase, far from events. Default:
+        the model's own guess.
     - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
         "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
         the section, else where the flow from the guess first crosses it. Default: the section right

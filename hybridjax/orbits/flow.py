@@ -64,11 +64,12 @@ _ROWS = 128
 
 @checked_methods
 class Flow(Showable, eqx.Module):
-    """The end of a flow, and the events on the way; of many flows with an axis more in front.
+    """The end of a flow, and the events on the way. For many flows, all arrays have a leading axis.
 
-    States are padded with zeros to the largest chart's dimension d, unless the chart at the end is
-    known while JAX traces the flow: it is if all charts have as many states, and after an event.
-    What is not known is NaN: all of a flow that failed, and events that did not happen.
+    States are padded with zeros to the largest chart's dimension d, unless the number of states at
+    the end is known while JAX traces the flow: it is known if all charts have the same number, and
+    right after an event. All numbers of a flow that failed are NaN, and so are those of events that
+    did not happen.
 
     **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end. `result`:
     a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and

@@ -170,8 +170,8 @@ def find_limit_cycles(
 
     From 250 systems on, all of them first follow the itinerary of the guess: its charts and events
     in order, and its steps. Newton's method on this itinerary is one compiled program. A system
-    that leaves it takes that of a neighbor, for which a search has found another. Each cycle is
-    integrated again, by another method with other steps.
+    that leaves it then follows the itinerary of a neighbor, which a search has found there. Each
+    cycle is integrated again, by another method with other steps.
 
     Fewer systems, and those that no itinerary suits, are searched side by side: first a few, from
     the guess, then four times as many in each round, from cycles of neighbors. If Newton's method

@@ -164,8 +164,9 @@ class Responses(Showable, eqx.Module):
 
     - `period`; `multipliers` (r,) and `exponents` (r,), per unit of time, of the modes that have
         amplitudes, by decreasing modulus.
-    - `modes` (r, d): the modes at phase 0. They are scaled so that the responses of amplitudes to
-        states have the length 1 there, in units of the states, and a real largest part.
+    - `modes` (r, d): the modes at phase 0. They are scaled so that, at this phase, the response of
+        an amplitude to the states is a vector of length 1 (in units of the states) whose largest
+        entry is real.
     - `left_out`: number of modes without an amplitude: with multipliers below 1e-6, and those that
         events or sliding remove at once.
     """

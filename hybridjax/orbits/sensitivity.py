@@ -35,9 +35,10 @@ class Sensitivity(Showable, eqx.Module):
     **Fields:**
 
     - `parameter`: its name. `period`: derivative of the period.
-    - `events`: names of the events of one period, from phase 0 on. `times` (E,), derivatives of
-        their times, those of the clock, or since phase 0 if there is none; `durations` (E,), of the
-        time from each to the next, the last to the first.
+    - `events`: names of the events of one period, from phase 0 on. `times` (E,): derivatives of
+        their times, which are those of the clock, or count from phase 0 if there is none.
+        `durations` (E,): derivatives of the time from each event to the next, and from the last to
+        the first.
     """
 
     parameter: str = eqx.field(static=True)

@@ -190,8 +190,8 @@ def animate(
     - `x`, `y`: names of states or outputs. Default: the first two states that every chart has.
     - `sections`: from `hj.sections.place_sections`, on this cycle. Default: None.
     - `perturbed`: a motion beside the cycle: a trajectory, from `simulate` or
-        `hj.experiments.perturbed_trajectory`; or data of experiments at `sections`, of which the
-        inputs of the first are applied, to the cycle, for four periods. Default: None.
+        `hj.experiments.perturbed_trajectory`; or data of experiments at `sections`: the inputs of
+        the first experiment are then applied to the cycle, for four periods. Default: None.
     - `traces`: names of states or outputs that are drawn over time. Default: `x` if the system has
         a picture, else up to four states.
     - `speed`: multiple of real speed. Default: 1. A motion of less than 0.25 s or more than 20 s,

@@ -194,7 +194,7 @@ def identify_recording(
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
     - `references`: signals that enter a control loop from outside, at least as many as inputs. The
-      controller makes the inputs; the plant is fitted, see `fit_series`. Default: None.
+      controller then sets the inputs, and the plant is fitted: see `fit_series`. Default: None.
 
     **Returns:** `hj.recordings.Identification` with the results of all steps: `phase`, `data`,
     `fit` (a `SeriesFit` with `multipliers` (d,)), `held_out`, `responses` and `diagnosis`. Its

@@ -64,8 +64,9 @@ def sample_sections(
     that is not smooth.
 
     Splines bridge gaps up to the mean time between sections, but not less than three samples of a
-    signal. Outputs are NaN at sections in longer gaps, in their own samples or in those of the
-    angle that is the phase; inputs are NaN if their interval touches a gap in their own.
+    signal. In longer gaps, values are NaN: an output at a section in a gap of its own samples, or
+    of those of the angle that is the phase; an input if the interval from its section to the next
+    touches a gap of its own samples.
 
     **Arguments:**
 

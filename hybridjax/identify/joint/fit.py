@@ -266,15 +266,15 @@ def fit_ldtp(
     - `noise`: model of the noise of time series, see above; "output" for HTFs. Default: "output".
     - `start`: initial state of each record of time series: "free", or zero for "cycle". HTFs have
       none. Default: "free".
-    - `check`: whether to raise an error if outputs do not respond to the inputs (not with
-      "innovations"), and to test whether one dimension less explains the data as well, whether
-      residuals of time series depend on the inputs, and whether drift explains the multipliers;
-      `findings`, and warnings (`FindingWarning`), then say so. Default: True.
-    - `references`: names of the inputs that enter a control loop from outside. The controller makes
-      the other inputs. The plant from these to the outputs is fitted with innovations; it may be
-      unstable. The fit is consistent if D is zero at sections where the controller responds without
-      delay, which the response of the outputs to the reference shows. If the reference was not
-      recorded, pass noise="innovations". Default: None.
+    - `check`: whether to check data and fit. An error is raised if outputs do not respond to the
+      inputs (not with "innovations"). `findings`, and warnings (`FindingWarning`), report if one
+      dimension less explains the data as well, if residuals of time series depend on the inputs,
+      and if drift explains the multipliers. Default: True.
+    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
+      those that the controller sets. The fit is that of the plant, from these inputs to the
+      outputs, with innovations; the plant may be unstable. The fit is consistent if D is zero at
+      sections where the controller responds without delay, which the response of the outputs to the
+      reference shows. If the reference was not recorded, pass noise="innovations". Default: None.
 
     Without a reference, D is fixed to zero in three cases: outputs do not depend on inputs at the
     same section; inputs depend on earlier residuals; or the past determines the inputs (few

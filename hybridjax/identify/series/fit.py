@@ -115,11 +115,11 @@ class SeriesFit(MultiplierFit):
       by the records.
     - `references`: signals that enter the loop from outside. With them, `noise` is the standard
       deviation of $\chi y$.
-    - `findings`: "drift" if drift of the outputs (in the first 1000 cycles), and "order" if one
-      multiplier more, or two, give multipliers outside of each other's confidence regions;
-      "feedback" if inputs answer earlier residuals, as by a controller: the fit is then biased;
-      "changing system" if the multipliers of earlier and later cycles differ; "undetermined"; "no
-      convergence".
+    - `findings`: "drift" if a fit to the first 1000 cycles, in which outputs may drift, and "order"
+      if a fit with one or two multipliers more has other multipliers (outside of each other's
+      confidence regions); "feedback" if inputs depend on earlier residuals, as those of a
+      controller do: the fit is then biased; "changing system" if the multipliers of earlier and
+      later cycles differ; "undetermined"; "no convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]

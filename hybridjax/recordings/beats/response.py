@@ -84,8 +84,8 @@ class PhaseResponse(PhaseCurve):
     - `rates` (trials,): w, in cycles per second.
     - `jitter`: standard deviation of the phase at the end of a cycle, in cycles.
     - `left_out`: fraction of the variance of durations within trials (R2) that is forecast in
-      blocks of intervals to which the curve was not fitted, by fits to the others to first order.
-      `left_out_flat`: the same for a flat curve.
+      intervals to which the curve was not fitted. Each block of intervals is forecast by a fit, to
+      first order, to the other blocks. `left_out_flat`: the same for a flat curve.
     - `p_flat`: probability of so much shape if the curve is flat (likelihood ratio; Self and Liang
       1987).
     - `excess`: variance of sums of residuals over blocks relative to that of independent errors.
