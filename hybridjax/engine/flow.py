@@ -1,4 +1,9 @@
-"""Flow of many lanes to their targets with the events on the way, differentiable."""
+"""Flow of many lanes to their targets with the events on the way, differentiable.
+
+As in `move.py`, values are those of a search, and derivatives those of the replay of its tape
+(`_passed_jvp`). In addition, events (`_events`) and states at given times (`_samples`) are read
+from the tape, and get their derivatives in the same way.
+"""
 
 import functools as ft
 from typing import NamedTuple

@@ -1,4 +1,18 @@
-"""Flow of many lanes to targets, differentiable in forward and reverse mode, and its Jacobians."""
+"""Flow of many trajectories (lanes) to their targets, with derivatives: search and replay as one.
+
+`move` is the function that other code calls. Its values are those of a search (`search/`), which
+decides on steps and events. Its derivatives, in forward and reverse mode, are those of a `replay`
+of the tape that the search has recorded; `_move_jvp` is the rule that joins both. With arrays of
+NumPy, `move` calls the search on the host, without derivatives; with those of JAX, it is traced.
+
+- `through` flows a lane to one target after the other, such as the ends of the pieces of a turn.
+- `follow` gives the derivatives of `move` to a flow that was recorded before.
+- `flow_jacobian` and `tape_jacobian` compute whole Jacobians, all columns in one pass.
+
+Nothing is decided here: look for wrong values in the search, and for wrong derivatives in
+`replay.py`, which says how single moves are tested. What this file can get wrong is which numbers
+are held constant (`fixed`), and which axes of `jax.vmap` become lanes (`_over_lanes`).
+"""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,10 @@
-"""The functions whose zeros end a step: guards, and the level function of the target section."""
+"""The functions whose zeros end a step: guards, and the level function of the target section.
+
+Here they are only evaluated: values and rates (`ChartFlow.watch`), and the zero near a given state
+(`ChartFlow.locate`, by which crossings get their times and derivatives). Whether a function has
+crossed zero within a step is decided in `search/`, and by `itinerary/flags.py`. All are signed so
+that they fall at their event: with a wrong sign, events are missed or happen at once.
+"""
 
 from typing import NamedTuple
 

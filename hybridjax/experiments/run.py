@@ -1,4 +1,16 @@
-"""Batched experiments on a hybrid system around its limit cycle (paper Sec. V)."""
+"""Batches of experiments on a hybrid system around its limit cycle (paper Sec. V).
+
+`run_experiments` (`stored.py`) lets `prepare` check its arguments and make a `Campaign`, whose
+method `run` computes any part of the experiments. Each batch is computed by one of three programs:
+
+1. along a table of the steps and events of the cycle (`rows.py`, `passage.py`), if there is one;
+2. experiments that leave this table: along a longer table (`Campaign._completed`);
+3. those that leave it, too, and experiments without a table: by a search for events
+   (`response.py`).
+
+All three agree within the accuracy asked for: to find a fault, run the same inputs by `_followed`
+and by `_searched`. Sizes of batches and chunks change the results by rounding only.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator

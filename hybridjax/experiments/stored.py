@@ -1,4 +1,9 @@
-"""Experiments at once, in chunks, or in a Zarr store that any number of processes fills."""
+"""Experiments at once, in chunks, or in a Zarr store that any number of processes fills.
+
+`run_experiments` is here. It leaves the experiments themselves to a `Campaign` (`run.py`), and
+decides only which of them run together, and where the records go. Stores, their description and
+interruptions are those of `_core/pieces/`, for which `ExperimentJob` is a job.
+"""
 
 import dataclasses
 from collections.abc import Iterator

@@ -1,4 +1,11 @@
-"""The flow from any state through any events, differentiable."""
+"""The flow from any state through any events, differentiable.
+
+`requested` checks the arguments of `flow`. A single flow that JAX does not trace is computed by
+`_on_host`: it is that of `simulate`, with its checks, and has a trajectory. All others are computed
+by a program (`_flows`, `_passage`), which takes many lanes in parts and makes fewer checks. Both
+must give the same numbers: compare them first if one is wrong. Steps, events and derivatives are
+those of `engine/flow.py`.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator

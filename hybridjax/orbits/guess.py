@@ -1,4 +1,9 @@
-"""The beginning of a search for a limit cycle: from a guess to a state on the section."""
+"""The beginning of a search for a limit cycle: from a guess to a state on the section.
+
+`return_map_near` takes the stages in order: it checks the guess, estimates the magnitudes of the
+states, simulates for `settle`, and, if no clock drives the system, flows to the section and back to
+it (`_on_section`), which gives the period from which Newton's method starts.
+"""
 
 import dataclasses
 from typing import Any

@@ -1,4 +1,10 @@
-"""Limit cycles of many systems at once: the points of a parameter sweep side by side."""
+"""Limit cycles of many systems at once: the points of a parameter sweep side by side.
+
+`solved` divides the work. Many systems first follow the itineraries of known cycles (`many.py`).
+Those that leave them, and all of a small sweep, take Newton steps from cycles of neighbors
+(`batches.py`). `examined` then tests events that coincide, and integrates eight cycles a second
+time (all of them, if one of the eight has a fault).
+"""
 
 import dataclasses
 from collections.abc import Sequence

@@ -2,6 +2,19 @@
 
 Simulators with fixed time steps let contacts begin and end at the ends of steps. The return is then
 a staircase as a function of the state: within a stair it has no noise, and a wrong slope.
+
+`measured_returns` takes the stages in order:
+
+1. `ReturnMap.solve` moves the state to the fixed point of the return.
+2. `ReturnMap.all_slopes` measures central differences with several steps, after `measure` has
+   found their sizes from the noise of returns.
+3. `_fitted` fits a Jacobian and its errors to these slopes.
+4. `_eigenvalues` and `_resolved` find the multipliers that differ from 0, with their covariance.
+
+Stages 2 to 4 are repeated with the longest steps if noise may hide a multiplier, and with shorter
+ones if narrow and wide steps disagree. The constants may be changed: each says what gets worse in
+either direction. For a wrong multiplier, compare `ReturnMap.slopes` with a Jacobian that is known,
+then each stage with the one before.
 """
 
 from typing import Any, NamedTuple

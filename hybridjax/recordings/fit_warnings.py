@@ -18,10 +18,10 @@ from .._core.findings import Finding, print_findings, warn_of
 from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import listed, p_value
+from ..identify.series.delayed_outputs import late_outputs, ordinary_least_squares
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.series.subspace import late_outputs, ordinary_least_squares
 from ..identify.validation import Validation
 from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectrum
 from .findings import NAME_REFERENCE

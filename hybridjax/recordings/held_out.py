@@ -10,11 +10,11 @@ from .._core.boundary.kinds import Order
 from ..errors import DefinitionError
 from ..experiments.record import HasRecords, SectionSeries, uninterrupted_records
 from ..identify.denominator import Covariance
+from ..identify.series.delayed_outputs import late_outputs, total_least_squares
 from ..identify.series.fit import SeriesFit, assemble, fit_series, missing_cycles
 from ..identify.series.linearization import linearize
 from ..identify.series.output_error import OutputErrorProblem, TooFewCycles
 from ..identify.series.records import CycleGrid, PreparedRecords
-from ..identify.series.subspace import late_outputs, total_least_squares
 from ..identify.validation import Validation, can_be_compared, validate
 from .data import SectionData
 

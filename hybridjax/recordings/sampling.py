@@ -1,4 +1,10 @@
-"""From sampled signals to data at the sections of a cycle, and the removal of slow drift."""
+"""From sampled signals to data at the sections of a cycle, and the removal of slow drift.
+
+`sample_sections` takes the stages in order, trial by trial (`_sample_trials`): isolated spikes are
+left out, splines through the outputs are evaluated where the phase crosses a section (`_Output`),
+inputs become one value for each interval between sections (`_held`), and the average cycle is
+subtracted. `_records` then makes a record of each stretch of the phase.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -10,6 +10,10 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate, contradicted_by
+from hybridjax.identify.series.delayed_outputs import (
+    late_outputs,
+    total_least_squares,
+)
 from hybridjax.identify.series.fit import block_scores
 from hybridjax.identify.series.linearization import (
     each_fit,
@@ -18,11 +22,7 @@ from hybridjax.identify.series.linearization import (
 )
 from hybridjax.identify.series.output_error import OutputErrorProblem
 from hybridjax.identify.series.records import OF_DRIFT, PreparedRecords, with_drift
-from hybridjax.identify.series.subspace import (
-    late_outputs,
-    subspace_model,
-    total_least_squares,
-)
+from hybridjax.identify.series.subspace import subspace_model
 
 from .conftest import SHAPES, scaled
 from .test_uncertainty import covered

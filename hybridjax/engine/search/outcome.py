@@ -1,4 +1,9 @@
-"""Outcome of attempted steps: accepted states, events, and reasons to stop."""
+"""Outcome of attempted steps: accepted states, events, and reasons to stop.
+
+`without_events` is the short way, for iterations in which no lane comes near an event; all others
+take `with_events`. Where both apply they must agree. `with_events` lists the failures: the first
+one that holds is the `Result` of the lane.
+"""
 
 import numpy as np
 from jaxtyping import Bool

@@ -2,6 +2,10 @@
 
 The search decides on step sizes, on the order of events, and on failures. It is not differentiated;
 its decisions are recorded in a `Tape`, which `replay` follows.
+
+Each iteration takes aim (the length of the step, up to the next known time), attempts the step
+(`attempt.py`), judges it (`accept.py`), and updates the state (`outcome.py`). A missed event has
+its cause in `accept.py` or `../cubic.py`, a wrong reason of a failure in `outcome.py`.
 """
 
 import numpy as np

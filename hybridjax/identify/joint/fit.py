@@ -1,4 +1,11 @@
-"""Maximum likelihood for the matrices of a linear periodic model."""
+"""Maximum likelihood for the matrices of a linear periodic model.
+
+`_fit_to_htf` and `_fit_to_records` take the same stages: a first model (`realization.py`, or
+`series/subspace.py`), the descent to the nearest minimum (`descent.py`), the fit with its
+covariance (`_finished`), and doubts about it. For records, it is also decided whether outputs
+depend on the input at their own section (D). The descent finds the minimum nearest to the first
+model: to see whether a poor fit has a better one, give a model that is known as `initial`.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

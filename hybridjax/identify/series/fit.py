@@ -1,4 +1,11 @@
-"""Multipliers and transfer functions from recorded time series with any input: output error."""
+"""Multipliers and transfer functions from recorded time series with any input: output error.
+
+`_fit_open_loop` takes the stages in order: a first c by regression (`delayed_outputs.py`), the
+minimum of the output error (`linearization.minimize`), a second minimum with outputs in units of
+their noise, the covariance of c from blocks of cycles (`_uncertainty`), and doubts about order,
+drift and feedback. With references, `in_loop.py` takes the place of the first four. A wrong
+multiplier comes from the minimum, a wrong error bar from `block_scores`.
+"""
 
 import dataclasses
 import itertools
@@ -58,6 +65,7 @@ from ..multipliers import NoiseRatios, unsupported
 from ..realization import default_horizon, realized
 from ..variable_projection import amounts
 from ..weights import SMALLEST_ERROR
+from .delayed_outputs import DelayedOutputs, late_outputs, total_least_squares
 from .in_loop import LoopEquations
 from .linearization import (
     Linearization,
@@ -79,7 +87,6 @@ from .records import (
     with_drift,
 )
 from .residuals import about_answers
-from .subspace import DelayedOutputs, late_outputs, total_least_squares
 
 
 _BIASED = "the fit is biased; name their `references`"

@@ -1,0 +1,78 @@
+"""Multipliers by one regression of outputs on those of earlier cycles, without iteration.
+
+By the theorem of Cayley and Hamilton, outputs of successive cycles at one section, less what inputs
+explain, obey the characteristic polynomial of the multipliers. `late_outputs` sums the products of
+outputs 0, 1, ..., d cycles earlier over all sections and records. `total_least_squares` has no bias
+by white noise: from it, `fit_series` and the choice of an order start. `ordinary_least_squares` is
+biased to zero, and only compared with fits.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ..denominator import SLOWEST, coefficients_of, multipliers_of
+from ..descent import NO_LEADING_COEFFICIENT, Coefficients
+from .linearization import sum_up
+from .output_error import OutputErrorProblem, SectionRegression
+from .records import CycleGrid, delay_cycles, lagged_inputs
+
+
+class DelayedOutputs(NamedTuple):
+    """The outputs 0, 1, ..., d cycles earlier, without the part that inputs explain."""
+
+    gram: Float[np.ndarray, "ny d1 d1"]
+    """Their Gram matrix, for each output."""
+    dof: int
+    """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
+    matrices that large."""
+
+
+def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
+    """Return the Gram matrix from the rows whose lagged inputs and outputs are all measured."""
+    N, _, ny = problem.shape
+    delays = range(order + 1)
+
+    def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
+        return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
+
+    def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
+        columns = lagged_inputs(part.u, n, problem.lags, problem.records.lead)
+        inputs = columns @ problem.to_lags[n]
+        sampled = part.sampled[:, :, n]
+        delayed = [delay_cycles(sampled, j, not problem.free) for j in delays]
+        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
+        used = np.all(delayed, axis=0) & later[..., None]
+        no_starts = part.drift[:, :, :0]
+        return [
+            SectionRegression.make(inputs, no_starts, part.drift, used[..., alike[0]])
+            for alike in problem.alike[n]
+        ]
+
+    gram = np.zeros((ny, order + 1, order + 1))
+    dof = 0
+    for section in sum_up(problem, np.zeros(0), past, regress):
+        for fit in section:
+            gram[fit.outputs] += fit.products
+            rows = round(fit.dof) - fit.root.shape[1]
+            dof += max(rows, 0) * len(fit.outputs)
+    return DelayedOutputs(gram, dof)
+
+
+def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
+    """Return c without bias by white noise in the outputs."""
+    order = delayed.gram.shape[1] - 1
+    _, vectors = np.linalg.eigh(delayed.gram.sum(axis=0))
+    null = vectors[:, 0]
+    if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
+        return np.zeros(order)
+    roots = np.roots(null / null[0])
+    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
+    return np.pad(coefficients_of(roots / size), (0, order - len(roots)))
+
+
+def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
+    """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
+    gram = delayed.gram.sum(axis=0)
+    return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
