@@ -54,7 +54,7 @@ class MultiplierGoal(eqx.Module):
 
 @checked
 class ParameterGoal(eqx.Module):
-    """Physical parameters, estimated by `fit_model` from HTFs: their relative errors.
+    """The relative errors of physical parameters that `fit_model` estimates from HTFs, as goal.
 
     The derivatives are exact, through the limit cycle and its sections; they compile at the first
     call, for a minute or so.

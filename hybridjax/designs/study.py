@@ -53,22 +53,22 @@ class SequentialDesign(Showable, eqx.Module):
     r"""A sequence of experiments that starts without a model, and ends at a requested precision.
 
     The first block is applied unchanged, also if it exceeds `limit`. Each later block has the
-    `optimal_design` for the model fitted to all blocks before it, with the noise estimated from
-    these, and as many experiments as the standard error still requires, but at most twice the
-    cycles so far. While the data do not support `order` multipliers, or the estimate is unstable,
-    the first block is repeated with new phases. No prior knowledge is used except the number of
-    multipliers.
+    `optimal_design` for a model and a noise level that are estimated from all blocks before it. It
+    has as many experiments as the standard error still requires, but at most twice as many cycles
+    as all blocks before it. While the data do not support `order` multipliers, or the estimate is
+    unstable, the first block is repeated with new phases. No prior knowledge is used except the
+    number of multipliers.
 
     *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
     blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
     the likelihood. The estimation error, divided by the estimated standard error, is Gaussian in
     the limit of many cycles (Wu, Biometrika 72, 1985, for designs that depend on estimates;
     Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for
-    stopping as soon as an interval of given width is reached). A standard error that is too small
-    by chance would violate this. Therefore the larger of two standard errors is used: one from the
-    scatter at the lines that determine the multipliers, the other from the mean noise level of all
-    lines. The study stops when the interval by Student's distribution is as narrow as requested, as
-    in Stein's two stages (Ann. Math. Stat. 16, 1945).
+    stopping as soon as an interval of given width is reached). If a standard error were too small
+    by chance, the study would stop too early. Therefore the larger of two standard errors is used:
+    one from the scatter at the lines that determine the multipliers, the other from the mean noise
+    level of all lines. The study stops when the interval by Student's distribution is as narrow as
+    requested, as in Stein's two stages (Ann. Math. Stat. 16, 1945).
 
     A study is immutable: `add` returns a new one. It depends on its arguments and blocks only, so
     that it can be reconstructed from stored data.

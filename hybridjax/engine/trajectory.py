@@ -1,4 +1,8 @@
-"""Single trajectories with their events, dense enough to plot."""
+"""Single trajectories with their events, dense enough to plot.
+
+`integrate` calls the search piece by piece, and makes the checks that programs leave out: guards on
+which a reset ends (`_passed`), and pulses (`unresolved.py`). Between steps, states follow cubics.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,9 @@
-"""The response of a hybrid system around its limit cycle to inputs: many experiments, compiled."""
+"""The response of a hybrid system around its limit cycle to inputs: many experiments, compiled.
+
+`flow_batch` moves all experiments from section to section, each time by a search for events
+(`engine/move.py`) with the steps that `plan.py` has computed. `response_function` is the same with
+derivatives. Experiments that stay near the cycle take the faster way of `passage.py` instead.
+"""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,9 @@
-"""Floquet multipliers from the exact structure of harmonic transfer functions, and their number."""
+"""Floquet multipliers from the exact structure of harmonic transfer functions, and their number.
+
+`fit_multipliers` leaves the minimum to `variable_projection.py`, and the weights to `weights.py`.
+The second half of this file decides on the number of multipliers, by what noise alone explains
+(`noise_ratios`, `supported`), and by description lengths (`compare_orders`).
+"""
 
 import dataclasses
 import functools

@@ -37,11 +37,12 @@ class VarianceDof(eqx.Module):
     **Arguments:**
 
     - `dof` (F,): complex degrees of freedom of the variance.
-    - `roundness` (M, F, ny, nu): $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ of the residuals d of
-      the realizations, relative to its mean for Gaussian errors: 0 if all residuals lie on a line.
-      None, or an array of ones: the shape is not used.
-    - `shared`: whether the errors of all lines f + integers stem from the same noise, as in a loop.
-      Default: False, independent errors.
+    - `roundness` (M, F, ny, nu): how round the sample is. It is $1 - |\sum_j d_j^2|^2 / (\sum_j
+      |d_j|^2)^2$ of the residuals d of the realizations, relative to its mean for Gaussian errors:
+      0 if all residuals lie on a line in the complex plane. None, or an array of ones: the shape is
+      not used.
+    - `shared`: whether errors at frequencies that differ by an integer stem from the same noise, as
+      in a loop. Default: False, independent errors.
 
     **Raises:** `DefinitionError` for freedom that is not positive, or negative roundness.
     """

@@ -67,9 +67,10 @@ class _Order(NamedTuple):
 def simultaneous_events(cycle: LimitCycle) -> list[SimultaneousEvents]:
     """Find groups of events that coincide on a limit cycle, with derivatives for each order.
 
-    If the orders of a group commute, `find_limit_cycle`, sweeps and `continuation` treat the cycle
-    as ok; otherwise its result is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it with
-    `throw=False`). A group contains at least one event that is not scheduled.
+    The orders of a group commute if all lead to the same state with the same derivative. Then
+    `find_limit_cycle`, sweeps and `continuation` treat the cycle as any other; otherwise its result
+    is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it with `throw=False`). A group contains at
+    least one event that is not scheduled.
 
     **Arguments:**
 

@@ -1,4 +1,9 @@
-"""The curve P(q; p) = q in the space of states and one parameter, point by point."""
+"""The curve P(q; p) = q in the space of states and one parameter, point by point.
+
+`Curve.step` predicts the next point along the tangent, and `Curve._correct` finds it by Newton's
+method; `branches.py` chooses the lengths of steps and looks for bifurcations between points. A
+branch that ends too early has its cause in `_correct`, whose reason is the `Result`.
+"""
 
 import dataclasses
 import functools as ft

@@ -1,4 +1,10 @@
-"""Limit cycles: fixed points of the return map, with their multipliers."""
+"""Limit cycles: fixed points of the return map, with their multipliers.
+
+`LimitCycle` is what searches return. It holds the numbers of the last turn, and computes all else
+when it is asked for: multipliers here, from `factors` (`fine_factors` where these contract too
+much), and responses, sensitivities, fluctuations and HTFs in files of these names. A wrong cycle
+has its cause in the search (`find.py`, `newton.py`); `findings` are those of `verdict.py`.
+"""
 
 from collections.abc import Mapping
 from typing import Annotated, Any

@@ -1,4 +1,9 @@
-"""The limit cycle of a plant: the sections on it, outputs there, and experiments around it."""
+"""The limit cycle of a plant: the sections on it, outputs there, and experiments around it.
+
+`find_cycle` lets the plant settle, or solves for the cycle from a guess (`returns.py`), and
+`_measure` records it. Steps, sections within a step and single experiments are those of `drive.py`:
+a section at a wrong time or an input that acts too late has its cause there.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,8 @@
-"""All steps from a recording to multipliers, in one call."""
+"""All steps from a recording to multipliers, in one call.
+
+`identify_recording` calls the steps in the order in which its source lists them, and computes
+nothing itself but the number of multipliers and the removal of drift. To find a wrong step, call
+them one by one: each is a public function of `hj` or `hj.recordings`."""
 
 import dataclasses
 import importlib

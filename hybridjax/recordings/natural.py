@@ -239,8 +239,8 @@ def natural_multipliers(
 
     The return map of every section is estimated from the deviations in successive cycles, as in the
     Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are unknown,
-    and taken as independent from cycle to cycle. The state at a section consists of all outputs
-    there and at the section before, in the `order` combinations that vary most. All sections have
+    and taken as independent from cycle to cycle. The state at a section consists of the `order`
+    combinations that vary most of all outputs there and at the section before. All sections have
     the same multipliers: the coefficients of their characteristic polynomials are averaged.
 
     The mean of each record is estimated, which biases the multipliers if there are few cycles. This
@@ -253,8 +253,9 @@ def natural_multipliers(
 
     - `data`: result of `sample_sections(..., inputs=())`; the average cycle of each trial is
       subtracted.
-    - `order`: the number of multipliers. Directions of smaller variance act as disturbances. If
-      one multiplier more contradicts the largest modulus, `findings` say so. Default: 1.
+    - `order`: the number of multipliers. Combinations that vary less than these count as
+      disturbances. If one multiplier more contradicts the largest modulus, `findings` say so.
+      Default: 1.
     - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
       (Künsch 1989), within each record; whole records where these are short. Default: 0.
 

@@ -231,9 +231,9 @@ class KinematicPhase(_Anchored):
     The sections follow the sense in which the cycle turns: if the angle decreases in time, section
     i is at the angle of section 0 minus 2 pi i / N.
 
-    The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). At its
-    sections the position and the velocity determine each other. As outputs they therefore contain
-    less information than at sections of a phase that is defined by a `Crossing`.
+    The same definition gives the phase of a recording (`hj.recordings.estimate_phase`). On a
+    section, which is one angle, the velocity follows from the position. As outputs, the two
+    therefore contain less information than at sections of a phase that is defined by a `Crossing`.
 
     **Fields:**
 

@@ -47,8 +47,8 @@ class PlacedSections(Showable, eqx.Module):
     - `bound`: the family evaluated on the cycle.
     - `lanes`: the cycle's state at each section (N lanes), in order, within one period from
         section 0.
-    - `tape`: the steps of the flow from each section to the next; None where it was repeated from
-        a known cycle.
+    - `tape`: the steps of the flow from each section to the next; None if the flow was repeated
+        from that of a known cycle.
     - `duration` (N,): time from section i to the next.
     - `result` (N,): `Result` codes of the flow from section i to the next.
     - `drop` (N,): the coordinate of (t, states...) that is left out on section i, or -1.

@@ -62,9 +62,9 @@ class Drawing(eqx.Module):
     - `lines`: points (k, 2) that are joined, by name. The line `ground` is drawn to the borders of
         the picture.
     - `circles`: (x, y, radius) by name. `points`: (x, y) by name, drawn as dots.
-    - `body`: the name of a circle or a point that no event moves. After an event that gives the
-        origin another meaning (the other foot), the picture is moved until the body is where it
-        was. Default: the origin stays.
+    - `body`: the name of a circle or a point that no event moves. An event may move the origin of
+        the coordinates (to the other foot): the picture is then moved such that the body stays
+        where it was. Default: the origin stays.
     - `velocity`: that of the origin over the ground, (2,), in charts whose states hold no position
         along the ground. Default: 0.
 

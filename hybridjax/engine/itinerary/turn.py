@@ -1,4 +1,10 @@
-"""A trajectory that follows an itinerary."""
+"""A trajectory that follows an itinerary.
+
+`follow` loops over the rows of a table, and each row does what `bodies.py` has for its kind. With
+`columns`, derivatives are carried along. Whether the itinerary was kept is decided by `flags.py`,
+and reported as `left`. A wrong state comes from `bodies.py` or `steps.py`; a trajectory that leaves
+without need, from `flags.py`.
+"""
 
 import dataclasses
 from typing import Any, NamedTuple

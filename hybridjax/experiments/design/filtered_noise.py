@@ -1,4 +1,4 @@
-"""Inputs with power up to a frequency, which any hardware that plays a file can apply."""
+"""`random_input`: noise with power up to a frequency, for any hardware that plays a file."""
 
 import numpy as np
 from jaxtyping import Float

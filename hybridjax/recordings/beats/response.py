@@ -1,4 +1,8 @@
-"""The phase response curve of a rhythm, from the times of its events under a known input."""
+"""The phase response curve of a rhythm, from the times of its events under a known input.
+
+`phase_response` fits a flat curve, then a smooth one (`estimation.py`), with the errors of
+intervals of `errors.py`. The phase model, which forecasts intervals, is in `model.py`.
+"""
 
 import equinox as eqx
 import numpy as np
@@ -267,7 +271,8 @@ def phase_response(
     - `sections`: the event at which each cycle begins, or a `Phase` estimated from events or
       crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
-      the rhythm (no feedback). The curve and the rates are those at its mean in each trial.
+      the rhythm (no feedback). The curve and the rates are those of the rhythm under the mean of
+      this signal in each trial.
 
     **Returns:** `hj.recordings.PhaseResponse`: `values` and `errors` (P,), in cycles per second and
     unit of the input, at the phases `phase` (P,) in cycles; `rates` (trials,), in cycles per

@@ -1,4 +1,9 @@
-"""`Population`: estimates of several subjects, with their errors, and what they say together."""
+"""`Population`: estimates of several subjects, with their errors, and what they say together.
+
+A mean or a difference takes three stages: trials of a subject are merged (`_trials`, `_merged`),
+the means are fitted (`reml.py`), and contrasts of them become rows of a table (`_effects`). Checks
+of the subjects' table are in `tables.py`.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
