@@ -1,4 +1,9 @@
-"""Is an identified model good enough? Simulation of data that it was not fitted to."""
+"""Is an identified model good enough? Simulation of data that it was not fitted to.
+
+`validate` simulates the model from initial states that fit best (`predicted` of the fits), and
+tests what is left. The tests themselves are in `series/residuals.py`: if a good model is rejected,
+see whether `whitened` takes the errors of the fit into account.
+"""
 
 import itertools
 from typing import Literal

@@ -2,6 +2,10 @@
 
 One turn is cut into pieces. The Jacobians of the pieces are computed with the pieces: their product
 is the Jacobian of the return map, and they are the factors of the monodromy matrix.
+
+`ReturnMap.turn` and `turn_with_jacobian` compute a turn; `_linear_on_host` and `_linear_in_program`
+are two ways to the same Jacobians, which must agree. `judge` decides whether a turn is a cycle, and
+gives the reason if it is none.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """A step of a chart, with its derivative columns beside the state.
 
-The step is that of a solver of diffrax. Of an implicit one, the stages are solved for by this
-package, whose iterations carry derivatives.
+Steps of explicit methods are those of a solver of diffrax. For implicit methods, this package
+solves for the stages, by iterations that carry derivatives.
 """
 
 import functools as ft
