@@ -31,6 +31,7 @@ hopper's flight up to its touchdown.
 
 import inspect
 import json
+import os
 import pathlib
 import re
 import sys
@@ -253,6 +254,8 @@ def sweep() -> dict[str, float]:
     import hybridjax as hj
 
     hj.enable_x64()
+    if "HYBRIDJAX_CACHE" in os.environ:
+        hj.scale.enable_compilation_cache()
     return twice(sweep=lambda: hj.sweep(hj.models.VerticalHopper(), AXES))
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import contextvars
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from . import jax_compat
-from .compilation import at_ease, uncollected
+from .compilation import at_ease, uncollected, whole
 from .exceptions import DefinitionError
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
 from .lanes import JACOBIAN_COLUMNS
@@ -93,6 +94,41 @@ def by_columns(
         )
 
     return derived
+
+
+def along_program(function: Callable) -> Callable:
+    """`function(*arguments)` and its derivatives in given directions (see `by_columns`), as one
+    program for all arguments of a kind."""
+
+    def along(arguments: tuple, directions: tuple) -> tuple[Any, Any]:
+        return whole(_with_columns, (function,), arguments, loops=True)(directions)
+
+    return along
+
+
+def _with_columns(
+    function: Callable, *arguments_and_directions: Any
+) -> tuple[Any, Any]:
+    """The value of `function(*arguments)`, and its derivatives in P directions."""
+    *arguments, directions = arguments_and_directions
+    is_still = jax.tree_util.tree_map(
+        lambda by, _: by is not None, directions, tuple(arguments), is_leaf=_is_none
+    )
+    moving, still = eqx.partition(tuple(arguments), is_still)
+
+    def of(moving):
+        value = function(*eqx.combine(moving, still))
+        return eqx.partition(value, eqx.is_inexact_array)
+
+    def push(direction):
+        return jax.jvp(of, (moving,), (direction,), has_aux=True)
+
+    smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(directions)
+    return eqx.combine(smooth, rest), columns
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
 
 
 def _compiled_derivatives(compiled: Callable, arguments: tuple, tangents: tuple):

@@ -20,7 +20,7 @@ from .._core.results import Result
 from ..engine.arrays import Array
 from ..orbits.cycle import LimitCycle
 from ..orbits.find import find_limit_cycle
-from ..orbits.near import first_order_cycle, route_near
+from ..orbits.near import first_order_cycle, route_near, with_numbers
 from ..orbits.repeat import Route, on_device
 from ..sections.families import AbstractSections
 from ..sections.walk import Walk, walk_of, walk_with
@@ -174,19 +174,13 @@ def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
     if any(walk is None for walk in walks):
         return None
     walks = (dataclasses.replace(w, forwards=True) for w in walks if w is not None)
-    return Beside(known, _as_numbers(route), tuple(walks))
+    return Beside(known, with_numbers(route), tuple(walks))
 
 
 def _families(observations: Any) -> list[AbstractSections]:
     is_family = lambda x: isinstance(x, AbstractSections)  # noqa: E731
     leaves = jax.tree_util.tree_leaves(observations, is_leaf=is_family)
     return [x for x in leaves if is_family(x)]
-
-
-def _as_numbers(route: Route) -> Route:
-    """The route with counts of rows as arrays, for which nothing is compiled again."""
-    finer = route.finer._replace(count=np.asarray(route.finer.count))
-    return route._replace(first=finer, finer=finer, other=finer)
 
 
 def _run(

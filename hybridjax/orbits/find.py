@@ -38,7 +38,7 @@ from .guess import (
     return_map_near,
 )
 from .linear_flow import keep_turn, last_turn, remembering
-from .near import repeated_cycle, route_near, traced_cycle
+from .near import derived_cycle, repeated_cycle, route_near, traced_cycle
 from .newton import Solution, search, solve
 from .periodic import has_period
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
@@ -301,10 +301,13 @@ def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycl
     """The cycle of a system that is similar to that of a known cycle: on the route of the known
     one where it has one, otherwise by Newton's method."""
     map = request.map
-    if request.section is None and is_inside_program():
+    if request.section is None and (is_inside_program() or traced):
         route = route_near(known)
-        if route is not None:
+        if route is not None and is_inside_program():
             return traced_cycle(known, route, map)
+        beside = None if route is None else derived_cycle(known, route, map)
+        if beside is not None:
+            return beside
     if traced:
         return _traced_without_route(known, map)
     _require_conserved(map)

@@ -11,10 +11,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._core.compilation import at_ease, identity, whole
-from .._core.executor import from_host, is_traced, is_tracer, on_the_cpu
+from .._core.compilation import at_ease, identity, quick_jit, whole
+from .._core.executor import (
+    from_host,
+    is_inside_program,
+    is_traced,
+    is_tracer,
+    on_the_cpu,
+)
+from .._core.host_derivatives import along_program, by_columns
 from .._core.jax_compat import outside
 from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory
@@ -38,7 +45,6 @@ from .repeat import (
     judge,
     leaves_of,
     maps_of,
-    on_device,
     periodic,
     route_of,
     travel,
@@ -51,6 +57,9 @@ from .verdict import verdict
 # Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
 # not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3
+# The same for derivatives outside of programs of users: compilation takes as long as so many
+# derivatives on the host.
+_DERIVATIVES_WORTH_COMPILING = 24
 _routes, _beside = Memory(), Memory()
 _calls: collections.Counter = collections.Counter()
 
@@ -83,9 +92,25 @@ def known_beside(cycle: LimitCycle) -> LimitCycle | None:
     return _beside.get(cycle, None)
 
 
+def derived_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle | None:
+    """The same outside of programs, once so many derivatives were asked for that it pays to compile
+    them. None if the search is to find the cycle: before that, where the cycle leaves the route,
+    and for derivatives by many numbers."""
+    key = "derivatives", route.first.form, identity((map.structure,))
+    _calls[key] += 1
+    traced = [x.size for x in leaves_of(map) if is_tracer(x)]
+    if _calls[key] <= _DERIVATIVES_WORTH_COMPILING or sum(traced) > JACOBIAN_COLUMNS:
+        return None
+    try:
+        found, result = _outside(map, with_numbers(route))
+    except _RouteLeftError:
+        return None
+    return _beside_known(known, route, map, found, result)
+
+
 def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
-    """The cycle of a return map whose system is traced, with derivatives, on the route of a known
-    cycle.
+    """The cycle of a return map whose system is traced inside of a program, with derivatives, on
+    the route of a known cycle.
 
     A cycle that leaves the route has a result code.
     """
@@ -97,10 +122,46 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
 
     few = sum(traced) <= JACOBIAN_COLUMNS
     found = by_jacobian(find)(map) if few else find(map, reverse=True)
-    cycle = _cycle(route.finer, route, map, found, _result(route, map, found))
-    cycle = derived_if_found(cycle)
+    return _beside_known(known, route, map, found, _result(route, map, found))
+
+
+def _beside_known(
+    known: LimitCycle, route: Route, map: ReturnMap, found: Corrected, result: Any
+) -> LimitCycle:
+    cycle = derived_if_found(_cycle(route.finer, route, map, found, result))
     _beside.recall(cycle, None, lambda: known)
     return cycle
+
+
+class _RouteLeftError(Exception):
+    """A cycle leaves the route of the known one."""
+
+
+def _on_route(map: ReturnMap, route: Route) -> tuple[Corrected, Int[Array, ""]]:
+    """The cycle on a route, with its code."""
+    found = _found(route, "all", _beginning(route, map), map)
+    return found, _result(route, map, found)
+
+
+def _on_route_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
+    """`_on_route` and its derivatives.
+
+    **Raises:** `_RouteLeftError`.
+    """
+    cycle, columns = along_program(_on_route)(arguments, directions)
+    _, result = cycle
+    if result != Result.OK:
+        raise _RouteLeftError
+    return cycle, columns
+
+
+_outside = by_columns(quick_jit(_on_route), _on_route_along)
+
+
+def with_numbers(route: Route) -> Route:
+    """The route with counts of rows as arrays, for which nothing is compiled again."""
+    finer = route.finer._replace(count=np.asarray(route.finer.count))
+    return route._replace(first=finer, finer=finer, other=finer)
 
 
 def first_order_cycle(
@@ -155,8 +216,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     if route is None:
         return None
     form = route.first.form
-    arrays = on_device(map)
-    key = form, identity((arrays,))
+    key = form, identity((map,))
     _calls[key] += 1
     if _calls[key] < _WORTH_COMPILING:
         return None
@@ -164,7 +224,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
-            program = whole(_correct, (), (arrays,), loops=True)
+            program = whole(_correct, (), (map,), loops=True)
             found = program(Plan.of(itinerary), *begin)
             code = judge(route, found, t, expected)
             if code != Result.STEP_LIMIT:
@@ -172,7 +232,7 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
             begin = [found.q, found.passage.ends]
         if code != Result.OK:
             return None
-        program = whole(_travel, (), (arrays,), loops=True)
+        program = whole(_travel, (), (map,), loops=True)
         check = program(Plan.of(route.other), found.q, found.passage.ends)
     if not agrees(route, found.q, check):
         return None

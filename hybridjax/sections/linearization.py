@@ -11,9 +11,15 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, SignalNames
 from .._core.boundary.values import Reals
-from .._core.compilation import host_first
-from .._core.executor import Array, is_traced, namespace, stop_gradient
-from .._core.host_derivatives import by_columns
+from .._core.compilation import host_first, quick_jit
+from .._core.executor import (
+    Array,
+    is_inside_program,
+    is_traced,
+    namespace,
+    stop_gradient,
+)
+from .._core.host_derivatives import along_program, by_columns
 from .._core.progress import working
 from ..engine import kernels
 from ..errors import DefinitionError
@@ -28,7 +34,7 @@ from ..systems.transition import TOGETHER
 from .families import AbstractSections, BoundSections, ClockPhase, Orbit, as_family
 from .place import as_placed, place_along, place_sections
 from .placed import PlacedSections, SectionsLike
-from .walk import walk_beside, walked
+from .walk import Walk, walk_beside, walked
 
 
 Delays = Annotated[Numbers, Reals("2", sign="nonnegative")]
@@ -100,10 +106,8 @@ def linearize(
     family = as_family(placed) if of_family else None
     walk = None if family is None else walk_beside(cycle, family)
     if family is not None and walk is not None:
-        on_walk, jacobians = walked(cycle, family, walk)
-        A, B = on_walk.between(jacobians)
-        C, D = _output_jacobians(on_walk, tuple(z.items))
-        dims = on_walk.dims
+        on_walk = _on_walk if is_inside_program() else _of_walk
+        A, B, C, D, dims, _ = on_walk(cycle, family, tuple(z.items), walk)
     elif family is not None:
         turn = last_turn(cycle)
         A, B, C, D, dims = _of_family(cycle, family, tuple(z.items), turn)
@@ -166,6 +170,32 @@ def _matrices_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     D = by_direction(by_point[..., n:])
     matrices, columns = kernels.parted((A, B, C, D))
     return (*matrices, placed.dims[::P]), (*columns, None)
+
+
+def _on_walk(
+    cycle: LimitCycle,
+    family: AbstractSections,
+    outputs: tuple[str | Output, ...],
+    walk: Walk,
+):
+    """`_matrices` beside a known cycle; and the codes of the sections."""
+    placed, jacobians = walked(cycle, family, walk)
+    matrices = placed.between(jacobians)
+    return *matrices, *_output_jacobians(placed, outputs), placed.dims, placed.result
+
+
+def _on_walk_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
+    """`_on_walk` and its derivatives; those of the host where sections leave the walk."""
+    found, columns = along_program(_on_walk)(arguments, directions)
+    codes = found[-1]
+    if np.any(codes):
+        cycle, family, outputs, _ = arguments
+        found, columns = _matrices_along((cycle, family, outputs, None), directions)
+        found, columns = (*found, np.zeros_like(codes)), (*columns, None)
+    return found, columns
+
+
+_of_walk = by_columns(quick_jit(_on_walk), _on_walk_along, of_flow)
 
 
 _of_family = by_columns(_matrices, _matrices_along, of_flow)

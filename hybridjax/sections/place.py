@@ -11,6 +11,7 @@ from .._core.boundary.checked import checked
 from .._core.compilation import quick_jit
 from .._core.executor import (
     Array,
+    is_inside_program,
     is_traced,
     to_host,
 )
@@ -68,7 +69,7 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
         return place_in_order(cycle, family)
     family.check(cycle.structure)
     require_program()
-    walk = walk_beside(cycle, family)
+    walk = walk_beside(cycle, family) if is_inside_program() else None
     if walk is not None:
         return walked(cycle, family, walk)[0]
     return place_in_program(cycle, family)
@@ -183,7 +184,8 @@ def observed_at(
 ) -> tuple[Array, Array | None]:
     """Times (N,) at which a cycle crosses a family's sections, and outputs (N, ny) there."""
     arguments = cycle, family, outputs, turn
-    if is_traced(cycle) and walk_beside(cycle, family) is not None:
+    in_program = is_inside_program() and is_traced(cycle)
+    if in_program and walk_beside(cycle, family) is not None:
         return _observed(*arguments)
     return _observed_by_columns(*arguments)
 

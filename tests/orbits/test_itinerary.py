@@ -170,6 +170,25 @@ def test_gradients_inside_of_programs_are_differences():
     assert_allclose(forwards, gradient, rtol=1e-10)
 
 
+@pytest.mark.slow  # (it compiles three programs)
+def test_repeated_gradients_outside_of_programs_are_those_of_the_search(monkeypatch):
+    """Also where the cycle leaves the route of the known one."""
+    known = hj.find_limit_cycle(Rebound(drive=2.0))
+    family = hj.ClockPhase(3)
+
+    def coefficient(drive, damping):
+        cycle = hj.find_limit_cycle(Rebound(drive=drive, damping=damping), known)
+        model = hj.linearize(cycle, family, ("x",))
+        return model.characteristic_polynomial()[1] + model.B[0, 0, 0]
+
+    gradient = jax.grad(coefficient, argnums=(0, 1))
+    drives = 2.0, 2.001, 0.5
+    searched = [gradient(drive, 0.4) for drive in drives]
+    monkeypatch.setattr(near, "_DERIVATIVES_WORTH_COMPILING", 0)
+    for drive, expected in zip(drives, searched, strict=True):
+        assert_allclose(gradient(drive, 0.4), expected, rtol=1e-9, atol=1e-12)
+
+
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     """Where the clock's phase of the anchor lies in stance for some, in flight for others."""
     monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
