@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int
 from .._core.compilation import at_ease, identity, quick_jit, whole
 from .._core.executor import (
     from_host,
-    is_inside_program,
     is_traced,
     is_tracer,
     on_the_cpu,
