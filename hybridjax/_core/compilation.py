@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 from . import executor, jax_compat
+from .call import once_in_call
 from .exceptions import ComputationError
 from .executor import as_numpy, from_host, is_hidden, on_cpu, on_the_cpu, to_host
 from .meaning import program_digest
@@ -348,8 +349,7 @@ def kernel(
     hands larger ones to another thread, which takes longer than they do.)
     """
     program, arrays = _bound(function, form, static, trees, lanes)
-    # (Calls with arrays of JAX are faster, and there are many with these.)
-    return ft.partial(_run_lanes, program, [jax.device_put(x) for x in arrays], lanes)
+    return ft.partial(_run_lanes, program, [_of_jax(x) for x in arrays], lanes)
 
 
 def _run_lanes(
@@ -439,6 +439,14 @@ def _nearby(x: Any) -> Any:
     device = getattr(x, "device", None)
     is_there = getattr(device, "platform", "") == "cpu"
     return x if is_there else np.asarray(x)
+
+
+def _of_jax(x: Any) -> jax.Array:
+    """An array of JAX, with which calls are faster: made once in a public call, since many kernels
+    take the same arrays."""
+    if isinstance(x, jax.Array):
+        return x
+    return once_in_call(("of JAX", id(x)), x, lambda: jax.device_put(x))
 
 
 _kernels: collections.OrderedDict[tuple, Callable] = collections.OrderedDict()

@@ -32,7 +32,7 @@ from .curve import Curve, Point
 from .cycle import LimitCycle
 from .find import find_limit_cycle
 from .guess import is_default
-from .limit_cycles import LimitCycles, examined
+from .limit_cycles import LimitCycles, examined, keep_turns
 from .newton import USUAL_STEPS
 from .return_map import SINGULAR
 from .rivals import coincident
@@ -490,4 +490,6 @@ def _stack(curve: Curve, points: list[Point]) -> LimitCycles:
         coincident(map, point.turn) is not None
         for map, point in zip(maps, points, strict=True)
     ]
-    return examined(cycles, np.array(together))
+    turns = [point.recorded for point in points]
+    checked = examined(keep_turns(cycles, turns), np.array(together))
+    return keep_turns(checked, turns)

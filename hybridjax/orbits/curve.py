@@ -40,6 +40,11 @@ _LEAST_RANGE = 0.02
 _SHRUNK = 1e-3
 
 
+# Bytes of recorded steps that the points of a branch keep. More: long branches of large systems
+# fill the memory. Less: more of their trajectories are integrated again for figures.
+_MEMORY = 2**28
+
+
 @dataclasses.dataclass
 class Point:
     """A cycle on the curve.
@@ -62,6 +67,12 @@ class Point:
     def departure(self) -> Lanes:
         """The lane at which it begins."""
         return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.pieces)
+
+    @property
+    def recorded(self) -> Turn | None:
+        """The turn, if its steps are kept."""
+        tapes = self.turn.tapes
+        return None if tapes is None or tapes.h is None else self.turn
 
     @property
     def value(self) -> float:
@@ -124,6 +135,7 @@ class Curve:
         self.sequence = _rotated(cycle.event_sequence)
         self.value = float(parameter_of(cycle.system, parameter))
         self.least_range = SAME
+        self.memory = 0
         if not self.sequence:
             first_ranges = self._ranges(to_host(cycle.pieces))
             self.least_range = max(SAME, _SHRUNK * float(np.max(first_ranges)))
@@ -248,11 +260,7 @@ class Curve:
         varied = Varied(self.system_at(z[-1]), self.parameter)
         with on_the_cpu(), at_ease():
             map = to_host(map.at_phase_of(varied.system))
-            turn = map.turn_with_jacobian(z[:-1], varied=varied)
-        assert turn.tapes is not None
-        # (Points keep what tells their events; states would fill the memory.)
-        tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
-        return turn._replace(tapes=tapes)
+            return map.turn_with_jacobian(z[:-1], varied=varied)
 
     def _failure(self, turn: Turn, z: Float[np.ndarray, " n"]) -> Result | None:
         if int(turn.result) != Result.OK:
@@ -286,7 +294,16 @@ class Curve:
         _, _, right = np.linalg.svd(point.scaled)
         same = right[-1] @ point.tangent >= 0
         tangent = right[-1] if same else -right[-1]
-        return dataclasses.replace(point, tangent=tangent)
+        return dataclasses.replace(point, tangent=tangent, turn=self._kept(point.turn))
+
+    def _kept(self, turn: Turn) -> Turn:
+        """A turn with its recorded steps; of long branches with what tells its events."""
+        assert turn.tapes is not None
+        self.memory += sum(x.nbytes for x in jax.tree_util.tree_leaves(turn.tapes))
+        if self.memory <= _MEMORY:
+            return turn
+        tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
+        return turn._replace(tapes=tapes)
 
 
 def _cubic(

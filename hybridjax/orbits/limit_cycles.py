@@ -21,7 +21,7 @@ from .._core.compilation import at_ease
 from .._core.execution import Execution
 from .._core.executor import from_host, to_host
 from .._core.meaning import current_of_many, first_of
-from .._core.memo import remembered
+from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
 from .._core.progress import working
 from .._core.results import Result
@@ -38,10 +38,11 @@ from .crossing import AtEvent, Crossing
 from .cycle import LimitCycle, require_unchanged
 from .find import kept
 from .guess import require_similar
+from .linear_flow import keep_turn
 from .many import TILE, Many, Solver
 from .newton import search as newton
 from .repeat import has_route, leaves_of
-from .return_map import ReturnMap, turn_product
+from .return_map import ReturnMap, Turn, turn_product
 from .rivals import coincide_on
 from .verdict import verdict
 
@@ -98,7 +99,7 @@ class LimitCycles(Showable, eqx.Module):
         take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
         pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
         arrays, static = eqx.partition(self.systems, eqx.is_array)
-        return LimitCycle(
+        cycle = LimitCycle(
             eqx.combine(pick(arrays), static),
             self.base,
             pick(self.period),
@@ -114,6 +115,11 @@ class LimitCycles(Showable, eqx.Module):
             self.multiplicity,
             pick(self.numbers),
         )
+        turns = _turns.get(self, None)
+        turn = None if turns is None else turns[i]
+        if turn is not None:
+            keep_turn(cycle, turn)
+        return cycle
 
     @property
     def scale(self) -> dict[str, float]:
@@ -430,6 +436,17 @@ def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
         map.multiplicity,
         copies_of(tiles.systems),
     )
+
+
+_turns = Memory()
+"""Recorded turns of many cycles."""
+
+
+def keep_turns(cycles: LimitCycles, turns: Sequence[Turn | None]) -> LimitCycles:
+    """Keep the last turns of cycles, from which their trajectories are made. (Without one, a cycle
+    is integrated again.) Returns the cycles."""
+    _turns.recall(cycles, None, lambda: tuple(turns))
+    return cycles
 
 
 def examined(
