@@ -31,14 +31,15 @@ from ..orbits.cycle import LimitCycle
 from ..orbits.near import known_beside
 from ..orbits.repeat import Plan, has_route, maps_of
 from ..orbits.return_map import ReturnMap
+from ..orbits.scale import has_implicit
 from .families import AbstractSections, BoundSections
 from .locate import bind_at, coordinates_on, place_on_host, recorded_flows
 from .placed import PlacedSections
 
 
 # Steps of a walk for each recorded one, which a system beside the known one may not suit. Fewer:
-# neighbors leave the walk. More: it takes longer.
-_DENSITY = 2.0
+# neighbors leave the walk. More: it takes longer. (Implicit steps differ much in length.)
+_DENSITY, _IMPLICIT_DENSITY = 2.0, 6.0
 # Passes of a walk: the first finds the ends of legs, with which the steps of the last one lie as on
 # the known cycle. Fewer: neighbors leave the walk. More: it takes longer.
 _PASSES = 2
@@ -91,6 +92,7 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
         placed = to_host(place_on_host(cycle, family))
         lead, flow = recorded_flows(placed)
         s, N = placed.cycle.structure, family.n_sections
+        density = _IMPLICIT_DENSITY if has_implicit(s) else _DENSITY
         begins_on_section = lead is not None and family.at_anchor
         to = np.arange(int(begins_on_section), N + 1) % N
         before = None
@@ -98,11 +100,11 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
             assert isinstance(family.anchor, Crossing)
             at_anchor = ListLevels((family.anchor,))
             nowhere = np.zeros(len(lead[0].t), np.int32)
-            before, _ = recorded_walk(s, lead, at_anchor, nowhere, False, _DENSITY)
+            before, _ = recorded_walk(s, lead, at_anchor, nowhere, False, density)
             if not before.certain:
                 return None
         path, arrivals = recorded_walk(
-            s, flow, placed.bound.levels, to, begins_on_section, _DENSITY
+            s, flow, placed.bound.levels, to, begins_on_section, density
         )
         if not path.certain or len(arrivals) < len(to):
             return None

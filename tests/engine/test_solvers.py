@@ -190,3 +190,19 @@ def test_linearization_of_a_stiff_system(damped):
     assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
     expected = exactly[:2, 2] / size
     assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_linearization_of_a_stiff_system_inside_of_a_program(damped):
+    """There it follows the walk of the known cycle: implicit steps of the columns of inputs."""
+    phases = hj.ClockPhase(3)
+
+    @jax.jit
+    def matrices():
+        cycle = hj.find_limit_cycle(damped.system, damped)
+        model = hj.linearize(cycle, phases, ("y",))
+        return model.A[:, :2, :2], model.B[:, :2]
+
+    outside = hj.linearize(damped, phases, ("y",))
+    A, B = matrices()
+    assert_allclose(A, outside.A, atol=1e-9)
+    assert_allclose(B, outside.B, rtol=1e-8)
