@@ -33,7 +33,8 @@ from .signal import Signal
 from .writing import replacing
 
 
-_FORMAT, _VERSION = "hybridjax", 2
+_FORMAT = "hybridjax"
+_VERSION = 2
 _HEADER = "header"
 
 

@@ -175,7 +175,8 @@ def host_first(
     Inside of a transformation of JAX this is `quick_jit`, or that `derived`.
     """
     compiled: Any = quick_jit(function)
-    transformed, hosted = derived(compiled), on_the_host(function)
+    transformed = derived(compiled)
+    hosted = on_the_host(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 

@@ -118,9 +118,11 @@ def unit_circle(
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [Curve(np.real(circle), np.imag(circle), color=COLORS[-1])]
     for z in regions:
-        x, y = np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3)
+        x = np.real(z).clip(-3, 3)
+        y = np.imag(z).clip(-3, 3)
         curves.append(Curve(x, y, color=COLORS[0]))
-    x, y = np.real(values), np.imag(values)
+    x = np.real(values)
+    y = np.imag(values)
     curves.append(Curve(x, y, color=COLORS[1], points=True))
     return picture(curves, "real part", "imaginary part", square=True)
 

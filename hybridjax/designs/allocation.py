@@ -36,7 +36,8 @@ ENOUGH = 0.02
 _MAX_STEPS = 300
 # Steps between two certificates, and of the iteration for the prices of several limits. Fewer of
 # the latter: the limits are not met, and the criterion may rise.
-_CHECK, _PRICES = 5, 8
+_CHECK = 5
+_PRICES = 8
 # Factor by which the length of steps (the multiple of their logarithm) grows; it is halved where a
 # step raises the criterion. Larger: more steps in vain. Smaller: more steps.
 _LONGER = 1.15

@@ -136,7 +136,7 @@ def response_criterion(
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
     N = cosines.n_sections
-    (low, high) = goal.frequencies
+    low, high = goal.frequencies
     if high > N / 2:
         raise DefinitionError(
             f"`frequencies` must lie within 0 and {N / 2:g}, not {goal.frequencies}."

@@ -211,7 +211,8 @@ def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
     over = xp.zeros((G, t.shape[0]), bool)
     clocks = [g for g in range(G) if s.clocks[g] >= 0]
     for g, h in itertools.product(clocks, clocks):
-        own, others = s.transitions[g].guard, s.transitions[h].guard
+        own = s.transitions[g].guard
+        others = s.transitions[h].guard
         assert isinstance(own, Scheduled) and isinstance(others, Scheduled)
         offset, period = own.numbers(t)
         later, other = others.numbers(t)

@@ -43,7 +43,8 @@ _DEVIATION = 1e-3
 _PER_STEP = 8
 # Periods of the design, and its versions with other random phases. More: time. Fewer: few lines,
 # and variances that are uncertain.
-_PERIODS, _REALIZATIONS = 16, 4
+_PERIODS = 16
+_REALIZATIONS = 4
 
 
 class ModelIdentification(WithMultipliers, eqx.Module):

@@ -246,7 +246,8 @@ def _solve(
 _ROUNDING_VARIES = 1e6
 # Probability that noise alone is taken for a multiplier, and the random matrices from which its
 # quantile is taken. Smaller: weak multipliers are missed; larger: orders are too high.
-_FALSE_ALARMS, _DRAWS = 0.01, 20000
+_FALSE_ALARMS = 0.01
+_DRAWS = 20000
 
 
 class OrderSelection(Showable, eqx.Module):

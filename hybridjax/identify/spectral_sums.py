@@ -35,7 +35,9 @@ SILENT_LINE = 1e-6
 # Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
 # lines. Fewer signals or redraws: random phases count as optimized more often, by chance; fewer
 # lines: chance does as well as any choice of phases.
-_TESTED, _REDRAWS, _FEWEST_LINES = 12, 200, 8
+_TESTED = 12
+_REDRAWS = 200
+_FEWEST_LINES = 8
 
 
 class Setup(NamedTuple):

@@ -133,10 +133,8 @@ class Validation(Showable, eqx.Module):
         tests = f"{'white':>11}  {'independent':>11}"
         rows = [f"{'output':>{width}}  {'fit':>9}  {'rms left':>9}  {tests}"]
         for i, name in enumerate(names):
-            white, independent = (
-                p_value(self.whiteness[i]),
-                p_value(self.independence[i]),
-            )
+            white = p_value(self.whiteness[i])
+            independent = p_value(self.independence[i])
             rows.append(
                 f"{name:>{width}}  {self.fit[i]:7.2f} %  {self.noise[i]:9.2e}  "
                 f"{white:>11}  {independent:>11}"

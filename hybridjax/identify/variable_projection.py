@@ -36,7 +36,8 @@ from .weights import check_values, error_weights
 EQUAL_WEIGHTS = 9
 # Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
 # that ends them. More, smaller: a closer start, which the descent does not need.
-_MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
+_MAX_REWEIGHTINGS = 6
+_SETTLED_START = 1e-3
 
 
 class HTFGroup(NamedTuple):

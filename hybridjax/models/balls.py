@@ -89,7 +89,7 @@ class PaddleJuggler(HybridSystem):
     def transitions(self):
         def bounce(t, q, u):
             a = self.restitution
-            (_, speed) = self.paddle(t)
+            _, speed = self.paddle(t)
             return q[0], -a * q[1] + (1 + a) * (speed + u[0])
 
         def above(t, q, u):

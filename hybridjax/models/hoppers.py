@@ -200,8 +200,8 @@ class HopperPair(VerticalHopper):
             bodies = []
             feet = []
             for i, between in enumerate((pull, -pull)):
-                (y, v) = whole[2 * i : 2 * i + 2]
-                (ym, vm) = whole[2 * i + 4 : 2 * i + 6]
+                y, v = whole[2 * i : 2 * i + 2]
+                ym, vm = whole[2 * i + 4 : 2 * i + 6]
                 leg = self.leg(t - i * self.lag, y, ym)
                 bodies += [v, (leg + between + u[i]) / self.M - self.g]
                 feet += [vm, -(leg + self.b * vm) / self.m - self.g]

@@ -116,7 +116,7 @@ class RotorFlap(HybridSystem):
         return {"blade": FieldChart(self._blade, ("b", "vb"), ("rad", ""))}
 
     def _blade(self, t, q, u):
-        (b, vb) = q
+        b, vb = q
         lock = self.lock / 8
         mu = self.mu
         damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))

@@ -61,7 +61,9 @@ def _settle(map: ReturnMap, periods: int):
     """The ends of a simulation of some periods, at the guess's phase or section (NaN for systems
     that do not get there), and expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * periods, map.settings.scale)
-    s, anchor, expected = map.structure, map.anchor, map.expected
+    s = map.structure
+    anchor = map.anchor
+    expected = map.expected
     u = np.zeros((s.nu, len(expected)))
     moved = move(s, anchor, u, until(anchor.t + periods * expected), patient).moved
     if map.base is not None:
@@ -123,7 +125,8 @@ class Tiles(NamedTuple):
         then from that cycle."""
         numbers = numbers_of(self.systems)
         order = np.random.default_rng(0).permutation(S)
-        known, rest = self.known, order
+        known = self.known
+        rest = order
         parts: list[Rounds] = []
         with working("cycles", S) as call, uncollected():
             call.done = 0
@@ -143,7 +146,10 @@ class Tiles(NamedTuple):
         found = Known(numbers[order], out.anchor, out.period, out.result)
         known = found if self.known is None else _join(found, known)
         if (known.result == Result.OK).any():
-            nearest = lambda rows: self._nearest(numbers[rows], known)  # noqa: E731
+
+            def nearest(rows):
+                return self._nearest(numbers[rows], known)
+
             out = self._again(order, out, nearest, _SETTLE)
         return _pick(out, np.argsort(order))
 
@@ -169,7 +175,8 @@ class Tiles(NamedTuple):
                 )
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
-                failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
+                failed = failed[arrived]
+                anchor, period = _pick(begin, arrived)
                 part = self._newton(rows[failed], anchor, period, FEW_STEPS)
                 part = part._replace(steps=part.steps + out.steps[failed])
                 out = _replace(out, failed, part)
@@ -284,7 +291,10 @@ def tiles_of(
     )
     periods = None
     if map.base is None:
-        of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
+
+        def of_one(system):
+            return map.multiplicity * jnp.asarray(system.period(), float)
+
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
     return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
 
@@ -334,7 +344,10 @@ def _of_one_width(parts):
     width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
     if all(x.ndim != 2 or x.shape[1] == width for x in parts):
         return parts
-    fill = lambda x: ((0, 0), (0, width - x.shape[1]))  # noqa: E731
+
+    def fill(x):
+        return (0, 0), (0, width - x.shape[1])
+
     return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
 
 

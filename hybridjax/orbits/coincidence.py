@@ -213,7 +213,8 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
     if all(s.clocks[g] >= 0 for g in group):
         return set()
     happened = {int(s.clocks[g]) for g in group}
-    codes, times = np.array(group), np.full(len(group), t)
+    codes = np.array(group)
+    times = np.full(len(group), t)
     return {
         g
         for g in np.flatnonzero(s.clocks >= 0).tolist()

@@ -48,7 +48,10 @@ def linear_outputs(
     s: Structure, flow: LinearFlow, z: Outputs
 ) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
-    outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
+
+    def outputs(a, *point):
+        return kernels.outputs(s, a, tuple(z.items), *point)
+
     make = ft.partial(flow.evaluated, s, outputs, len(z.names))
     # (Other functions than states may have changed.)
     kept = on_host(flow.q) and all(isinstance(x, str) for x in z.items)
@@ -94,10 +97,8 @@ def continuous_htf(
     inputs: SignalNames | None,
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
-    harmonics, frequencies = (
-        check_harmonics(harmonics, 0),
-        np.asarray(f, float).reshape(-1),
-    )
+    harmonics = check_harmonics(harmonics, 0)
+    frequencies = np.asarray(f, float).reshape(-1)
     if not len(frequencies):
         raise DefinitionError("`frequencies` holds no frequency: give one or more.")
     map = cycle.return_map

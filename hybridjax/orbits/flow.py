@@ -295,7 +295,9 @@ def requested(
     check_schedules(s)
     if isinstance(start, Flow):
         _require_start(start, s)
-        lanes, many, result = start.lanes, start.request.many, start.lane_results
+        lanes = start.lanes
+        many = start.request.many
+        result = start.lane_results
     else:
         lanes, many = _lanes_of(s, start)
         result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)

@@ -361,7 +361,8 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         n = s.dims[a]
         plane = _across(map, a, pieces.q[:n, k], f[:n, k])
         signal: Any = plane.signal
-        point, normal = np.asarray(signal.point), np.asarray(signal.normal)
+        point = np.asarray(signal.point)
+        normal = np.asarray(signal.normal)
         before = normal @ (moves.q[:n] - point[:, None])
         after = normal @ (ends[:n] - point[:, None])
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)

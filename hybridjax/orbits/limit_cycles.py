@@ -89,8 +89,14 @@ class LimitCycles(Showable, eqx.Module):
 
     def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
-        take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
-        pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
+
+        def take(x):
+            # (By NumPy, since JAX compiles a program for each shape.)
+            return np.asarray(x)[i]
+
+        def pick(tree):
+            return from_host(jax.tree_util.tree_map(take, tree))
+
         arrays, static = eqx.partition(self.systems, eqx.is_array)
         return LimitCycle(
             eqx.combine(pick(arrays), static),
@@ -288,16 +294,24 @@ def _search(map: ReturnMap) -> ReturnMap | None:
 
 def _some(systems: HybridSystem, rows) -> HybridSystem:
     """Some of many systems."""
-    pick = lambda x: jax.device_put(np.asarray(x)[rows])  # noqa: E731
+
+    def pick(x):
+        return jax.device_put(np.asarray(x)[rows])
+
     return jax.tree_util.tree_map(lambda x: pick(x) if eqx.is_array(x) else x, systems)
 
 
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
     """The cycles that were found on routes; NaN for the others."""
-    found, s, S = solver.found, map.structure, len(solver.found.path)
-    G, K = len(s.transitions), found.pieces_t.shape[1]
-    chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
-    armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
+    found = solver.found
+    s = map.structure
+    S = len(solver.found.path)
+    G = len(s.transitions)
+    K = found.pieces_t.shape[1]
+    chart = np.zeros((S, K), np.int32)
+    events = np.zeros((S, K), np.int32)
+    armed = np.zeros((S, G, K), bool)
+    codes = np.full((S, 1), -1)
     for path, itinerary in enumerate(solver.itineraries):
         rows = np.flatnonzero(found.path == path)
         if not len(rows):
@@ -342,7 +356,10 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
 def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
     """Codes of events with those of other rows."""
     width = max(codes.shape[1], more.shape[1])
-    fill = lambda x: np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)  # noqa: E731
+
+    def fill(x):
+        return np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)
+
     return np.maximum(fill(codes), fill(more))
 
 
@@ -407,7 +424,8 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 
 
 def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
-    turn, map = rounds.turn, tiles.map
+    turn = rounds.turn
+    map = tiles.map
     return LimitCycles(
         tiles.systems,
         map.base,
@@ -486,8 +504,11 @@ def _stacked(systems) -> HybridSystem:
         raise DefinitionError(
             "`systems` must be at least one system, all of the same class."
         )
+
     # (By NumPy: a program of JAX with thousands of arguments compiles for minutes.)
-    stack = lambda x: jax.device_put(np.stack([np.asarray(y) for y in x]))  # noqa: E731
+    def stack(x):
+        return jax.device_put(np.stack([np.asarray(y) for y in x]))
+
     columns = zip(*(leaves for leaves, _ in parts), strict=True)
     stacked = [stack(x) if eqx.is_array(x[0]) else x[0] for x in columns]
     return jax.tree_util.tree_unflatten(parts[0][1], stacked)
@@ -496,7 +517,8 @@ def _stacked(systems) -> HybridSystem:
 def rough(cycle: LimitCycle) -> dict[str, Any]:
     """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
     chart = int(np.asarray(cycle.anchor.chart)[0])
-    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
+    q = np.asarray(cycle.anchor.q)[:, 0]
+    size = np.asarray(cycle.settings.scale)[chart]
     state = [f"{x:.4f}" for x in (q / size).round(4) + 0.0]
     period, time = (f"{float(x):.5g}" for x in (cycle.period, cycle.anchor.t[0]))
     return {"period": period, "time": time, "chart": chart, "state": state}

@@ -126,7 +126,8 @@ class LinearFlow(eqx.Module):
         self, s: Structure, function: Callable, rows: int
     ) -> Float[Array, "P K rows n"]:
         """A function (see `with_derivatives`) at the nodes, and its derivatives."""
-        chart, (P, K, d) = namespace(self.q).repeat(self.chart, NODES), self.q.shape
+        chart = namespace(self.q).repeat(self.chart, NODES)
+        P, K, d = self.q.shape
         at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
         by = with_derivatives(s, function, *at, rows)
         return namespace(by).moveaxis(by, -1, 0).reshape(P, K, rows, -1)
@@ -140,8 +141,10 @@ class LinearFlow(eqx.Module):
     ):
         """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
         ratio = size[:, :, None] / size[:, None]
-        d, D = self.q.shape[2], rule().derivative[rows, rows]
-        n, xp = len(D), namespace(self.q)
+        d = self.q.shape[2]
+        D = rule().derivative[rows, rows]
+        n = len(D)
+        xp = namespace(self.q)
         field = (
             xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
         )
@@ -156,7 +159,8 @@ class LinearFlow(eqx.Module):
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
         """Deviations at the nodes of each piece by that at its beginning, and by forces at the
         nodes (times the length of the piece)."""
-        xp, d = namespace(self.q), self.q.shape[2]
+        xp = namespace(self.q)
+        d = self.q.shape[2]
         inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
         free = xp.concatenate(
@@ -167,7 +171,8 @@ class LinearFlow(eqx.Module):
     @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
-        xp, d = namespace(self.q), self.q.shape[2]
+        xp = namespace(self.q)
+        d = self.q.shape[2]
         by_state = xp.swapaxes(self.by_state, -1, -2)
         inverse = self._implicit(1.0, slice(0, -1), by_state, 1 / self.size)
         free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
@@ -262,7 +267,9 @@ class LinearFlow(eqx.Module):
         )
 
 
-_hosted, _flows, _turns = Memory(), Memory(), Memory()
+_hosted = Memory()
+_flows = Memory()
+_turns = Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
@@ -290,7 +297,10 @@ def last_turn(cycle: Any) -> Any:
     """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
-    make = lambda: side_by_side(to_host(cycle.return_map).pieces())  # noqa: E731
+
+    def make():
+        return side_by_side(to_host(cycle.return_map).pieces())
+
     return (
         _turns.get(cycle, None)
         if is_hidden(cycle)
@@ -333,7 +343,10 @@ def linear_flow(
     cycle = hosted(cycle)
     if not on_host(cycle.period):
         return _of_cycle(cycle, longest, parameter)
-    make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
+
+    def make():
+        return _linear_flow(cycle, longest, parameter)
+
     return _flows.recall(cycle, (parameter, longest), make)
 
 
@@ -401,9 +414,13 @@ def _linear_flow(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
         )
-    map, K, directions = cycle.return_map, NODES, 1
-    s, of = map.structure, with_inputs(map.system, parameter)
-    d, period = s.d, float(map.expected)
+    map = cycle.return_map
+    K = NODES
+    directions = 1
+    s = map.structure
+    of = with_inputs(map.system, parameter)
+    d = s.d
+    period = float(map.expected)
     lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
     t = np.append(moves.t, map.anchor.t[0] + period)[:, None]
@@ -414,20 +431,24 @@ def _linear_flow(
         of = kernels.Tangents(of, of_by, None, None, directions)
         s = kernels.Tangents(s, by.structure, None, None, directions)
         tangents = 1j * kernels.TINY * _along(s, map, lanes, tape, by)
-        t, q = t + tangents[:, 0], q + tangents[:-1, 1:]
+        t = t + tangents[:, 0]
+        q = q + tangents[:-1, 1:]
     # (A step of an explicit method is short for the polynomials of a piece.)
     most = 1 if has_implicit(s) else _STEPS
     pieces = _pieces(moves, t, most, longest * period)
-    chart, P = moves.chart[pieces.first], len(pieces.first)
+    chart = moves.chart[pieces.first]
+    P = len(pieces.first)
 
     # Lanes: by piece, node and direction. (Directions are lanes of their own, and come last.)
     each = 1 + d + np.arange(P * K * directions) % directions
-    charts, times = np.repeat(chart, K * directions), pieces.time.ravel()
+    charts = np.repeat(chart, K * directions)
+    times = pieces.time.ravel()
     step = (
         np.searchsorted(np.real(t[:-1, 0]), np.real(pieces.time)[..., 0], "right") - 1
     )
     step = np.clip(step, pieces.first[:, None], pieces.last[:, None])
-    begin, start = t[step].ravel(), np.moveaxis(q[step], 2, 0).reshape(d, -1)
+    begin = t[step].ravel()
+    start = np.moveaxis(q[step], 2, 0).reshape(d, -1)
     u = kernels.unpushed(s, each)
     states = _ahead(s, begin, charts, start, u, times - begin)
     field = ft.partial(kernels.field, of)
@@ -442,7 +463,8 @@ def _linear_flow(
     states = lay(states)
     # Ends of pieces: by direction and piece.
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(directions), P))
-    events, times_of_ends = np.tile(pieces.event, directions), pieces.time[:, -1].T
+    events = np.tile(pieces.event, directions)
+    times_of_ends = pieces.time[:, -1].T
     ends = times_of_ends.ravel(), u, states[:, :, -1].reshape(-1, d)
     jumps = _jumps(of, events, *ends)
     jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
@@ -468,9 +490,11 @@ def _along(
     s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
 ) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, (begin, longer) = recorded_ends(map, lanes), beginning(by, s.d, s.directions)
+    ends = recorded_ends(map, lanes)
+    begin, longer = beginning(by, s.d, s.directions)
     # A turn that ends on a section ends at a time, too.
-    start, full = map.anchor.t[0], map.expected
+    start = map.anchor.t[0]
+    full = map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
     tape = tape._replace(
         code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code)
@@ -490,7 +514,8 @@ def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]
 
 def of_flow(tangents: Any) -> Any:
     """The tangents of a cycle on which its flow depends, others replaced by `None`."""
-    nothing, anchor = jax.tree_util.tree_map(lambda _: None, tangents), tangents.anchor
+    nothing = jax.tree_util.tree_map(lambda _: None, tangents)
+    anchor = tangents.anchor
     anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
     moving = dict(system=tangents.system, period=tangents.period, anchor=anchor)
     return dataclasses.replace(nothing, **moving)
@@ -540,8 +565,12 @@ def _jumps(s: Structure, code, t, u, q) -> Jumps:
 
 def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]):
     """Padded states, or what belongs to them, by name; NaN in charts that lack one."""
-    xp, points = namespace(states), np.arange(len(chart))
+    xp = namespace(states)
+    points = np.arange(len(chart))
     wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)
     places = [dict(zip(c.states, range(s.d), strict=False)) for c in s.charts]
-    row = lambda name: xp.asarray([x.get(name, s.d) for x in places])[chart]  # noqa: E731
+
+    def row(name):
+        return xp.asarray([x.get(name, s.d) for x in places])[chart]
+
     return {name: wide[points, row(name)] for name in s.state_names()}

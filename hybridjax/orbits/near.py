@@ -51,7 +51,8 @@ from .verdict import verdict
 # Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
 # not used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3
-_routes, _beside = Memory(), Memory()
+_routes = Memory()
+_beside = Memory()
 _calls: collections.Counter = collections.Counter()
 
 
@@ -66,7 +67,10 @@ def route_near(guess: LimitCycle) -> Route | None:
         guess = hosted(guess)
         if verdict(guess).refused:  # (flags compare with what was recorded)
             return None
-        make = lambda: route_of(guess.return_map, last_turn(guess))  # noqa: E731
+
+        def make():
+            return route_of(guess.return_map, last_turn(guess))
+
         route = _routes.recall(guess, None, make)
         return route if route.first.certain else None
 
@@ -133,7 +137,8 @@ def _found(
 def _result(route: Route, map: ReturnMap, found: Corrected):
     """The code of a cycle."""
     still = jax.lax.stop_gradient
-    t, expected = still(map.anchor.t[0]), still(map.expected)
+    t = still(map.anchor.t[0])
+    expected = still(map.expected)
     result = judge(route, still(found), t, expected)
     together = _coincide(route, map, still(found.passage))
     result = update_result(result, together, Result.SIMULTANEOUS)
@@ -161,7 +166,8 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     if _calls[key] < _WORTH_COMPILING:
         return None
     begin = [np.asarray(x) for x in _beginning(route, map)]
-    t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
+    t = np.asarray(map.anchor.t[0])
+    expected = np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
             program = whole(_correct, (), (arrays,), loops=True)

@@ -65,7 +65,8 @@ SINGULAR = 1e-7
 CLOSED = 2e-8
 # A turn closes at most at this multiple of the accuracy of the flow, or of the derivative of the
 # turn. Smaller: rounding rejects cycles. Larger: errors of the cycle exceed the accuracy asked for.
-_ACCURACIES, _ROUNDED = 20.0, 1e-12
+_ACCURACIES = 20.0
+_ROUNDED = 1e-12
 # Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
 # for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
@@ -213,8 +214,10 @@ class ReturnMap(eqx.Module):
 
     def watch(self, lanes: Lanes, target: Target) -> Watch:
         """Guards and levels at lanes, without input."""
-        xp, L = namespace(lanes.t), lanes.t.shape[0]
-        u, everywhere = xp.zeros((self.structure.nu, L)), xp.ones(L, bool)
+        xp = namespace(lanes.t)
+        L = lanes.t.shape[0]
+        u = xp.zeros((self.structure.nu, L))
+        everywhere = xp.ones(L, bool)
         s = self._structure_of(lanes)
         return watch(s, lanes.t, lanes.chart, lanes.q, u, target, everywhere)
 
@@ -225,14 +228,17 @@ class ReturnMap(eqx.Module):
 
     def _structure_of(self, lanes: Lanes) -> Structure:
         """The structure, for each piece of its turn if `lanes` are the pieces of all turns."""
-        turns, count = len(self.anchor.t), len(lanes.t)
+        turns = len(self.anchor.t)
+        count = len(lanes.t)
         if turns == count:
             return self.structure
         return self.structure.at(np.arange(count) % turns)
 
     def departure(self, q: Float[Array, " d"]) -> Lanes:
         """The lane at the beginning of a turn; an event that has just happened is not armed."""
-        s, anchor, xp = self.structure, self.anchor, namespace(q)
+        s = self.structure
+        anchor = self.anchor
+        xp = namespace(q)
         lanes = start_lanes(s, anchor.t, anchor.chart, xp.atleast_2d(q).T)
         span = xp.atleast_1d(self.expected)
         lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), span)
@@ -242,7 +248,8 @@ class ReturnMap(eqx.Module):
     def turn(self, q: Float[Array, " d"], record: Recorded | None = None) -> Return:
         """One turn from a state on the section; by the steps of a `record`, from a state close to
         its start."""
-        s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
+        s = self.structure
+        u = namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result, piece):
             return follow(s, lanes, u, target, piece).moved, None
@@ -371,7 +378,8 @@ class ReturnMap(eqx.Module):
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
-        sizes, xp = self.sizes, namespace(q)
+        sizes = self.sizes
+        xp = namespace(q)
         defect = self._defect(q, turn)
         existing = self.valid.sum(axis=-1)[..., None]
         counts = np.arange(self.structure.d) < existing
@@ -421,7 +429,8 @@ class ReturnMap(eqx.Module):
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
         """True if a guard has the sign that it has after its event at the beginnings of all pieces
         in its chart: it was crossed by none of them, so that it was never armed."""
-        s, shape = self.structure, turn.distance.shape
+        s = self.structure
+        shape = turn.distance.shape
         if not any(s.guards(a) for a in range(len(s.charts))):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
@@ -433,7 +442,8 @@ class ReturnMap(eqx.Module):
                 )
             )
         watched = self.watch(lanes, until(lanes.t))
-        value, rate = watched.value[:-1], watched.rate[:-1]
+        value = watched.value[:-1]
+        rate = watched.rate[:-1]
         error = CLOSED * xp.max(self.expected) * xp.abs(rate)
         here = belongs(s, lanes.chart)[:-1]
         u = xp.zeros((s.nu, len(lanes.t)))
@@ -474,7 +484,8 @@ class ReturnMap(eqx.Module):
         Conserved quantities do not change along P(q) - q. So P(q) - q and this step can add up to
         zero only if both are zero; and J - I is regular once the derivative is subtracted from it.
         """
-        xp, sizes = namespace(q), self.sizes
+        xp = namespace(q)
+        sizes = self.sizes
         if not self.conserved:
             return xp.zeros_like(q), xp.zeros(
                 (*q.shape, q.shape[-1] + (varied is not None))
@@ -500,8 +511,12 @@ class ReturnMap(eqx.Module):
     ) -> tuple[Float[Array, " c"], Float[Array, "c n"]]:
         """Outputs at the anchor's time in its chart, and their derivatives by the state, and the
         parameter of `varied`."""
-        s, (t, chart, *_) = varied or self.structure, self.anchor
-        outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
+        s = varied or self.structure
+        t, chart, *_ = self.anchor
+
+        def outputs(a, *point):
+            return kernels.outputs(s, a, names, *point)
+
         q = namespace(q).atleast_2d(q).T
         by = self.each(
             with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1)
@@ -516,7 +531,8 @@ class ReturnMap(eqx.Module):
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
-        xp, ends = namespace(q), self.ends()
+        xp = namespace(q)
+        ends = self.ends()
 
         def follow_piece(carry, end):
             lanes, h, result = carry
@@ -529,10 +545,8 @@ class ReturnMap(eqx.Module):
         lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
         h = xp.atleast_1d(0.5 * self.expected / PIECES)
         if isinstance(flow, Options):
-            u, begin = (
-                xp.zeros((self.structure.nu, len(h))),
-                (lanes, stride(h), lanes.events),
-            )
+            u = xp.zeros((self.structure.nu, len(h)))
+            begin = (lanes, stride(h), lanes.events)
             (end, _, result), extra = through(
                 self.structure, begin, u, ends, self.settings, flow
             )
@@ -553,11 +567,9 @@ class ReturnMap(eqx.Module):
 
     def ends(self) -> Target:
         """The ends of the pieces, as lanes; of several lanes, by piece and lane."""
-        t0, expected, xp = (
-            self.each(self.anchor.t),
-            self.expected,
-            namespace(self.expected),
-        )
+        t0 = self.each(self.anchor.t)
+        expected = self.expected
+        xp = namespace(self.expected)
         k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
         if self.base is None:
             return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
@@ -572,7 +584,8 @@ class ReturnMap(eqx.Module):
         )
 
     def _meetings(self, pieces: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
-        xp, shape = namespace(codes), codes.shape[:-2]
+        xp = namespace(codes)
+        shape = codes.shape[:-2]
         if self.base is None:
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
@@ -611,7 +624,8 @@ def with_derivatives(
 
     **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`. `u`: Default: 0.
     """
-    xp, L = namespace(t), len(t)
+    xp = namespace(t)
+    L = len(t)
     u = xp.zeros((s.nu, 1)) if u is None else u
 
     def work(a, here, out):

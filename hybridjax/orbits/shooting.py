@@ -27,7 +27,8 @@ from .scale import has_implicit
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
 # Larger: it ends one step too early. Smaller: rounding keeps it from ending.
-ATOL, RTOL = 1e-12, 1e-11
+ATOL = 1e-12
+RTOL = 1e-11
 
 
 def newton_steps(

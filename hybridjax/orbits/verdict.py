@@ -488,7 +488,8 @@ def _skipped_schedules(s: Structure, visit: Visit) -> Iterable[Finding]:
         transition = s.transitions[g]
         guard = transition.guard
         assert isinstance(guard, Scheduled)
-        period, offset = float(guard.period), float(guard.offset)
+        period = float(guard.period)
+        offset = float(guard.offset)
         since = (visit.t[0] - offset) / period
         until = (visit.t[-1] - offset) / period
         due = np.floor(since + 10 * SAME_TIME) + 1

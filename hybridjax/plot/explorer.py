@@ -131,7 +131,9 @@ class Explorer:
         begin = {
             name: float(parameter_of(self.cycle.system, name)) for name in self.values
         }
-        share, step, self.message = 0.0, 1.0, ""
+        share = 0.0
+        step = 1.0
+        self.message = ""
         while share < 1:
             at = min(share + step, 1.0)
             mixed = {n: (1 - at) * x + at * self.values[n] for n, x in begin.items()}

@@ -42,7 +42,8 @@ from .wanted import Measure, Want, Wanted
 _PIECES = 64
 # Points of a piece, at least, and of one for which users' functions of cycles are evaluated. More:
 # more is lost with a worker. Fewer: many small files.
-_SMALLEST, _MEASURED = 4000, 250
+_SMALLEST = 4000
+_MEASURED = 250
 # Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
 # they save.
 _COARSE = 250

@@ -32,7 +32,8 @@ def flow_along(
     """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
     known times or all at states: what `through` returns. None if a target is not reached once in a
     turn, and for implicit methods, whose steps have errors that decay before the turn ends."""
-    s, begin = map.structure, carry[0]
+    s = map.structure
+    begin = carry[0]
     if has_implicit(s):
         return None
     moves, before = _three_turns(map, turn)
@@ -44,7 +45,8 @@ def flow_along(
     arrives = walk.at_target[1:] & (event[np.minimum(walk.piece, len(event) - 1)] < 0)
     arrival = ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL
     ends_in = moves.code[walk.key[:-1]]
-    h, code = np.diff(walk.t), np.where(arrives, arrival, ends_in)
+    h = np.diff(walk.t)
+    code = np.where(arrives, arrival, ends_in)
     # (Where events and sections coincide, a search decides which comes first.)
     at_event = arrives & (np.diff(walk.key) > 0) & (ends_in >= 0)
     if (at_event | (code >= 0) & (h == 0) | (h < 0)).any():
@@ -125,7 +127,8 @@ def _ends_at_targets(
     map: ReturnMap, walk: _Walk, chart, code, events_before: Int[np.ndarray, "1"]
 ) -> Lanes:
     """Lanes at the targets, with the transitions that are armed there."""
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     at = np.flatnonzero(walk.at_target)
     fired = np.maximum(code[at - 1], -1)
     count = events_before + np.cumsum(code >= 0, dtype=np.int32)
@@ -144,9 +147,11 @@ def _places_on(
 ) -> _Places | None:
     """Where the targets, which follow each other, lie on moves whose `ends` are those of one turn;
     None if one is not met once."""
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     late = TOGETHER * period
-    M, K = ends.shape[1], len(targets.time)
+    M = ends.shape[1]
+    K = len(targets.time)
     by_clock = np.isfinite(targets.time[0])
     event = np.broadcast_to(targets.event, K)
 
@@ -166,7 +171,8 @@ def _places_on(
     end = _until_settled(s, moves, targets, move, h, is_inside, by_clock, period)
     if end is None:
         return None
-    time, turns = moves.t[move] + h, 0
+    time = moves.t[move] + h
+    turns = 0
     if not by_clock:
         turns = np.ceil((begin.t[0] + late - time[0]) / period)
         is_next = np.append(False, time[1:] <= time[:-1] + late)
@@ -181,7 +187,8 @@ def _places_on(
 def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):
     """The move of one turn in which each target lies, and the time from its start, to first order;
     None if one is not met once."""
-    K, M = len(targets.time), ends.shape[1]
+    K = len(targets.time)
+    M = ends.shape[1]
     level = _levels_on(s, once, ends, targets)
     falls = (level[0] > 0) & (level[1] <= 0)
     is_reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])

@@ -53,7 +53,8 @@ def check_placed(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
     crossed twice, or by the clock at the time of an event."""
     _require_reached(placed, [first, *np.asarray(placed.result).tolist()])
-    name, anchor = placed.family.describe, placed.family.anchor
+    name = placed.family.describe
+    anchor = placed.family.anchor
     if isinstance(anchor, Crossing) and len(_met(placed, 0).places) > 1:
         raise ComputationError(
             f"{name(0)} lies at {anchor}, which {_AGAIN}{_remedy(placed, 0)}"
@@ -86,7 +87,9 @@ def check_placed(placed: PlacedSections, first: int) -> None:
 def _require_reached(placed: PlacedSections, results: list[int]) -> None:
     """**Raises:** `ComputationError` for the first result that is not OK: of the flow to section 0,
     and from each section to the next."""
-    N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
+    N = placed.n_sections
+    name = placed.family.describe
+    anchor = placed.family.anchor
     if isinstance(placed.family, families.KinematicPhase) and any(results):
         _require_turns(placed.family, placed.cycle)
     for i, code in enumerate(results):
@@ -128,8 +131,10 @@ def _about_next_event(placed: PlacedSections, i: int) -> str:
 def _require_order(placed: PlacedSections) -> None:
     """**Raises:** `ComputationError` for sections that are met twice in a round, at the same time,
     or in another order."""
-    N, name = placed.n_sections, placed.family.describe
-    period, duration = float(placed.cycle.period), np.asarray(placed.duration)
+    N = placed.n_sections
+    name = placed.family.describe
+    period = float(placed.cycle.period)
+    duration = np.asarray(placed.duration)
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} {_AGAIN}{_remedy(placed, 0)}")
@@ -165,18 +170,22 @@ class _Met(NamedTuple):
 def _met(placed: PlacedSections, i: int) -> _Met:
     """Where the level of section i falls."""
     cycle = placed.cycle
-    N, levels = placed.n_sections, placed.bound.levels
+    N = placed.n_sections
+    levels = placed.bound.levels
     items = getattr(placed.family, "items", (placed.family.anchor,))
     item = items[i] if i < len(items) else None
     section = item if isinstance(item, Crossing) else None
     if section is not None:
-        i, N, levels = 0, 1, ListLevels((section,))
+        i = 0
+        N = 1
+        levels = ListLevels((section,))
     s = cycle.structure
     t, chart, q = cycle.trajectory().dense()
     level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = np.flatnonzero((np.diff(level) < 0) & (np.diff(t) > 0))
-    high, low = level[falls], level[falls + 1]
+    high = level[falls]
+    low = level[falls + 1]
     crossed = falls[(high > 0) & (low <= 0)]
     places = [f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed]
     return _Met(section, high, low, places)
@@ -219,7 +228,8 @@ def _require_turns(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
 def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     """The number of crossings of each section in one period, and their steepness: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
-    event, levels = np.asarray(placed.bound.event), placed.bound.levels
+    event = np.asarray(placed.bound.event)
+    levels = placed.bound.levels
     counts = np.array(
         [placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event]
     )

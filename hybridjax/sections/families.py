@@ -279,10 +279,8 @@ class KinematicPhase(_Anchored):
         self.anchor = _as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
-        where, names = (
-            "KinematicPhase(position, velocity): ",
-            (self.position, self.velocity),
-        )
+        where = "KinematicPhase(position, velocity): "
+        names = (self.position, self.velocity)
         require_among("output", names, s.output_names(), where)
         super().check(s)
 
@@ -310,8 +308,12 @@ def _along(s: Structure, function: Callable, t, chart, q) -> tuple[Array, Array]
     """A function (a, t, q, u) at a point of an orbit, and its rate along the orbit."""
 
     def in_chart(a):
-        state, u = q[: s.dims[a]], jnp.zeros(s.nu)
-        value = lambda t, q: function(a, t, q, u)  # noqa: E731
+        state = q[: s.dims[a]]
+        u = jnp.zeros(s.nu)
+
+        def value(t, q):
+            return function(a, t, q, u)
+
         return jax.jvp(value, (t, state), (jnp.ones_like(t), s.field(a, t, state, u)))
 
     return jax.lax.switch(

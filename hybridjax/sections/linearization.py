@@ -87,7 +87,8 @@ def linearize(
     if delay is not None:
         return Delayed.of(cycle, sections, outputs, inputs, delay).to_ldtp()
     cycle.require_found()
-    s, traced = cycle.structure, is_traced(cycle, sections)
+    s = cycle.structure
+    traced = is_traced(cycle, sections)
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
@@ -110,7 +111,9 @@ def linearize(
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
         d = int(np.max(np.asarray(dims)))
-        A, B, C = A[:, :d, :d], B[:, :d], C[:, :, :d]
+        A = A[:, :d, :d]
+        B = B[:, :d]
+        C = C[:, :, :d]
     return LDTP(
         A,
         B[..., columns],
@@ -207,7 +210,8 @@ class _Departures(AbstractSections):
         self.phase.check(s)
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
-        leave, step = self.phase.bind(s, orbit).time - self.delay[1], orbit.period
+        leave = self.phase.bind(s, orbit).time - self.delay[1]
+        step = orbit.period
         change = leave + self.delay.sum() - self.lag * step / self.phase.n_sections
         return BoundSections.at_times(
             jnp.stack([leave, change][: self.parts], axis=1).ravel()
@@ -276,7 +280,8 @@ class Delayed(NamedTuple):
                 "the delays decide on the number of states: they cannot be traced. To fit delays, "
                 "give them to `ObservedHTF`."
             )
-        nu, wide = len(self.inputs), len(self.model.inputs)
+        nu = len(self.inputs)
+        wide = len(self.model.inputs)
         first = int(self.lag) * nu
         past = first + wide - nu
         if not past:

@@ -164,7 +164,8 @@ def _locate(
 
 def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) -> Target:
     """The targets on one section after the other, until section 0 is met again."""
-    N, xp = len(bound.time), namespace(bound.time)
+    N = len(bound.time)
+    xp = namespace(bound.time)
     k = xp.arange(int(begins_on_section), N + 1)
     index = k % N
     return Target(
@@ -183,7 +184,8 @@ def _near_events(
 ) -> Array:
     """Test at which of N clock sections an event happens, but for those of the clock: rounding
     would decide on which side of it they lie."""
-    xp, s = namespace(bound.time), map.structure
+    xp = namespace(bound.time)
+    s = map.structure
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     ignored = xp.asarray(
         [*is_scheduled, True]
@@ -198,7 +200,8 @@ def coordinates_on(
     map: ReturnMap, bound: BoundSections, lanes: Lanes
 ) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, "N n"]]:
     """The fields `drop`, `dims` and `normal` of `PlacedSections`."""
-    s, xp = map.structure, namespace(lanes.t)
+    s = map.structure
+    xp = namespace(lanes.t)
     N = len(lanes.t)
     normal = normals(s, bound, lanes, xp.arange(N), xp.zeros((s.nu, 1)))
     field = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
@@ -228,7 +231,9 @@ def _bind(
     s: Structure, map: ReturnMap, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
     """The family evaluated on the cycle; clock sections in the period that begins at the anchor."""
-    period, t, M = map.expected, anchor.t[0], family.points
+    period = map.expected
+    t = anchor.t[0]
+    M = family.points
     xp = namespace(period)
 
     lanes = anchor
@@ -259,7 +264,8 @@ def _bind_program(
 
 def normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Array:
     """Gradients (N, n) of the levels with respect to (t, q)."""
-    xp, levels = namespace(lanes.t), bound.levels
+    xp = namespace(lanes.t)
+    levels = bound.levels
     out = xp.zeros((1 + s.d, len(index)), lanes.t.dtype)
     if levels is None:
         return out.T

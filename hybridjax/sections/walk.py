@@ -90,7 +90,8 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)
         placed = to_host(place_on_host(cycle, family))
         lead, flow = recorded_flows(placed)
-        s, N = placed.cycle.structure, family.n_sections
+        s = placed.cycle.structure
+        N = family.n_sections
         begins_on_section = lead is not None and family.at_anchor
         to = np.arange(int(begins_on_section), N + 1) % N
         before = None
@@ -150,7 +151,8 @@ def walked(
     (t, q) and the inputs on this one. The result of sections that leave the walk is a code."""
     map = cycle.return_map
     start = map.anchor.t[0], map.anchor.q[:, 0]
-    begin, code = start, jnp.zeros((), jnp.int32)
+    begin = start
+    code = jnp.zeros((), jnp.int32)
     if walk.lead is not None:
         assert isinstance(family.anchor, Crossing)
         at_anchor = ListLevels((family.anchor,))

@@ -246,7 +246,8 @@ class Guess(eqx.Module):
     __repr__ = fields
 
 
-DEFAULT_INPUT, SECOND_NAME = "u", "input"
+DEFAULT_INPUT = "u"
+SECOND_NAME = "input"
 """The name of the input of a system whose author named none, and its name where a state or an
 output is called so."""
 

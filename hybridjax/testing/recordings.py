@@ -214,7 +214,7 @@ def simulate_beats(
     """
     force = np.asarray(force, float)
     table = np.asarray(curve, float)
-    (S, m) = force.shape
+    S, m = force.shape
     n = len(table)
     if not n or not S:
         raise DefinitionError("`curve` and `force` need at least one value.")

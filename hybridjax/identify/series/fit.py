@@ -521,7 +521,8 @@ def _noise_ratios(
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
 # by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
-_WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
+_WHITE_DRAWS = 4
+_FILTERED_DRAWS = 16
 # Blocks beyond the number of coefficients from which changes in time are tested. Fewer: the test
 # sees nothing.
 _FEWEST_BLOCKS = 6

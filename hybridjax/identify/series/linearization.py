@@ -164,7 +164,7 @@ def linearize(
 
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
-    (N, _, ny) = problem.shape
+    N, _, ny = problem.shape
     d = len(c)
     out = Linearization(
         c=c,

@@ -380,7 +380,9 @@ def noise_model(
     D = [unit * root for root in roots]
     if not model.K[0].shape[1]:
         N, ny, _ = S.shape
-        A, B, C = np.zeros((N, 1, 1)), np.zeros((N, 1, ny)), np.zeros((N, ny, 1))
+        A = np.zeros((N, 1, 1))
+        B = np.zeros((N, 1, ny))
+        C = np.zeros((N, ny, 1))
         return LDTP(A, B, C, D, None, names, outputs)
     B = [K @ root for K, root in zip(model.K, roots, strict=True)]
     C = [unit * C for C in model.C]

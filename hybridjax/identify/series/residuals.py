@@ -35,7 +35,8 @@ _COLORED = 0.01
 # Shifts by whole cycles from which the dependence of residuals on inputs of other cycles follows,
 # and the deviates by which that on their own must exceed it. More shifts: time. Larger deviates:
 # too few dimensions are called noise. Smaller: noise is called too few dimensions.
-_SHIFTS, _ALONE = 8, 4.0
+_SHIFTS = 8
+_ALONE = 4.0
 # Advice where inputs answer residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"

@@ -39,7 +39,8 @@ _ALL = 12
 _MANY = 30
 # Levels of the test for skewed values, for means and for groups. Larger: wider bands where normal
 # values seem skewed by chance. Smaller: bands of skewed values of few subjects are too narrow.
-_SKEWED_MEAN, _SKEWED_GROUPS = 0.2, 0.05
+_SKEWED_MEAN = 0.2
+_SKEWED_GROUPS = 0.05
 # Rotations in the test for skewed values. Fewer: its level is coarse. More: time.
 _ROTATIONS = 200
 

@@ -25,7 +25,8 @@ Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
 # Fewest subjects whose distribution is tested, and the level. Fewer subjects: the test sees
 # nothing. Larger level: normal subjects are doubted. Smaller: outliers pass.
-_FEWEST_TESTED, _NORMAL = 5, 0.02
+_FEWEST_TESTED = 5
+_NORMAL = 0.02
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
 
