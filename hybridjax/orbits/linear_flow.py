@@ -61,26 +61,33 @@ class Rule(NamedTuple):
 @ft.lru_cache
 def rule() -> Rule:
     legendre = np.polynomial.legendre
+    unit = np.eye(NODES)
+    derivatives = [legendre.legder(e) for e in unit]
     # (Roots are real here, and complex numbers since NumPy 2.5.)
-    x = np.r_[
-        -1.0, np.sort(legendre.legroots(legendre.legder(np.eye(NODES)[-1])).real), 1.0
-    ]
+    inner = legendre.legroots(derivatives[-1]).real
+    x = np.r_[-1.0, np.sort(inner), 1.0]
     x = (x - x[::-1]) / 2
-    vander = legendre.legvander(x, NODES - 1)
-    slopes = np.stack(
-        [legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1
+    values = legendre.legvander(x, NODES - 1)
+    slopes = np.stack([legendre.legval(x, e) for e in derivatives], axis=1)
+    inverse = np.linalg.inv(values)
+    return Rule(
+        nodes=(x + 1) / 2,
+        weights=inverse[0],
+        derivative=2 * slopes @ inverse,
+        coefficients=inverse,
     )
-    inverse = np.linalg.inv(vander)
-    return Rule((x + 1) / 2, inverse[0], 2 * slopes @ inverse, inverse)
 
 
 def polynomials(x: Float[Array, " p"]) -> Float[Array, "p K"]:
     """Legendre's polynomials at points of [0, 1]."""
+    xp = namespace(x)
     z = 2 * x - 1
-    rows = [namespace(x).ones_like(z), z]
+    rows = [xp.ones_like(z), z]
     for k in range(1, NODES - 1):
-        rows.append(((2 * k + 1) * z * rows[k] - k * rows[k - 1]) / (k + 1))
-    return namespace(x).stack(rows, axis=-1)
+        # Bonnet's recursion.
+        following = (2 * k + 1) * z * rows[k] - k * rows[k - 1]
+        rows.append(following / (k + 1))
+    return xp.stack(rows, axis=-1)
 
 
 class Jumps(NamedTuple):
@@ -126,11 +133,12 @@ class LinearFlow(eqx.Module):
         self, s: Structure, function: Callable, rows: int
     ) -> Float[Array, "P K rows n"]:
         """A function (see `with_derivatives`) at the nodes, and its derivatives."""
-        chart = namespace(self.q).repeat(self.chart, NODES)
         P, K, d = self.q.shape
-        at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
-        by = with_derivatives(s, function, *at, rows)
-        return namespace(by).moveaxis(by, -1, 0).reshape(P, K, rows, -1)
+        chart = namespace(self.q).repeat(self.chart, NODES)
+        q = self.q.reshape(P * K, d).T
+        by = with_derivatives(s, function, chart, self.t.ravel(), q, rows)
+        by = namespace(by).moveaxis(by, -1, 0)
+        return by.reshape(P, K, rows, -1)
 
     def after(self, map: ReturnMap) -> Float[Array, "P K"]:
         """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
@@ -140,19 +148,22 @@ class LinearFlow(eqx.Module):
         self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array
     ):
         """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
-        ratio = size[:, :, None] / size[:, None]
+        xp = namespace(self.q)
         d = self.q.shape[2]
         D = rule().derivative[rows, rows]
         n = len(D)
-        xp = namespace(self.q)
-        field = (
-            xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
-        )
-        whole = D[:, None, :, None] * np.eye(d)[:, None, :]
-        whole = whole + sign * self.length[:, None, None, None, None] * field
-        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(
-            -1, n, d, n, d
-        )
+        ratio = size[:, :, None] / size[:, None]
+
+        # Axes: piece, node, state, node, state.
+        same_node = xp.eye(n)[:, None, :, None]
+        same_state = np.eye(d)[:, None, :]
+        in_sizes = matrix / ratio[:, None]
+        field = same_node * in_sizes[:, rows, :, None, :]
+        h = self.length[:, None, None, None, None]
+        whole = D[:, None, :, None] * same_state
+        whole = whole + sign * h * field
+        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d))
+        inverse = inverse.reshape(-1, n, d, n, d)
         return inverse * ratio[:, None, :, None, :]
 
     @remembered
@@ -162,11 +173,12 @@ class LinearFlow(eqx.Module):
         xp = namespace(self.q)
         d = self.q.shape[2]
         inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
-        free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
-        free = xp.concatenate(
-            [xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1
-        )
-        return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
+        by_first = rule().derivative[1:, 0]
+        free = -xp.einsum("piajb,j->piab", inverse, by_first)
+        unit = xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))
+        free = xp.concatenate([unit, free], axis=1)
+        forced = xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
+        return free, forced
 
     @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
@@ -175,10 +187,10 @@ class LinearFlow(eqx.Module):
         d = self.q.shape[2]
         by_state = xp.swapaxes(self.by_state, -1, -2)
         inverse = self._implicit(1.0, slice(0, -1), by_state, 1 / self.size)
-        free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
-        return xp.concatenate(
-            [free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1
-        )
+        by_last = rule().derivative[:-1, -1]
+        free = -xp.einsum("piajb,j->piab", inverse, by_last)
+        unit = xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))
+        return xp.concatenate([free, unit], axis=1)
 
     def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
         """Covectors at the nodes by those at the end of the turn."""
@@ -188,7 +200,9 @@ class LinearFlow(eqx.Module):
             before = jump.T @ after
             return free @ before, before
 
-        _, ends = scan(back, end, (self.jumps.by_state[::-1], self.adjoint[::-1, 0]))
+        # From the last piece to the first.
+        pieces = (self.jumps.by_state[::-1], self.adjoint[::-1, 0])
+        _, ends = scan(back, end, pieces)
         return self.adjoint @ ends[::-1, None]
 
     def at(
@@ -198,12 +212,16 @@ class LinearFlow(eqx.Module):
         xp = jnp if isinstance(phase, jax.Array) else namespace(self.q)
         time = xp.asarray(phase) % 1.0 * period
         # (The last piece that begins there: those before may have the length 0.)
-        turn = xp.asarray(self.turn)
-        k = xp.maximum(xp.searchsorted(turn, time, side="right") - 1, 0)
+        begins = xp.asarray(self.turn)
+        following = xp.searchsorted(begins, time, side="right")
+        k = xp.maximum(following - 1, 0)
         length = xp.asarray(self.length)[k]
-        x = (time - turn[k]) / xp.where(length == 0, 1.0, length)
+        x = (time - begins[k]) / xp.where(length == 0, 1.0, length)
         mix = polynomials(x) @ rule().coefficients
-        mixed = (xp.einsum("pk,pk...->p...", mix, xp.asarray(y)[k]) for y in values)
+        mixed = []
+        for value in values:
+            at_nodes = xp.asarray(value)[k]
+            mixed.append(xp.einsum("pk,pk...->p...", mix, at_nodes))
         return xp.asarray(self.chart)[k], *mixed
 
     @remembered
@@ -248,10 +266,14 @@ class LinearFlow(eqx.Module):
         begin = own[..., None] + 0 * kick[0]
         through = xp.asarray(self.through, dtype=waves.dtype)
         end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
-        by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
-        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
-        by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
-        delays = xp.einsum("pa,pacf->pcf", by_begin, x) + by_input
+
+        # The delays of events.
+        free, _ = self.forward
+        delay_by_begin = (jumps.delay_by_state[:, None] @ free[:, -1])[:, 0]
+        by_state = xp.einsum("pa,pacf->pcf", delay_by_begin, x)
+        by_arrived = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
+        by_input = jumps.delay_by_input[..., None] * last
+        delays = by_state + wide(by_arrived + by_input)
         return x, delays / last, end
 
     @remembered
@@ -262,9 +284,8 @@ class LinearFlow(eqx.Module):
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
         zero outside of the `valid` rows and columns."""
-        return namespace(self.q).where(
-            valid[:, None] & valid, monodromy(self.through), 0.0
-        )
+        both = valid[:, None] & valid
+        return namespace(self.q).where(both, monodromy(self.through), 0.0)
 
 
 _hosted = Memory()
@@ -310,12 +331,18 @@ def last_turn(cycle: Any) -> Any:
 
 def begin_later(cycle: Any, k: int) -> Any:
     """A guess for neighbors of a clocked cycle that begins with its piece k, with its last turn."""
-    lanes, tape = jax.tree_util.tree_map(
-        lambda x: np.roll(x, -k, axis=-1), last_turn(cycle)
-    )
-    later = float(cycle.period) * (np.arange(len(lanes.t)) >= len(lanes.t) - k)
+
+    def rolled(x):
+        return np.roll(x, -k, axis=-1)
+
+    lanes, tape = jax.tree_util.tree_map(rolled, last_turn(cycle))
+    count = len(lanes.t)
+    is_next_turn = np.arange(count) >= count - k
+    later = float(cycle.period) * is_next_turn
     anchor = cycle.anchor._replace(
-        t=lanes.t[:1], chart=lanes.chart[:1], q=lanes.q[:, :1]
+        t=lanes.t[:1],
+        chart=lanes.chart[:1],
+        q=lanes.q[:, :1],
     )
     guess = dataclasses.replace(cycle, anchor=anchor)
     turn = lanes._replace(t=lanes.t + later), tape._replace(t=tape.t + later)
@@ -423,7 +450,8 @@ def _linear_flow(
     period = float(map.expected)
     lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
-    t = np.append(moves.t, map.anchor.t[0] + period)[:, None]
+    end = map.anchor.t[0] + period
+    t = np.append(moves.t, end)[:, None]
     q = moves.q.T[..., None]
     if by is not None:
         directions = len(jax.tree_util.tree_leaves(by)[0])
@@ -443,10 +471,7 @@ def _linear_flow(
     each = 1 + d + np.arange(P * K * directions) % directions
     charts = np.repeat(chart, K * directions)
     times = pieces.time.ravel()
-    step = (
-        np.searchsorted(np.real(t[:-1, 0]), np.real(pieces.time)[..., 0], "right") - 1
-    )
-    step = np.clip(step, pieces.first[:, None], pieces.last[:, None])
+    step = _step_at(moves, pieces)
     begin = t[step].ravel()
     start = np.moveaxis(q[step], 2, 0).reshape(d, -1)
     u = kernels.unpushed(s, each)
@@ -464,26 +489,33 @@ def _linear_flow(
     # Ends of pieces: by direction and piece.
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(directions), P))
     events = np.tile(pieces.event, directions)
-    times_of_ends = pieces.time[:, -1].T
-    ends = times_of_ends.ravel(), u, states[:, :, -1].reshape(-1, d)
-    jumps = _jumps(of, events, *ends)
+    times_of_ends = pieces.time[:, -1].T.ravel()
+    states_at_ends = states[:, :, -1].reshape(-1, d)
+    jumps = _jumps(of, events, times_of_ends, u, states_at_ends)
     jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
     flow = LinearFlow(
-        lay(times),
-        pieces.length.T,
-        None,
-        None,
-        states,
-        lay(by_field[:, 0]),
-        lay(by_field[:, 2 : 2 + d]),
-        lay(by_field[:, 2 + d :]),
-        jumps,
-        np.broadcast_to(map.scale[chart], (directions, P, d)),
+        t=lay(times),
+        length=pieces.length.T,
+        chart=None,
+        event=None,
+        q=states,
+        field=lay(by_field[:, 0]),
+        by_state=lay(by_field[:, 2 : 2 + d]),
+        by_input=lay(by_field[:, 2 + d :]),
+        jumps=jumps,
+        size=np.broadcast_to(map.scale[chart], (directions, P, d)),
     )
     if by is not None:
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, flow)
     flow = jax.tree_util.tree_map(lambda x: x[0], flow)
     return dataclasses.replace(flow, chart=chart, event=pieces.event)
+
+
+def _step_at(moves: Moves, pieces: _Pieces) -> Int[np.ndarray, "P K"]:
+    """The recorded moves in which the nodes of pieces lie."""
+    time = np.real(pieces.time)[..., 0]
+    step = np.searchsorted(moves.t, time, "right") - 1
+    return np.clip(step, pieces.first[:, None], pieces.last[:, None])
 
 
 def _along(
