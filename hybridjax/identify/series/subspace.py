@@ -154,8 +154,12 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
             out[:, :, n] = regression.reduced(z).reshape(z.shape)
         return out
 
-    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
-    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=no_columns)
+    all_sampled = np.asarray(grid.sampled.all(axis=3))
+    return grid._replace(
+        u=left(grid.u, grid.inside),
+        y=left(grid.y, all_sampled),
+        drift=no_columns,
+    )
 
 
 def _sections(
@@ -184,16 +188,20 @@ class _Section:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
         record."""
         back = self.time[:, None] + later - 1 - np.arange(length)
+        is_inside = back >= 0
         rows = self._z[self.record[:, None], np.maximum(back, 0)]
-        return np.where((back >= 0)[..., None], rows, 0.0).reshape(len(back), -1)
+        rows = np.where(is_inside[..., None], rows, 0.0)
+        return rows.reshape(len(back), -1)
 
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
-    size = np.sqrt(np.square(rows).sum(axis=0))
-    rows = rows / positive(size)
-    x = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
-    return x / positive(size)[:, None]
+    size = positive(np.sqrt(np.square(rows).sum(axis=0)))
+    rows = rows / size
+    gram = rows.T @ rows
+    shrunk = gram + _SHRINKAGE * np.eye(len(size))
+    x = np.linalg.solve(shrunk, rows.T @ target)
+    return x / size[:, None]
 
 
 def _from_states(
@@ -254,13 +262,18 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         inputs = columns @ problem.to_lags[n]
         sampled = part.sampled[:, :, n]
         delayed = [delay_cycles(sampled, j, not problem.free) for j in delays]
-        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
-        used = np.all(delayed, axis=0) & later[..., None]
+        cycle = np.arange(part.y.shape[1])
+        first = part.first[:, n, None] + problem.free
+        is_later = cycle >= first
+        used = np.all(delayed, axis=0) & is_later[..., None]
         no_starts = part.drift[:, :, :0]
-        return [
-            SectionRegression.make(inputs, no_starts, part.drift, used[..., alike[0]])
-            for alike in problem.alike[n]
-        ]
+        regressions = []
+        for alike in problem.alike[n]:
+            rows = used[..., alike[0]]
+            regressions.append(
+                SectionRegression.make(inputs, no_starts, part.drift, rows)
+            )
+        return regressions
 
     gram = np.zeros((ny, order + 1, order + 1))
     dof = 0
@@ -280,8 +293,9 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])
-    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
-    return np.pad(coefficients_of(roots / size), (0, order - len(roots)))
+    too_slow = np.maximum(np.abs(roots) / SLOWEST, 1.0)
+    c = coefficients_of(roots / too_slow)
+    return np.pad(c, (0, order - len(roots)))
 
 
 def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
