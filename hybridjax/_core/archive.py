@@ -115,12 +115,27 @@ class _Field(NamedTuple):
 def _fields_of(kind: type) -> list[_Field]:
     if issubclass(kind, tuple):
         hints = typing.get_type_hints(kind)
-        return [_Field(name, x, x is bool, True) for name, x in hints.items()]
+        return [
+            _Field(
+                name=name,
+                type=x,
+                static=x is bool,
+                required=True,
+            )
+            for name, x in hints.items()
+        ]
     fields = []
     for x in dataclasses.fields(cast(Any, kind)):
         is_static = x.metadata.get("static", False)
         is_required = x.default is dataclasses.MISSING
-        fields.append(_Field(x.name, x.type, is_static, is_required))
+        fields.append(
+            _Field(
+                name=x.name,
+                type=x.type,
+                static=is_static,
+                required=is_required,
+            )
+        )
     return fields
 
 

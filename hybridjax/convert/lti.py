@@ -234,7 +234,14 @@ def to_harmonic_state_space(
         m = np.arange(-n, n + 1)
         A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
         A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
-        space = HarmonicStateSpace(A, B, C, D, n, error=np.nan)
+        space = HarmonicStateSpace(
+            A=A,
+            B=B,
+            C=C,
+            D=D,
+            order=n,
+            error=np.nan,
+        )
         truncated = space.transfer(_TRIED, period)[:, n - 1 : n + 2]
         error = np.abs(truncated - exact).max() / np.abs(exact).max()
         space = space._replace(error=float(error))

@@ -221,7 +221,12 @@ def measured_htfs(
             inputs=htf.inputs[i : i + 1],
             outputs=tuple(htf.outputs[k] for k in noise.outputs),
         )
-        yield Measured(htf, members, int(i), float(np.sqrt(larger)))
+        yield Measured(
+            htf=htf,
+            cosines=members,
+            channel=int(i),
+            weight=float(np.sqrt(larger)),
+        )
 
 
 @checked

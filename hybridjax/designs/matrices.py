@@ -63,7 +63,13 @@ class Matrices(NamedTuple):
         unknowns = tuple(
             f"combination {k} of the matrices" for k in range(wanted.shape[1])
         )
-        return LinearCriterion(names, unknowns, (self.channel,), wanted, part)
+        return LinearCriterion(
+            names=names,
+            unknowns=unknowns,
+            channels=(self.channel,),
+            wanted=wanted,
+            part=part,
+        )
 
 
 def ldtp_matrices(

@@ -323,7 +323,13 @@ def optimal_design(
         distortion.require_those_of(models[0])
         limits = limits._replace(curved=distortion.bound)
     limits.require_limits()
-    rules = Rules(linear, distortion, cosines, dict(given.peak), seed)
+    rules = Rules(
+        linear=linear,
+        distortion=distortion,
+        cosines=cosines,
+        peak=dict(given.peak),
+        seed=seed,
+    )
     usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]

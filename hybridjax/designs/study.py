@@ -236,7 +236,12 @@ class SequentialDesign(Showable, eqx.Module):
             plan = None
         else:
             plan = self._next(best, errors, cycles, len(blocks))
-        history = History(blocks, np.array(padded), best, plan)
+        history = History(
+            blocks=blocks,
+            standard_errors=np.array(padded),
+            estimate=best,
+            plan=plan,
+        )
         return eqx.tree_at(
             lambda s: s._history, self, history, is_leaf=lambda x: x is None
         )

@@ -185,7 +185,13 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
         objection = (
             "the estimate is unstable, and an unstable system has no periodic response"
         )
-    return Estimate(fit, by_level, noise, most, objection)
+    return Estimate(
+        fit=fit,
+        by_level=by_level,
+        noise=noise,
+        supported=most,
+        objection=objection,
+    )
 
 
 def refuse_transient(

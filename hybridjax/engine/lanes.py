@@ -37,7 +37,14 @@ def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
     zero = chart * 0
     armed = np.zeros((len(s.transitions), t.shape[0]), bool)
-    return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace_of(zero))
+    return Lanes(
+        t=t,
+        chart=chart,
+        q=q,
+        armed=namespace(t).asarray(armed),
+        events=zero,
+        pace=pace_of(zero),
+    )
 
 
 def pace_of(events: Index) -> Float[Array, "4 L"]:

@@ -101,7 +101,15 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
         lanes, stride, result = carry
         time, index, event, limit = (namespace(x).atleast_1d(x) for x in end)
         limit = namespace(time).minimum(limit, lanes.t + patience)
-        target = Target(time, index, event, limit, sequence, levels, missed)
+        target = Target(
+            time=time,
+            index=index,
+            event=event,
+            limit=limit,
+            event_sequence=sequence,
+            levels=levels,
+            missed=missed,
+        )
         moved, tape = flow(s, lanes, u, target, settings, stride, result, options)
         carry = moved.lanes, stride._replace(h=moved.h), moved.result
         return carry, (lanes, moved, tape)

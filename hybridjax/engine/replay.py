@@ -474,7 +474,13 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     dt = longer.copy()
     dt[:, 0, 0] += 1.0
     dq = by_start + by_length * longer
-    return _Ends(t, q, field, dt, dq)
+    return _Ends(
+        t=t,
+        q=q,
+        field=field,
+        dt=dt,
+        dq=dq,
+    )
 
 
 def _at_zeros(
@@ -492,7 +498,13 @@ def _at_zeros(
     crossed = crossed[lands]
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane[lands]]
     landing = s.at(lands)
-    flow = ChartFlow(landing, a, u[:, lands], target.levels, index)
+    flow = ChartFlow(
+        s=landing,
+        a=a,
+        u=u[:, lands],
+        levels=target.levels,
+        index=index,
+    )
     zero = flow.locate(ends.t[lands], ends.q[:, lands], ends.field[:, lands], crossed)
     t = ends.t.copy()
     q = ends.q.copy()
@@ -519,7 +531,13 @@ def _at_zeros(
     all_dq = ends.dq.copy()
     all_dt[lands] = dt + delay
     all_dq[lands] = moved + field @ delay
-    return _Ends(t, q, ends.field, all_dt, all_dq)
+    return _Ends(
+        t=t,
+        q=q,
+        field=ends.field,
+        dt=all_dt,
+        dq=all_dq,
+    )
 
 
 def _after_resets(

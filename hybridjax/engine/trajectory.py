@@ -114,7 +114,14 @@ class Trajectory(Showable, eqx.Module):
             before = s.by_name(s.chart_index(tr.source), self.before[k])
             after = s.by_name(s.chart_index(tr.target), self.after[k])
             events.append(
-                Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after)
+                Event(
+                    time=float(self.t[k]),
+                    name=tr.name,
+                    source=tr.source,
+                    target=tr.target,
+                    before=before,
+                    after=after,
+                )
             )
         return events
 

@@ -139,12 +139,12 @@ def follow_table(
     finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
     left = end.left | ~finite | (end.place != BEGIN)
     response = Response(
-        y,
-        jnp.zeros(S, jnp.int32),
-        jnp.full(S, -1),
-        ROUNDING + plan.least + end.largest,
-        jnp.concatenate([end.t[None], end.q]).T,
-        None if feedback is None else to_experiments(answers),
+        y=y,
+        result=jnp.zeros(S, jnp.int32),
+        failed_at=jnp.full(S, -1),
+        error=ROUNDING + plan.least + end.largest,
+        end=jnp.concatenate([end.t[None], end.q]).T,
+        feedback=None if feedback is None else to_experiments(answers),
     )
     return response, left
 

@@ -285,7 +285,13 @@ def _try_ways(
         taken = xp.take_along_axis(tape.h, accepted, axis=0)
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
-    return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
+    return _Ways(
+        ends=ends,
+        estimate=estimate,
+        first=first,
+        slack=xp.asarray(slack[:K]),
+        lead=lead,
+    )
 
 
 def _lead(placed: PlacedSections, target):
@@ -366,7 +372,12 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
         plan = make_plan(placed, settings, accuracy, scales)
-        return Stepping(plan, settings, scales, accuracy)
+        return Stepping(
+            plan=plan,
+            settings=settings,
+            scales=scales,
+            accuracy=accuracy,
+        )
 
     # A plan is no part of the program that JAX traces.
     inside = is_inside_program() and not is_traced(placed)

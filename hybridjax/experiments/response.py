@@ -198,7 +198,14 @@ def flow_batch(
     end = jnp.concatenate([lanes.t[None], lanes.q])
     end = jnp.where(result == Result.OK, end, jnp.nan)
     answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
-    return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
+    return Response(
+        y=jnp.moveaxis(y, -1, 0),
+        result=result,
+        failed_at=failed_at,
+        error=error,
+        end=end.T,
+        feedback=answers,
+    )
 
 
 @checked_methods

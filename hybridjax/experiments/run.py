@@ -186,7 +186,12 @@ class Campaign:
         def make() -> _AtSections:
             z = self.placed.structure().resolve_outputs(self.outputs)
             on_cycle = np.asarray(self.placed.observe(tuple(z.items)))
-            return _AtSections(z, course(self.placed, z.items), on_cycle, self.outputs)
+            return _AtSections(
+                outputs=z,
+                course=course(self.placed, z.items),
+                on_cycle=on_cycle,
+                given=self.outputs,
+            )
 
         return _resolved.recall(self.placed, names, make)
 

@@ -320,7 +320,12 @@ def _solve_classes(
         )
     if kind == "noise" or dof[0] <= 0:
         dof[:] = sums.experiments * (repeats - 1)
-        return _ClassEstimates(H, noise, None, dof)
+        return _ClassEstimates(
+            H=H,
+            variance=noise,
+            noise=None,
+            dof=dof,
+        )
     # The error of P multiplies all of U in E, of which the references explain only a part. The
     # other part adds errors of entries of P to E: of one at the edge of its disc, where they
     # count three times, and of all others, whose scatter takes degrees of freedom.
@@ -329,7 +334,12 @@ def _solve_classes(
     counted = dof + _diagonal(left).sum(axis=1)
     total = variance(G, counted[:, None, None] + 2 * edge[:, None])
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
-    return _ClassEstimates(H, total, noise, 1 / (1 / dof + taken))
+    return _ClassEstimates(
+        H=H,
+        variance=total,
+        noise=noise,
+        dof=1 / (1 / dof + taken),
+    )
 
 
 def _require_answers(

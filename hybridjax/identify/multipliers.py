@@ -229,7 +229,13 @@ def _solve(
     groups = varpro.group_htf(htf, weight, size)
     c, converged = varpro.maximum_likelihood(groups, order)
     if htf.variance is not None:
-        return _Solution(groups, weight, size, c, converged)
+        return _Solution(
+            groups=groups,
+            weight=weight,
+            size=size,
+            c=c,
+            converged=converged,
+        )
     lines = weights.line_variances(htf)
     for _ in range(_REWEIGHTINGS):
         variance = varpro.error_spectrum(
@@ -238,7 +244,13 @@ def _solve(
         weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
         groups = varpro.group_htf(htf, weight, size)
         c, converged = varpro.maximum_likelihood(groups, order, c)
-    return _Solution(groups, weight, size, c, converged)
+    return _Solution(
+        groups=groups,
+        weight=weight,
+        size=size,
+        c=c,
+        converged=converged,
+    )
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;

@@ -125,7 +125,12 @@ class PeriodicModel(NamedTuple):
         """
         fixed_A = [np.zeros((len(A), 0)) for A in self.A]
         fixed_C = [np.zeros((len(C), 0)) for C in self.C]
-        coordinates = LocalCoordinates(self, fixed_A, fixed_C, direct)
+        coordinates = LocalCoordinates(
+            model=self,
+            to_A=fixed_A,
+            to_C=fixed_C,
+            direct=direct,
+        )
         step, _ = linearize(coordinates).step(0.0)
         return coordinates.moved(step)
 
@@ -224,7 +229,12 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         orthogonal = np.linalg.qr(columns, mode="complete")[0][:, d:]
         to_C.append(orthogonal[states:])
         to_A.append(orthogonal[:states] / rho + K @ orthogonal[states:])
-    return LocalCoordinates(normal, to_A, to_C, direct)
+    return LocalCoordinates(
+        model=normal,
+        to_A=to_A,
+        to_C=to_C,
+        direct=direct,
+    )
 
 
 def _gramians(model: PeriodicModel, rho: float) -> Blocks:

@@ -174,10 +174,10 @@ def _sums_of_part(
     if first or len(lines) < len(line):  # lines were measured several times
         tested = _compare_crest_factors(data.u[:, data.window])
     return SpectralSums(
-        Setup.of(data),
-        harmonics,
-        lines,
-        mirrored,
+        setup=Setup.of(data),
+        harmonics=harmonics,
+        line=lines,
+        mirrored=mirrored,
         gram=total(products),
         count=total(np.ones(len(U), int)),
         along=total(X.conj()[:, :, None, None] * Y[:, None]),

@@ -135,7 +135,12 @@ class Tiles(NamedTuple):
                 out = self._newton(first, *self._given(first), FEW_STEPS)
                 if not (out.result == Result.OK).any():
                     out = self._again(first, out, self._given, _SETTLE)
-                known = Known(numbers[first], out.anchor, out.period, out.result)
+                known = Known(
+                    numbers=numbers[first],
+                    anchor=out.anchor,
+                    period=out.period,
+                    result=out.result,
+                )
                 parts.append(out)
             for k in range(0, len(rest), self.size):
                 call.done = S - len(rest) + k
@@ -143,7 +148,12 @@ class Tiles(NamedTuple):
                 begin = self._nearest(numbers[rows], known)
                 parts.append(self._newton(rows, *begin, FEW_STEPS))
         out = _join(*parts)
-        found = Known(numbers[order], out.anchor, out.period, out.result)
+        found = Known(
+            numbers=numbers[order],
+            anchor=out.anchor,
+            period=out.period,
+            result=out.result,
+        )
         known = found if self.known is None else _join(found, known)
         if (known.result == Result.OK).any():
 
@@ -229,7 +239,16 @@ class Tiles(NamedTuple):
         anchor.q[other], anchor.chart[other] = turn.end.q[other], turn.end.chart[other]
         size[extra | other] = np.inf
         once = np.ones(len(rows), int)
-        return Rounds(anchor, size, period, turn, codes, together, -once, once)
+        return Rounds(
+            anchor=anchor,
+            excess=size,
+            period=period,
+            turn=turn,
+            codes=codes,
+            together=together,
+            result=-once,
+            steps=once,
+        )
 
     def _turn(self, rows, anchor: Lanes, period):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
@@ -296,7 +315,13 @@ def tiles_of(
             return map.multiplicity * jnp.asarray(system.period(), float)
 
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
-    return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
+    return Tiles(
+        systems=systems,
+        map=to_host(map),
+        periods=periods,
+        size=size or 4 * WIDE,
+        workers=workers,
+    )
 
 
 def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:

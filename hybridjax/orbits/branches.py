@@ -224,7 +224,12 @@ def continuation(
             f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
             f"{curve.value:.6g}: {first.message}. Find it anew."
         )
-    trace = _Trace(curve, np.sort(values), step, max_points)
+    trace = _Trace(
+        curve=curve,
+        values=np.sort(values),
+        step=step,
+        max_points=max_points,
+    )
     sense = np.sign(values[-1] - values[0])
     back, begin = trace.run(first.oriented(-sense))
     ahead, end = trace.run(first.oriented(sense))
@@ -278,7 +283,12 @@ def _branch(
     begin = _explained(cycles[0], begin)
     end = _explained(cycles[len(points) - 1], end)
     marked = tuple(
-        BranchPoint(point.kind, k, point.value, cycles[k].multipliers)
+        BranchPoint(
+            kind=point.kind,
+            index=k,
+            value=point.value,
+            multipliers=cycles[k].multipliers,
+        )
         for k, point in enumerate(points)
         if point.kind
     )

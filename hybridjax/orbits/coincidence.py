@@ -146,7 +146,12 @@ def _coincidence(
     t = float(path.t[k])
     a = int(path.chart[k - 1])
     n = s.dims[a]
-    before = _Order((), a, path.before[k, :n], np.eye(n))
+    before = _Order(
+        events=(),
+        chart=a,
+        state=path.before[k, :n],
+        derivative=np.eye(n),
+    )
     due = 10 * TOGETHER * period
     orders = list(_orders(s, t, before, due))
     names = tuple(
@@ -154,7 +159,12 @@ def _coincidence(
     )
     derivatives = tuple(order.derivative for order in orders)
     commute = _commute(scale, a, orders)
-    return SimultaneousEvents(t, names, derivatives, commute)
+    return SimultaneousEvents(
+        time=t,
+        orders=names,
+        derivatives=derivatives,
+        commute=commute,
+    )
 
 
 def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
@@ -286,7 +296,12 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
             continue
         b = s.chart_index(s.transitions[g].target)
         events = (*before.events, g)
-        order = _Order(events, b, event.after[0], saltation @ before.derivative)
+        order = _Order(
+            events=events,
+            chart=b,
+            state=event.after[0],
+            derivative=saltation @ before.derivative,
+        )
         is_last = False
         yield from _orders(s, t, order, due)
     if is_last and before.events:

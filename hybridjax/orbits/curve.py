@@ -224,7 +224,14 @@ class Curve:
             failure = self._failure(turn, z)
             if failure is not None:
                 return failure
-            point = Point(anchor, z, size, forward, turn, k)
+            point = Point(
+                anchor=anchor,
+                z=z,
+                size=size,
+                tangent=forward,
+                turn=turn,
+                steps=k,
+            )
             equations = np.vstack([point.scaled, row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
             (change,) = newton_steps(equations[None], residual[None], rounding)

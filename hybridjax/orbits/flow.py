@@ -651,7 +651,16 @@ def _on_host(request: _Request) -> Flow:
     )
     nothing = np.zeros(1)
     none = Samples(np.zeros((0, 1), np.int32), np.zeros((0, s.d, 1)))
-    passage = Passage(Moved(end, nothing, nothing, code), events, none)
+    passage = Passage(
+        Moved(
+            lanes=end,
+            h=nothing,
+            error=nothing,
+            result=code,
+        ),
+        events,
+        none,
+    )
     return _result(request, passage, path)
 
 

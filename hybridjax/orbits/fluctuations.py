@@ -238,7 +238,12 @@ def _events(cycle: Any, flow: LinearFlow, levels: np.ndarray) -> _Events:
     count = len(_names_of_events(cycle))
     number_of_event = xp.cumsum(hit)[:, None] - 1
     slot = (number_of_event == np.arange(count)) & hit[:, None]
-    return _Events(hit, delay, delay_by_noise, slot)
+    return _Events(
+        hit=hit,
+        delay=delay,
+        delay_by_noise=delay_by_noise,
+        slot=slot,
+    )
 
 
 def _pieces(

@@ -262,7 +262,13 @@ def solved(
         anchor = to_host(begin.anchor)._replace(t=times[row : row + 1])
         return _search(dataclasses.replace(tiles.map, anchor=anchor, **at_phase))
 
-    many = Many(leaves, times, expected, workers, size or TILE)
+    many = Many(
+        leaves=leaves,
+        t=times,
+        expected=expected,
+        workers=workers,
+        size=size or TILE,
+    )
     solver = Solver(many, tiles.map, search)
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
@@ -323,12 +329,12 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         codes = _wider(codes, more)
     pace = np.array([0.0, np.inf, 0.0, 0.0])
     pieces = Lanes(
-        found.pieces_t,
-        chart,
-        np.swapaxes(found.pieces_q, 1, 2),
-        armed,
-        events,
-        np.tile(pace[:, None], (S, 1, K)),
+        t=found.pieces_t,
+        chart=chart,
+        q=np.swapaxes(found.pieces_q, 1, 2),
+        armed=armed,
+        events=events,
+        pace=np.tile(pace[:, None], (S, 1, K)),
     )
     anchor = jax.tree_util.tree_map(lambda x: x[..., :1], pieces)
     if map.event >= 0:
@@ -384,7 +390,12 @@ def _coincide(
 
 def known_from(cycles: LimitCycles) -> Known:
     """Cycles as guesses for others."""
-    return Known(None, cycles.anchor, cycles.period, cycles.result)
+    return Known(
+        numbers=None,
+        anchor=cycles.anchor,
+        period=cycles.period,
+        result=cycles.result,
+    )
 
 
 def _some_known(cycles: LimitCycles) -> Known | None:

@@ -201,12 +201,12 @@ def _cycle(
     """The cycle that Newton's method has found on an itinerary of a route."""
     passage = found.passage
     pieces = Lanes(
-        passage.pieces_t,
-        itinerary.charts,
-        passage.pieces_q.T,
-        itinerary.armed,
-        itinerary.begins,
-        pace_of(itinerary.begins),
+        t=passage.pieces_t,
+        chart=itinerary.charts,
+        q=passage.pieces_q.T,
+        armed=itinerary.armed,
+        events=itinerary.begins,
+        pace=pace_of(itinerary.begins),
     )
     anchor = map.anchor._replace(q=found.q[:, None])
     return LimitCycle(

@@ -363,7 +363,13 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             break
         if steps == 2 * MAX_STEPS:
             break
-    return _Descent(x, best or turn, least, damping, steps)
+    return _Descent(
+        x=x,
+        turn=best or turn,
+        residual=least,
+        damping=damping,
+        steps=steps,
+    )
 
 
 def _moves(turn: Turn) -> int:

@@ -165,7 +165,13 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     begin = map.anchor.t[0]
     ends = begin + first.ends
     together = coincide_on(map, first.events, ends, begin, ends[first.last])
-    return Route(map, first, finer, other, together)
+    return Route(
+        map=map,
+        first=first,
+        finer=finer,
+        other=other,
+        together=together,
+    )
 
 
 class Corrected(NamedTuple):
@@ -231,7 +237,12 @@ class Maps(NamedTuple):
 
 def maps_of(map: ReturnMap) -> Maps:
     """The return map of one system."""
-    return Maps(map, leaves_of(map.system), map.anchor.t[0], map.expected)
+    return Maps(
+        map=map,
+        numbers_of_system=leaves_of(map.system),
+        t=map.anchor.t[0],
+        expected=map.expected,
+    )
 
 
 def leaves_of(system: Any) -> tuple[Array, ...]:
@@ -250,10 +261,10 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
         is_last = jnp.arange(ends.shape[-1]) >= plan.last
         known = jnp.where(is_last, end, jnp.inf)
     travelers = Travelers(
-        lambda numbers: maps.of(numbers).structure,
-        maps.numbers,
-        maps.many,
-        maps.map.structure,
+        of=lambda numbers: maps.of(numbers).structure,
+        numbers=maps.numbers,
+        many=maps.many,
+        structure=maps.map.structure,
     )
     passage = follow(
         travelers,
@@ -296,7 +307,14 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         passage, residual = turn(maps, plan, q, before.passage.ends)
         steps = maps.each(_newton, passage.factors, residual, q)
         jacobian, step, excess, distance = steps
-        found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
+        found = Corrected(
+            q=q,
+            passage=passage,
+            jacobian=jacobian,
+            distance=distance,
+            excess=excess,
+            turns=before.turns + 1,
+        )
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
         closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
@@ -327,7 +345,14 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
     unsolved = zeros() + jnp.inf
     turns = jnp.zeros(lanes, int)
-    return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
+    return Corrected(
+        q=q,
+        passage=passage,
+        jacobian=zeros(d, d),
+        distance=zeros(),
+        excess=unsolved,
+        turns=turns,
+    )
 
 
 def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:

@@ -329,7 +329,13 @@ class ReturnMap(eqx.Module):
             return moved, (lanes, factor, tape, Recorded(moved, steps))
 
         end, (pieces, factors, tapes, record) = self.travel(q, flow, record)
-        return _Linear(end, pieces, factors, tapes, record)
+        return _Linear(
+            end=end,
+            pieces=pieces,
+            factors=factors,
+            tapes=tapes,
+            record=record,
+        )
 
     def _linear_on_host(
         self,
@@ -352,11 +358,25 @@ class ReturnMap(eqx.Module):
             s = self._structure_of(lanes)
             by, _ = tape_jacobian(s, lanes, ends, tape, True)
             factors = by[:, 1:].reshape(PIECES, *q.shape, d)
-            return _Linear(end, pieces, factors, tapes, gap=gap)
+            return _Linear(
+                end=end,
+                pieces=pieces,
+                factors=factors,
+                tapes=tapes,
+                gap=gap,
+            )
         by, at = tape_jacobian(varied, lanes, ends, tape, False)
         by_parameter = self._by_parameter(varied, by[:, 1:], at)
         factors = by[:, 1:, 1 : 1 + d]
-        return _Linear(end, pieces, factors, tapes, None, gap, by_parameter)
+        return _Linear(
+            end=end,
+            pieces=pieces,
+            factors=factors,
+            tapes=tapes,
+            record=None,
+            gap=gap,
+            by_parameter=by_parameter,
+        )
 
     def _by_parameter(
         self,
@@ -538,7 +558,15 @@ class ReturnMap(eqx.Module):
             lanes, h, result = carry
             *end, piece = end
             time, index, event, limit = (xp.atleast_1d(x) for x in end)
-            target = Target(time, index, event, limit, None, ends.levels, ends.missed)
+            target = Target(
+                time=time,
+                index=index,
+                event=event,
+                limit=limit,
+                event_sequence=None,
+                levels=ends.levels,
+                missed=ends.missed,
+            )
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
@@ -556,7 +584,12 @@ class ReturnMap(eqx.Module):
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
         residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
         residual = xp.where(same[..., None], residual, np.nan)
-        return Return(residual, each(end.t - self.anchor.t), each(result), end), extra
+        return Return(
+            residual=residual,
+            period=each(end.t - self.anchor.t),
+            result=each(result),
+            end=end,
+        ), extra
 
     def pieces(self) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""

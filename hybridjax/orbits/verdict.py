@@ -222,7 +222,16 @@ def _walk_along(cycle) -> _Path:
     between = np.diff(t)
     same = np.abs(moves.h - between) <= 1e-14 * np.abs(t[1:])
     length = np.where(same, moves.h, between)
-    walked = walk(s, Stretch(t[:-1], length, moves.chart, moves.q), scale)
+    walked = walk(
+        s,
+        Stretch(
+            t=t[:-1],
+            length=length,
+            chart=moves.chart,
+            q=moves.q,
+        ),
+        scale,
+    )
     chart = moves.chart.copy()
     q = walked.q.copy()
     by_state = np.moveaxis(walked.by_state, -1, 0).copy()
@@ -314,7 +323,14 @@ def _jump(
     slip[:m] = event.slip[0]
     by_state[:m, :n] = event.by_state[0]
     chart = s.chart_index(transition.target)
-    return _Jump(chart, after, by_state, slip, delay, findings)
+    return _Jump(
+        chart=chart,
+        q=after,
+        by_state=by_state,
+        slip=slip,
+        delay=delay,
+        findings=findings,
+    )
 
 
 def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
@@ -376,7 +392,14 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
         a = int(path.chart[moves[0]])
         q = np.concatenate(states, axis=1)[: s.dims[a]]
         event = int(path.event[moves[-1]])
-        visits.append(Visit(a, np.concatenate(times), q, event))
+        visits.append(
+            Visit(
+                chart=a,
+                t=np.concatenate(times),
+                q=q,
+                event=event,
+            )
+        )
     return visits
 
 
@@ -585,7 +608,12 @@ def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
     moves = np.searchsorted(path.t, times) - 1
     begins = path.t[moves]
     chart = path.chart[moves]
-    stretch = Stretch(begins, times - begins, chart, path.begin[:, moves])
+    stretch = Stretch(
+        t=begins,
+        length=times - begins,
+        chart=chart,
+        q=path.begin[:, moves],
+    )
     reached = walk(map.structure, stretch, scale).q
     distance = np.abs(reached - path.begin[:, :1]) / scale[path.chart[0]][:, None]
     closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])

@@ -102,12 +102,12 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
     all_points = np.concatenate(points, axis=1)
     order = np.lexsort((times, all_lanes))
     return Walked(
-        q,
-        by_state,
-        error,
-        all_lanes[order],
-        times[order],
-        all_points[:, order],
+        q=q,
+        by_state=by_state,
+        error=error,
+        lane=all_lanes[order],
+        t=times[order],
+        points=all_points[:, order],
     )
 
 

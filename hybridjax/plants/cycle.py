@@ -150,12 +150,12 @@ class PlantCycle(Showable):
         warn_of(findings)
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
-            failed_at,
-            None,
-            self.sections.label,
-            rows[..., -1],
-            causes,
-            tuple(findings),
+            failed_at=failed_at,
+            error=None,
+            label=self.sections.label,
+            late=rows[..., -1],
+            causes=causes,
+            findings=tuple(findings),
         )
         return ExperimentData(
             u,

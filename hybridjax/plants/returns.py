@@ -532,7 +532,14 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     condition = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
     rounding = _ROUNDING * np.linalg.norm(J) * condition
     error = np.hypot(scatter + rounding, _BIAS * np.abs(apart))
-    return _Eigenvalues(values, left, right, variance, apart, error)
+    return _Eigenvalues(
+        value=values,
+        left=left,
+        right=right,
+        variance=variance,
+        apart=apart,
+        error=error,
+    )
 
 
 def _resolved(jacobian: _Jacobian) -> _Resolved:

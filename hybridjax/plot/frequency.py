@@ -388,7 +388,14 @@ def _curves(
         for which in inputs:
             pushed = _pick("input", which, htf.inputs)
             label = _curve(output, pushed, htf) if input is None else output
-            curves.append(_Curve(output, pushed, which, label))
+            curves.append(
+                _Curve(
+                    output=output,
+                    input=pushed,
+                    which=which,
+                    label=label,
+                )
+            )
     return curves
 
 

@@ -319,9 +319,24 @@ def _tracks(
     count = max(12, round(length / pace * _RATE))
     times = longest.t[0] + np.linspace(0, length, count, endpoint=False)
     title = "" if beside is None else "cycle"
-    tracks = [Track(title, CYCLE[0], path, times, period)]
+    tracks = [
+        Track(
+            title=title,
+            color=CYCLE[0],
+            trajectory=path,
+            times=times,
+            period=period,
+        )
+    ]
     if beside is not None:
-        tracks.append(Track("perturbed", COLORS["red"], beside, times))
+        tracks.append(
+            Track(
+                title="perturbed",
+                color=COLORS["red"],
+                trajectory=beside,
+                times=times,
+            )
+        )
     return tracks, pace, note
 
 

@@ -176,7 +176,14 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
             total += len(part)
             t = time[part]
             unseen = gaps(t, bridgeable(t))[1:-1]
-            of_trial.append(Winding(t[rising], mean[rising], False, unseen))
+            of_trial.append(
+                Winding(
+                    time=t[rising],
+                    phase=mean[rising],
+                    linear=False,
+                    gaps=unseen,
+                )
+            )
         stretches.append(tuple(of_trial))
     return Phase(
         tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1)

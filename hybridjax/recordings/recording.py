@@ -121,7 +121,14 @@ class Recording(Showable, eqx.Module):
             happened[key] = np.sort(values[~np.isnan(values)])
             check_events(where, key, happened[key], time)
         values = np.stack(list(columns.values()), axis=1)
-        self.trials = (Trial(time, values, happened, name),)
+        self.trials = (
+            Trial(
+                time=time,
+                values=values,
+                events=happened,
+                name=name,
+            ),
+        )
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
         self.findings = tuple(findings)

@@ -399,7 +399,17 @@ def _sample(
             values[:, nu + i] = np.where(observed, output.at(start), np.nan)
             change[:, i] = output.change(start)
         none = np.zeros((0, 0))
-        sections.append(_Sections(trial, k[:-1], start, observed, values, change, none))
+        sections.append(
+            _Sections(
+                trial=trial,
+                k=k[:-1],
+                t=start,
+                observed=observed,
+                values=values,
+                change=change,
+                cycle=none,
+            )
+        )
     return sections
 
 

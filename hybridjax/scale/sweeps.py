@@ -141,7 +141,15 @@ def sweep(
         "guess": None if guess is None else rough(guess),
         "piece": list(blocks.block),
     }
-    job = SweepJob(family, system, space, blocks, wanted, guess, description)
+    job = SweepJob(
+        family=family,
+        system=system,
+        space=space,
+        blocks=blocks,
+        wanted=wanted,
+        guess=guess,
+        description=description,
+    )
     return fill(job, store, client).dataset()
 
 
@@ -191,12 +199,12 @@ class SweepJob:
         points = self.space.constants(units)
         states = self.wanted.constants()
         layout = Layout(
-            self.space.dims,
-            self.blocks,
-            variables,
-            {**points, **states},
-            (*points, *states),
-            self.description,
+            dims=self.space.dims,
+            blocks=self.blocks,
+            variables=variables,
+            constants={**points, **states},
+            coordinates=(*points, *states),
+            description=self.description,
         )
         begun = begun._replace(coarse=solved)
         whole = cycles if len(self.blocks) == 1 else None
@@ -268,7 +276,12 @@ class SweepJob:
         anchor = jax.tree_util.tree_map(
             lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor
         )
-        blank = Known(None, anchor, np.zeros(n), np.zeros(n, int))
+        blank = Known(
+            numbers=None,
+            anchor=anchor,
+            period=np.zeros(n),
+            result=np.zeros(n, int),
+        )
         return Begun(map, index, blank)
 
     def _guess(self) -> LimitCycle:

@@ -65,7 +65,16 @@ def flow_along(
     rows = h, code, walk.t[1:], *ways, chart[1:], at_once, rival, events
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
     none = np.zeros(len(event), np.int32)
-    flow = pieces, Moved(ends, none, none, none), tape
+    flow = (
+        pieces,
+        Moved(
+            lanes=ends,
+            h=none,
+            error=none,
+            result=none,
+        ),
+        tape,
+    )
     last = Lanes(*(x[..., -1:] for x in ends))
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)
 
@@ -120,7 +129,12 @@ def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
     times = np.concatenate([begin.t, moves.t[between], places.t])
     states = np.concatenate([begin.q, moves.q[:, between], places.q], axis=1)
     order = np.lexsort((times, keys))
-    return _Walk(keys[order], times[order], states[:, order], order > len(between))
+    return _Walk(
+        key=keys[order],
+        t=times[order],
+        q=states[:, order],
+        at_target=order > len(between),
+    )
 
 
 def _ends_at_targets(
@@ -181,7 +195,12 @@ def _places_on(
     key = np.where(event < 0, move_at(time), turns * M + move + 1).astype(int)
     state = moves.q[:, key]
     state[:, is_inside] = end[:, 1:].T
-    return _Places(move_at(begin.t), key, time, state)
+    return _Places(
+        first=move_at(begin.t),
+        key=key,
+        t=time,
+        q=state,
+    )
 
 
 def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):

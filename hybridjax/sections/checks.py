@@ -188,7 +188,12 @@ def _met(placed: PlacedSections, i: int) -> _Met:
     low = level[falls + 1]
     crossed = falls[(high > 0) & (low <= 0)]
     places = [f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed]
-    return _Met(section, high, low, places)
+    return _Met(
+        section=section,
+        high=high,
+        low=low,
+        places=places,
+    )
 
 
 def _remedy(placed: PlacedSections, i: int) -> str:

@@ -249,7 +249,12 @@ def _bind(
 
 def bind_at(map: ReturnMap, family: AbstractSections, points: Lanes) -> BoundSections:
     """The family evaluated on the cycle, from points at equal times."""
-    orbit = Orbit(map.expected, points.t, points.chart, points.q.T)
+    orbit = Orbit(
+        period=map.expected,
+        t=points.t,
+        chart=points.chart,
+        q=points.q.T,
+    )
     if on_host(map.expected):
         return to_host(_bind_program(map, family, orbit))
     return family.bind(map.structure, orbit)

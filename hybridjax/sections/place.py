@@ -130,7 +130,12 @@ def place_along(
     M = family.points
     points = side_by_side(flows[0][0])
     moved_points = x[None]
-    orbit = Orbit(cycle.period, points.t[:M], points.chart[:M], points.q.T[:M])
+    orbit = Orbit(
+        period=cycle.period,
+        t=points.t[:M],
+        chart=points.chart[:M],
+        q=points.q.T[:M],
+    )
     if M > 1:
         times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
         variation, tangents, _ = follow(flows.pop(0), None, times)
@@ -203,7 +208,15 @@ def _bind_along(
 ):
     def bind(s, family, moving):
         period, t, q = moving
-        return family.bind(s, Orbit(period, t, orbit.chart, q))
+        return family.bind(
+            s,
+            Orbit(
+                period=period,
+                t=t,
+                chart=orbit.chart,
+                q=q,
+            ),
+        )
 
     begin = s, family, (orbit.period, orbit.t, orbit.q)
 

@@ -256,7 +256,13 @@ def section_target(
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
     limit = xp.maximum(arrival, t) + 0.5 * period
     return Target(
-        time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED
+        time=time,
+        index=i,
+        event=bound.event[i],
+        limit=limit,
+        event_sequence=None,
+        levels=bound.levels,
+        missed=Result.SECTION_MISSED,
     )
 
 

@@ -213,10 +213,10 @@ def _followed(
         map, begin, known, levels = moving
         maps = maps_of(map)
         travelers = Travelers(
-            lambda numbers: maps.of(numbers).structure,
-            maps.numbers,
-            False,
-            map.structure,
+            of=lambda numbers: maps.of(numbers).structure,
+            numbers=maps.numbers,
+            many=False,
+            structure=map.structure,
         )
         settings = jax.lax.stop_gradient(map.settings)
         table = path.form, path.rows, path.count if few else None

@@ -170,7 +170,12 @@ class ZarrStore:
                 arrays[name] = Variable(x.dtype.str, dims, x.shape[p:])
             blocks = Blocks(first.shape[:p], first.chunks[:p])
             self.layout = Layout(
-                tuple(about["dims"]), blocks, arrays, {}, (), about["description"]
+                dims=tuple(about["dims"]),
+                blocks=blocks,
+                variables=arrays,
+                constants={},
+                coordinates=(),
+                description=about["description"],
             )
             # (Zarr would read a chunk that was deleted as zeros.)
             kept = self._group[_START]

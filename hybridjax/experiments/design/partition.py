@@ -208,7 +208,15 @@ class _Division:
         of_second[j] = leaves
         hits = _hits(of_first, self._products), _hits(of_second, self._products)
         worse = sum(hits) - self.hits[first] - self.hits[second]
-        return _Swap(first, i, second, j, (of_first, of_second), hits, worse)
+        return _Swap(
+            first=first,
+            i=i,
+            second=second,
+            j=j,
+            classes=(of_first, of_second),
+            hits=hits,
+            worse=worse,
+        )
 
     def apply(self, swap: _Swap) -> None:
         """Exchange the lines."""

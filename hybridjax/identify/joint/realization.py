@@ -81,7 +81,12 @@ def realized_htf(
         K=[np.zeros((len(a), 0)) for a in A],
     )
     weights = np.broadcast_to(weight, H.shape)
-    problem = FrequencyProblem(f, harmonics, H / unit, weights)
+    problem = FrequencyProblem(
+        f=f,
+        harmonics=harmonics,
+        target=H / unit,
+        weight=weights,
+    )
     for _ in range(2):  # the second time removes rounding errors
         model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)

@@ -349,7 +349,12 @@ def _fit_open_loop(
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
         ratios = _noise_ratios(delayed, noise * _noise(solution))
-        return _Weighted(problem, solution, converged, ratios)
+        return _Weighted(
+            problem=problem,
+            solution=solution,
+            converged=converged,
+            ratios=ratios,
+        )
 
     best = weighted(order)
     covariance, p_steady = _uncertainty(best.problem, best.solution)

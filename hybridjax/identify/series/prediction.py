@@ -448,7 +448,13 @@ class Predictor(NamedTuple):
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
-        problem = SeriesProblem([part], self.S, True, free_start, 0)
+        problem = SeriesProblem(
+            parts=[part],
+            S=self.S,
+            by_section=True,
+            free_start=free_start,
+            residuals=0,
+        )
         path = problem.path(self.model, part)
         out = np.zeros(grid.y.shape)
         for n, x in enumerate(path.x):

@@ -185,7 +185,12 @@ def _regressed(
     left_by_fit = (root**2).sum() - by_fit
     ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
     p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
-    return _Regressed(correlation, float(stats.norm.isf(p)), degrees, float(by_fit))
+    return _Regressed(
+        correlation=correlation,
+        deviate=float(stats.norm.isf(p)),
+        degrees=degrees,
+        by_fit=float(by_fit),
+    )
 
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:

@@ -107,7 +107,13 @@ def whitening(
     by_drift = weight * ahead.slopes[:, -1]
     nothing = np.zeros(L)
     if not wander.size:
-        return Whitening(weight, nothing, nothing, nothing, np.ones(L))
+        return Whitening(
+            weight=weight,
+            by_drift=nothing,
+            kept=nothing,
+            learned=nothing,
+            scale=np.ones(L),
+        )
     left = _left(intervals, wander.memory)
     kept = np.zeros(L)
     learned = np.zeros(L)
@@ -122,7 +128,13 @@ def whitening(
         learned[k] = a * gain
         scale[k] = square**0.5
         variance = a * a * variance * (1 - gain * g) + (1 - a * a) * stationary
-    return Whitening(weight, by_drift, kept, learned, scale)
+    return Whitening(
+        weight=weight,
+        by_drift=by_drift,
+        kept=kept,
+        learned=learned,
+        scale=scale,
+    )
 
 
 def _left(intervals: Intervals, memory: float) -> Lanes:

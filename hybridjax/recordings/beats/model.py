@@ -131,7 +131,13 @@ def _of_trial(
     # The phase advances evenly under the mean input.
     inputs = np.interp(start + half_steps, time, x - x.mean())
     trial = np.full(len(start), number)
-    return Intervals(start, duration, trial, np.full(len(start), step), inputs)
+    return Intervals(
+        start=start,
+        duration=duration,
+        trial=trial,
+        step=np.full(len(start), step),
+        inputs=inputs,
+    )
 
 
 def basis(phase: Lanes, waves: int, jitter: float = 0.0) -> Table:
@@ -311,7 +317,16 @@ class _PhaseModel:
         drift *= gain[:, None]
         drift += (half * (1 - part))[:, None] * now.force
         drift += (half * part)[:, None] * force
-        return _Running(now.rows, now.step, now.rate, phase, u, drift, force, growth)
+        return _Running(
+            rows=now.rows,
+            step=now.step,
+            rate=now.rate,
+            phase=phase,
+            u=u,
+            drift=drift,
+            force=force,
+            growth=growth,
+        )
 
 
 def _end(
