@@ -85,7 +85,8 @@ def polynomials(x: Float[Array, " p"]) -> Float[Array, "p K"]:
     rows = [xp.ones_like(z), z]
     for k in range(1, NODES - 1):
         # Bonnet's recursion.
-        following = (2 * k + 1) * z * rows[k] - k * rows[k - 1]
+        before, last = rows[-2:]
+        following = (2 * k + 1) * z * last - k * before
         rows.append(following / (k + 1))
     return xp.stack(rows, axis=-1)
 
@@ -409,24 +410,27 @@ def _pieces(
     after_event = np.roll(moves.code, 1) >= 0
     begins = np.maximum.accumulate(np.where(after_event, k, 0))
     first = np.flatnonzero((k - begins) % most == 0)
-    last = np.append(first[1:], len(k)) - 1
-    length = t[last + 1] - t[first]
+    following = np.append(first[1:], len(k))
+    last = following - 1
+    length = t[following] - t[first]
     event = np.maximum(moves.code[last], -1)
 
     # Each of these is divided into equal parts. (Rounding divides no piece.)
     count = np.ceil(np.real(length[:, 0]) / longest - 1e-9)
     count = np.maximum(count, 1).astype(int)
     whole = np.repeat(np.arange(len(first)), count)
-    part = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
+    parts_before = np.cumsum(count) - count
+    part = np.arange(len(whole)) - np.repeat(parts_before, count)
     parts = count[whole]
     share = (part[:, None] + rule().nodes) / parts[:, None]
-    time = t[first[whole]][:, None] + share[..., None] * length[whole][:, None]
+    begin = t[first][whole]
+    duration = length[whole]
     is_last = part == parts - 1
     return _Pieces(
         first=first[whole],
         last=last[whole],
-        time=time,
-        length=length[whole] / parts[:, None],
+        time=begin[:, None] + share[..., None] * duration[:, None],
+        length=duration / parts[:, None],
         event=np.where(is_last, event[whole], -1),
     )
 
@@ -539,9 +543,14 @@ def _along(
 def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]:
     """Tangents of (t, q) at the anchor of a cycle, and of its period."""
     begin = np.zeros((1 + d, directions))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
-    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
-    return begin, np.zeros(directions) if by.period is None else by.period
+    if by.anchor.t is not None:
+        begin[0] = by.anchor.t[:, 0]
+    if by.anchor.q is not None:
+        begin[1:] = by.anchor.q[..., 0].T
+    period = by.period
+    if period is None:
+        period = np.zeros(directions)
+    return begin, period
 
 
 def of_flow(tangents: Any) -> Any:
@@ -568,21 +577,35 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
 
     def work(a, here, out):
         n = s.dims[a]
-        out[:n, here] = kernels.step(s, a, t[here], q[:n, here], u[:, here], h[here]).q
+        step = kernels.step(s, a, t[here], q[:n, here], u[:, here], h[here])
+        out[:n, here] = step.q
         return out
 
-    return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
+    everywhere = np.ones(len(t), bool)
+    return for_each_chart(s, chart, everywhere, work, np.zeros_like(q))
 
 
 def _jumps(s: Structure, code, t, u, q) -> Jumps:
     """The events at the ends of pieces, where the states are q."""
     P, d = q.shape
-    shapes = (P, d, d), (P, d, s.nu), (P, d), (P, s.nu), (P, d), (P,)
-    out = Jumps(*(np.zeros(shape, q.dtype) for shape in shapes))
+    nu = s.nu
+
+    def zeros(*shape):
+        return np.zeros((P, *shape), q.dtype)
+
+    out = Jumps(
+        by_state=zeros(d, d),
+        by_input=zeros(d, nu),
+        delay_by_state=zeros(d),
+        delay_by_input=zeros(nu),
+        slip=zeros(d),
+        delay_by_level=zeros(),
+    )
     out.by_state[:] = np.eye(d)
     for g in np.unique(code[code >= 0]).tolist():
         now = np.flatnonzero(code == g)
-        n = s.dims[s.chart_index(s.transitions[g].source)]
+        source = s.transitions[g].source
+        n = s.dims[s.chart_index(source)]
         event = jump(s, g, t[now], q[now, :n], u[:, now])
         m = event.after.shape[1]
         out.by_state[now] = 0.0
@@ -600,9 +623,12 @@ def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]
     xp = namespace(states)
     points = np.arange(len(chart))
     wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)
-    places = [dict(zip(c.states, range(s.d), strict=False)) for c in s.charts]
-
-    def row(name):
-        return xp.asarray([x.get(name, s.d) for x in places])[chart]
-
-    return {name: wide[points, row(name)] for name in s.state_names()}
+    named = {}
+    for name in s.state_names():
+        # (Column d is NaN.)
+        column = [s.d] * len(s.charts)
+        for a, states in enumerate(x.states for x in s.charts):
+            if name in states:
+                column[a] = states.index(name)
+        named[name] = wide[points, xp.asarray(column)[chart]]
+    return named

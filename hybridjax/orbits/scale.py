@@ -8,7 +8,7 @@ as they do a state that a symmetry keeps at zero, the size is large enough to to
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -123,10 +123,14 @@ def scale_of(
     take those of another such array, or 1."""
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
-        scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
-    others: ArrayLike = 1.0 if otherwise is None else to_host(otherwise)
+        for row, name in enumerate(chart.states):
+            scale[a, row] = sizes.get(name, np.nan)
+    others: ArrayLike = 1.0
+    if otherwise is not None:
+        others = to_host(otherwise)
     xp = jnp if is_tracer(others) else np
-    return real(xp.where(np.isnan(scale), others, scale))
+    is_missing = np.isnan(scale)
+    return real(xp.where(is_missing, others, scale))
 
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
@@ -190,11 +194,15 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
 
 def points(s: Structure, pieces: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Charts, times and states at the beginnings of the pieces of a turn, until it failed."""
-    t, chart, q = map(np.asarray, (pieces.t, pieces.chart, pieces.q))
-    for a in np.unique(chart):
-        rows = (chart == a) & np.isfinite(q).all(axis=0)
+    t = np.asarray(pieces.t)
+    chart = np.asarray(pieces.chart)
+    q = np.asarray(pieces.q)
+    is_reached = np.isfinite(q).all(axis=0)
+    for a in np.unique(chart).tolist():
+        n = s.dims[a]
+        rows = (chart == a) & is_reached
         if rows.any():
-            yield int(a), t[rows], q[: s.dims[a], rows]
+            yield a, t[rows], q[:n, rows]
 
 
 def _modes(s: Structure, a: int, t, q) -> np.ndarray:
@@ -221,12 +229,14 @@ def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
     zeros = np.zeros(q.shape)
     derivative = np.zeros((s.d, *q.shape))
     out = _Fields(zeros, zeros.copy(), derivative, zeros.copy())
-    for a in np.unique(chart):
+    for a in np.unique(chart).tolist():
+        n = s.dims[a]
         rows = np.flatnonzero(chart == a)
-        parts = _fields_of_chart(s, int(a), t[rows], q[: s.dims[a], rows])
-        for whole, part in zip(out, parts, strict=True):
-            unpadded = map(slice, part.shape[:-1])
-            whole[cast(Any, (*unpadded, rows))] = part
+        of_chart = _fields_of_chart(s, a, t[rows], q[:n, rows])
+        out.f[:n, rows] = of_chart.f
+        out.change[:n, rows] = of_chart.change
+        out.derivative[:n, :n, rows] = of_chart.derivative
+        out.rounding[:n, rows] = of_chart.rounding
     return out
 
 
@@ -248,17 +258,25 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     delays = times - t[:, None]
     by_shifts = np.einsum("ijk,jks->iks", derivative, shifts)
     by_delays = by_time[..., None] * delays
-    error = values - f[..., None] - (by_shifts + by_delays)
-    in_state, in_time = np.split(np.abs(error), [1 + len(_SHIFTS)], axis=-1)
+    smooth = by_shifts + by_delays
+    error = np.abs(values - f[..., None] - smooth)
+    in_state, in_time = np.split(error, [1 + len(_SHIFTS)], axis=-1)
 
     # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
     of_time = 2 * np.finfo(float).eps * np.abs(by_time * t)
     in_time = in_time - of_time[..., None]
     # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
     earlier, later = np.split(in_time, 2, axis=-1)
-    with_time = np.minimum(earlier.max(axis=-1), later.max(axis=-1))
-    rounding = np.maximum(in_state.max(axis=-1), with_time)
-    return _Fields(f, change, derivative, rounding)
+    with_earlier = earlier.max(axis=-1)
+    with_later = later.max(axis=-1)
+    with_time = np.minimum(with_earlier, with_later)
+    with_state = in_state.max(axis=-1)
+    return _Fields(
+        f=f,
+        change=change,
+        derivative=derivative,
+        rounding=np.maximum(with_state, with_time),
+    )
 
 
 def _shifted(t: Float[np.ndarray, " K"], q: Float[np.ndarray, "n K"]):
@@ -291,7 +309,8 @@ def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
             b = s.chart_index(transition.target)
             if a in reached and b not in reached:
                 before = states[a, : s.dims[a], None]
-                after = kernels.reset(s, s.member(g), time, before, u)[:, 0, 0]
+                expanded = kernels.reset(s, s.member(g), time, before, u)
+                after = expanded[:, 0, 0]
                 states[b] = np.pad(after, (0, s.d - len(after)))
                 reached.add(b)
     return states
@@ -301,14 +320,17 @@ def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
     """The time of the fastest mode of the field's derivative at the first point that has one (the
     guess comes first); in free flight, the time in which a state changes by its size."""
     for derivative in np.moveaxis(near.derivative, -1, 0):
-        rate = np.max(np.abs(np.linalg.eigvals(derivative)))
-        if rate > 0:
-            return 1 / float(rate)
+        modes = np.linalg.eigvals(derivative)
+        fastest_rate = np.max(np.abs(modes))
+        if fastest_rate > 0:
+            return 1 / float(fastest_rate)
     size = np.abs(q[:, 0])
     speed = np.abs(near.f[:, 0])
     acceleration = np.abs(near.change[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        times = np.concatenate([np.sqrt(size / acceleration), size / speed])
+        by_acceleration = np.sqrt(size / acceleration)
+        by_speed = size / speed
+    times = np.concatenate([by_acceleration, by_speed])
     moves = (times > 0) & (times < np.inf)
     return float(min(times[moves], default=1.0))
 
@@ -319,7 +341,11 @@ def _by_name(
     """The largest size of each state in any chart; 1 for one that is zero everywhere."""
     sizes = dict.fromkeys(s.state_names(), 0.0)
     for a, column in zip(chart, size.T, strict=True):
-        for name, x in zip(s.charts[a].states, column, strict=False):
+        states = s.charts[a].states
+        for name, x in zip(states, column.tolist(), strict=False):
             if np.isfinite(x):
-                sizes[name] = max(sizes[name], float(x))
-    return {name: size if size > 0 else 1.0 for name, size in sizes.items()}
+                sizes[name] = max(sizes[name], x)
+    for name, largest in sizes.items():
+        if largest == 0:
+            sizes[name] = 1.0
+    return sizes

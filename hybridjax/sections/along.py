@@ -41,28 +41,42 @@ def flow_along(
     if places is None:
         return None
     walk = _walk(map, moves, begin, places)
+    by_clock = np.isfinite(targets.time[0])
+    arrival = ARRIVE_TIME if by_clock else ARRIVE_LEVEL
     event = np.broadcast_to(targets.event, len(places.key))
-    arrives = walk.at_target[1:] & (event[np.minimum(walk.piece, len(event) - 1)] < 0)
-    arrival = ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL
-    ends_in = moves.code[walk.key[:-1]]
+    last_piece = len(event) - 1
+    event_at_end = event[np.minimum(walk.piece, last_piece)]
+    arrives = walk.at_target[1:] & (event_at_end < 0)
+    move = walk.key[:-1]
+    ends_in = moves.code[move]
     h = np.diff(walk.t)
     code = np.where(arrives, arrival, ends_in)
+    happens = code >= 0
     # (Where events and sections coincide, a search decides which comes first.)
     at_event = arrives & (np.diff(walk.key) > 0) & (ends_in >= 0)
-    if (at_event | (code >= 0) & (h == 0) | (h < 0)).any():
+    at_once = happens & (h == 0)
+    if (at_event | at_once | (h < 0)).any():
         return None
     chart = moves.chart[walk.key]
     ends = _ends_at_targets(map, walk, chart, code, begin.events)
-    pieces = Lanes(
-        *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
-    )
+    begins = []
+    for first, others in zip(begin, ends, strict=True):
+        begins.append(np.append(first, others[..., :-1], axis=-1))
+    pieces = Lanes(*begins)
+
     M = before.shape[1]
-    states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
-    at_once = np.zeros(len(h), bool)
-    rival = np.full(len(h), -1)
-    events = np.cumsum(code >= 0)
-    ways = states, walk.q[:, 1:]
-    rows = h, code, walk.t[1:], *ways, chart[1:], at_once, rival, events
+    after = walk.q[:, 1:]
+    rows = Tape(
+        h=h,
+        code=code,
+        t=walk.t[1:],
+        before=np.where(happens, before[:, move % M], after),
+        after=after,
+        chart=chart[1:],
+        at_once=np.zeros(len(h), bool),
+        rival=np.full(len(h), -1),
+        events=np.cumsum(happens),
+    )
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
     none = np.zeros(len(event), np.int32)
     flow = (
@@ -85,12 +99,15 @@ def _three_turns(
     """The moves of a turn three times, one turn after the other, and the states before the events
     of one. (Targets lie in the first two turns, and what follows them at most at the beginning of a
     third.)"""
-    is_move = turn[1].code.T != IDLE
-    before = turn[1].before.transpose(2, 0, 1)[is_move].T
-    moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in recorded_moves(*turn)))
-    later = map.expected * np.repeat([0, 1, 2], before.shape[1])
+    starts, tape = turn
+    is_move = tape.code.T != IDLE
+    before = tape.before.transpose(2, 0, 1)[is_move].T
+    once = recorded_moves(starts, tape)
+    moves = Moves(*(np.concatenate([x, x, x], axis=-1) for x in once))
+    number_of_turn = np.repeat([0, 1, 2], before.shape[1])
+    t = moves.t + map.expected * number_of_turn
     code = np.where(moves.code < 0, MOVE, moves.code)
-    return moves._replace(t=moves.t + later, code=code), before
+    return moves._replace(t=t, code=code), before
 
 
 class _Places(NamedTuple):
@@ -121,9 +138,11 @@ class _Walk(NamedTuple):
 
 
 def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
-    late = TOGETHER * map.expected
-    is_replaced = places.t - moves.t[places.key] <= late
-    passed = np.arange(places.first[0] + 1, places.key[-1] + 1)
+    late = places.t - moves.t[places.key]
+    is_replaced = late <= TOGETHER * map.expected
+    first = places.first[0]
+    last = places.key[-1]
+    passed = np.arange(first + 1, last + 1)
     between = np.setdiff1d(passed, places.key[is_replaced])
     keys = np.concatenate([places.first, between, places.key])
     times = np.concatenate([begin.t, moves.t[between], places.t])
@@ -150,10 +169,17 @@ def _ends_at_targets(
     ends = ends._replace(events=count[at - 1])
     watched = map.watch(ends, until(ends.t))
     armed = arm(s, ends, watched, period)
-    none = np.zeros(len(at), np.int32)
-    u = np.zeros((s.nu, 1))
-    entry = Entry(ends.armed, ends.armed)
-    return rearm(s, armed, watched, fired, none > 0, period, u, none, entry)
+    return rearm(
+        s,
+        armed,
+        watched,
+        fired,
+        together=np.zeros(len(at), bool),
+        span=period,
+        u=np.zeros((s.nu, 1)),
+        residue=np.zeros(len(at), np.int32),
+        entry=Entry(ends.armed, ends.armed),
+    )
 
 
 def _places_on(
@@ -192,7 +218,8 @@ def _places_on(
         is_next = np.append(False, time[1:] <= time[:-1] + late)
         turns = turns + np.cumsum(is_next)
     time = time + turns * period
-    key = np.where(event < 0, move_at(time), turns * M + move + 1).astype(int)
+    after_event = turns * M + move + 1
+    key = np.where(event < 0, move_at(time), after_event).astype(int)
     state = moves.q[:, key]
     state[:, is_inside] = end[:, 1:].T
     return _Places(
@@ -207,16 +234,19 @@ def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths
     """The move of one turn in which each target lies, and the time from its start, to first order;
     None if one is not met once."""
     K = len(targets.time)
-    M = ends.shape[1]
-    level = _levels_on(s, once, ends, targets)
-    falls = (level[0] > 0) & (level[1] <= 0)
-    is_reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])
-    if (is_reached.sum(axis=1) != 1).any():
+    start, end = _levels_on(s, once, ends, targets)
+    falls = (start > 0) & (end <= 0)
+    wanted = event[:, None]
+    is_reached = np.where(wanted < 0, falls, once.code == wanted)
+    times_reached = is_reached.sum(axis=1)
+    if (times_reached != 1).any():
         return None
     move = np.argmax(is_reached, axis=1)
-    start, end = level[:, np.arange(K), move]
+    target = np.arange(K)
+    start = start[target, move]
+    end = end[target, move]
     part = np.where(event < 0, start / (start - end), 1.0)
-    return move, part * lengths[:M][move]
+    return move, part * lengths[move]
 
 
 def _until_settled(
