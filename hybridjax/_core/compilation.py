@@ -483,7 +483,8 @@ def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
         return x.repeat(filled, axis=-1)
     if filled == L:
         return x
-    return np.concatenate([x, np.repeat(x[..., :1], filled - L, axis=-1)], axis=-1)
+    padding = np.repeat(x[..., :1], filled - L, axis=-1)
+    return np.concatenate([x, padding], axis=-1)
 
 
 def _is_array(x: Any) -> bool:

@@ -115,7 +115,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         ]
         text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
         note(f"{name}: bumps of H_0 around f = 2", any(map(len, peaks)), text)
-        power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
+        H = np.asarray(family.estimate.H)[..., 0]
+        power = np.sum(np.abs(H) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
         within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
         second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)

@@ -76,7 +76,8 @@ def to_lti(model: LDTP) -> LDTP:
         return (A @ from_state, states), (C @ from_state, outputs)
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
-    (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
+    sections = (jnp.arange(N), A, B, C, D)
+    (A, B), (C, D) = jax.lax.scan(advance, carry, sections)
     first = d if is_traced(model.dims) else int(np.asarray(model.dims)[0])
     return LDTP(
         A[None, :first, :first],
@@ -132,7 +133,8 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     pairs = itertools.product(thing.harmonics, thing.outputs)
     outputs = [f"{y}[{m}]" for m, y in pairs]
     inputs = list(map(str, thing.inputs))
-    H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
+    H = np.moveaxis(np.asarray(thing.H), 1, -1)
+    H = H.reshape(len(outputs), len(inputs), -1)
     frequencies = 2 * np.pi * np.asarray(thing.frequencies) / period
     return package("control").FrequencyResponseData(
         H, frequencies, inputs=inputs, outputs=outputs, sysname="HTF"
@@ -213,7 +215,8 @@ def to_harmonic_state_space(
     period = map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
-    sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
+    size_after = np.roll(flow.size, -1, axis=0)
+    sizes = flow.size[:, None] / size_after[:, :, None]
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
         raise DefinitionError(

@@ -76,7 +76,8 @@ def certify(
     limits = limits.tangent(power, level)
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
-    best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
+    one = np.ones(len(limits.cost))
+    best = linprog(-gain / gain.max(), limits.cost * alone, one)
     if best.x is None:
         # The tangent of a quadratic limit may leave some powers unbounded.
         return Certificate(np.inf, np.full(len(power), np.nan))

@@ -340,7 +340,8 @@ class Products(NamedTuple):
     ) -> Float[np.ndarray, "O k k"]:
         """Return the expected mean square, in units of the limit, as a form of the mean powers of
         cosines whose power in each experiment is a `share` of it."""
-        expected = self.expected[:, kept][:, :, kept] / (self.level**2)[:, None, None]
+        expected = self.expected[:, kept][:, :, kept]
+        expected = expected / (self.level**2)[:, None, None]
         return expected * (share.T @ share) / len(share)
 
 

@@ -66,7 +66,8 @@ def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
     N = data.n_sections
     P = data.periods
     line = np.concatenate([sums.line for sums in each])
-    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
+    gram = [np.real(sums.gram[:, 0, 0]) for sums in each]
+    power = np.concatenate(gram)[:, None]
     along = np.concatenate([sums.along[:, 0] for sums in each])
     H = (along.swapaxes(0, 1) / power)[..., None]
     variance = np.broadcast_to((N * P / repeats / power)[..., None], H.shape)
@@ -218,11 +219,13 @@ def refuse_transient(
     if not before:
         return
     k = min(1, before - 1)
-    cycles = y[:, : y.shape[1] // N * N].reshape(len(y), -1, N, y.shape[2])
+    whole = y.shape[1] // N * N
+    cycles = y[:, :whole].reshape(len(y), -1, N, y.shape[2])
     early = cycles[:, k]
     late = cycles[:, k + P]
     excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
-    threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / early[..., 0].size)
+    numbers = early[..., 0].size
+    threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / numbers)
     size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
     decay = np.abs(multipliers).max() ** (before - k)
     left = np.where(excess > threshold, size, 0).max() * decay

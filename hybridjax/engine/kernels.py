@@ -485,5 +485,6 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
         (value, f), (tangent, _) = jax.jvp(end, (t, q, u, h), tuple(tangents))
         return value, f, tangent
 
-    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(jnp.eye(split[-1] + 1))
+    unit = jnp.eye(split[-1] + 1)
+    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(unit)
     return jnp.concatenate([value[:, None], f[:, None], columns], axis=1)

@@ -505,7 +505,8 @@ def _at_zeros(
         levels=target.levels,
         index=index,
     )
-    zero = flow.locate(ends.t[lands], ends.q[:, lands], ends.field[:, lands], crossed)
+    at_end = ends.t[lands], ends.q[:, lands], ends.field[:, lands]
+    zero = flow.locate(*at_end, crossed)
     t = ends.t.copy()
     q = ends.q.copy()
     t[lands] += zero.past
@@ -548,7 +549,8 @@ def _after_resets(
     n = len(ends.q)
     end = np.zeros((M, 1 + s.d), ends.dq.dtype)
     by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
-    columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
+    inputs = slice(1 + s.d, 1 + s.d + s.nu)
+    columns = np.r_[: 1 + n, inputs]
     end[:, 0] = ends.t
     by[:, :1, columns] = ends.dt
     event = np.maximum(moves.code, -1)

@@ -226,7 +226,8 @@ def observed(
         if all(item in states for item in items):  # (without compiling a function)
             values[:, at] = q[at].T[[states.index(item) for item in items]]
             continue
-        point = t[at], q[at, : s.dims[a]].T, np.zeros((s.nu, 1))
+        u = np.zeros((s.nu, 1))
+        point = t[at], q[at, : s.dims[a]].T, u
         values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
     return values
 
@@ -480,8 +481,10 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
         sizes = np.abs(after[:, :n]).max(axis=0)
         state = after[rows, :n].T
         guard = _guards_at(s, a, t[rows], state, u)
-        value_before = _guards_at(s, a, t[rows], before[rows, :n].T, u)[:, 0]
-        value_later = _guards_at(s, a, t[rows + 1], before[rows + 1, :n].T, u)[:, 0]
+        begin = before[rows, :n].T
+        end = before[rows + 1, :n].T
+        value_before = _guards_at(s, a, t[rows], begin, u)[:, 0]
+        value_later = _guards_at(s, a, t[rows + 1], end, u)[:, 0]
         value = guard[:, 0]
         slope = guard[:, 2 : 2 + n]
         field = kernels.field(s, a, t[rows], state, u)[:, 0]

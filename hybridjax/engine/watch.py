@@ -194,7 +194,8 @@ def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Pad
 
     def work(a, here, out):
         n = s.dims[a]
-        f = chart_field(s, a, only(here, u))(only(here, t), only(here, q[:n]))
+        field = chart_field(s, a, only(here, u))
+        f = field(only(here, t), only(here, q[:n]))
         return put(out, slice(n), xp.where(here, f, out[:n]))
 
     xp = namespace(q)

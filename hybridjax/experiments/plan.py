@@ -129,7 +129,8 @@ def make_plan(
     J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
     ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
-    error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
+    reference = ways.ends[:, -1:]
+    error = np.moveaxis(ways.ends[:, :-1] - reference, 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
 
@@ -143,7 +144,8 @@ def make_plan(
     least = np.zeros(())
     if ways.estimate.shape[1] > 1:
         after = np.roll(section, -1)
-        own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
+        off = ways.ends[1:, -1, 0] - placed.lanes.q[:, after]
+        own = off / scale[after, 1:].T
         least = largest[best, section].sum() + np.abs(own).max()
 
     # The cycle itself comes first, and then the larger deviations.
@@ -276,7 +278,9 @@ def _try_ways(
         s, lanes, u, target, tolerance, start, options=Options(tape=implicit)
     )
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
-    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
+    arrives = moved.result == Result.OK
+    ends = xp.where(arrives, ends, xp.nan)
+    ends = ends.reshape(1 + s.d, W, M, N)
     tolerances = rtol[:K, None, None] / settings.rtol
     estimate = moved.error.reshape(W, M, N)[:K] * tolerances
     first = longest / divide[:K, None]

@@ -143,7 +143,8 @@ def spectral_products(
         unit = positive(size)
     else:
         unit = like.unit
-    bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
+    classes = np.arange(P // 2 + 1)
+    bins = (classes[:, None] + P * np.arange(N)) % (N * P)
     windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
     spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
@@ -201,7 +202,8 @@ def excited_classes(
     size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
-    least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
+    relative = power / scale[:, :, None] / scale[:, None]
+    least = np.linalg.eigvalsh(relative)[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
     if whole.any():
         return np.flatnonzero(whole)

@@ -237,7 +237,8 @@ def _fit_one(
     rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
-    powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
+    exponents = 1 + np.arange(zeros + 1)
+    powers = np.exp(-2j * np.pi * f[:, None] * exponents)
     response = FittedResponse(
         harmonic=(0, -1),
         share=1.0,

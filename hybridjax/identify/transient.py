@@ -104,7 +104,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     data.require_ok()
     # Inputs have units of their own.
     u = data.u[data.ok]
-    u = u / np.maximum(np.abs(u).max(axis=(0, 1)), np.finfo(float).tiny)
+    largest = np.abs(u).max(axis=(0, 1))
+    u = u / np.maximum(largest, np.finfo(float).tiny)
     _require_repetition(data, u)
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
@@ -115,7 +116,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     clean = data.y[:, N:].copy()
     clean[data.ok] -= transients
     removed = np.full((len(clean), clean.shape[2]), np.nan)
-    removed[data.ok] = np.sqrt(np.mean(transients[:, -N * P :] ** 2, axis=1))
+    window = transients[:, -N * P :]
+    removed[data.ok] = np.sqrt(np.mean(window**2, axis=1))
     simulated = None
     if data.simulated is not None:
         # Events, some of which lie in the cycles that were cut off, are left out.
@@ -176,7 +178,8 @@ def _decays(
 def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) -> None:
     """**Raises:** `DefinitionError` for an input that does not repeat after P periods."""
     length = data.n_sections * data.periods
-    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    later = u[:, length:]
+    change = np.abs(later - u[:, :-length]).max(axis=(1, 2))
     worst = int(np.argmax(change))
     if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
         raise DefinitionError(

@@ -332,7 +332,8 @@ def group_htf(
     """
     f = np.asarray(htf.frequencies)
     N = htf.n_sections
-    powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(size))
+    delay = -2j * np.pi / N * f[:, None]
+    powers = np.exp(delay * np.arange(size))
     turned = np.concatenate([powers, 1j * powers], axis=1)
     conjugate = np.concatenate([powers, -1j * powers], axis=1)
     matrices = {

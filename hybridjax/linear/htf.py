@@ -406,7 +406,8 @@ class HTF(Showable, eqx.Module):
         require_same("HTFs to be compared", self, other, fields)
         _require_same_lines(self, other)
         H, reference, zero = to_host((self.H, other.H, other[0]))
-        return from_host(abs(H - reference).max((1, 3)) / abs(zero).max((0, 2)))
+        difference = abs(H - reference).max((1, 3))
+        return from_host(difference / abs(zero).max((0, 2)))
 
     def error(self, other: "HTF") -> Float[Array, " ny"]:
         """The largest of `harmonic_errors`, per output."""

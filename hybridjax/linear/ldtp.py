@@ -360,7 +360,15 @@ class LDTP(WithMultipliers, eqx.Module):
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
         # Without common padding.
         d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
-        return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
+        return LDTP(
+            A=A[:, :d, :d],
+            B=B[:, :d],
+            C=C[:, :, :d],
+            D=D,
+            dims=dims,
+            inputs=inputs,
+            outputs=outputs,
+        )
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""

@@ -115,9 +115,32 @@ class TorsoWalker(HybridSystem):
     def mechanism(self) -> Mechanism:
         """The walker by three angles, and for the floating base also by the position (x, y) of the
         stance foot."""
-        legs = self.r / 2 * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
-        arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
-        ends = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, 0, 1]])
+        # Each mass is so many half legs and torsos away from the stance foot.
+        half_legs = np.array(
+            [
+                [1, 0, 0],
+                [2, -1, 0],
+                [2, 0, 0],
+                [2, 0, 0],
+            ]
+        )
+        torsos = np.array(
+            [
+                [0, 0, 0],
+                [0, 0, 0],
+                [0, 0, 0],
+                [0, 0, 1],
+            ]
+        )
+        arms = self.r / 2 * half_legs + self.l * torsos
+        ends = np.array(
+            [
+                [0, 0, 0],
+                [1, 0, 0],
+                [1, -1, 0],
+                [1, 0, 1],
+            ]
+        )
         ends = ends * jnp.stack([self.r, self.r, self.l])
         drawn = {
             "stance": ends[:2],

@@ -131,7 +131,10 @@ class TwoLeggedBar(HybridSystem):
     def draw(self, chart, t, q):
         """The table, the bar, and legs that have their rest length in the air."""
         table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
-        hips = [(self.hip(leg), q["y"] + self.hip(leg) * q["q"]) for leg in _LEGS]
+        hips = []
+        for leg in _LEGS:
+            hip = self.hip(leg)
+            hips.append((hip, q["y"] + hip * q["q"]))
         lines: dict = {"ground": [(-1.0, table), (1.0, table)], "bar": hips}
         for leg, (x, y) in zip(_LEGS, hips, strict=True):
             lines[leg] = Drawing.spring(

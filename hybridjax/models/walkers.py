@@ -214,7 +214,8 @@ class CompassGait(HybridSystem):
         c = jnp.cos(s - n)
         d = coupling * jnp.sin(s - n)
         gravity = self.g * (mH * length + m * a + m * length)
-        torque_n = -d * vs**2 - m * self.g * b * jnp.sin(n) + u[0]
+        weight = m * self.g * b * jnp.sin(n)
+        torque_n = -d * vs**2 - weight + u[0]
         torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
         # The inverse of [[A, B], [B, D]].
         A = m * b**2
@@ -255,7 +256,8 @@ class CompassGait(HybridSystem):
         )
         leg = -m * a * b * vs
         A = m * b * (b - length * c)
-        B = m * length * (length - b * c) + m * a**2 + mH * length**2
+        swinging = m * length * (length - b * c)
+        B = swinging + m * a**2 + mH * length**2
         C = m * b**2
         D = -m * b * length * c
         det = A * D - B * C

@@ -129,7 +129,8 @@ def _touched_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 def _is_slow(row, field, sizes, period: float) -> bool:
     """True if a function changes slowly along the flow, given its derivatives in a row."""
     slope = row[2 : 2 + len(field)]
-    possible = abs(row[1]) + np.abs(slope) @ np.maximum(np.abs(field), sizes / period)
+    fastest = np.maximum(np.abs(field), sizes / period)
+    possible = abs(row[1]) + np.abs(slope) @ fastest
     return bool(abs(row[1] + slope @ field) < _SLOW * possible)
 
 

@@ -307,7 +307,8 @@ def check_jumps(cycle: LimitCycle) -> None:
     for a in charts:
         if not unresolved.may_jump(s, a):
             continue
-        inside = (chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0)
+        in_chart = (chart[1:] == a) & (chart[:-1] == a)
+        inside = in_chart & (np.diff(t) > 0)
         before = np.flatnonzero(inside)
         if not len(before):
             continue
@@ -458,7 +459,8 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
             throw=False,
         )
         if path.result != Result.OK:
-            return f" It stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}'."
+            where = s.names[path.chart[-1]]
+            return f" It stopped at t = {path.t[-1]:.6g} in chart '{where}'."
     rate = rate_of_short_steps(s, turn, expected)
     if rate == 0.0:
         return ""

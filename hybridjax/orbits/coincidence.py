@@ -239,14 +239,17 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
     a = int(path.chart[k - 1])
     n = s.dims[a]
     times = path.t[[k - 1, k]]
-    states = np.stack([path.after[k - 1, :n], path.before[k, :n]])
+    begin = path.after[k - 1, :n]
+    end = path.before[k, :n]
+    states = np.stack([begin, end])
     u = np.zeros((s.nu, 1))
     found = set()
     for g in s.guards(a):
         event = jump(s, g, times, states, u)
         was_positive = event.level[0] > TOGETHER * period * abs(event.rate[0])
         falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
-        holds = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u).all()
+        predicate = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u)
+        holds = predicate.all()
         if g not in events and was_positive and falls and holds:
             found.add(g)
     return found

@@ -172,7 +172,8 @@ def _transfer(
     H = _integrals(map, flow, z, harmonics, inside, begin, delay)
 
     H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1)
-    at_f = (fine @ H.reshape(len(coarse), -1)).reshape(len(f), rows + d, -1)
+    at_f = fine @ H.reshape(len(coarse), -1)
+    at_f = at_f.reshape(len(f), rows + d, -1)
     H, end = xp.split(at_f, [rows], axis=1)
 
     # The deviation at phase 0 is that one period later.

@@ -302,12 +302,15 @@ def _cubic(
         along = p.tangent * p.size
         return along * (row @ chord) / (row @ along) - chord
 
-    return a.z + x * chord + x * (1 - x) * ((1 - x) * off(a) - x * off(b))
+    on_chord = a.z + x * chord
+    beside = (1 - x) * off(a) - x * off(b)
+    return on_chord + x * (1 - x) * beside
 
 
 def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
     """Which of the times of a cycle is farthest from all events."""
-    apart = np.mod(t[:, None] - events + 0.5 * period, period) - 0.5 * period
+    since = t[:, None] - events
+    apart = np.mod(since + 0.5 * period, period) - 0.5 * period
     return int(np.abs(apart).min(axis=1).argmax())
 
 

@@ -213,7 +213,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         dims = self.dims
         scale = np.asarray(self.settings.scale)[np.asarray(self.pieces.chart)]
         after = np.roll(np.arange(len(dims)), -1)
-        factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
+        factors = np.asarray(self.factors)
+        factors = factors * scale[:, None, :] / scale[after, :, None]
         return [
             factor[: dims[end], : dims[begin]]
             for begin, (end, factor) in enumerate(zip(after, factors, strict=True))

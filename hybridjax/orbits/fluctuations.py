@@ -262,7 +262,8 @@ def _pieces(
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     free, _ = flow.forward
-    forward = _pad(free[:, -1], n) + np.diag(np.arange(n) >= d)
+    stays = np.arange(n) >= d
+    forward = _pad(free[:, -1], n) + np.diag(stays)
     # An event begins a delay of its own, and ends a duration, from the delay before to its own.
     none = xp.zeros((P, d, 1 + E))
     each = events.slot[..., None]
@@ -277,7 +278,8 @@ def _pieces(
     )
     by_delay = xp.concatenate([flow.jumps.slip, xp.ones((P, 1)), events.slot], axis=1)
     late = events.delay_by_noise[:, None] * by_delay
-    scattered = xp.asarray(scatter)[flow.event][:, :, None] ** 2 * np.eye(d)
+    deviations = xp.asarray(scatter)[flow.event]
+    scattered = deviations[:, :, None] ** 2 * np.eye(d)
     added = late[:, :, None] * late[:, None] + _pad(scattered, n)
     return _Pieces(forward, _pad(collected, n), jump, added)
 
@@ -342,7 +344,8 @@ def _within_pieces(
     xp = namespace(before)
     free, _ = flow.forward
     inward = solve(free, columns)
-    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
+    h = flow.length[:, None, None, None]
+    rate = h * inward @ xp.swapaxes(inward, -1, -2)
     # (Integrals are zero at the first node.)
     integral = np.linalg.inv(rule().derivative[1:, 1:])
     integral = np.pad(integral, [(1, 0), (1, 0)])

@@ -147,7 +147,8 @@ def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
     """**Raises:** `DefinitionError` for a guess at which the field is not finite."""
     a = int(lane.chart[0])
     u = np.zeros((s.nu, 1))
-    rate = kernels.field(s, a, lane.t, lane.q[: s.dims[a]], u)[:, 0, 0]
+    q = lane.q[: s.dims[a]]
+    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
             f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
@@ -185,7 +186,8 @@ def _time_of_motion(map: ReturnMap, lanes: Lanes) -> float:
     lane = to_host(lanes)
     a = int(lane.chart[0])
     q = lane.q[: s.dims[a]]
-    rates = kernels.field(s, a, lane.t, q, np.zeros((s.nu, 1)))[:, 0, 0]
+    u = np.zeros((s.nu, 1))
+    rates = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         times = np.abs(q[:, 0] / rates)
     return float(np.nanmin(times, initial=np.inf))
@@ -196,7 +198,8 @@ def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     s = map.structure
     lane = to_host(lanes)
     a = int(lane.chart[0])
-    return bool(fastest(s, a, lane.t, lane.q[: s.dims[a]])[0] > 0)
+    (rate,) = fastest(s, a, lane.t, lane.q[: s.dims[a]])
+    return bool(rate > 0)
 
 
 def _on_section(
@@ -384,7 +387,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
     field = kernels.field(s, a, t, lane.q[:n], u)[..., 0]
-    sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
+    scale = np.asarray(map.scale)[a, :n]
+    sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
     rate = field[:, 0] / sizes
     jacobian = field[:, 2 : 2 + n] * sizes / sizes[:, None]
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
@@ -408,7 +412,7 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
-    known = np.abs(lane.q[:n, 0]) > _REST * np.asarray(map.scale)[a, :n]
+    known = np.abs(lane.q[:n, 0]) > _REST * scale
     place = signal_values(s.states(a), np.where(known, lane.q[:n, 0], 0.0))
     raise ComputationError(
         f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', {place}, where "
@@ -420,7 +424,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
 def _at_anchor(map: ReturnMap):
     """The field (d,), and the value and rate of the level of a crossing."""
     watched = map.watch(map.anchor, to_section(until(map.anchor.t), map.base, -1))
-    return map.slopes(map.anchor)[:, 0], watched.value[-1, 0], watched.rate[-1, 0]
+    slope = map.slopes(map.anchor)[:, 0]
+    return slope, watched.value[-1, 0], watched.rate[-1, 0]
 
 
 def _go(map: ReturnMap, doing: str, lanes: Lanes, target: Target) -> Lanes:

@@ -144,7 +144,8 @@ class LimitCycles(Showable, eqx.Module):
     def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
         values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
-        order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
+        moduli = np.round(np.abs(values), 12)
+        order = np.lexsort((-np.imag(values), -moduli), axis=-1)
         values = np.take_along_axis(values.astype(complex), order, axis=-1)
         values[~self.ok] = np.nan
         return values

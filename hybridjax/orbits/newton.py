@@ -151,7 +151,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     times = np.where(np.isfinite(ends.time), along, 0.0)
     orbit = Variation(s, turn.pieces, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
-    moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
+    end = orbit.tangents(begin)[-1, 1:].T
+    moved = np.where(map.valid, end, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
     begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
     tangents = orbit.tangents(begin)

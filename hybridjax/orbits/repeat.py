@@ -98,7 +98,8 @@ class Plan(eqx.Module):
         whether they have kept the itinerary, with steps that are fine enough."""
         xp = namespace(passage.t)
         ends = passage.ends
-        durations = ends - xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        begins = xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        durations = ends - begins
         # (Rounding makes legs that last no time negative.)
         forwards = durations >= -ROUNDING * period[..., None]
         unused = np.arange(ends.shape[-1]) > self.last

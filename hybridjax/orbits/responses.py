@@ -286,7 +286,8 @@ class Responses(Showable, eqx.Module):
         parts = 1 + harmonics // 2
         x, weight = np.polynomial.legendre.leggauss(NODES)
         x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
-        phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
+        times = flow.turn[:, None] + flow.length[:, None] * x
+        phase = (times / period).ravel()
         weight = (
             flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)
         ).ravel()
@@ -301,7 +302,8 @@ class Responses(Showable, eqx.Module):
         wave = weight @ wave
         response = weight @ Z
         for x in self.impulses():
-            response += xp.exp(-2j * np.pi * n * x.phase) * x.weight[signal] / period
+            wave_there = xp.exp(-2j * np.pi * n * x.phase)
+            response += wave_there * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
             raise DefinitionError(

@@ -442,7 +442,8 @@ class ReturnMap(eqx.Module):
         """Test whether a turn stays where it begins, as at an equilibrium."""
         xp = namespace(q)
         same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
-        apart = xp.abs(turn.pieces.q - q[..., None]) / self.sizes[..., None]
+        apart = xp.abs(turn.pieces.q - q[..., None])
+        apart = apart / self.sizes[..., None]
         farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
@@ -582,7 +583,9 @@ class ReturnMap(eqx.Module):
             rows = ends.time, ends.index, ends.event, ends.limit, record
             (end, _, result), extra = scan(follow_piece, (lanes, h, lanes.events), rows)
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
-        residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
+        returned = xp.where(self.valid, each(end.q.T), 0.0)
+        off, _ = self.held(q)
+        residual = returned - q - off
         residual = xp.where(same[..., None], residual, np.nan)
         return Return(
             residual=residual,
@@ -607,7 +610,8 @@ class ReturnMap(eqx.Module):
         if self.base is None:
             return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
-        time = xp.where(k < PIECES, t0 + free * expected * k / (PIECES - 1), np.inf)
+        grid = t0 + free * expected * k / (PIECES - 1)
+        time = xp.where(k < PIECES, grid, np.inf)
         section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
         last = k == PIECES
         return dataclasses.replace(
@@ -625,7 +629,8 @@ class ReturnMap(eqx.Module):
             return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
         level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
         level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
-        falls = (level[1:-1] > 0) & (level[2:] <= 0) & (events[1:-1] == events[2:])
+        crosses = (level[1:-1] > 0) & (level[2:] <= 0)
+        falls = crosses & (events[1:-1] == events[2:])
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 
 
@@ -664,7 +669,8 @@ def with_derivatives(
     def work(a, here, out):
         n = s.dims[a]
         by = function(a, only(here, t), only(here, q[:n]), only(here, u))
-        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, 2 + s.d : 2 + s.d + s.nu])
+        inputs = slice(2 + s.d, 2 + s.d + s.nu)
+        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, inputs])
         return put(out, index, xp.where(here, by, out[index]))
 
     begin = xp.zeros((rows, 2 + s.d + s.nu, L), t.dtype)

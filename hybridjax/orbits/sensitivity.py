@@ -89,7 +89,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     clocked = map.base is None
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
     starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
-    whole = xp.where(map.valid[:, None] & map.valid, total[:, 1:], 0.0)
+    both = map.valid[:, None] & map.valid
+    whole = xp.where(both, total[:, 1:], 0.0)
     closed, Z = loop(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
@@ -140,4 +141,6 @@ def section_delay(
         return kernels.watched(of, a, levels, t, q, u, index)[-1:]
 
     by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
-    return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)
+    by_state = by[:-1]
+    rate = -(by_state @ f)
+    return by_state / rate, by[-1] / rate

@@ -300,7 +300,8 @@ def _jump(
     led to this state, where its guard is at zero, or beyond. `span`: the period."""
     transition = s.transitions[g]
     n = s.dims[a]
-    event = jump(s, g, np.array([t]), q[None, :n], np.zeros((s.nu, 1)))
+    u = np.zeros((s.nu, 1))
+    event = jump(s, g, np.array([t]), q[None, :n], u)
     delay = np.zeros(s.d)
     if isinstance(transition.guard, Scheduled):
         findings = [] if at_once else _off_schedule(transition, t)
@@ -422,7 +423,8 @@ def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
     u = np.zeros((s.nu, 1))
     first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
-    noise = _noise(np.moveaxis(rows[:, 2 : 2 + n], 0, 1), scale[a, :n])
+    derivative = rows[:, 2 : 2 + n]
+    noise = _noise(np.moveaxis(derivative, 0, 1), scale[a, :n])
     return np.where(np.abs(rows[:, 0]) > noise, rows[:, 0], 0.0)
 
 
@@ -472,7 +474,9 @@ def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
     before = int(np.flatnonzero(level[:point])[-1])
     part = level[before] / (level[before] - level[point])
     t = visit.t[before] + part * (visit.t[point] - visit.t[before])
-    q = visit.q[:, before] + part * (visit.q[:, point] - visit.q[:, before])
+    begin = visit.q[:, before]
+    end = visit.q[:, point]
+    q = begin + part * (end - begin)
     return visit._replace(t=t[None], q=q[:, None])
 
 
@@ -481,7 +485,9 @@ def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
     if s.transitions[g].enabled is None:
         return True
     u = np.zeros((s.nu, 1))
-    holds = kernels.enabled(s, s.member(g), visit.t[points], visit.q[:, points], u)
+    t = visit.t[points]
+    q = visit.q[:, points]
+    holds = kernels.enabled(s, s.member(g), t, q, u)
     return bool(holds.any())
 
 
@@ -553,7 +559,8 @@ def _rest(s: Structure, path: _Path, scale) -> list[Finding]:
     """A finding on a cycle on which nothing moves but the clock."""
     if (path.event >= 0).any():
         return []
-    apart = np.abs(path.begin - path.begin[:, :1]) / scale[path.chart].T
+    apart = np.abs(path.begin - path.begin[:, :1])
+    apart = apart / scale[path.chart].T
     if np.max(apart, where=_exists(s, path.chart), initial=0.0) > _APART:
         return []
     text = (
@@ -615,7 +622,8 @@ def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
         q=path.begin[:, moves],
     )
     reached = walk(map.structure, stretch, scale).q
-    distance = np.abs(reached - path.begin[:, :1]) / scale[path.chart[0]][:, None]
+    size = scale[path.chart[0]]
+    distance = np.abs(reached - path.begin[:, :1]) / size[:, None]
     closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])
     return [part for part, closes in zip(parts, closed, strict=True) if closes]
 

@@ -124,7 +124,8 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
     order = len(_EULER_STEPS) if implicit else 2 * len(_MIDPOINT_STEPS) - 1
 
     def field(t, x):
-        rows = kernels.field(s, a, t, x[..., 0].T, np.zeros((s.nu, 1)))
+        u = np.zeros((s.nu, 1))
+        rows = kernels.field(s, a, t, x[..., 0].T, u)
         return np.moveaxis(rows, -1, 0)
 
     unit = np.tile(np.eye(n), (L, 1, 1))
@@ -187,7 +188,8 @@ def _midpoint(field: Callable, by_field, t, length, x) -> tuple[np.ndarray, np.n
         before = x
         now = x + h * rates
         for k in range(1, count):
-            ahead = before + 2 * h * _rates(field(t + k * length / count, now), now)
+            by_now = field(t + k * length / count, now)
+            ahead = before + 2 * h * _rates(by_now, now)
             before = now
             now = ahead
         last = _rates(field(t + length, now), now)
@@ -204,7 +206,8 @@ def _linear_euler(
     n = x.shape[1]
     for count in _EULER_STEPS:
         h = (length / count)[:, None, None]
-        matrix = np.linalg.inv(np.eye(n) - h * by_field[..., 2 : 2 + n])
+        by_state = by_field[..., 2 : 2 + n]
+        matrix = np.linalg.inv(np.eye(n) - h * by_state)
         now = x
         for k in range(1, count + 1):
             rates = _rates(field(t + k * length / count, now), now)

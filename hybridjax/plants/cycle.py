@@ -398,7 +398,9 @@ def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:
 
 def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> None:
     half = len(values) // 2
-    change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
+    first = values[:half].mean(axis=0)
+    last = values[-half:].mean(axis=0)
+    change = np.abs(first - last)
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     scatter = 1.6 * values.std(axis=0)
     if (change > np.maximum(1e-4 * size, scatter)).any():

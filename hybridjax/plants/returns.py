@@ -403,7 +403,8 @@ def measured_returns(map: ReturnMap) -> Returns:
 
 def _slopes_of(map: ReturnMap) -> "_Jacobian":
     """Return the Jacobian of a map and its errors, in units of the ranges."""
-    tolerance = map.tolerance[:, None] / map.h * map.size / map.size[:, None]
+    relative = map.size / map.size[:, None]
+    tolerance = map.tolerance[:, None] / map.h * relative
     return _fitted(map.all_slopes(), tolerance)
 
 

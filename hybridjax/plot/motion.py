@@ -468,7 +468,8 @@ def _marks(
     spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
     marks = []
     for line, begin in zip(lines, -pictures.camera(at)[:, 0], strict=True):
-        x = begin % spacing + spacing * np.arange(*np.round(line[[0, -1], 0] / spacing))
+        low, high = np.round(line[[0, -1], 0] / spacing)
+        x = begin % spacing + spacing * np.arange(low, high)
         marks.append(np.stack([x, np.interp(x, *line.T)]))
     return marks
 

@@ -245,7 +245,9 @@ def _side(x: float, below: Any, above: Any) -> Any:
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:
     width, height = ax.get_window_extent().size
-    unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
+    width_of_axes = np.ptp(ax.get_xlim())
+    height_of_axes = np.ptp(ax.get_ylim())
+    unit = np.array([width_of_axes, height_of_axes * width / height])
     bars = []
     step = max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
@@ -270,7 +272,8 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
     items = tuple(s.resolve_outputs(names).items)
     for a in np.unique(charts).tolist():
         mask = charts == a
-        at = times[mask], states[: s.dims[a], mask], np.zeros((s.nu, 1))
+        q = states[: s.dims[a], mask]
+        at = times[mask], q, np.zeros((s.nu, 1))
         flow = kernels.field(s, a, *at)[:, 0]
         values = kernels.outputs(s, a, items, *at)
         points[mask], by_time, *by_state = values.transpose(1, 2, 0)

@@ -219,7 +219,8 @@ def _about_excitation(
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
         for z in _upper(fit.multipliers):
             at = abs(np.angle(z)) / (2 * np.pi)
-            distance = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1)
+            shifted = f[:, None] - [at, -at]
+            distance = np.abs((shifted + 0.5) % 1 - 0.5).min(axis=1)
             near = strength[distance < 0.1].max(initial=0)
             if near < LEAST_POWER * strength.max():
                 yield Finding(

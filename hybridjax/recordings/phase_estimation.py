@@ -134,7 +134,9 @@ def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
         # A sampled edge may lie on the level, or on a sample.
         last = np.minimum(after + 1, len(x) - 1)
         first = np.maximum(after - 2, 0)
-        jumps = np.abs(np.stack([x[after] - x[after - 1], x[last] - x[first]]))
+        within = x[after] - x[after - 1]
+        around = x[last] - x[first]
+        jumps = np.abs(np.stack([within, around]))
         shares.append(np.nanmax(jumps, axis=0) / range_)
     jumps_there = np.nanmedian(np.concatenate(shares)) > _SWITCHED
     return bool(jumps_there and min(at_two_values) > _SWITCHED)
@@ -302,7 +304,8 @@ def _angle_at(
 
 def _turns_per_time(angles: Sequence[_Angle]) -> float:
     """Return the signed rate. **Raises:** `DefinitionError` if the angle does not wind twice."""
-    turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
+    unwrapped = [np.unwrap(a) for _, a in angles]
+    turns = sum(float(a[-1] - a[0]) for a in unwrapped) / (2 * np.pi)
     span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
         raise DefinitionError(

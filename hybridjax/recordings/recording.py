@@ -254,7 +254,8 @@ class Recording(Showable, eqx.Module):
             if crossing.direction != "rising":
                 y = -y
             known = np.diff(t) <= bridgeable(t, 0.5 / bandwidth)
-            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & known)
+            rises = (y[:-1] < 0) & (y[1:] >= 0)
+            at = np.flatnonzero(rises & known)
             if not len(at):
                 if np.nanmin(x) < level < np.nanmax(x) and bandwidth < np.inf:
                     remedy = (

@@ -360,7 +360,8 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
     t = part.t[inner]
     late = detrend(part.values[inner, -1])
     place = (t - detrend(t)) / step
-    waves = np.exp(2j * np.pi * np.outer(place, np.arange(4))).view(float)
+    angle = 2 * np.pi * np.outer(place, np.arange(4))
+    waves = np.exp(1j * angle).view(float)
     unexplained = late - waves @ np.linalg.lstsq(waves, late)[0]
     # Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.
     if unexplained.std() <= 0.1 * late.std() + ROUNDING * t[-1]:

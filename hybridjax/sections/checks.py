@@ -259,7 +259,8 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     moves = recorded_moves(lanes, placed.tape)
     value, rate = levels_at(s, levels, N, *_along_steps(s, moves, placed.tape))
     level = value.reshape(N, -1, len(moves.t))
-    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (moves.h > 0)
+    crosses = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
+    falls = crosses & (moves.h > 0)
 
     # Around the section itself, rounding decides the signs.
     begins_at = np.where(moves.order == 0, moves.lane, -1)
@@ -268,7 +269,9 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     falls[:, -1] &= ~np.roll(is_itself, -1, axis=1)
 
     field = slopes(s, lanes.t, lanes.chart, lanes.q, np.zeros((s.nu, 1)))
-    on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * field.T, axis=1)
+    by_time = placed.normal[:, 0]
+    by_state = placed.normal[:, 1:]
+    on_section = by_time + np.sum(by_state * field.T, axis=1)
     count = np.sum(falls, axis=(1, 2))
     fastest = np.max(np.nan_to_num(np.abs(rate)), axis=1)
     return count, fastest, on_section

@@ -255,7 +255,8 @@ class Delayed(NamedTuple):
         if together:
             return cls(model, lag, model.inputs)
         A, B, C, D, dims = model.matrices
-        B = jnp.concatenate([B[1::2], A[1::2] @ B[::2]], axis=2)
+        after_both = A[1::2] @ B[::2]
+        B = jnp.concatenate([B[1::2], after_both], axis=2)
         D = jnp.concatenate([0 * D[::2], D[::2]], axis=2)
         names = *model.inputs, *(f"{x} before" for x in model.inputs)
         model = LDTP(A[1::2] @ A[::2], B, C[::2], D, dims[::2], names, model.outputs)

@@ -280,7 +280,8 @@ def normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Array
         if not levels.present(s, a):
             return out
         point = [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u, index)]
-        by = kernels.watched(s, a, levels, *point)[-1, 1 : 2 + s.dims[a]]
+        expanded = kernels.watched(s, a, levels, *point)[-1]
+        by = expanded[1 : 2 + s.dims[a]]
         return xp.where(mask, put(out, slice(len(by)), by), out)
 
     return for_each_chart(s, lanes.chart, state_based, work, out).T

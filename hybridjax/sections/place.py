@@ -137,7 +137,8 @@ def place_along(
         q=points.q.T[:M],
     )
     if M > 1:
-        times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
+        share = np.arange(1, M + 1) / M
+        times = x[0][:, None] + longer[:, None] * share
         variation, tangents, _ = follow(flows.pop(0), None, times)
         moved_points = tangents[variation.first]
     by_time = np.moveaxis(moved_points[:, 0], 1, 0)

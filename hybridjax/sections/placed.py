@@ -203,7 +203,9 @@ class PlacedSections(Showable, eqx.Module):
         jacobian = xp.where(failed[:, None, None], xp.nan, jacobian)
         embed, select = self.frames()
         after = xp.roll(select, -1, axis=0)
-        return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+        by_state = jacobian[:, :, :n]
+        by_input = jacobian[:, :, n:]
+        return after @ by_state @ embed, after @ by_input
 
     @property
     def across(self) -> Float[Array, "A d"] | None:

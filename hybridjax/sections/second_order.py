@@ -109,7 +109,8 @@ class Quadratic(NamedTuple):
         back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
         returned = back_a_period * monodromy(A)
         unit = np.eye(A.shape[-1])
-        x = np.linalg.solve(unit - returned, x.T[:, :, None])[:, :, 0].T
+        column = np.linalg.solve(unit - returned, x.T[:, :, None])
+        x = column[:, :, 0].T
 
         states = []
         for section in range(len(A)):
@@ -134,7 +135,8 @@ class Quadratic(NamedTuple):
             both = self._pairs_from(w, f, first)
             # A cosine with itself has a mean, at the difference of frequencies.
             row = np.arange(len(first))
-            mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[:, :, row, 1, row]
+            outputs_first = np.moveaxis(np.real(both), 0, 1)
+            mean[:, :, first] = outputs_first[:, :, row, 1, row]
             square = np.mean(np.abs(both) ** 2, axis=0)
             square = np.moveaxis(square, 2, 0)
             squares[:, :, first, begin:] = square
@@ -281,7 +283,8 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
 
     # Second derivatives are symmetric: those of pairs with i <= j are all.
     i, j = np.triu_indices(m)
-    first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])
+    unit = jnp.eye(m)
+    first, second = jax.vmap(twice)(unit[i], unit[j])
     place = np.zeros((m, m), int)
     place[i, j] = np.arange(len(i))
     place[j, i] = np.arange(len(i))

@@ -58,7 +58,8 @@ def solve_positive(
         rows = [right[..., i] for i in range(n)]
         rows[0] = jnp.where(singular, jnp.nan, rows[0])
         for i in range(n):
-            rows[i] = _less(rows[i], [(lower[i, k], rows[k]) for k in range(i)])
+            known = [(lower[i, k], rows[k]) for k in range(i)]
+            rows[i] = _less(rows[i], known)
         for i in reversed(range(n)):
             above = [(lower[k, i], rows[k]) for k in range(i + 1, n)]
             rows[i] = _less(rows[i] * inverse[i], above)

@@ -133,7 +133,8 @@ def _arctan2(y, x):
     z = r * r
     angle = r + r * z * _polynomial(n.arctan, z)
     angle = jax.lax.select(steep, jnp.pi / 4 + (angle + n.pi_4_low), angle)
-    angle = jax.lax.select(ay > ax, jnp.pi / 2 - (angle - 2 * n.pi_4_low), angle)
+    beyond_diagonal = jnp.pi / 2 - (angle - 2 * n.pi_4_low)
+    angle = jax.lax.select(ay > ax, beyond_diagonal, angle)
     angle = jax.lax.select(jnp.signbit(x), jnp.pi - (angle - 4 * n.pi_4_low), angle)
     return jax.lax.select(jnp.signbit(y), -angle, angle)
 

@@ -328,8 +328,10 @@ def _lower(phase, free, line, size, length: int):
         peak = np.abs(u).max()
         v = np.abs(u) / peak
         total = np.sum(v**p)
-        slope = np.fft.rfft(v ** (p - 1) * np.sign(u) / (peak * total))[line[free]]
-        turn = np.real(1j * size[free] * np.exp(1j * x) * slope.conj())
+        by_signal = v ** (p - 1) * np.sign(u) / (peak * total)
+        slope = np.fft.rfft(by_signal)[line[free]]
+        wave = 1j * size[free] * np.exp(1j * x)
+        turn = np.real(wave * slope.conj())
         return np.log(peak) + np.log(total) / p, 2 / length * turn
 
     x = phase[free]

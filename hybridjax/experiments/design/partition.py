@@ -69,7 +69,8 @@ def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     unit = np.maximum(size.max(axis=0, initial=0), np.finfo(float).tiny)
     even = (size / unit).min(axis=1) > SINGULAR * (size / unit).max(axis=1)
     size = np.where(even[:, None], size, 1.0)
-    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
+    products = size[:, :, None] * size[:, None, :]
+    least = np.linalg.eigvalsh(gram / products)[:, 0]
     return even & (least > SINGULAR)
 
 
@@ -270,7 +271,9 @@ def check_sharing(
     number = experiment[order]
     of_line = classes[order]
     j = line[order]
-    clash = (number[1:] == number[:-1]) & (of_line[1:] == of_line[:-1])
+    same_number = number[1:] == number[:-1]
+    same_line = of_line[1:] == of_line[:-1]
+    clash = same_number & same_line
     if not clash.any():
         return
     k = int(np.argmax(clash))

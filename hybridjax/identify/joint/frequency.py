@@ -95,7 +95,8 @@ def transfer(
     N = model.n_sections
     states = states_at(model, f)
     responses = [_outputs(model, n, states[n]) for n in range(N)]
-    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
+    turns = np.outer(harmonics, np.arange(N)) / N
+    waves = np.exp(-2j * np.pi * turns) / N
     return np.tensordot(waves, np.stack(responses), 1).swapaxes(1, 2)
 
 

@@ -103,7 +103,8 @@ def _without_later_inputs(
     N, F, ny, nu = responses.shape
     # One weight for each column, that of its noise, keeps the rows of an input as they are.
     column = np.sqrt(np.mean(weight**2, axis=1)).T.ravel()  # (nu F)
-    powers = np.exp(2j * np.pi / N * f) ** np.arange(p + 1)[:, None]
+    delay = np.exp(2j * np.pi / N * f)
+    powers = delay ** np.arange(p + 1)[:, None]
     inputs = _real(np.kron(np.eye(nu), powers) * column)
     _, size, directions = np.linalg.svd(inputs, full_matrices=False)
     taken = directions[size > ROUNDING * size[0]]
@@ -112,7 +113,8 @@ def _without_later_inputs(
         later = [
             responses[(n + i) % N] * powers[i][:, None, None] for i in range(p + 1)
         ]
-        rows = np.stack(later).transpose(0, 2, 3, 1).reshape((p + 1) * ny, nu * F)
+        rows = np.stack(later).transpose(0, 2, 3, 1)
+        rows = rows.reshape((p + 1) * ny, nu * F)
         rows = _real(rows * column)
         for _ in range(2):  # the second time removes rounding errors
             rows = rows - (rows @ taken.T) @ taken

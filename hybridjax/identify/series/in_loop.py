@@ -154,7 +154,8 @@ class LoopEquations:
         Z, U, late = np.split(rows, np.cumsum([self.lags * nu] * 2), axis=1)
         # Combinations of lags, of which the reference excites those that stand out of the noise.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
-        noise = np.linalg.norm((U - Z) @ V.T, axis=0) / np.sqrt(max(used.sum(), 1))
+        size = np.linalg.norm((U - Z) @ V.T, axis=0)
+        noise = size / np.sqrt(max(used.sum(), 1))
         kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
         to_lags = V[kept].T / size[kept]
         instruments = Z @ to_lags
@@ -235,7 +236,8 @@ class LoopEquations:
         along = along[:, 1:]
         # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
         part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
-        part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
+        others = y[:, 1:]
+        part = np.linalg.pinv(others.T @ others, RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
         seen = part * dof * len(scale) > _DETERMINED * (1 - part)
         return Solution(c, along, scale, int(seen.sum()))

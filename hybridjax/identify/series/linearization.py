@@ -99,7 +99,8 @@ def filtered_response(
 ) -> Float[np.ndarray, "S T d m C"]:
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
-    delayed = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
+    S, T = x.shape[:2]
+    delayed = np.zeros((S, T, len(c), *x.shape[2:]))
     for j in range(len(c)):
         delayed[:, :, j] = delay_cycles(filtered, j + 1)
     return delayed

@@ -180,7 +180,8 @@ class OutputErrorProblem(NamedTuple):
         starts = (
             len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids
         )
-        return int(self.records.sampled[n, i]) - self.lags * self.shape[1] - sum(starts)
+        samples = int(self.records.sampled[n, i])
+        return samples - self.lags * self.shape[1] - sum(starts)
 
     def parts(self) -> list[CycleGrid]:
         """Return all grids, with the outputs in units of `scale`."""

@@ -296,7 +296,8 @@ def recursion(
         phi = step @ phi
     starts = np.zeros_like(x)
     for k in range(T - 1):
-        starts[:, k + 1] = phi[:, min(k, phi.shape[1] - 1)] @ starts[:, k] + x[:, k]
+        period = phi[:, min(k, phi.shape[1] - 1)]
+        starts[:, k + 1] = period @ starts[:, k] + x[:, k]
     x = starts
     for n, step in enumerate(F):
         enter(n, x)
@@ -335,7 +336,8 @@ def slopes_of(
     for n, states in enumerate(recursion(path.F, shape, enter, drive, ends)):
         place = places[n]
         slopes = model.C[n] @ states
-        slopes[..., place["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
+        to_C = coordinates.to_C[n][None, None]
+        slopes[..., place["Y"]] += _outer(to_C, path.x[n])
         if coordinates.direct:
             unit = np.eye(len(model.C[n]))[None, None]
             slopes[..., place["D"]] += _outer(unit, part.u[n])

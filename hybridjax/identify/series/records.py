@@ -105,7 +105,8 @@ def drift_waves(record: SectionSeries) -> Float[np.ndarray, "T K"]:
     if record.drift is None:
         return np.zeros((T, 0))
     waves = np.arange(int(2 * T / record.drift) + 1)
-    return np.cos(np.pi / T * (np.arange(T)[:, None] + 0.5) * waves)
+    middle = np.arange(T)[:, None] + 0.5
+    return np.cos(np.pi / T * middle * waves)
 
 
 class PreparedRecords:

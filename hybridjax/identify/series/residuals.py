@@ -85,12 +85,15 @@ def whiteness_test(
     tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
         product = np.full(scaled.shape, np.nan)
-        product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
+        now = scaled[:, k + 1 :]
+        before = scaled[:, : -k - 1]
+        product[:, k + 1 :] = now * before
         by_section = product.reshape(error.shape)
         samples = np.isfinite(by_section).sum(axis=(0, 1))
         total = np.nansum(by_section, axis=(0, 1))
         tested[:, k] = samples >= FEWEST_SAMPLES
-        z[:, k] = tested[:, k] * total / np.sqrt(np.maximum(samples, 1))
+        deviation = np.sqrt(np.maximum(samples, 1))
+        z[:, k] = tested[:, k] * total / deviation
     # The mean over the sections of each lag, and the deviations from it: independent.
     sections = tested.sum(axis=0)
     by_lag = z.sum(axis=0) ** 2 / np.maximum(sections, 1)
@@ -218,7 +221,8 @@ def about_misfit(
     inputs = outside.u
     if not direct:
         earlier = np.zeros((S, T * N, inputs.shape[3]))
-        earlier[:, 1:] = inputs.reshape(S, T * N, -1)[:, :-1]
+        in_order = inputs.reshape(S, T * N, -1)
+        earlier[:, 1:] = in_order[:, :-1]
         inputs = earlier.reshape(inputs.shape)
     _, p, _ = independence_test(inputs, late, N, ANSWER)
     tested = ~is_exact(grid, error)
@@ -290,12 +294,15 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     S, T, N, nu = grid.u.shape
     lags = 2
     earlier = np.zeros((S, T * N, error.shape[3]))
-    earlier[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
+    in_order = np.nan_to_num(error).reshape(S, T * N, -1)
+    earlier[:, 1:] = in_order[:, :-1]
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
-        whole = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
+        is_late = grid.age[:, :, n] > lags + 1
+        whole = grid.inside[:, :, n] & is_late
         past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
         u = grid.u[:, :, n][whole]
-        new[:, :, n][whole] = u - past @ np.linalg.lstsq(past, u)[0]
+        by_past, *_ = np.linalg.lstsq(past, u)
+        new[:, :, n][whole] = u - past @ by_past
     _, p, _ = independence_test(earlier.reshape(error.shape), new, lags, ANSWER)
     return p

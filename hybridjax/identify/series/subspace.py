@@ -75,7 +75,8 @@ def subspace_model(
             raise DefinitionError(
                 f"the data show {len(size)} dimensions of section {n}, not {d}: lower `dims`."
             )
-        scale = np.maximum(size[:d], _SHRINKAGE * size[0]) / np.sqrt(len(section.y))
+        size = np.maximum(size[:d], _SHRINKAGE * size[0])
+        scale = size / np.sqrt(len(section.y))
         to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
 
@@ -118,7 +119,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
-    answer = bool(special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2) <= ANSWER)
+    p = special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2)
+    answer = bool(p <= ANSWER)
     if left <= _SHRINKAGE * whole:
         return answer or None
     if answer:
@@ -182,7 +184,8 @@ class _Section:
         self.record, cycle = np.nonzero(sampled[:, :, section])
         self.time = cycle * z.shape[2] + section
         self._z = z.reshape(len(z), -1, z.shape[3])
-        self.u, self.y = np.split(self._z[self.record, self.time], [-ny], axis=1)
+        signals = self._z[self.record, self.time]
+        self.u, self.y = np.split(signals, [-ny], axis=1)
 
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
@@ -301,4 +304,5 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
 def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
     gram = delayed.gram.sum(axis=0)
-    return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
+    c, *_ = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])
+    return multipliers_of(-c)

@@ -127,7 +127,8 @@ def whitening(
         kept[k] = a * (1 - gain * g)
         learned[k] = a * gain
         scale[k] = square**0.5
-        variance = a * a * variance * (1 - gain * g) + (1 - a * a) * stationary
+        update = a * a * variance * (1 - gain * g)
+        variance = update + (1 - a * a) * stationary
     return Whitening(
         weight=weight,
         by_drift=by_drift,

@@ -315,7 +315,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     def improbable(log_size: float) -> float:
         """Return minus twice the logarithm of the likelihood of tau^2."""
         size = np.exp(log_size)
-        return float((np.log1p(size * gain) - size * power / (1 + size * gain)).sum())
+        information = 1 + size * gain
+        return float((np.log1p(size * gain) - size * power / information).sum())
 
     def unlikely(log_size: float) -> float:
         """Return minus twice the logarithm of the posterior density of the logarithm of tau."""

@@ -75,7 +75,8 @@ class MapResult(Showable):
         places = np.nonzero(self.significant)
         for (name, x), place in zip(self.axes.items(), places, strict=True):
             if len(place):
-                spans.append(f"{name} {x[place].min():.3g} to {x[place].max():.3g}")
+                values = x[place]
+                spans.append(f"{name} {values.min():.3g} to {values.max():.3g}")
         where = ", ".join(spans) or "none"
         largest = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
         half_width = f"{np.median(self.reach):.3g} {self.unit}".rstrip()
@@ -334,7 +335,8 @@ def _are_skewed(parts: list[Maps], level: float, rng: np.random.Generator) -> bo
         n = len(part)
         values = np.concatenate([part.real, part.imag], axis=1)
         # Deviations from a mean have n - 1 dimensions.
-        contrasts = np.linalg.qr(np.eye(n) - 1 / n)[0][:, : n - 1]
+        basis, _ = np.linalg.qr(np.eye(n) - 1 / n)
+        contrasts = basis[:, : n - 1]
         rotation, _ = np.linalg.qr(rng.normal(size=(_ROTATIONS, n - 1, n - 1)))
         found += _skewness(values[None])[0]
         rotated += [_skewness(contrasts @ q @ (contrasts.T @ values)) for q in rotation]

@@ -437,8 +437,13 @@ class Population(Showable):
         require(dict(list(data.groupby("cell")["subject"])), 2)
         cell, names = data["cell"].factorize()
         is_a = data.drop_duplicates("cell")[factor].to_numpy() == a
-        w = np.where(is_a, 1 / max(is_a.sum(), 1), -1 / max((~is_a).sum(), 1))
-        weighted = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2)
+        weight_of_a = 1 / max(is_a.sum(), 1)
+        weight_of_b = -1 / max((~is_a).sum(), 1)
+        w = np.where(is_a, weight_of_a, weight_of_b)
+        weighted = data.assign(
+            y=data["y"] * w[cell],
+            v=data["v"] * w[cell] ** 2,
+        )
         of_subjects = weighted.groupby("subject")
         whole = of_subjects.size() == len(names)
         return data, cell, w, of_subjects[["y", "v"]].sum()[whole]
