@@ -222,7 +222,9 @@ def kind(arguments) -> tuple:
     """All that a program is compiled for: everything of the arguments but the values of arrays, and
     JAX's settings (in a thread: those of all threads)."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    types = ((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
+    types = []
+    for x in leaves:
+        types.append((x.shape, x.dtype) if _is_array(x) else (type(x), x))
     return structure, *jax_compat.settings_of_programs(), *types
 
 

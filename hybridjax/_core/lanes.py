@@ -210,7 +210,8 @@ def lane_jvp(
 
     # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]
-    rows += [jnp.broadcast_to(t.reshape(-1, 1), (t.size, 1)) for t in leaves(t_common)]
+    for leaf in leaves(t_common):
+        rows.append(jnp.broadcast_to(leaf.reshape(-1, 1), (leaf.size, 1)))
     lanes = max(x.shape[-1] for x in leaves(columns))
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
 

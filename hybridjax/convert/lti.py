@@ -160,8 +160,10 @@ class HarmonicStateSpace(NamedTuple):
         """Responses of all harmonics to inputs of `frequencies` (F,) in cycles per period."""
         M = 2 * self.order + 1
         # (Inputs have the harmonic 0 only.)
-        B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
-        rates = 2j * np.pi * np.asarray(frequencies).reshape(-1, 1, 1) / period
+        B = self.B.reshape(len(self.B), M, -1)[:, self.order]
+        D = self.D.reshape(len(self.D), M, -1)[:, self.order]
+        f = np.asarray(frequencies).reshape(-1, 1, 1)
+        rates = 2j * np.pi * f / period
         resolvent = rates * np.eye(len(self.A)) - self.A
         H = self.C @ np.linalg.solve(resolvent, B[None]) + D
         return H.reshape(len(rates), M, len(self.C) // M, D.shape[-1])
@@ -236,7 +238,8 @@ def to_harmonic_state_space(
     for n in orders:
         m = np.arange(-n, n + 1)
         A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
-        A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
+        rotation = np.repeat(2j * np.pi * m / period, s.d)
+        A = A - np.diag(rotation)
         space = HarmonicStateSpace(
             A=A,
             B=B,

@@ -376,4 +376,5 @@ def _convex(form: Float[np.ndarray, "K K"], unit: Powers) -> Float[np.ndarray, "
     in units of each cosine's power. (In units in which each alone distorts alike the bound of the
     hopper is up to two times as large where power belongs.)"""
     values, vectors = np.linalg.eigh(form * unit[:, None] * unit)
-    return (vectors * np.maximum(values, 0)) @ vectors.T / unit[:, None] / unit
+    positive = (vectors * np.maximum(values, 0)) @ vectors.T
+    return positive / unit[:, None] / unit

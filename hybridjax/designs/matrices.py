@@ -164,7 +164,10 @@ def response_criterion(
     each = each.reshape(len(names), -1, matrices.coordinates.size)
     # As few rows of each quantity as have the same sum of squares, up to rounding.
     _, values, vectors = np.linalg.svd(each, full_matrices=False)
-    kept = values**2 > np.finfo(float).eps * values[:, :1] ** 2
-    rows = [s[k, None] * v[k] for s, v, k in zip(values, vectors, kept, strict=True)]
+    largest = values[:, :1] ** 2
+    kept = values**2 > np.finfo(float).eps * largest
+    rows = []
+    for s, v, k in zip(values, vectors, kept, strict=True):
+        rows.append(s[k, None] * v[k])
     part = np.repeat(np.arange(len(rows)), [len(x) for x in rows])
     return matrices.criterion(np.concatenate(rows), tuple(names), part)

@@ -158,7 +158,8 @@ class OptimalDesign(Showable, eqx.Module):
             for name, a, b in errors
         ]
         rms = ((n, x) for n, x in self.usual_rms.items() if x > 0)
-        rows += [(f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}") for n, x in rms]
+        for n, x in rms:
+            rows.append((f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}"))
         bounded = any(n.startswith("distortion of ") for n in self.rms)
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum):\n  "

@@ -223,10 +223,12 @@ def refuse_transient(
     cycles = y[:, :whole].reshape(len(y), -1, N, y.shape[2])
     early = cycles[:, k]
     late = cycles[:, k + P]
-    excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
+    difference = np.mean((early - late) ** 2, axis=(0, 1))
+    excess = difference - 2 * noise**2
     numbers = early[..., 0].size
     threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / numbers)
-    size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
+    square = np.mean(y**2, axis=(0, 1))
+    size = np.sqrt(np.maximum(excess, 0) / square)
     decay = np.abs(multipliers).max() ** (before - k)
     left = np.where(excess > threshold, size, 0).max() * decay
     if left > allowed:

@@ -193,4 +193,5 @@ def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
 
 def _divide(a, b):
     xp = namespace(b)
-    return xp.where(b == 0, xp.inf, a / xp.where(b == 0, 1.0, b))
+    divisor = xp.where(b == 0, 1.0, b)
+    return xp.where(b == 0, xp.inf, a / divisor)

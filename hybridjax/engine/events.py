@@ -92,7 +92,9 @@ def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
     A piece of flow between two events at the same time has no `span`: that of its clock is left.
     """
     late = SAME_TIME * span + ROUNDING * abs(t)
-    return watched.value[:-1] < -late * abs(watched.rate[:-1])
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
+    return value < -late * abs(rate)
 
 
 def rival_of(

@@ -482,7 +482,8 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
         tangents = [
             jnp.broadcast_to(x.reshape(*shape, 1), (*shape, L)) for x, shape in parts
         ]
-        (value, f), (tangent, _) = jax.jvp(end, (t, q, u, h), tuple(tangents))
+        point = (t, q, u, h)
+        (value, f), (tangent, _) = jax.jvp(end, point, tuple(tangents))
         return value, f, tangent
 
     unit = jnp.eye(split[-1] + 1)

@@ -254,7 +254,8 @@ def _columns(s, lanes, target, tape, of_states):
     def push(tangent):
         return jax.jvp(flow, (point,), (tangent,))
 
-    point = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
+    unpushed = jnp.zeros((s.nu, L))
+    point = jnp.concatenate([lanes.t[None], lanes.q, unpushed])
     directions = jnp.eye(len(point))
     if of_states:
         directions = directions[states]

@@ -226,7 +226,8 @@ def chain(
     moves = recorded_moves(lanes, tape)
     end, by = linear_moves(s, moves, target)
     if across is not None:
-        f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+        u = np.zeros((s.nu, 1))
+        f = slopes(s, moves.t, moves.chart, moves.q, u).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
         project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
         by[flows, :, 1:n] = by[flows, :, 1:n] @ project

@@ -373,7 +373,8 @@ def recorded(
 ) -> Trajectory:
     """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
     under another one in each piece (nu, pieces)."""
-    rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
+    state = begin.q.T
+    rows = [(begin.t, state, state, begin.chart, np.full(1, -1))]
     for tape in tapes:
         lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = lane.t, lane.before, lane.after, lane.chart, lane.code
@@ -384,7 +385,8 @@ def recorded(
     u_before = u
     u_after = u
     if u.shape[1] > 1:
-        of_step = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        counts = [len(x) for x, *_ in rows[1:]]
+        of_step = np.repeat(u, counts, axis=1)
         u_before = np.hstack([of_step[:, :1], of_step])
         u_after = np.hstack([of_step, of_step[:, -1:]])
     with at_ease():
@@ -453,7 +455,8 @@ def guards_reached(
     first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, lane.t, q, u, first)[..., 0]
     point = np.append(lane.t, q)
-    flow = np.append(1.0, kernels.field(s, a, lane.t, q, u)[:, 0, 0])
+    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    flow = np.append(1.0, rate)
     for g, row in zip(guards, rows, strict=True):
         if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
             continue

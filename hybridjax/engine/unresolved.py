@@ -298,7 +298,9 @@ def values_at(
     lanes = kernels.POINTS if may_have_pulses(s, a) <= POLES else kernels.WIDE
 
     def at(x):
-        point = (x[:, 0], x[:, 1:].T, u[:, None])
+        t = x[:, 0]
+        q = x[:, 1:].T
+        point = (t, q, u[:, None])
         n = s.dims[a]
         by = kernels.field(s, a, *point, lanes=lanes)
         by_input = by[:, 2 + n :]
@@ -377,7 +379,8 @@ def jumps(
         last = values[worst + 1, here]
         is_jump = (change > _JUMP) & (change > _STEEP * distance)
         for i, j in np.argwhere(is_jump[worst, here]):
-            yield low[i, 0], j, change[worst[i], i, j] * limit[j]
+            largest_change = change[worst[i], i, j] * limit[j]
+            yield low[i, 0], j, largest_change
         keep = uneven.max(axis=(0, 2)) > _JUMP
         low, high, first, last = (x[keep] for x in (low, high, first, last))
         if not keep.any():

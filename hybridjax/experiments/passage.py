@@ -130,7 +130,8 @@ def follow_table(
         return tuple(carry), (outputs, answers)
 
     begin = moves.begin(start, S)
-    (end, _), (y, answers) = jax.lax.scan(turn, (begin, Kept.of(begin)), held)
+    carry = (begin, Kept.of(begin))
+    (end, _), (y, answers) = jax.lax.scan(turn, carry, held)
 
     def to_experiments(x):
         return jnp.moveaxis(x, -1, 0).reshape(S, n, -1)
@@ -313,7 +314,8 @@ class _Moves:
     def _stepped(self, a: int, u, t, q, h):
         """The state after a step, and its error relative to what is allowed."""
         # (The step of diffrax's solver takes twice as long: it writes stages as `K.at[k].set`.)
-        end, error = looped_step(self.s.method(a), self._field(a, u), t, q, h)
+        field = self._field(a, u)
+        end, error = looped_step(self.s.method(a), field, t, q, h)
         allowed = self.settings.rtol * size(self.settings, a, q, end)
         return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
 

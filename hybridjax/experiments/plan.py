@@ -159,7 +159,8 @@ def make_plan(
     weight = weight * np.maximum(together, 1 / _MOST_CANCELLATION)
 
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
-    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0) / len(section)
+    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0)
+    share = share / len(section)
     spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
     of_equal_steps = np.maximum(spare * estimate[0], share)
     slack = ways.slack[best]
@@ -342,7 +343,8 @@ def _accumulated(J, error, scale) -> float:
     largest = 0.0
     for m in range(_PERIODS * N):
         total = J[m % N] @ total + error[m % N]
-        largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
+        relative = np.abs(total) / scale[(m + 1) % N]
+        largest = max(largest, np.max(relative))
     return largest
 
 

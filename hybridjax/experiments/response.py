@@ -183,7 +183,8 @@ def flow_batch(
         events = moved.lanes.events - turns * one_turn
         lanes = moved.lanes._replace(t=t, events=events)
         ok = result == Result.OK
-        share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
+        counts = ok & (moved.error > 0)
+        share = jnp.where(counts, moved.error * plan.weight[i], 0.0)
         return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))

@@ -488,7 +488,8 @@ class _Writer:
             n = s.dims[a]
             here = np.flatnonzero(chart == a)
             index = (section[here] + 1) % self.N
-            point = t[here], q[:n, here], np.zeros((s.nu, 1))
+            u = np.zeros((s.nu, 1))
+            point = t[here], q[:n, here], u
             columns = kernels.watched(s, a, self.levels, *point, index)
             field = kernels.field(s, a, *point)[:, 0]
             value = columns[:, 0]

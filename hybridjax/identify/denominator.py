@@ -103,7 +103,8 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     # (Sums over fewer pairs scatter more.)
-    return int(min(np.ceil(np.log(_FORGOTTEN) / np.log(slowest)), cycles // 4))
+    forgotten = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
+    return int(min(forgotten, cycles // 4))
 
 
 def fading(c: Coefficients) -> Coefficients:

@@ -155,7 +155,8 @@ def _small_design(
     lines = np.unique(plain.line / plain.periods)
     H = np.asarray(model.htf(lines).H)
     # (The response to inputs of rms 1: of all harmonics together, on average over the lines.)
-    gain = np.sqrt((np.abs(H) ** 2).sum(axis=(0, 3)).mean(axis=0))
+    power = (np.abs(H) ** 2).sum(axis=(0, 3))
+    gain = np.sqrt(power.mean(axis=0))
     orbit = cycle.trajectory()
     values = observed(orbit.structure, outputs, *orbit.dense(_PER_STEP))
     reach = np.array([np.nanmax(x) - np.nanmin(x) for x in values]) / 2

@@ -165,7 +165,8 @@ def fit_multipliers(
     H = np.asarray(htf.H)
     misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
-    residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
+    square = np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))
+    residual = np.sqrt(square) / rms
     exact = htf.variance is None and residual.max() < ROUNDING
 
     def ratios(k: int) -> NoiseRatios:
@@ -370,7 +371,8 @@ def _left_over(
     number = np.zeros(outputs)
     for group in groups:
         residual = varpro.misfit_of(group, c).residual
-        np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
+        of_channel = (residual**2).sum(axis=(0, 1))
+        np.add.at(square, group.channel[:, 0], of_channel)
         np.add.at(number, group.channel[:, 0], group.dof)
     return np.sqrt(square / number)
 
@@ -384,7 +386,8 @@ def _largest_of_noise(size: int) -> float:
     """
     draws = np.random.default_rng(0).normal(size=(_DRAWS, size, size))
     symmetric = (draws + draws.mT) / 2
-    return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
+    largest = np.linalg.eigvalsh(symmetric)[:, -1]
+    return float(np.quantile(largest, 1 - _FALSE_ALARMS))
 
 
 NoiseRatios = tuple[Float[np.ndarray, " d1"], float]

@@ -194,7 +194,8 @@ class LocalCoordinates(NamedTuple):
             }
             later_K = K + change["K"]
             later_gain = later_K if later_K.shape[1] else gain
-            later_F = F + (self.to_A[n] - gain @ self.to_C[n]) @ change["Y"]
+            to_F = self.to_A[n] - gain @ self.to_C[n]
+            later_F = F + to_F @ change["Y"]
             later_C = C + self.to_C[n] @ change["Y"]
             later_D = D + change.get("D", 0.0)
             later_A = later_F + later_gain @ later_C
@@ -298,8 +299,10 @@ def characteristic_slopes(
     for n, entering in zip(reversed(sections), reversed(before), strict=True):
         place = places[n]
         by_A = after.T @ np.array(by_phi) @ entering.T
-        slopes[:, place["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
+        by_Y = coordinates.to_A[n].T @ by_A
+        slopes[:, place["Y"]] = by_Y.reshape(d, -1)
         if model.K[n].shape[1]:
-            slopes[:, place["K"]] = (by_A @ model.C[n].T).reshape(d, -1)
+            by_K = by_A @ model.C[n].T
+            slopes[:, place["K"]] = by_K.reshape(d, -1)
         after = after @ model.A[n]
     return np.array(c), slopes

@@ -285,6 +285,6 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)
-        a = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])[0]
+        a, *_ = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])
         if step in _STARTS:
             yield a

@@ -129,7 +129,8 @@ def _step_of(
     q = x * sizes
     off, held = map.held(q)
     returned = np.where(map.valid, end[:, -1], 0.0)
-    by_start = np.where(map.valid[:, None], end[:, :-1], 0.0)
+    valid = map.valid[:, None]
+    by_start = np.where(valid, end[:, :-1], 0.0)
     residual = returned - q - off
     jacobian = by_start - np.eye(len(x)) - held
     in_sizes = jacobian * sizes / sizes[:, None]

@@ -178,7 +178,11 @@ def _verdict(cycle) -> Verdict:
     scale = np.asarray(cycle.settings.scale)
     path = _walk_along(cycle)
     visits = _visits(s, path)
-    long = [visit for visit in visits if visit.t[-1] - visit.t[0] > _SHORT * period]
+    long = []
+    for visit in visits:
+        duration = visit.t[-1] - visit.t[0]
+        if duration > _SHORT * period:
+            long.append(visit)
     never = set(range(len(s.transitions))) - set(cycle.event_sequence)
     findings = [*path.findings, *_beyond_guards(s, long, never, scale)]
     for visit in long:
@@ -387,7 +391,8 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
         for k in moves:
             own = path.walked.lane == k % M
             later = period if k >= 0 else 0.0
-            times.append(later + np.append(path.t[k % M], path.walked.t[own]))
+            own_times = np.append(path.t[k % M], path.walked.t[own])
+            times.append(later + own_times)
             points = path.begin[:, k % M], path.walked.points[:, own]
             states.append(np.column_stack(points))
         a = int(path.chart[moves[0]])
@@ -425,7 +430,8 @@ def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
     rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
     derivative = rows[:, 2 : 2 + n]
     noise = _noise(np.moveaxis(derivative, 0, 1), scale[a, :n])
-    return np.where(np.abs(rows[:, 0]) > noise, rows[:, 0], 0.0)
+    level = rows[:, 0]
+    return np.where(np.abs(level) > noise, level, 0.0)
 
 
 def _beyond_guards(
@@ -464,7 +470,8 @@ def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
 def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
     """Points at which a guard is below zero for the first time after it was above."""
     points = np.flatnonzero(level)
-    falls = (level[points][1:] < 0) & (level[points][:-1] > 0)
+    at_points = level[points]
+    falls = (at_points[1:] < 0) & (at_points[:-1] > 0)
     return points[1:][falls]
 
 
@@ -492,7 +499,8 @@ def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
 
 
 def _beyond(s: Structure, transition, a: int, level) -> Finding:
-    low, high = sorted(transition.sign * np.array([level.min(), level.max()]))
+    extremes = np.array([level.min(), level.max()])
+    low, high = sorted(transition.sign * extremes)
     text = (
         f"the cycle lies beyond the guard of '{transition.name}' all along its stay in chart "
         f"'{s.names[a]}' (values from {low:.3g} to {high:.3g}; the guard should be "

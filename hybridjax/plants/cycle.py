@@ -137,7 +137,8 @@ class PlantCycle(Showable):
                 about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
-        rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
+        S, steps = u.shape[:2]
+        rows = np.full((S, steps, len(self.outputs) + 1), np.nan)
         failed_at = np.full(len(u), -1)
         for s, (values, cause) in enumerate(trials):
             rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[-1]))
@@ -185,7 +186,8 @@ class PlantCycle(Showable):
         s = int(whole[0])
         rows = []
         for part in (0.5, 0.0):
-            values, cause = self.drive.run(self.seed + 1 + s, (part * u[s]).tolist())
+            inputs = part * u[s]
+            values, cause = self.drive.run(self.seed + 1 + s, inputs.tolist())
             if cause:
                 return []
             rows.append(np.array(values)[:, :-1])

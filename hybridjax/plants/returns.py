@@ -216,7 +216,8 @@ class ReturnMap:
         Within a stair of a simulator, returns from nearly equal states have no noise: these have.
         """
         rng = np.random.default_rng(1)
-        move = 2 * _LARGEST_STEP * self.size * rng.choice([-1, 1], len(self.x))
+        signs = rng.choice([-1, 1], len(self.x))
+        move = 2 * _LARGEST_STEP * self.size * signs
         states = []
         signals = []
         for pair in range(1, _GRIDS + 1):
@@ -525,7 +526,8 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     # (Of pair j and eigenvalue i, the share of column k.)
     noise = np.stack([(rows @ error) * right.T for error in jacobian.errors])
     variance = (np.abs(noise) ** 2).sum(axis=0)
-    common = np.abs(rows) ** 2 @ jacobian.tolerance**2 @ np.abs(right) ** 2
+    by_component = np.abs(rows) ** 2 @ jacobian.tolerance**2
+    common = by_component @ np.abs(right) ** 2
     scatter = np.sqrt(variance.sum(axis=1) + np.diagonal(common))
     apart = np.diagonal(rows @ jacobian.apart @ right)
     is_noise = np.abs(apart) <= 2 * jacobian.apart_noise * scatter
@@ -583,7 +585,8 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
     none."""
     differs = np.abs(found.value) > _RESOLVED * found.error
     for i in np.flatnonzero(differs):
-        twin = int(np.argmin(np.abs(found.value - found.value[i].conj())))
+        distance = np.abs(found.value - found.value[i].conj())
+        twin = int(np.argmin(distance))
         differs[i] = differs[i] and differs[twin]
     rows = np.flatnonzero(differs)
     chosen = found.value[rows]

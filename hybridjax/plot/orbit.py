@@ -169,11 +169,16 @@ def by_chart(
 ) -> dict[int, Float[np.ndarray, "2 p"]]:
     """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
-    cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
+    is_jump = (np.diff(t) == 0) | (np.diff(chart) != 0)
+    cuts = np.flatnonzero(is_jump) + 1
     curve = np.insert(trajectory(x, y)[1:], cuts, np.nan, axis=1)
     chart = np.insert(chart, cuts, chart[cuts])
-    curves = {a: np.where(chart == a, curve, np.nan) for a in np.unique(chart).tolist()}
-    return {a: x for a, x in curves.items() if np.isfinite(x).all(axis=0).any()}
+    curves = {}
+    for a in np.unique(chart).tolist():
+        in_chart = np.where(chart == a, curve, np.nan)
+        if np.isfinite(in_chart).all(axis=0).any():
+            curves[a] = in_chart
+    return curves
 
 
 def at_events(

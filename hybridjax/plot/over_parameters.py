@@ -109,8 +109,11 @@ def _parts(branch: Branch) -> list[tuple[slice, bool]]:
     parts = []
     for a, b in itertools.pairwise(cuts):
         if b > a:
-            inside = branch.stable[a + 1 : b] if b > a + 1 else branch.stable[[a, b]]
-            parts.append((slice(a, b + 1), bool(np.mean(inside) > 0.5)))
+            inside = branch.stable[a + 1 : b]
+            if b <= a + 1:
+                inside = branch.stable[[a, b]]
+            is_stable = bool(np.mean(inside) > 0.5)
+            parts.append((slice(a, b + 1), is_stable))
     return parts
 
 

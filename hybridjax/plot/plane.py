@@ -235,7 +235,15 @@ def _zoom(
     side = 0.36
     far = ax.get_xlim()[1]
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
-    places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
+    places = np.array(
+        [
+            0.6 + 0.5j,
+            0.33 + 0.5j,
+            0.5 + 0.5j,
+            0.5 + 0.25j,
+            0.5 + 0.75j,
+        ]
+    )
     apart = points - places[:, None]
     room = np.maximum(np.abs(apart.real), np.abs(apart.imag)).min(axis=1)
     place = places[int(room.argmax())]

@@ -151,7 +151,8 @@ def diagnosis_of(
     )
     # Variances decrease with the number of strides beyond that of the unknowns.
     cycles = (100, 300, 1000, 3000)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in cycles], float)
+    parameters = R * nu + d + 1
+    later = np.array([max(n - parameters, 0) for n in cycles], float)
     with np.errstate(divide="ignore"):
         smaller = np.sqrt(max(sampled - unknowns, 1) / later)
     return Diagnosis(

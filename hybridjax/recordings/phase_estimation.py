@@ -228,7 +228,10 @@ def _angles(
         angles.append((time, angle_of(*smooth)))
     if isinstance(anchor, Crossing):
         at_anchor = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [(time, np.angle(np.exp(1j * (a - at_anchor)))) for time, a in angles]
+        relative = []
+        for time, a in angles:
+            relative.append((time, np.angle(np.exp(1j * (a - at_anchor)))))
+        angles = relative
     return angles
 
 
@@ -258,7 +261,8 @@ def _plane(
     """Return center and scale, by default from the middle 98 % of the signals over all trials."""
     limits = []
     for name in (family.position, family.velocity):
-        values = np.concatenate([x[np.isfinite(x)] for _, x in recording.samples(name)])
+        finite = [x[np.isfinite(x)] for _, x in recording.samples(name)]
+        values = np.concatenate(finite)
         if not len(values):
             raise DefinitionError(
                 f"{name} is missing at every sample: define the phase by others."

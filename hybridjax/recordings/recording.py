@@ -423,7 +423,8 @@ def _begins_again(time: Series, bad: int) -> bool:
     so_far = np.ptp(time[:bad])
     after = time[bad : bad + 3]
     goes_on = len(after) > 1 and bool((np.diff(after) > 0).all())
-    return time[bad - 1] - time[bad] > so_far / 2 and goes_on and bad > 2
+    jump_back = time[bad - 1] - time[bad]
+    return jump_back > so_far / 2 and goes_on and bad > 2
 
 
 def signal_of(crossing: Crossing) -> str:

@@ -352,7 +352,8 @@ def _require_changes(
 def _require_times(part: _Sections, N: int, step: float) -> None:
     """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
     errors depend on the place of a crossing between samples, which are `step` seconds apart."""
-    known = (part.k % N == 0) & np.isfinite(part.values[:, -1])
+    is_anchor = part.k % N == 0
+    known = is_anchor & np.isfinite(part.values[:, -1])
     inner = np.flatnonzero(known)[3:-3]
     # Of fewer cycles, the seven waves below explain too much.
     if len(inner) <= 20:
@@ -387,7 +388,8 @@ def _sample(
         k = _crossed(stretch, N)
         if len(k) <= N:
             continue
-        t = np.clip(stretch.when(k / N), stretch.time[0], stretch.time[-1])
+        t = stretch.when(k / N)
+        t = np.clip(t, stretch.time[0], stretch.time[-1])
         start = t[:-1]
         long_gaps = np.diff(stretch.gaps, axis=1)[:, 0] > plan.period / N
         observed = ~inside(stretch.gaps[long_gaps], start, start)
@@ -489,7 +491,8 @@ def _after_clock(
     """Return times minus those of the clock: a line through the times of each section,
     t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
     N = plan.n_sections
-    begin = parts[0].t[0] / plan.period - parts[0].k[0] / N
+    first = parts[0]
+    begin = first.t[0] / plan.period - first.k[0] / N
     cycles = [
         part.k // N + round(part.t[0] / plan.period - part.k[0] / N - begin)
         for part in parts
@@ -500,8 +503,10 @@ def _after_clock(
     )
     cycle, time = (both - average_cycle(section, both, N)[section]).T
     slope = (cycle @ time) / (cycle @ cycle)
-    late = np.where(np.isnan(np.concatenate(times)), np.nan, time - slope * cycle)
-    return np.split(late, np.cumsum([len(part.k) for part in parts])[:-1])
+    is_missing = np.isnan(np.concatenate(times))
+    late = np.where(is_missing, np.nan, time - slope * cycle)
+    ends = np.cumsum([len(part.k) for part in parts])
+    return np.split(late, ends[:-1])
 
 
 @checked
@@ -531,7 +536,8 @@ def without_drift(
             if len(middle) >= FEWEST and cycles < np.inf:
                 bandwidth = 0.5 / (cycles * phase.period)
                 drift = spline(middle, level - level.mean(), bandwidth)
-                values[:, k] -= drift(np.clip(trial.time, middle[0], middle[-1]))
+                within = np.clip(trial.time, middle[0], middle[-1])
+                values[:, k] -= drift(within)
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)
 

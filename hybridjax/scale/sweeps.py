@@ -124,7 +124,9 @@ def sweep(
         )
     space = Space(axes, not isinstance(values, SweepPoints))
     family = Family(model, list(space.axes))
-    middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
+    middle = {}
+    for name, x in space.axes.items():
+        middle[name] = float(np.sort(x)[len(x) // 2])
     system = family.check(middle)
     wanted = Wanted(quantities, system)
     total = math.prod(space.shape)
@@ -234,7 +236,10 @@ class SweepJob:
             cycles = self._solved(self._points(k), workers, known)
         shape = [x.stop - x.start for x in self.blocks.slices(k)]
         values = self.wanted.values(cycles, self.variables)
-        return {name: x.reshape(*shape, *x.shape[1:]) for name, x in values.items()}
+        shaped = {}
+        for name, x in values.items():
+            shaped[name] = x.reshape(*shape, *x.shape[1:])
+        return shaped
 
     def _points(self, k: int) -> tuple[np.ndarray, ...]:
         """Return the indices of the points of piece k."""

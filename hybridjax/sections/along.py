@@ -269,7 +269,8 @@ def _until_settled(
         goal = dataclasses.replace(targets, time=moves.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[inside]), goal)
         last = change
-        change = np.abs(end[:, 0] - start.t - h[inside]).max(initial=0.0)
+        change_of_each = np.abs(end[:, 0] - start.t - h[inside])
+        change = change_of_each.max(initial=0.0)
         if not change <= last:
             return None
         h[inside] = end[:, 0] - start.t
@@ -290,7 +291,9 @@ def _levels_on(
     )
     level = levels_at(s, targets.levels, 1 + max(index), *point)[0]
     start, end = np.split(level, 2, axis=1)
-    start = np.where(np.roll(once.code, 1) < 0, np.roll(end, 1, axis=1), start)
+    end_of_last = np.roll(end, 1, axis=1)
+    no_event = np.roll(once.code, 1) < 0
+    start = np.where(no_event, end_of_last, start)
     return np.stack([start, end])[:, index]
 
 
@@ -308,6 +311,7 @@ def levels_at(
     for a in np.unique(chart).tolist():
         if levels is not None and levels.present(s, a):
             rows = np.flatnonzero(chart == a)
-            both = kernels.levels(s, a, levels, N, t[rows], q[: s.dims[a], rows])
+            q_of_chart = q[: s.dims[a], rows]
+            both = kernels.levels(s, a, levels, N, t[rows], q_of_chart)
             out[:, :, rows] = both.swapaxes(0, 1)
     return out

@@ -218,8 +218,10 @@ class ArcLength(_Anchored):
         signals = s.resolve_outputs(self.signals)
         rates = jax.vmap(lambda *point: _along(s, signals, *point)[1])(*orbit[1:])
         speed = jnp.linalg.norm(rates / self.scale, axis=1)
-        length = jnp.cumsum(jnp.append(0.0, (speed + jnp.roll(speed, -1)) / 2))
-        times = orbit.t[0] + orbit.period * jnp.linspace(0.0, 1.0, self.points + 1)
+        mean_speed = (speed + jnp.roll(speed, -1)) / 2
+        length = jnp.cumsum(jnp.append(0.0, mean_speed))
+        share = jnp.linspace(0.0, 1.0, self.points + 1)
+        times = orbit.t[0] + orbit.period * share
         equal = length[-1] * jnp.arange(self.n_sections) / self.n_sections
         return BoundSections.at_times(jnp.interp(equal, length, times))
 
@@ -337,7 +339,8 @@ class _AngleLevels(AbstractLevels):
             self._signals(s)(a, t, q, jnp.zeros(s.nu))
         )
         across = self.across[:, i]
-        return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)
+        signal = across[0] * position + across[1] * velocity
+        return jnp.where(i < 0, 1.0, signal)
 
 
 @checked

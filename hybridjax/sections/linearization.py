@@ -259,7 +259,8 @@ class Delayed(NamedTuple):
         B = jnp.concatenate([B[1::2], after_both], axis=2)
         D = jnp.concatenate([0 * D[::2], D[::2]], axis=2)
         names = *model.inputs, *(f"{x} before" for x in model.inputs)
-        model = LDTP(A[1::2] @ A[::2], B, C[::2], D, dims[::2], names, model.outputs)
+        over_both = A[1::2] @ A[::2]
+        model = LDTP(over_both, B, C[::2], D, dims[::2], names, model.outputs)
         return cls(model, lag, names[: len(names) // 2])
 
     def htf(

@@ -133,10 +133,12 @@ def _locate(
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
-    carry = map.anchor, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
+    first_step = stride((0.1 * period / N)[None])
+    carry = map.anchor, first_step, xp.zeros(1, xp.int32)
     before = None
     if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, map.anchor.t + 1.5 * period)
+        no_time = xp.full(1, np.inf)
+        target = toward(no_time, -1, map.anchor.t + 1.5 * period)
         carry, before = go(carry, to_section(target, family.anchor))
         if not family.at_anchor:
             before = None
@@ -238,7 +240,8 @@ def _bind(
 
     lanes = anchor
     if M > 1:
-        carry = anchor, stride((0.1 * period / M)[None]), xp.zeros(1, xp.int32)
+        first_step = stride((0.1 * period / M)[None])
+        carry = anchor, first_step, xp.zeros(1, xp.int32)
         times = anchor.t + period * xp.arange(1, M + 1) / M
         lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
     bound = bind_at(map, family, lanes)

@@ -74,7 +74,8 @@ class PlacedSections(Showable, eqx.Module):
     @property
     def section_zero(self) -> Float[Array, " n"]:
         """Time and padded state at which the cycle meets section 0."""
-        return namespace(self.lanes.t).append(self.lanes.t[0], self.lanes.q[:, 0])
+        lanes = self.lanes
+        return namespace(lanes.t).append(lanes.t[0], lanes.q[:, 0])
 
     def __repr__(self):
         system = type(self.cycle.system).__name__

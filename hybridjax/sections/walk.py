@@ -111,7 +111,8 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
         raw = bind_at(placed.cycle.return_map, family, begin)
     late = 0.0
     if np.isfinite(raw.time[0]):
-        late = np.rint((placed.bound.time[0] - raw.time[0]) / placed.cycle.period)
+        late = placed.bound.time[0] - raw.time[0]
+        late = np.rint(late / placed.cycle.period)
     return Walk(
         lead=None if before is None else Plan.of(before),
         path=Plan.of(path),
@@ -167,7 +168,8 @@ def walked(
     bound = dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
     known = _known_ends(map, walk, bound)
     passage = _followed(map, walk, walk.path, bound.levels, begin, known, columns=True)
-    code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
+    of_walk = _code(map, walk.path, passage, begin[0])
+    code = jnp.where(code == Result.OK, of_walk, code)
     N = family.n_sections
     lanes = Lanes(
         t=passage.pieces_t,

@@ -143,5 +143,8 @@ class SlidingChart(DerivedChart):
         side reaches by the same direction f_a - f_b."""
         f, g = self.fields(t, q, u)
         a, b = self.rates(t, q, u)
-        normal = jax.grad(self.surface, 1)(jnp.asarray(t, float), jnp.asarray(q, float))
-        return jnp.eye(len(f)) - jnp.outer(f - g, normal) / (a - b)
+        t = jnp.asarray(t, float)
+        q = jnp.asarray(q, float)
+        normal = jax.grad(self.surface, 1)(t, q)
+        back = jnp.outer(f - g, normal) / (a - b)
+        return jnp.eye(len(f)) - back

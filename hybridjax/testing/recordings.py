@@ -163,7 +163,8 @@ def add_artifacts(
     for trial in recording.trials:
         values = np.array(trial.values)
         time = trial.time
-        y = values[:, columns] + noise * rng.normal(size=(len(time), len(columns)))
+        error = rng.normal(size=(len(time), len(columns)))
+        y = values[:, columns] + noise * error
         y = np.round(y / quantum) * quantum if quantum else y
         if spikes:
             struck = rng.random(y.shape) < spikes
@@ -247,7 +248,8 @@ def simulate_beats(
         move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):
-            events[trial].append((i + (1 - phase[trial]) / move[trial]) * h)
+            share = (1 - phase[trial]) / move[trial]
+            events[trial].append((i + share) * h)
         phase = np.where(after >= 1, after - 1, after)
     time = np.arange(m) / rate
     trials = [

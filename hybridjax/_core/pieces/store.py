@@ -53,7 +53,10 @@ class Blocks:
     def slices(self, k: int) -> tuple[slice, ...]:
         """Return the part of the grid that is block k."""
         sides = zip(self.place(k), self.block, self.shape, strict=True)
-        return tuple(slice(i * b, min((i + 1) * b, n)) for i, b, n in sides)
+        slices = []
+        for i, b, n in sides:
+            slices.append(slice(i * b, min((i + 1) * b, n)))
+        return tuple(slices)
 
 
 def near_cube(shape: Sequence[int], most: int) -> tuple[int, ...]:

@@ -103,7 +103,8 @@ def _eliminated(matrix, right):
             pivot = upper[0]
             share = lower[0] / jnp.where(pivot == 0, 1.0, pivot)
             rows[k][k:] = upper
-            rows[i][k:] = [y - share * x for x, y in zip(upper, lower, strict=True)]
+            pairs = zip(upper, lower, strict=True)
+            rows[i][k:] = [y - share * x for x, y in pairs]
 
     x: dict[int, Array] = {}
     for i in reversed(range(n)):

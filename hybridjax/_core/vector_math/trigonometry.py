@@ -99,7 +99,9 @@ def _sincos(x):
     lost = (a - r) - b  # by rounding
     r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]
     # Acts from |x| ~ 1e14 on only, where x does not determine r any more.
-    r = jax.lax.clamp(jax.lax.full_like(r, -0.8), r, jax.lax.full_like(r, 0.8))
+    low = jax.lax.full_like(r, -0.8)
+    high = jax.lax.full_like(r, 0.8)
+    r = jax.lax.clamp(low, r, high)
     z = r * r
     s = r + r * z * _polynomial(n.sin, z)
     c = 1 - (0.5 * z - z * z * _polynomial(n.cos, z))
@@ -127,7 +129,8 @@ def _arctan2(y, x):
     ay = abs(y)
     low = jax.lax.min(ax, ay)
     high = jax.lax.max(ax, ay)
-    ratio = jnp.where(low == high, jnp.where(high == 0, 0.0, 1.0), low / high)
+    of_equal = jnp.where(high == 0, 0.0, 1.0)
+    ratio = jnp.where(low == high, of_equal, low / high)
     steep = ratio > _TAN_PI_8
     r = jax.lax.select(steep, (ratio - 1) / (ratio + 1), ratio)
     z = r * r
@@ -135,7 +138,8 @@ def _arctan2(y, x):
     angle = jax.lax.select(steep, jnp.pi / 4 + (angle + n.pi_4_low), angle)
     beyond_diagonal = jnp.pi / 2 - (angle - 2 * n.pi_4_low)
     angle = jax.lax.select(ay > ax, beyond_diagonal, angle)
-    angle = jax.lax.select(jnp.signbit(x), jnp.pi - (angle - 4 * n.pi_4_low), angle)
+    left = jnp.pi - (angle - 4 * n.pi_4_low)
+    angle = jax.lax.select(jnp.signbit(x), left, angle)
     return jax.lax.select(jnp.signbit(y), -angle, angle)
 
 

@@ -128,7 +128,8 @@ def transfer_slopes(
         rows = slice(first, first + step)
         w = weight[:, rows]
         states = states_at(model, f[rows])
-        later = states_at(dual, np.add.outer(m, f[rows]).ravel())[::-1]
+        shifted = np.add.outer(m, f[rows]).ravel()
+        later = states_at(dual, shifted)[::-1]
         slopes = np.zeros((coordinates.size, *w.shape), complex)
         for n, place in enumerate(places):
             shapes = coordinates.blocks(n)
@@ -136,7 +137,8 @@ def transfer_slopes(
                 name: slopes[place[name]].reshape(*shape, *w.shape)
                 for name, shape in shapes.items()
             }
-            waves = np.exp(-2j * np.pi / model.n_sections * n * m) / model.n_sections
+            turns = n * m / model.n_sections
+            waves = np.exp(-2j * np.pi * turns) / model.n_sections
             after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
             _fill(blocks, coordinates, n, states[n], after, waves, w)
         yield rows, slopes
@@ -197,7 +199,8 @@ def states_at(
         return states, x
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
-    turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
+    back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
+    turn = phi * back_a_period
     resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
     states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))
     return states

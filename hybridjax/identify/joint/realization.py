@@ -57,10 +57,12 @@ def realized_htf(
     harmonics = all_harmonics(N)
     H = np.zeros((N, F, ny, nu), complex)
     H[np.isin(harmonics, htf.harmonics)] = htf.H
-    waves = np.exp(2j * np.pi * np.outer(np.arange(N), harmonics) / N)
+    turns = np.outer(np.arange(N), harmonics) / N
+    waves = np.exp(2j * np.pi * turns)
     responses = np.tensordot(waves, H, 1)
     if htf.variance is None:
-        scale = positive(np.sqrt(np.mean(np.abs(responses) ** 2, axis=(0, 1, 3))))
+        power = np.mean(np.abs(responses) ** 2, axis=(0, 1, 3))
+        scale = positive(np.sqrt(power))
         weight = np.broadcast_to(1 / scale[:, None], (F, ny, nu))
         edge = 0.0
     else:

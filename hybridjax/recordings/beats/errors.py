@@ -144,7 +144,8 @@ def _left(intervals: Intervals, memory: float) -> Lanes:
     if not memory:
         return left
     middle = intervals.start + intervals.duration / 2
-    left[:-1] = np.exp(-np.abs(np.diff(middle)) / memory)
+    step = np.abs(np.diff(middle))
+    left[:-1] = np.exp(-step / memory)
     left[:-1][np.diff(intervals.trial) != 0] = 0.0
     return left
 

@@ -276,7 +276,9 @@ def projected(intervals: Intervals, fit: CurveFit, white: Whitening) -> Projecte
     intervals), without what the rates of the trials explain."""
     columns = np.column_stack([fit.residual, fit.forecast.slopes])
     columns = white(columns)
-    rest, along, _ = without_rates(intervals, columns[:, -1], columns[:, :-1])
+    by_rate = columns[:, -1]
+    others = columns[:, :-1]
+    rest, along, _ = without_rates(intervals, by_rate, others)
     return Projected(rest[:, 0], rest[:, 1:], along)
 
 
@@ -304,7 +306,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     score = across.T @ errors.residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
     share = curvature[1:, 0] / max(curvature[0, 0], _TINY)
-    inner = curvature[1:, 1:] - np.outer(share, curvature[0, 1:])
+    by_first = np.outer(share, curvature[0, 1:])
+    inner = curvature[1:, 1:] - by_first
     pull = score[1:] - share * score[0]
     gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
     unit = max(noise, _TINY)

@@ -230,7 +230,8 @@ class PopulationMaps:
         **Arguments:** `parts`: maps of the subjects of each group. `largest`: in ascending order.
         """
         flat = [y.reshape(len(y), -1) for y in parts]
-        value, error, t = moments(flat, [np.ones((1, len(y))) for y in flat])
+        each_once = [np.ones((1, len(y))) for y in flat]
+        value, error, t = moments(flat, each_once)
         # Up to rounding.
         below = np.searchsorted(largest, np.abs(t) * (1 - 1e-9))
         above = np.maximum(len(largest) - below, 1)
@@ -337,7 +338,8 @@ def _are_skewed(parts: list[Maps], level: float, rng: np.random.Generator) -> bo
         # Deviations from a mean have n - 1 dimensions.
         basis, _ = np.linalg.qr(np.eye(n) - 1 / n)
         contrasts = basis[:, : n - 1]
-        rotation, _ = np.linalg.qr(rng.normal(size=(_ROTATIONS, n - 1, n - 1)))
+        drawn = rng.normal(size=(_ROTATIONS, n - 1, n - 1))
+        rotation, _ = np.linalg.qr(drawn)
         found += _skewness(values[None])[0]
         rotated += [_skewness(contrasts @ q @ (contrasts.T @ values)) for q in rotation]
     return bool((1 + (rotated >= found).sum()) <= level * (1 + _ROTATIONS))
@@ -347,7 +349,8 @@ def _skewness(deviation: Float[np.ndarray, "... n V"]) -> Float[np.ndarray, "...
     """Return the sum over the grid of squared skewness, times the number of subjects."""
     second = np.mean(deviation**2, axis=-2)
     third = np.mean(deviation**3, axis=-2)
-    square = third**2 / np.maximum(second, np.finfo(float).tiny ** 0.25) ** 3
+    least = np.finfo(float).tiny ** 0.25
+    square = third**2 / np.maximum(second, least) ** 3
     return deviation.shape[-2] * square.sum(axis=-1)
 
 
