@@ -397,4 +397,5 @@ def _no_better(y: Signals, error: Signals) -> Float[np.ndarray, " ny"]:
     alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
     by_cycle = np.nansum(alone**2 - error**2, axis=2)
     gain = by_cycle[sampled.any(axis=(2, 3))]
-    return stats.norm.sf(gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0))
+    deviate = gain.mean(axis=0) * np.sqrt(len(gain))
+    return stats.norm.sf(deviate, scale=gain.std(axis=0))

@@ -531,4 +531,5 @@ def amounts(
     if both.min() >= 0:
         return both
     only = int(both.argmax())
-    return np.where(np.arange(2) == only, square[only] / expected[only, only], 0.0)
+    alone = square[only] / expected[only, only]
+    return np.where(np.arange(2) == only, alone, 0.0)

@@ -80,7 +80,9 @@ def connect(
     by_state = to_inputs[..., :d]
     by_input = to_inputs[..., d:]
     # Padding goes behind the states of both, which stay in their order.
-    is_padding = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
+    is_padding = []
+    for x in (a, b):
+        is_padding.append(xp.arange(x.A.shape[1]) >= x.dims[:, None])
     key = xp.concatenate(is_padding, axis=1) * d + xp.arange(d)
     order = xp.argsort(key, axis=1)
     before = order[:, None, :]
@@ -111,9 +113,11 @@ def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -
     """**Raises:** `DefinitionError` where a section answers itself without bounds by -F."""
     if is_traced(D, F):
         return
-    answer = np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F)
+    loop = np.asarray(D) @ np.asarray(F)
+    answer = np.eye(D.shape[1]) + loop
     size = np.linalg.svd(answer, compute_uv=False)
-    singular = size[:, -1] < _WELL_POSED * np.maximum(size[:, 0], 1)
+    least = _WELL_POSED * np.maximum(size[:, 0], 1)
+    singular = size[:, -1] < least
     if singular.any():
         raise DefinitionError(
             f"direct feed-through answers itself at section {np.argmax(singular)} (I + D of plant "
@@ -207,7 +211,8 @@ def feedback(P, F):
     xp = namespace(P)
     before = xp.linalg.inv(xp.eye(P.shape[1]) + P @ F)
     R = before @ P
-    return R, [(before, xp.eye(P.shape[2]) - F @ R), (R, R)]
+    after = xp.eye(P.shape[2]) - F @ R
+    return R, [(before, after), (R, R)]
 
 
 def variance_of(pairs: list[tuple], variances: list[Array]) -> Array:

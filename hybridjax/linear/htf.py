@@ -385,7 +385,8 @@ class HTF(Showable, eqx.Module):
         H = to_host(self.H)
         xp = namespace(H)
         mirror = np.array([self._index(-m) for m in self.harmonics])
-        H = xp.concatenate([H, H[mirror].conj()], axis=1)[:, distance.argmin(axis=1)]
+        both = xp.concatenate([H, H[mirror].conj()], axis=1)
+        H = both[:, distance.argmin(axis=1)]
         parts = xp.einsum("mkij,kj->mki", H, U[lines])
         Y = xp.zeros((n, len(self.outputs)), complex)
         for m, part in zip(self.harmonics, parts, strict=True):

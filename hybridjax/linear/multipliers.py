@@ -35,7 +35,8 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
 
     **Raises:** `ComputationError` for NaN and infinity.
     """
-    basis, _ = _carry_range(_balanced(factors), np.eye(factors[0].shape[1]), rtol)
+    unit = np.eye(factors[0].shape[1])
+    basis, _ = _carry_range(_balanced(factors), unit, rtol)
     return basis.shape[1]
 
 

@@ -130,7 +130,8 @@ class ChainContact(eqx.Module):
         e = self.chain.restitution
         n = self.chain.n
         _, speed = self.table(t)
-        return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
+        speed_after = (1 + e) * speed - e * q[n + self.i]
+        return q.at[n + self.i].set(speed_after)
 
 
 class BouncingChain(HybridSystem):
@@ -189,6 +190,7 @@ class BouncingChain(HybridSystem):
         first, lift, v, _ = PaddleJuggler(
             self.A, self.T, self.g, self.restitution
         ).exact()
-        past = -(first + jnp.arange(self.n) * self.T / self.n) % self.T
+        delays = jnp.arange(self.n) * self.T / self.n
+        past = -(first + delays) % self.T
         y = lift + v * past - self.g * past**2 / 2
         return Guess("flight", jnp.concatenate([y, v - self.g * past]))

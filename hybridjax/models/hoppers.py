@@ -53,7 +53,8 @@ class VerticalHopper(HybridSystem):
 
     def leg(self, t: Array, yM: Array, ym: Array | float) -> Array:
         """Force of the leg on the body."""
-        return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
+        spring = self.k * (self.l0 - (yM - ym))
+        return spring + self.a * jnp.sin(self.omega * t)
 
     def charts(self):
         def pushed(t, q, u):

@@ -261,7 +261,9 @@ class CompassGait(HybridSystem):
         C = m * b**2
         D = -m * b * length * c
         det = A * D - B * C
-        return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det
+        stance = (D * whole - B * leg) / det
+        swing = (A * leg - C * whole) / det
+        return s, n, stance, swing
 
     def draw(self, chart, t, q):
         return _two_legs(self.slope, self.l, q["s"], q["n"])

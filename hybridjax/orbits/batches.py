@@ -236,7 +236,8 @@ class Tiles(NamedTuple):
         # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
         other = (turn.result == Result.OK) & (turn.end.chart != anchor.chart)[:, 0]
         anchor = anchor._replace(q=q[..., None])
-        anchor.q[other], anchor.chart[other] = turn.end.q[other], turn.end.chart[other]
+        anchor.q[other] = turn.end.q[other]
+        anchor.chart[other] = turn.end.chart[other]
         size[extra | other] = np.inf
         once = np.ones(len(rows), int)
         return Rounds(
@@ -337,7 +338,8 @@ def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
 def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
     """The numbers of systems, one row for each."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
-    return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+    rows = [np.asarray(x).reshape(len(x), -1) for x in arrays]
+    return np.concatenate(rows, axis=1)
 
 
 def nearest(
@@ -351,7 +353,8 @@ def nearest(
     apart = (finite - finite.mean(axis=0)).filled(0.0)
     spread = np.sqrt(np.mean(apart**2, axis=0))
     points = apart / np.where(spread > 0, spread, 1.0)
-    distance, place = KDTree(points[: len(known)]).query(points[len(known) :])
+    tree = KDTree(points[: len(known)])
+    distance, place = tree.query(points[len(known) :])
     return distance, np.asarray(place)
 
 
@@ -391,6 +394,9 @@ def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     """Codes of events moved to the front of each row, without the columns that are empty."""
     row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
     count = np.bincount(row, minlength=len(codes))
-    out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
-    out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
+    width = max(count.max(initial=0), 1)
+    out = np.full((len(codes), width), -1, codes.dtype)
+    begins = np.cumsum(count) - count
+    place = np.arange(len(row)) - begins[row]
+    out[row, place] = codes[row, column]
     return out

@@ -72,7 +72,8 @@ def _shrunk(cycle: LimitCycle) -> End | None:
     scale = np.asarray(cycle.settings.scale)
     a = int(path.chart[0])
     n = cycle.structure.dims[a]
-    ranges = np.ptp(path.after[:, :n], axis=0) / scale[a, :n]
+    states = path.after[:, :n]
+    ranges = np.ptp(states, axis=0) / scale[a, :n]
     if ranges.max() > _SMALL:
         return None
     text = "the cycle shrinks to an equilibrium, as it does at a Hopf point"
@@ -92,7 +93,8 @@ def _touched_section(cycle: LimitCycle) -> End | None:
     q = map.anchor.q[:n]
     u = np.zeros((s.nu, 1))
     first = np.zeros(1, np.int32)
-    row = kernels.watched(s, a, target.levels, t, q, u, first)[-1, :, 0]
+    expanded = kernels.watched(s, a, target.levels, t, q, u, first)
+    row = expanded[-1, :, 0]
     field = kernels.field(s, a, t, q, u)[:, 0, 0]
     if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
         return None
@@ -162,7 +164,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             continue
         u = np.zeros((s.nu, 1))
         first = np.zeros(1, np.int32)
-        rows = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)[:, 0]
+        expanded = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)
+        rows = expanded[:, 0]
         for g, level in zip(guards, rows, strict=True):
             near = _CLOSE * np.ptp(level)
             if len(level) < 3 or near == 0:

@@ -111,7 +111,11 @@ class Branch(Showable, eqx.Module):
         """Floquet multipliers of every cycle, by decreasing modulus, padded with zeros."""
         rows = [self[k].multipliers for k in range(len(self))]
         width = max(map(len, rows))
-        return np.array([np.pad(x.astype(complex), (0, width - len(x))) for x in rows])
+        padded = []
+        for row in rows:
+            missing = width - len(row)
+            padded.append(np.pad(row.astype(complex), (0, missing)))
+        return np.array(padded)
 
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
@@ -347,7 +351,8 @@ class _Trace(NamedTuple):
         length = self.step
         before: Point | None = None
         moved: Point | None = None
-        last_value = self.values[-1] if start.tangent[-1] > 0 else self.values[0]
+        rises = start.tangent[-1] > 0
+        last_value = self.values[-1 if rises else 0]
         over = bool(start.value == last_value)
         while not over and len(points) < self.max_points:
             last = points[-1]

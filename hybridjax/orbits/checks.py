@@ -172,7 +172,8 @@ def _compare(
     change = np.abs(np.stack(later) - now).max(axis=0)
     by_point = np.abs(now[:, 1 : 1 + len(size)])
     rounding = ROUNDING * np.sum(by_point * size[:, None], axis=1)
-    values_differ = change[:, 0] > SAME * np.abs(now[:, 0]) + rounding
+    tolerance = SAME * np.abs(now[:, 0]) + rounding
+    values_differ = change[:, 0] > tolerance
     by_inputs = np.abs(now[:, 1 + len(size) :])
     largest = by_inputs.max(initial=0.0)
     gains_differ = change[:, 1 + len(size) :] > SAME * largest

@@ -192,12 +192,14 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     by_t = guard[1]
     by_q = guard[2 : 2 + m]
     by_u = guard[2 + m :]
-    rate = by_t + by_q @ kernels.field(s, chart, time, after, u)[:, 0, 0]
+    field = kernels.field(s, chart, time, after, u)[:, 0, 0]
+    rate = by_t + by_q @ field
     if value < -TOGETHER * period * abs(rate):
         return True
     # The guard after the reset, by the time, the state before it and the inputs: zero up to
     # rounding, if it is zero in each neighbor.
-    by_reset = kernels.reset(s, s.member(g), time, before, u)[:, 1:, 0]
+    expanded = kernels.reset(s, s.member(g), time, before, u)
+    by_reset = expanded[:, 1:, 0]
     direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
     size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
@@ -268,7 +270,10 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     if len(orders) < 2 or len(ends) > 1:
         return False
     m, n = orders[0].derivative.shape
-    rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
+    rows = []
+    for order in orders:
+        derivative = order.derivative * scale[a, :n]
+        rows.append(np.column_stack([order.state, derivative]))
     apart = np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]
     return bool(np.max(apart) < SAME)
 

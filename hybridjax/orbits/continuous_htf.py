@@ -126,7 +126,8 @@ def _interpolation(
     """
     middle = (np.max(f) + np.min(f)) / 2
     half = np.ptp(f) / 2
-    n = int(np.pi * half + _EXTRA * np.cbrt(1 + np.pi * half))
+    turns = np.pi * half
+    n = int(turns + _EXTRA * np.cbrt(1 + turns))
     if n >= len(f) or not half:
         return f, f, np.eye(len(f))
     k = np.arange(n)
@@ -197,7 +198,8 @@ def _require_no_pole(
 ) -> None:
     """**Raises:** `DefinitionError` for a frequency at which the HTF is infinite."""
     turns = np.exp(2j * np.pi * f)
-    apart = np.abs(turns[:, None] - np.linalg.eigvals(monodromy)).min(axis=1)
+    multipliers = np.linalg.eigvals(monodromy)
+    apart = np.abs(turns[:, None] - multipliers).min(axis=1)
     if (apart < _POLE).any():
         where = "every whole number" if map.base else "its multipliers of modulus 1"
         raise DefinitionError(
@@ -226,7 +228,8 @@ def _integrals(
     rows = len(harmonics) * len(z.names)
     values, by_state, by_input = linear_outputs(map.structure, flow, z)
     orders = np.asarray(harmonics)[:, None, None]
-    waves = xp.exp(-2j * np.pi * orders * flow.after(map) / map.expected)
+    phase = flow.after(map) / map.expected
+    waves = xp.exp(-2j * np.pi * orders * phase)
     weighted = waves * flow.length[:, None] * rule().weights
     back = xp.conj(inside)
 

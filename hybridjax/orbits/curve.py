@@ -188,7 +188,8 @@ class Curve:
         if self.map.base is not None or not len(events):
             return None
         k = far_from_events(pieces.t, events, float(point.turn.period))
-        phase = pieces.t[k : k + 1] / point.turn.period * float(self.map.expected)
+        begin = pieces.t[k : k + 1] / point.turn.period
+        phase = begin * float(self.map.expected)
         anchor = point.anchor._replace(t=phase, chart=pieces.chart[[k]])
         if k == 0:
             return None
@@ -332,4 +333,5 @@ def away_from_events(cycle: LimitCycle) -> LimitCycle:
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:
     """Events of a turn, from the same one on wherever the turn begins."""
     events = tuple(sequence)
-    return min((events[k:] + events[:k] for k in range(len(events))), default=())
+    rotations = [events[k:] + events[:k] for k in range(len(events))]
+    return min(rotations, default=())

@@ -650,7 +650,8 @@ def _on_host(request: _Request) -> Flow:
         padded(path.event * 0 - 1, -1),
     )
     nothing = np.zeros(1)
-    none = Samples(np.zeros((0, 1), np.int32), np.zeros((0, s.d, 1)))
+    charts = np.zeros((0, 1), np.int32)
+    none = Samples(charts, np.zeros((0, s.d, 1)))
     passage = Passage(
         Moved(
             lanes=end,

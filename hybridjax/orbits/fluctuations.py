@@ -280,7 +280,8 @@ def _pieces(
     late = events.delay_by_noise[:, None] * by_delay
     deviations = xp.asarray(scatter)[flow.event]
     scattered = deviations[:, :, None] ** 2 * np.eye(d)
-    added = late[:, :, None] * late[:, None] + _pad(scattered, n)
+    by_noise = late[:, :, None] * late[:, None]
+    added = by_noise + _pad(scattered, n)
     return _Pieces(forward, _pad(collected, n), jump, added)
 
 

@@ -297,7 +297,8 @@ def _next_crossing(
     wait = _patience(map, lanes) if max_period is None else max_period
     begin = float(np.asarray(lanes.t)[0])
     for _ in range(_LOOKS):
-        target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
+        no_time = np.full(1, np.inf)
+        target = toward(no_time, -1, np.asarray(lanes.t) + wait)
         moved = _moved(map, lanes, to_section(target, section, map.event))
         waited = float(np.asarray(moved.lanes.t)[0]) - begin
         if not _misses(moved) or max_period is not None:
@@ -390,7 +391,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     scale = np.asarray(map.scale)[a, :n]
     sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
     rate = field[:, 0] / sizes
-    jacobian = field[:, 2 : 2 + n] * sizes / sizes[:, None]
+    by_state = field[:, 2 : 2 + n]
+    jacobian = by_state * sizes / sizes[:, None]
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):
@@ -403,7 +405,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     guards = s.guards(a)
     if guards:
         first = np.zeros(1, np.int32)
-        levels = kernels.watched(s, a, None, t, lane.q[:n], u, first)[:, 0, 0]
+        expanded = kernels.watched(s, a, None, t, lane.q[:n], u, first)
+        levels = expanded[:, 0, 0]
         passed = [g for g, level in zip(guards, levels, strict=True) if level < 0]
         beyond = [f"'{s.transitions[g].name}'" for g in passed]
     text = ""
@@ -413,7 +416,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
     known = np.abs(lane.q[:n, 0]) > _REST * scale
-    place = signal_values(s.states(a), np.where(known, lane.q[:n, 0], 0.0))
+    place = np.where(known, lane.q[:n, 0], 0.0)
+    place = signal_values(s.states(a), place)
     raise ComputationError(
         f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', {place}, where "
         f"nothing moves: start elsewhere.{text}"

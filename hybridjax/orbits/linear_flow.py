@@ -270,7 +270,8 @@ class LinearFlow(eqx.Module):
 
         # The delays of events.
         free, _ = self.forward
-        delay_by_begin = (jumps.delay_by_state[:, None] @ free[:, -1])[:, 0]
+        free_at_end = free[:, -1]
+        delay_by_begin = (jumps.delay_by_state[:, None] @ free_at_end)[:, 0]
         by_state = xp.einsum("pa,pacf->pcf", delay_by_begin, x)
         by_arrived = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
         by_input = jumps.delay_by_input[..., None] * last
@@ -535,7 +536,8 @@ def _along(
     tape = tape._replace(
         code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code)
     )
-    times = begin[0][:, None] + np.outer(longer, (time - start) / full)
+    delay = np.outer(longer, (time - start) / full)
+    times = begin[0][:, None] + delay
     ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
 
@@ -577,7 +579,8 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
 
     def work(a, here, out):
         n = s.dims[a]
-        step = kernels.step(s, a, t[here], q[:n, here], u[:, here], h[here])
+        q_here = q[:n, here]
+        step = kernels.step(s, a, t[here], q_here, u[:, here], h[here])
         out[:n, here] = step.q
         return out
 

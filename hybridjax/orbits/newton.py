@@ -133,7 +133,9 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
     """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
     recorded turn."""
-    (map, _, factors, _), (by, *_), solution = arguments, directions, _solve(*arguments)
+    map, _, factors, _ = arguments
+    by, *_ = directions
+    solution = _solve(*arguments)
     turn = solution.turn
     ends = map.ends()
     sizes = map.sizes
@@ -154,7 +156,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     end = orbit.tangents(begin)[-1, 1:].T
     moved = np.where(map.valid, end, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
-    begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
+    each = np.tile(jacobian, (P, 1, 1))
+    begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
     moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])

@@ -293,7 +293,8 @@ def _newton(map: ReturnMap, factors, residual, q):
     jacobian = product - jnp.eye(len(q)) - map.held(q)[1]
     sizes = map.sizes
     step = -solve_by_columns(jacobian * sizes / sizes[:, None], residual / sizes)
-    excess = jnp.max(jnp.abs(step) / (ATOL + RTOL * jnp.abs(q / sizes)))
+    tolerance = ATOL + RTOL * jnp.abs(q / sizes)
+    excess = jnp.max(jnp.abs(step) / tolerance)
     return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
 
 
@@ -357,7 +358,8 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
 
 
 def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
-    return jnp.where(mask.reshape(mask.shape + (1,) * (yes.ndim - mask.ndim)), yes, no)
+    missing = (1,) * (yes.ndim - mask.ndim)
+    return jnp.where(mask.reshape(mask.shape + missing), yes, no)
 
 
 @eqx.filter_custom_jvp

@@ -110,7 +110,8 @@ class Coupling(Showable, eqx.Module):
     def __call__(self, lead: Phases) -> Float[Array, " p"]:
         xp = namespace(self.coefficients)
         n = np.arange(len(self.coefficients))
-        waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
+        angle = 2j * np.pi * xp.asarray(lead)[..., None]
+        waves = xp.exp(angle * n)
         return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
 
     __repr__ = fields
@@ -152,7 +153,11 @@ class Coupling(Showable, eqx.Module):
             optimize.brentq(value, *grid[k : k + 2], full_output=True)[0]
             for k in crossed
         ]
-        return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
+        locked = []
+        for x in roots:
+            slope = float(self._slope([x])[0])
+            locked.append(Locked(x % 1.0, slope))
+        return tuple(locked)
 
 
 # When responses were made, for messages.
@@ -255,7 +260,9 @@ class Responses(Showable, eqx.Module):
         flow = to_host(self.flow)
         period = float(self.period)
         phase = (flow.t - flow.t[0, 0]) / period
-        tail = np.where(flow.event >= 0, np.nan, pushed[:, -1]) / period
+        # (A piece that ends in an event is separated from the next one.)
+        end = np.where(flow.event >= 0, np.nan, pushed[:, -1])
+        tail = end / period
         pairs = (phase, phase[:, -1]), (pushed / period, tail)
         phase, values = (
             np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs
@@ -285,7 +292,8 @@ class Responses(Showable, eqx.Module):
         # Nodes within parts of pieces that resolve the fastest wave.
         parts = 1 + harmonics // 2
         x, weight = np.polynomial.legendre.leggauss(NODES)
-        x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
+        begin_of_part = np.arange(parts)[:, None]
+        x = ((begin_of_part + (x + 1) / 2) / parts).ravel()
         times = flow.turn[:, None] + flow.length[:, None] * x
         phase = (times / period).ravel()
         weight = (
@@ -298,7 +306,8 @@ class Responses(Showable, eqx.Module):
         else:
             wave = xp.asarray(push(phase), float)
         n = np.arange(harmonics + 1)
-        weight = xp.exp(-2j * np.pi * n[:, None] * phase) * weight
+        waves = xp.exp(-2j * np.pi * n[:, None] * phase)
+        weight = waves * weight
         wave = weight @ wave
         response = weight @ Z
         for x in self.impulses():
@@ -480,7 +489,8 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
     xp = namespace(M)
     scaled = M * size / size[:, None]
     values, right = xp.linalg.eig(stop_gradient(scaled))
-    order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
+    lower_last = 1e-9 * (xp.imag(values) < 0)
+    order = xp.argsort(-xp.abs(values) + lower_last, stable=True)
     if on_host(M):
         kept = int(np.sum(np.abs(values) > _LEAST))
         count = kept if count is None else count
@@ -488,7 +498,9 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
             raise DefinitionError(
                 f"{count} modes were asked for; {kept} have amplitudes."
             )
-    modes = [_mode(scaled, size, values[k], right[:, k]) for k in order[:count]]
+    modes = []
+    for k in order[:count]:
+        modes.append(_mode(scaled, size, values[k], right[:, k]))
     if not modes:
         return values[:0], right[:0], right[:0]
     return tuple(xp.stack(x) for x in zip(*modes, strict=True))
@@ -505,7 +517,8 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
     still = stop_gradient(M)
 
     def pair(M, still, x):
-        matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
+        shifted = still - value * np.eye(n)
+        matrix = xp.concatenate([shifted, xp.conj(x)[None]])
         column = xp.append(-x, 0.0)[:, None]
         off = xp.append(M @ x - value * x, 0.0)
         step = xp.linalg.solve(xp.concatenate([matrix, column], axis=1), off)
@@ -515,7 +528,8 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
     right, root = pair(M, still, right)
     left, _ = pair(M.T, still.T, xp.conj(rows[-1]))
     if on_host(M):
-        apart = np.abs(left @ right) / (np.linalg.norm(left) * np.linalg.norm(right))
+        lengths = np.linalg.norm(left) * np.linalg.norm(right)
+        apart = np.abs(left @ right) / lengths
         if not apart > SINGULAR:
             raise ComputationError(
                 "two multipliers coincide, and their modes have no amplitudes of their own: "

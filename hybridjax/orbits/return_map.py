@@ -444,7 +444,8 @@ class ReturnMap(eqx.Module):
         same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
         apart = xp.abs(turn.pieces.q - q[..., None])
         apart = apart / self.sizes[..., None]
-        farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
+        farthest_state = xp.max(apart, axis=-2)
+        farthest = xp.max(xp.where(same, farthest_state, np.inf), axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
@@ -513,7 +514,8 @@ class ReturnMap(eqx.Module):
             )
         values, gradient = self.outputs(q, tuple(self.conserved), varied)
         excess = values - xp.stack(list(self.conserved.values()))
-        scaled = gradient[..., : q.shape[-1]] * sizes[..., None, :]
+        by_state = gradient[..., : q.shape[-1]]
+        scaled = by_state * sizes[..., None, :]
         steep = xp.linalg.norm(scaled, axis=-1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
         back = (
@@ -542,7 +544,8 @@ class ReturnMap(eqx.Module):
         by = self.each(
             with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1)
         )
-        return by[..., 0], by[..., 2 : 2 + s.d + (varied is not None)]
+        columns = 2 + s.d + (varied is not None)
+        return by[..., 0], by[..., 2:columns]
 
     def travel(
         self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
@@ -668,7 +671,8 @@ def with_derivatives(
 
     def work(a, here, out):
         n = s.dims[a]
-        by = function(a, only(here, t), only(here, q[:n]), only(here, u))
+        point = only(here, t), only(here, q[:n]), only(here, u)
+        by = function(a, *point)
         inputs = slice(2 + s.d, 2 + s.d + s.nu)
         index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, inputs])
         return put(out, index, xp.where(here, by, out[index]))

@@ -74,7 +74,8 @@ class SectionRegression(NamedTuple):
         basis, size, right = np.linalg.svd(unknown, full_matrices=False)
         kept = size > RANK * size.max(axis=1, initial=0, keepdims=True)
         basis = basis * kept[:, None]
-        inverse = np.where(kept, 1 / np.where(kept, size, 1), 0)[:, None]
+        divisor = np.where(kept, size, 1)
+        inverse = np.where(kept, 1 / divisor, 0)[:, None]
         to_starts = (right.mT * inverse)[:, : starts.shape[2]]
         remainder = without(basis, rows * inputs)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
@@ -147,7 +148,8 @@ class OutputErrorProblem(NamedTuple):
         def triangle(n: int):
             rows = []
             for grid in records.grids:
-                later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
+                cycle = np.arange(grid.y.shape[1])
+                later = cycle >= grid.first[:, n, None] + free
                 used = grid.sampled[:, :, n].any(axis=2) & later
                 rows.append(lagged_inputs(grid.u, n, lags, records.lead)[used])
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))

@@ -118,7 +118,8 @@ class SeriesProblem(NamedTuple):
                 except np.linalg.LinAlgError:
                     return np.inf
                 pairs = zip(path.whiten, path.error, strict=True)
-                cost += sum(float((np.matvec(w, e) ** 2).sum()) for w, e in pairs)
+                for w, e in pairs:
+                    cost += float((np.matvec(w, e) ** 2).sum())
         return cost
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
@@ -178,7 +179,8 @@ class SeriesProblem(NamedTuple):
             whiten.append(root)
             gain.append(G)
             F.append(model.A[n] - G @ model.C[n])
-            y.append(part.y[n] - part.u[n] @ model.D[n].T)
+            at_once = part.u[n] @ model.D[n].T
+            y.append(part.y[n] - at_once)
         starts = 0
         if self.free_start:
             starts = max(model.dims[n] for n in part.first)
@@ -191,7 +193,8 @@ class SeriesProblem(NamedTuple):
 
         def drive(n: int, later: Columns) -> None:
             later[..., 0] += part.u[n] @ model.B[n].T
-            later[..., 0] += np.matvec(gain[n], y[n] * part.sampled[n])
+            sampled = y[n] * part.sampled[n]
+            later[..., 0] += np.matvec(gain[n], sampled)
 
         # The first column is driven, the others start from each coordinate of the initial state.
         filled = [1 + starts] * N
@@ -290,7 +293,8 @@ def recursion(
     for n, step in enumerate(F):
         enter(n, x)
         later = np.zeros((R, T, step.shape[-2], columns))
-        later[..., : filled[n]] = step @ x[..., : filled[n]]
+        columns_so_far = slice(filled[n])
+        later[..., columns_so_far] = step @ x[..., columns_so_far]
         drive(n, later)
         x = later
         phi = step @ phi

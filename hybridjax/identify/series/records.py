@@ -144,7 +144,8 @@ class PreparedRecords:
         varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
         _require_signals(self.outputs, varies, "constant")
         require_deviations(self.records)
-        self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
+        power = np.nansum(y**2, axis=0) / self.sampled.sum(axis=0)
+        self.scale = np.sqrt(power)
 
     @property
     def about(self) -> dict[str, Any]:

@@ -180,7 +180,8 @@ def _regressed(
     spread /= 1 + (root**2).sum() / samples
     correlation = inputs.T @ residual / np.sqrt(spread)
     left, values, _ = np.linalg.svd(inputs, full_matrices=False)
-    left = left[:, values > RANK * values[0]][:, : samples // 2]
+    kept = values > RANK * values[0]
+    left = left[:, kept][:, : samples // 2]
     explained = ((left.T @ residual) ** 2).sum()
     by_fit = ((left.T @ root) ** 2).sum()
     unexplained = (residual**2).sum() - explained
