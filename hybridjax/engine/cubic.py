@@ -60,11 +60,14 @@ def first_crossing(
     va = xp.where(sa < 1, cubic.value(sa), v1)
     vb = xp.where(sb < 1, cubic.value(sb), v1)
 
+    # The monotone piece that falls through zero first.
     first = armed & (va <= 0)
     second = (va > 0) & (vb <= 0) & (sb > sa)
     third = (vb > 0) & (v1 <= 0) & (sb < 1)
-    lo = xp.where(first, 0.0, xp.where(second, sa, sb))
-    hi = xp.where(first, sa, xp.where(second, sb, 1.0))
+    begin_of_others = xp.where(second, sa, sb)
+    end_of_others = xp.where(second, sb, 1.0)
+    lo = xp.where(first, 0.0, begin_of_others)
+    hi = xp.where(first, sa, end_of_others)
     crosses = first | second | third
 
     s = 0.5 * (lo + hi)
@@ -88,7 +91,8 @@ def first_crossing(
         is_small = xp.abs(value) <= small
         sure = _beside(node, margin) <= small
         touch = touch | (dips & is_small & sure)
-        near = near | (dips & (value > small) & (value < NEAR * scale))
+        is_near = (value > small) & (value < NEAR * scale)
+        near = near | (dips & is_near)
     # Before the first crossing, the guard may have another sign than the cubic.
     for node in (sa, sb, *_POINTS):
         unsure = xp.abs(cubic.value(node)) < _beside(node, margin)
@@ -131,8 +135,10 @@ class _Cubic(NamedTuple):
         pivot = -(b + sign * xp.sqrt(xp.maximum(disc, 0.0)))
         r1 = _divide(pivot, 3 * c)
         r2 = _divide(d0, pivot)
-        r1 = xp.where((disc > 0) & (r1 > 0) & (r1 < 1), r1, 1.0)
-        r2 = xp.where((disc > 0) & (r2 > 0) & (r2 < 1), r2, 1.0)
+        has_first = (disc > 0) & (r1 > 0) & (r1 < 1)
+        has_second = (disc > 0) & (r2 > 0) & (r2 < 1)
+        r1 = xp.where(has_first, r1, 1.0)
+        r2 = xp.where(has_second, r2, 1.0)
         return xp.minimum(r1, r2), xp.maximum(r1, r2)
 
 

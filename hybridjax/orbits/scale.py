@@ -99,10 +99,13 @@ def sizes_near(
 
 def sizes_on(s: Structure, lanes: Lanes, period: float) -> Sizes:
     """Sizes of all states, from points of a cycle."""
-    t, chart, q = (np.asarray(x) for x in lanes[:3])
+    t = np.asarray(lanes.t)
+    chart = np.asarray(lanes.chart)
+    q = np.asarray(lanes.q)
     rounding = _fields(s, chart, t, q).rounding
     floor = _TIMES_ROUNDING * period * rounding
-    return _by_name(s, chart, np.maximum(np.abs(q), floor))
+    size = np.maximum(np.abs(q), floor)
+    return _by_name(s, chart, size)
 
 
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:

@@ -39,7 +39,8 @@ def newton_steps(
     """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
     NaN for systems that are not finite."""
     step = np.full(residual.shape, np.nan)
-    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    good = np.isfinite(residual).all(axis=1)
+    good = good & np.isfinite(jacobian).all(axis=(1, 2))
     inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
     step[good] = -np.matvec(inverse, residual[good])
     return step
@@ -79,7 +80,8 @@ def fixed_point(
         q = moves.q + shift[:, 1:].T
         moves = moves._replace(t=t, q=q, h=h)
         # (The error after a step is about its square.)
-        if length <= np.maximum(CLOSED, np.asarray(map.settings.rtol)):
+        rtol = np.asarray(map.settings.rtol)
+        if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
         before = length
     return otherwise, None
@@ -90,8 +92,9 @@ def _shift(
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
     """The Newton step of the state at the anchor, in sizes, the changes of (t, q) where moves start
     that close the gaps between moves, and the lengths of the moves after them."""
+    n = 1 + len(x)
     end, by = linear_moves(map.structure, moves, target)
-    by_point = by[:, :, : 1 + len(x)]
+    by_point = by[:, :, :n]
     starts = np.concatenate([moves.t[None], moves.q]).T
     between = end[:-1] - starts[1:]
     gaps = np.concatenate([between, end[-1:]])
@@ -111,10 +114,11 @@ def _changes(
     """Changes of (t, q) where moves start, and at the last end, by the state at the first start,
     and in the last column by the gaps between moves. The first one is `late`."""
     n = by.shape[1]
-    changes = [np.eye(n, k=-1)]
-    changes[0][0, -1] = late
+    change = np.eye(n, k=-1)
+    change[0, -1] = late
+    changes = [change]
     for of_move, gap in zip(by, gaps, strict=True):
-        change = of_move @ changes[-1]
+        change = of_move @ change
         change[:, -1] += gap
         changes.append(change)
     return np.stack(changes)

@@ -49,7 +49,8 @@ def solve_positive(
             products = [(scaled[i, k], lower[j, k]) for k in range(j)]
             scaled[i, j] = _less(matrix[..., i, j], products)
         pivot = scaled[j, j]
-        singular = singular | ~(pivot > least * matrix[..., j, j])
+        is_positive = pivot > least * matrix[..., j, j]
+        singular = singular | ~is_positive
         inverse.append(1 / pivot)
         for i in range(j + 1, n):
             lower[i, j] = scaled[i, j] * inverse[j]
@@ -147,7 +148,8 @@ def _by_columns(matrix, right):
         is_done = jnp.arange(n) < k
         sizes = jnp.where(is_done, -1.0, jnp.abs(rows[:, k]))
         pivot = jnp.argmax(sizes)
-        chosen = rows[pivot] / rows[pivot, k]
+        pivot_row = rows[pivot]
+        chosen = pivot_row / rows[pivot, k]
         rows = rows.at[pivot].set(rows[k])
         shares = rows[:, k]
         rows = rows - jnp.outer(shares, chosen)
@@ -227,7 +229,8 @@ def lu(
         other = jnp.sum(masked, axis=-2, dtype=rows.dtype, keepdims=True)
         row = jax.lax.dynamic_slice_in_dim(rows, k, 1, rows.ndim - 2)
         here = (index == k)[:, None]
-        return jnp.where(here, other, jnp.where(mask, row, rows))
+        replaced = jnp.where(mask, row, rows)
+        return jnp.where(here, other, replaced)
 
     def eliminate(k, carry):
         X, pivots, order = carry
@@ -242,11 +245,13 @@ def lu(
         # Subtract shares of row k from the rows below, and keep these shares in its column.
         column = _column(X, k)
         pivot = _row(column[..., None], k)
+        is_later = index > k
         share = column / jnp.where(pivot == 0, 1.0, pivot)
-        share = jnp.where(index > k, share, 0.0)[..., :, None]
-        row = jnp.where(index > k, _row(X, k), 0.0)[..., None, :]
-        below = (index == k) & (index[:, None] > k)
-        X = jnp.where(below, share, X - share * row)
+        share = jnp.where(is_later, share, 0.0)[..., :, None]
+        row = jnp.where(is_later, _row(X, k), 0.0)[..., None, :]
+        below = (index == k) & is_later[:, None]
+        reduced = X - share * row
+        X = jnp.where(below, share, reduced)
         return X, pivots, order
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
