@@ -113,7 +113,8 @@ def test_the_bcg_trials():
 
 def test_complete_pairs_give_the_paired_t_test():
     """And two groups with equal errors give Welch's, with nearly its degrees of freedom."""
-    y, error = RNG.normal(size=2 * N), np.full(2 * N, 0.01)
+    y = RNG.normal(size=2 * N)
+    error = np.full(2 * N, 0.01)
     y[N:] += RNG.normal(size=N)
     labels = np.repeat(["a", "b"], N)
     table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
@@ -130,16 +131,20 @@ def test_complete_pairs_give_the_paired_t_test():
 
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
     """That of all contrasts without a mean, for errors that differ and missing conditions."""
-    y, v = (
-        RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1)),
-        RNG.uniform(0.02, 0.2, (8, 2)),
-    )
+    y = RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1))
+    v = RNG.uniform(0.02, 0.2, (8, 2))
     present = np.ones((8, 2), bool)
     present[0, 0] = present[1, 1] = False
-    (subjects, cells), y, v = np.nonzero(present), y[present], v[present]
-    x, same = np.eye(2)[cells], subjects[:, None] == subjects
-    fit, contrasts = mixed(y, v, x, subjects, cells), linalg.null_space(x.T)
-    covariance = lambda between: same * between[np.ix_(cells, cells)] + np.diag(v)  # noqa: E731
+    (subjects, cells) = np.nonzero(present)
+    y = y[present]
+    v = v[present]
+    x = np.eye(2)[cells]
+    same = subjects[:, None] == subjects
+    fit = mixed(y, v, x, subjects, cells)
+    contrasts = linalg.null_space(x.T)
+
+    def covariance(between):
+        return same * between[np.ix_(cells, cells)] + np.diag(v)
 
     def likelihood(between):
         part = contrasts.T @ covariance(between) @ contrasts
@@ -158,7 +163,8 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
 
 
 def test_predictions_shrink_and_covariates_explain():
-    age, error = np.linspace(20, 60, N), RNG.uniform(0.1, 0.4, N)
+    age = np.linspace(20, 60, N)
+    error = RNG.uniform(0.1, 0.4, N)
     people = study(0.1 * age + 0.01 * RNG.normal(size=N), error, age=age)
     row = people.mean("gain", covariates="age")
     assert list(row["effect"]) == ["mean", "slope of age"]
@@ -169,7 +175,8 @@ def test_predictions_shrink_and_covariates_explain():
 
 
 def test_moderated_variances_are_closer_to_the_true_ones():
-    strides, dof = RNG.uniform(60, 300, 400), np.full(400, 6.0)
+    strides = RNG.uniform(60, 300, 400)
+    dof = np.full(400, 6.0)
     true = 1 / strides
     v = true * RNG.chisquare(6, 400) / 6
     trend = np.column_stack([np.ones(400), np.log(strides)])

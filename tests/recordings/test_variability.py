@@ -24,13 +24,12 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
 
 def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
-    rng, gains = (
-        np.random.default_rng(seed),
-        np.random.default_rng(5).normal(size=(N, 3)),
-    )
+    rng = np.random.default_rng(seed)
+    gains = np.random.default_rng(5).normal(size=(N, 3))
     trials = []
     for count in strides:
-        x, y = 0.0, []
+        x = 0.0
+        y = []
         for n in range(count * N):
             y.append(gains[n % N] * np.real(x))
             x = multiplier ** (1 / N) * x + rng.normal()
@@ -38,7 +37,8 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         slow = drift * np.sin(np.arange(len(y))[:, None] / 800)
         y += y.std(axis=0) * (noise * rng.normal(size=y.shape) + slow)
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
-        t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
+        t = np.arange(len(y)) / N
+        events = {"e": np.arange(count)}
         trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
     return hj.Recording.join(trials)
 
@@ -86,7 +86,8 @@ def test_a_pair_has_one_interval_that_contains_the_estimate():
 @pytest.mark.slow
 def test_instruments_have_no_bias_by_noise():
     found = [hj.recordings.natural_multipliers(variable(0.7, seed=k)) for k in range(3)]
-    (low, high), (_, top) = found[0].interval(0.99)[0], found[0].interval(plain=True)[0]
+    (low, high) = found[0].interval(0.99)[0]
+    (_, top) = found[0].interval(plain=True)[0]
     assert low < 0.6 < high and top < 0.6
     assert abs(np.mean([f.multipliers[0].real for f in found]) - 0.6) < 0.05
     assert np.mean([f.plain[0].real for f in found]) < 0.53
