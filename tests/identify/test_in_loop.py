@@ -38,14 +38,17 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     x = np.zeros((S, A.shape[1]))
     u = np.zeros((S, n))
     y = np.zeros((S, n))
+    last = np.zeros(S)
     for i in range(n):
         k = i % N
         free = x @ C[k, 0] + d[:, i] + e[:, i] / 4
-        last = y[:, i - 1] if waits and i else 0 * free
         answer = 0.3 * last if waits else free
-        u[:, i] = r[:, i] + c[:, i] - GAIN[k, 0, 0] * answer
-        y[:, i] = free + through * u[:, i]
-        x = x @ A[k].T + (u[:, i] + w[:, i])[:, None] * B[k, :, 0]
+        command = r[:, i] + c[:, i]
+        u[:, i] = command - GAIN[k, 0, 0] * answer
+        last = free + through * u[:, i]
+        y[:, i] = last
+        drive = u[:, i] + w[:, i]
+        x = x @ A[k].T + drive[:, None] * B[k, :, 0]
     return u, y
 
 

@@ -63,24 +63,25 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     sizes alone hold 90 % (three realizations), 92 % (four), 94 % (eight); two tell no more."""
     rng = np.random.default_rng(R)
     runs = 20_000
-    error = constant * np.exp(2j * np.pi * rng.random((R, runs)))
-    error += noise * rng.normal(size=(R, runs, 2)) @ [np.sqrt(0.5), 1j * np.sqrt(0.5)]
+    phases = 2 * np.pi * rng.random((R, runs))
+    parts = np.sqrt(0.5) * rng.normal(size=(R, runs, 2))
+    error = constant * np.exp(1j * phases) + noise * parts @ [1, 1j]
     shares = np.full((R, 1), 1 / R)
-    if (
-        constant == 0
-    ):  # Of experiments of different strengths; Gaussian errors know nothing of it.
+    if constant == 0:
+        # Of experiments of different strengths; Gaussian errors know nothing of it.
         shares = rng.dirichlet(np.full(R, 3.0))[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
-    variance = np.sum(shares * np.abs(error - mean) ** 2, axis=0) / (R - 1)
     residuals = np.sqrt(shares) * (error - mean)
     square = (np.abs(residuals) ** 2).sum(axis=0)
     turned = (residuals**2).sum(axis=0)
-    shape = roundness(square, turned, np.full(runs, 1.0 * R))[None, :, None, None]
-    variance_dof = hj.linear.VarianceDof(np.full(runs, R - 1.0), shape)
+    variance = square / (R - 1)
+    shape = roundness(square, turned, np.full(runs, 1.0 * R))
+    dof = np.full(runs, R - 1.0)
+    variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
     for level in (0.5, 0.8, 0.95, 0.99):
-        square = np.asarray(variance_dof.quantile(level))[0, :, 0, 0] * variance
-        inside = np.abs(mean) ** 2 <= square
+        quantile = np.asarray(variance_dof.quantile(level))[0, :, 0, 0]
+        inside = np.abs(mean) ** 2 <= quantile * variance
         if constant == 0:
             assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
         elif R > 3 and level == 0.95:

@@ -275,32 +275,55 @@ def identify(files, out, *more):
     return main(["identify", *trials, *options, "--out", str(out), *more])
 
 
+@pytest.fixture(scope="module")
+def out(files, tmp_path_factory):
+    """The results of the command, in a folder that was not empty."""
+    folder = tmp_path_factory.mktemp("results") / "out"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        assert identify(files, ".") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def summary(out):
+    return json.loads((out / "summary.json").read_text())
+
+
 @pytest.mark.slow
-def test_the_command(files, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "notes.txt").write_text("mine")
-    monkeypatch.chdir(out)
-    assert identify(files, ".") == 0
-    summary = json.loads((out / "summary.json").read_text())
+def test_the_summary_of_the_command(summary):
     (found,) = np.array(summary["multipliers"]) @ [1, 1j]
     assert abs(found - MULTIPLIER) < 2e-2
     assert summary["held_out_fit_percent"][0] > 80
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") >= 7 and "<script" not in page
-    top = page[: page.index("<img")]
-    assert "± standard error" in top and f"<td>{found.real:.3f}" in top
-    assert "from force (N) to x (m), v (m/s)" in top
-    said = re.sub("</?code>", "`", top)
-    assert all(
-        f'<p class="warn">{html.escape(w)}</p>' in said for w in summary["warnings"]
-    )
-    assert all(
-        (html.escape(x) in said) == bool(n) for x, n in summary["left_out"].items()
-    )
     assert summary["sampling_rates"] == pytest.approx([64, 64])
     assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+
+
+@pytest.mark.slow
+def test_the_page_of_the_command(out, summary):
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 7
+    assert "<script" not in page
     assert "p &lt; 0.001" in page or "p = " in page
+
+    above_figures = page[: page.index("<img")]
+    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    assert "± standard error" in above_figures
+    assert f"<td>{found.real:.3f}" in above_figures
+    assert "from force (N) to x (m), v (m/s)" in above_figures
+
+    text = re.sub("</?code>", "`", above_figures)
+    for warning in summary["warnings"]:
+        assert f'<p class="warn">{html.escape(warning)}</p>' in text
+    for reason, count in summary["left_out"].items():
+        is_listed = html.escape(reason) in text
+        assert is_listed == bool(count)
+
+
+@pytest.mark.slow
+def test_the_files_of_the_command(out):
     assert hj.load(out / "fit.npz").contains([MULTIPLIER], 0.999).all()
     assert hj.load(out / "htf.npz").variance is not None
     rows = (out / "sections.csv").read_text().splitlines()
@@ -308,10 +331,16 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert len(rows) > 16 * 190
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_failure_of_the_command_leaves_nothing(files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(hj.plot, "validation", lambda validation: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        identify(files, "../new")
-    assert [p.name for p in tmp_path.iterdir()] == ["out"] and not pyplot.get_fignums()
+        identify(files, "new")
+    assert not list(tmp_path.iterdir())
+    assert not pyplot.get_fignums()
 
 
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])
@@ -328,16 +357,24 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(
 
 def test_signals_with_clocks_of_their_own(rhythm):
     """Position and velocity are never sampled together, the input more often than either."""
-    t = rhythm.trials[0].time
-    (force, x, v) = rhythm.trials[0].values.T
-    parts = (t, {"force": force}), (t[::2], {"x": x[::2]}), (t[1::2], {"v": v[1::2]})
-    own = hj.Recording.beside([hj.Recording(*part) for part in parts])
+    (trial,) = rhythm.trials
+    t = trial.time
+    force, x, v = trial.values.T
+    parts = [
+        hj.Recording(t, {"force": force}),
+        hj.Recording(t[::2], {"x": x[::2]}),
+        hj.Recording(t[1::2], {"v": v[1::2]}),
+    ]
+    own = hj.Recording.beside(parts)
     angle = hj.KinematicPhase(
         16, position="x", velocity="v", center=(0, 0), scale=(1, 1)
     )
-    data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
-    assert data[1].missing == 0 and data[1].cycles == data[0].cycles
-    together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
+    common_clock = sample(rhythm, angle, inputs="force")
+    own_clocks = sample(own, angle, inputs="force")
+    assert own_clocks.missing == 0
+    assert own_clocks.cycles == common_clock.cycles
+    together = hj.fit_series(common_clock, order=1).multipliers
+    apart = hj.fit_series(own_clocks, order=1).multipliers
     np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
     np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)
 
