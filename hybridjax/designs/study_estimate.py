@@ -171,28 +171,33 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
         return noise_ratios(fewer, htf, coefficients)
 
     most, _ = supported(ratios, order)
-    objection = ""
-    if not most:
-        objection = (
-            "the data show no multiplier above the noise (if that remains so, take a first design "
-            "of more power or of more experiments)"
-        )
-    elif most < order:
-        objection = (
-            f"the data support {most} multipliers, not {order} (if that remains so, lower `order` "
-            "in a new study)"
-        )
-    elif (np.abs(fit.multipliers) >= 1).any():
-        objection = (
-            "the estimate is unstable, and an unstable system has no periodic response"
-        )
     return Estimate(
         fit=fit,
         by_level=by_level,
         noise=noise,
         supported=most,
-        objection=objection,
+        objection=_objection(fit, most, order),
     )
+
+
+def _objection(fit: MultiplierFit, most: int, order: int) -> str:
+    """Return why a fit of this order cannot be used, where the data support at `most` so many
+    multipliers; empty for one that can."""
+    if not most:
+        return (
+            "the data show no multiplier above the noise (if that remains so, take a first design "
+            "of more power or of more experiments)"
+        )
+    if most < order:
+        return (
+            f"the data support {most} multipliers, not {order} (if that remains so, lower `order` "
+            "in a new study)"
+        )
+    if (np.abs(fit.multipliers) >= 1).any():
+        return (
+            "the estimate is unstable, and an unstable system has no periodic response"
+        )
+    return ""
 
 
 def refuse_transient(

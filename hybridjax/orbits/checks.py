@@ -356,6 +356,29 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
     code = Result(int(cycle.result))
+    about_orbit = _about_orbit(cycle, code, turn)
+    if about_orbit:
+        return about_orbit
+    name = type(cycle.system).__name__
+    reason = code.message
+    if code == Result.STEP_LIMIT:
+        reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
+        reason = f"{reason} from {cycle.settings.max_steps} {reached}"
+    if code == Result.NOT_CONVERGED:
+        reason = _why_not_converged(cycle, turn)
+    better = (
+        " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
+        f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
+    )
+    s = cycle.structure
+    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
+    if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+        advice += _about_decisions(s)
+    return f"no limit cycle of {name} was found: {reason}.{advice or better}"
+
+
+def _about_orbit(cycle: LimitCycle, code: Result, turn: Turn) -> str:
+    """The reason why the orbit that a search ended on is no cycle to work with; empty for none."""
     map = cycle.return_map
     if code == Result.EVENT_ORDER and map.event >= 0:
         follows = int(map.followed(turn.end))
@@ -378,21 +401,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
             f"{cycle.multiplicity} periods of `multiplicity`: leave that out, or give a guess "
             "nearer to the longer cycle, with `settle` if it is stable."
         )
-    reason = code.message
-    if code == Result.STEP_LIMIT:
-        reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
-        reason = f"{reason} from {cycle.settings.max_steps} {reached}"
-    if code == Result.NOT_CONVERGED:
-        reason = _why_not_converged(cycle, turn)
-    better = (
-        " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
-        f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
-    )
-    s = cycle.structure
-    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
-    if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
-        advice += _about_decisions(s)
-    return f"no limit cycle of {name} was found: {reason}.{advice or better}"
+    return ""
 
 
 def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
