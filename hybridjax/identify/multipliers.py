@@ -229,22 +229,14 @@ def _solve(
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)
     c, converged = varpro.maximum_likelihood(groups, order)
-    if htf.variance is not None:
-        return _Solution(
-            groups=groups,
-            weight=weight,
-            size=size,
-            c=c,
-            converged=converged,
-        )
-    lines = weights.line_variances(htf)
-    for _ in range(_REWEIGHTINGS):
-        variance = varpro.error_spectrum(
-            groups, c, np.asarray(htf.frequencies), lines, len(rms)
-        )
-        weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
-        groups = varpro.group_htf(htf, weight, size)
-        c, converged = varpro.maximum_likelihood(groups, order, c)
+    if htf.variance is None:
+        f = np.asarray(htf.frequencies)
+        lines = weights.line_variances(htf)
+        for _ in range(_REWEIGHTINGS):
+            variance = varpro.error_spectrum(groups, c, f, lines, len(rms))
+            weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
+            groups = varpro.group_htf(htf, weight, size)
+            c, converged = varpro.maximum_likelihood(groups, order, c)
     return _Solution(
         groups=groups,
         weight=weight,

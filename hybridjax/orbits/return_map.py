@@ -354,26 +354,20 @@ class ReturnMap(eqx.Module):
         lanes, tape, ends = side_by_side((pieces, tapes, ends))
         ends = ends.with_levels(levels)
         d = self.structure.d
+        by_parameter = None
         if varied is None:
             s = self._structure_of(lanes)
             by, _ = tape_jacobian(s, lanes, ends, tape, True)
             factors = by[:, 1:].reshape(PIECES, *q.shape, d)
-            return _Linear(
-                end=end,
-                pieces=pieces,
-                factors=factors,
-                tapes=tapes,
-                gap=gap,
-            )
-        by, at = tape_jacobian(varied, lanes, ends, tape, False)
-        by_parameter = self._by_parameter(varied, by[:, 1:], at)
-        factors = by[:, 1:, 1 : 1 + d]
+        else:
+            by, at = tape_jacobian(varied, lanes, ends, tape, False)
+            by_parameter = self._by_parameter(varied, by[:, 1:], at)
+            factors = by[:, 1:, 1 : 1 + d]
         return _Linear(
             end=end,
             pieces=pieces,
             factors=factors,
             tapes=tapes,
-            record=None,
             gap=gap,
             by_parameter=by_parameter,
         )

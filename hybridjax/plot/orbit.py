@@ -15,7 +15,7 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
-from .look import COLORS, AxesLike, Plot, axis_of, panels
+from .look import COLORS, AxesLike, Plot, axis_of, legend_above, panels
 
 
 CHARTS = [
@@ -113,12 +113,7 @@ def cycle(
                 label="perturbed",
             )
         panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
-        panel.legend(
-            loc="lower center",
-            bbox_to_anchor=(0.5, 1.0),
-            ncols=4,
-            columnspacing=1.2,
-        )
+        legend_above(panel)
     return Plot(axes)
 
 

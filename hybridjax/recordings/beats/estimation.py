@@ -469,11 +469,6 @@ class Carried(NamedTuple):
     error: float
     """Standard error; infinite if no two intervals follow each other."""
 
-    @property
-    def significance(self) -> float:
-        """Number of standard errors."""
-        return abs(self.part) / self.error
-
 
 def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:
     """Return which intervals after the first begin where the one before ends, both used."""
