@@ -58,9 +58,12 @@ def facts(pairs: Mapping[str, str]) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first rows of a table, and how many more there are."""
     rows = list(rows)
-    lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
-    if len(rows) > _ROWS:
-        lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
+    lines = [_row("th", head)]
+    for row in rows[:_ROWS]:
+        lines.append(_row("td", row))
+    more = len(rows) - _ROWS
+    if more > 0:
+        lines.append(_row("td", [f"and {more} more"]))
     return f'<table class="plain">{"".join(lines)}</table>'
 
 

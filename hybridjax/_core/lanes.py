@@ -90,7 +90,9 @@ def by_lane(
     def call(*arguments):
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
-        points = [x[..., 0] if x.shape[-1] < lanes else x for x in arguments]
+        points = []
+        for x, is_common in zip(arguments, common, strict=True):
+            points.append(x[..., 0] if is_common else x)
         many = lanes >= _VECTOR_LANES and not quick
         return program(common, many)(arrays, *points)
 
@@ -315,8 +317,10 @@ def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:
     if on_host(x) or len(rows) > _FEW:
         place = np.full(max(rows, default=0) + 2, -1)  # the last for -1
         place[np.array(rows, int)] = np.arange(len(rows))
-        k = xp.asarray(place)[xp.minimum(which, len(place) - 1)]
-        return xp.where(k >= 0, x[k, np.arange(x.shape[1])], 0.0)
+        last = len(place) - 1
+        k = xp.asarray(place)[xp.minimum(which, last)]
+        own = x[k, np.arange(x.shape[1])]
+        return xp.where(k >= 0, own, 0.0)
     out = xp.zeros_like(x[0])
     for k, row in enumerate(rows):
         out = xp.where(which == row, x[k], out)

@@ -71,8 +71,10 @@ def to_lti(model: LDTP) -> LDTP:
         # The state at section n: from that at section 0, and from the inputs since then.
         from_state, from_inputs = carry
         n, A, B, C, D = section
-        outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
-        states = jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B)
+        outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs)
+        outputs = outputs.at[:, n].set(D)
+        states = jnp.einsum("ij,jkl->ikl", A, from_inputs)
+        states = states.at[:, n].set(B)
         return (A @ from_state, states), (C @ from_state, outputs)
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
@@ -165,8 +167,10 @@ class HarmonicStateSpace(NamedTuple):
         f = np.asarray(frequencies).reshape(-1, 1, 1)
         rates = 2j * np.pi * f / period
         resolvent = rates * np.eye(len(self.A)) - self.A
-        H = self.C @ np.linalg.solve(resolvent, B[None]) + D
-        return H.reshape(len(rates), M, len(self.C) // M, D.shape[-1])
+        states = np.linalg.solve(resolvent, B[None])
+        H = self.C @ states + D
+        ny = len(self.C) // M
+        return H.reshape(len(rates), M, ny, D.shape[-1])
 
 
 # Orders that are tried, and frequencies of the comparison, in cycles per period. More:

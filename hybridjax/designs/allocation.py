@@ -213,6 +213,8 @@ def _balanced(share: Float[np.ndarray, "K E"], use: Powers) -> Float[np.ndarray,
     those that are negligible."""
     experiments = share.shape[1]
     for _ in range(_SWEEPS):
-        share = share * (use.sum() / experiments / share.sum(axis=0))
+        of_experiment = use.sum() / experiments
+        share = share * (of_experiment / share.sum(axis=0))
         share = share * (use / share.sum(axis=1))[:, None]
-    return np.where(share < _WEAK * share.max(axis=1, keepdims=True), 0.0, share)
+    largest = share.max(axis=1, keepdims=True)
+    return np.where(share < _WEAK * largest, 0.0, share)

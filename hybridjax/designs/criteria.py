@@ -181,9 +181,11 @@ def _channels(
     """
     for group in grouped(x.htf, len(c), extra_lags):
         delay = group.period_delay[:, None]
-        powers = range(1, len(c) + 1)
-        slopes = [group.weighted(c, delay**j * group.data) for j in powers]
-        size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
+        slopes = []
+        for j in range(1, len(c) + 1):
+            slopes.append(group.weighted(c, delay**j * group.data))
+        size = group.weight / np.abs(chi(group.period_delay, c))
+        size = np.tile(size, 2)
         cosines = np.tile(x.cosines[group.line], 2)
         slope = x.weight * np.concatenate(slopes, axis=1)
         yield Channel(cosines, slope, size[:, None] * group.basis)

@@ -117,13 +117,14 @@ def _rows(
     """Yield derivatives of the measurements of some cosines, in units of their standard deviations
     at power 1."""
     for htf, cosines, channel, unit in htfs:
+        f = np.asarray(htf.frequencies)
         weight = unit * error_weights(htf, scale)[..., 0] * scale
-        for chunk, slopes in transfer_slopes(
-            coordinates, np.asarray(htf.frequencies), htf.harmonics
-        ):
+        for chunk, slopes in transfer_slopes(coordinates, f, htf.harmonics):
             rows = slopes[..., channel] * weight[:, chunk]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
-            yield cosines[chunk], rows.reshape(*rows.shape[:2], -1).view(float)
+            lines, P = rows.shape[:2]
+            rows = rows.reshape(lines, P, -1).view(float)
+            yield cosines[chunk], rows
 
 
 def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines*rows"]:

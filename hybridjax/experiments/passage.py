@@ -392,9 +392,12 @@ class _Moves:
         guards = len(self.s.guards(a))
         signs = row.signs[:, None]
         # (Comparisons with NaN are false.)
-        other = ((signs != 0) & ~(jnp.sign(value) * signs > 0))[:count]
+        is_known = signs != 0
+        same = jnp.sign(value) * signs > 0
+        other = (is_known & ~same)[:count]
         before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
-        returns = dips(before, Watched(x.h, value, rate), signs) & (signs != 0)
+        now = Watched(x.h, value, rate)
+        returns = dips(before, now, signs) & is_known
         return other.any(axis=0) | returns[:guards].any(axis=0)
 
 

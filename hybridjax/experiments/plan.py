@@ -175,7 +175,8 @@ def _impacts(ways: "_Ways", J, error, scale) -> Float[np.ndarray, "K M N"]:
     impact = np.where(np.isnan(impact), np.inf, impact)
     reference = ways.ends[0, -1]
     deviates = np.arange(len(reference))[:, None] > 0
-    return np.where(np.isnan(reference) & deviates, 0.0, impact)
+    has_no_reference = np.isnan(reference) & deviates
+    return np.where(has_no_reference, 0.0, impact)
 
 
 def _require_ways(impact: Float[np.ndarray, "K N"]) -> None:
@@ -228,10 +229,12 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
     after = np.roll(scale, -1, axis=0)[:, :, None]
-    largest = np.abs(by_input / after)[:, time:].max(axis=(0, 1))
+    relative = np.abs(by_input / after)[:, time:]
+    largest = relative.max(axis=(0, 1))
     unit = np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu))
+    none = np.zeros((1, nu))
     kicks = [size * np.diag(unit) for size in _KICKS]
-    return np.concatenate([np.zeros((1, nu)), *kicks])
+    return np.concatenate([none, *kicks])
 
 
 @host_first
@@ -322,18 +325,23 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     N = len(scale)
     after = np.roll(scale, -1, axis=0)
     # (All errors of a section side by side: one product of matrices for each.)
-    x = (error / after).reshape(-1, *scale.shape).transpose(1, 2, 0)
+    x = (error / after).reshape(-1, *scale.shape)
+    x = x.transpose(1, 2, 0)
     J = J * scale[:, None] / after[:, :, None]
     section = np.arange(N)
     worst = np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
         period = worst[m // N]
-        np.maximum(period, np.abs(x).max(axis=1), out=period)
+        largest = np.abs(x).max(axis=1)
+        np.maximum(period, largest, out=period)
         x = J[(section + 1 + m) % N] @ x
+    # Later periods continue the last two as a geometric series.
     *_, before, last = worst
-    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    divisor = np.where(before > 0, before, 1.0)
+    ratio = np.clip(last / divisor, 0.0, 0.999)
     later = last * ratio / (1 - ratio)
-    return (worst.sum(axis=0) + later).T.reshape(error.shape[:-1])
+    total = worst.sum(axis=0) + later
+    return total.T.reshape(error.shape[:-1])
 
 
 def _accumulated(J, error, scale) -> float:

@@ -75,7 +75,9 @@ class Feedback(NamedTuple):
         """Return what the controller adds to the inputs at section i, and its next state."""
         A, B, C, D, _ = (x[i] for x in self.matrices)
         deviation = y - self.on_cycle[i][:, None]
-        return -(C @ state + D @ deviation), A @ state + B @ deviation
+        answer = -(C @ state + D @ deviation)
+        later = A @ state + B @ deviation
+        return answer, later
 
 
 class Course(eqx.Module):

@@ -352,7 +352,8 @@ class _Writer:
         if before is None:
             return float(self.t[k]), self.at_sections, k
         turn, number = divmod(before, len(self.events))
-        t = self.events[number].t + turn * float(self.placed.cycle.period)
+        period = float(self.placed.cycle.period)
+        t = self.events[number].t + turn * period
         return t, self.after, number
 
     def _to_section(self, k: int, count: int) -> None:

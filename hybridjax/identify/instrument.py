@@ -305,10 +305,12 @@ def _solve_classes(
 
     def variance(G, rows):
         """Return the variances of H for errors Y - H U with these products, of so many rows."""
-        cross = block(y, u, G) @ _adjoint(H)
+        adjoint = _adjoint(H)
+        cross = block(y, u, G) @ adjoint
         square = block(y, y, G) - cross - _adjoint(cross)
-        square = square + H @ block(u, u, G) @ _adjoint(H)
-        mean = np.maximum(_diagonal(square), 0)[:, :, None] / rows
+        square = square + H @ block(u, u, G) @ adjoint
+        of_outputs = np.maximum(_diagonal(square), 0)
+        mean = of_outputs[:, :, None] / rows
         return mean * by_input[:, None]
 
     noise = None

@@ -267,7 +267,8 @@ class MultiplierFit(Fit):
         axes = vectors * np.sqrt(np.maximum(values, 0))
         angle = np.linspace(0, 2 * np.pi, _BORDER_POINTS)
         circle = np.stack([np.cos(angle), np.sin(angle)])
-        x, y = np.sqrt(self._radius(level, equations)) * (axes @ circle)
+        radius = np.sqrt(self._radius(level, equations))
+        x, y = radius * (axes @ circle)
         return self.multipliers[index] + x + 1j * y
 
     @checked

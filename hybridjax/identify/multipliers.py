@@ -197,9 +197,15 @@ def fit_multipliers(
         fewer = max(solution.size - 1 - order * htf.n_sections, 0)
         size = varpro.numerator_size(htf, order, fewer)
         groups = varpro.group_htf(htf, solution.weight, size)
-        start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
+        more = order - len(fit.coefficients)
+        start = np.pad(fit.coefficients, (0, more))
         c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
-        return c, lambda: varpro.summarize(groups, c, covariance)[0]
+
+        def covariance_there():
+            of_coefficients, *_ = varpro.summarize(groups, c, covariance)
+            return of_coefficients
+
+        return c, covariance_there
 
     # One more multiplier, or a pair.
     higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]

@@ -66,8 +66,9 @@ def needs_two_phases(
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    unit = np.maximum(size.max(axis=0, initial=0), np.finfo(float).tiny)
-    even = (size / unit).min(axis=1) > SINGULAR * (size / unit).max(axis=1)
+    largest = size.max(axis=0, initial=0)
+    relative = size / np.maximum(largest, np.finfo(float).tiny)
+    even = relative.min(axis=1) > SINGULAR * relative.max(axis=1)
     size = np.where(even[:, None], size, 1.0)
     products = size[:, :, None] * size[:, None, :]
     least = np.linalg.eigvalsh(gram / products)[:, 0]

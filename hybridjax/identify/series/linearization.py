@@ -192,8 +192,13 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
         rows = columns @ problem.to_lags[n]
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
-        sampled = (part.sampled[:, :, n, alike[0]] for alike in problem.alike[n])
-        return [SectionRegression.make(rows, starts, part.drift, x) for x in sampled]
+        regressions = []
+        for alike in problem.alike[n]:
+            sampled = part.sampled[:, :, n, alike[0]]
+            regressions.append(
+                SectionRegression.make(rows, starts, part.drift, sampled)
+            )
+        return regressions
 
     return regress
 

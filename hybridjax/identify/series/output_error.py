@@ -103,11 +103,13 @@ class SectionRegression(NamedTuple):
 
     def response(self, a: ByInput, x: Columns) -> Columns:
         """Return the response to the inputs and to the initial conditions that fit x best."""
-        columns = x.reshape(*x.shape[:2], -1)
+        S, T = x.shape[:2]
+        columns = x.reshape(S, T, -1)
         forced = self.inputs @ a.reshape(len(a), columns.shape[2])
         left = self.weight * (columns - forced)
-        free = self.to_starts @ (self.basis.mT @ left)
-        return (forced + self.starts @ free).reshape(x.shape)
+        starts = self.to_starts @ (self.basis.mT @ left)
+        free = self.starts @ starts
+        return (forced + free).reshape(x.shape)
 
 
 class OutputErrorProblem(NamedTuple):
