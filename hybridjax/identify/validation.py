@@ -337,8 +337,8 @@ def _simulated(model: LDTP | Fit, record: SectionSeries) -> LDTP | SeriesFit | L
 def _as_series_fit(fit: StructuredFit) -> SeriesFit:
     """Return the same model with numerators at sections, whose errors are not known."""
     N = fit.n_sections
-    turns = np.outer(np.arange(N), fit.harmonics) / N
-    waves = np.exp(2j * np.pi * turns)
+    lags = np.outer(np.arange(N), fit.harmonics)
+    waves = np.exp(2j * np.pi * lags / N)
     numerators = np.einsum("nm,mrij->nrij", waves, fit.numerators).real
     _, R, ny, nu = numerators.shape
     return SeriesFit(

@@ -228,8 +228,8 @@ def _integrals(
     rows = len(harmonics) * len(z.names)
     values, by_state, by_input = linear_outputs(map.structure, flow, z)
     orders = np.asarray(harmonics)[:, None, None]
-    phase = flow.after(map) / map.expected
-    waves = xp.exp(-2j * np.pi * orders * phase)
+    rates = -2j * np.pi * orders
+    waves = xp.exp(rates * flow.after(map) / map.expected)
     weighted = waves * flow.length[:, None] * rule().weights
     back = xp.conj(inside)
 

@@ -95,8 +95,8 @@ def transfer(
     N = model.n_sections
     states = states_at(model, f)
     responses = [_outputs(model, n, states[n]) for n in range(N)]
-    turns = np.outer(harmonics, np.arange(N)) / N
-    waves = np.exp(-2j * np.pi * turns) / N
+    lags = np.outer(harmonics, np.arange(N))
+    waves = np.exp(-2j * np.pi / N * lags) / N
     return np.tensordot(waves, np.stack(responses), 1).swapaxes(1, 2)
 
 
@@ -137,8 +137,8 @@ def transfer_slopes(
                 name: slopes[place[name]].reshape(*shape, *w.shape)
                 for name, shape in shapes.items()
             }
-            turns = n * m / model.n_sections
-            waves = np.exp(-2j * np.pi * turns) / model.n_sections
+            N = model.n_sections
+            waves = np.exp(-2j * np.pi / N * n * m) / N
             after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
             _fill(blocks, coordinates, n, states[n], after, waves, w)
         yield rows, slopes

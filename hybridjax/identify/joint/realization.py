@@ -57,8 +57,8 @@ def realized_htf(
     harmonics = all_harmonics(N)
     H = np.zeros((N, F, ny, nu), complex)
     H[np.isin(harmonics, htf.harmonics)] = htf.H
-    turns = np.outer(np.arange(N), harmonics) / N
-    waves = np.exp(2j * np.pi * turns)
+    lags = np.outer(np.arange(N), harmonics)
+    waves = np.exp(2j * np.pi * lags / N)
     responses = np.tensordot(waves, H, 1)
     if htf.variance is None:
         power = np.mean(np.abs(responses) ** 2, axis=(0, 1, 3))

@@ -174,8 +174,8 @@ class SeriesFit(MultiplierFit):
         harmonics = check_harmonics(harmonics, self.n_sections)
         N = self.n_sections
         c = self.coefficients
-        turns = np.outer(harmonics, np.arange(N)) / N
-        waves = np.exp(-2j * np.pi * turns) / N
+        lags = np.outer(harmonics, np.arange(N))
+        waves = np.exp(-2j * np.pi * lags / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
             by_harmonic = np.einsum("mn,...nrij->...mrij", waves, b)
