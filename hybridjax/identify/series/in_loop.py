@@ -155,8 +155,8 @@ class LoopEquations:
         Z, U, late = np.split(rows, [lags, 2 * lags], axis=1)
         # Combinations of lags, of which the reference excites those that stand out of the noise.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
-        size = np.linalg.norm((U - Z) @ V.T, axis=0)
-        noise = size / np.sqrt(max(used.sum(), 1))
+        unexplained = np.linalg.norm((U - Z) @ V.T, axis=0)
+        noise = unexplained / np.sqrt(max(used.sum(), 1))
         kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
         to_lags = V[kept].T / size[kept]
         instruments = Z @ to_lags
