@@ -11,6 +11,7 @@ from .._core.executor import from_host, to_host
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
+from ..identify.multiplier_estimate import MultiplierFit
 from ..identify.multipliers import (
     NoiseRatios,
     StructuredFit,

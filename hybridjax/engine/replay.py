@@ -241,12 +241,12 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
     """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
     n, m = by.shape[1:]
     columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
-    by_point = by[:, :, :n]
+    by_start = by[:, :, :n]
     by_input = by[:, :, n:]
     for order in range(1 + max(moves.order, default=-1)):
         now = moves.order == order
         lane = moves.lane[now]
-        columns[lane] = by_point[now] @ columns[lane]
+        columns[lane] = by_start[now] @ columns[lane]
         columns[lane, :, n:] += by_input[now]
     return columns
 

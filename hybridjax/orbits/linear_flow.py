@@ -630,8 +630,8 @@ def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]
     for name in s.state_names():
         # (Column d is NaN.)
         column = [s.d] * len(s.charts)
-        for a, states in enumerate(x.states for x in s.charts):
-            if name in states:
-                column[a] = states.index(name)
+        for a, chart_states in enumerate(x.states for x in s.charts):
+            if name in chart_states:
+                column[a] = chart_states.index(name)
         named[name] = wide[points, xp.asarray(column)[chart]]
     return named
