@@ -137,7 +137,12 @@ def test_claims_name_tests_that_exist():
 
 PAGES = ["docs/index.md", "docs/experiments.md"]
 PAGES += [f"docs/how-to/{p.name}" for p in (ROOT / "docs/how-to").glob("*.md")]
-long_or_not = lambda x: [pytest.mark.long] * (Path(x).stem in LONG)  # noqa: E731
+
+
+def long_or_not(x):
+    return [pytest.mark.long] * (Path(x).stem in LONG)
+
+
 LONG = """experiments figures fit-parameters fmu identify-from-recordings learn-a-policy models
 mujoco populations scale sweep unperturbed-gait""".split()
 
@@ -148,7 +153,8 @@ mujoco populations scale sweep unperturbed-gait""".split()
 )
 def test_the_page_runs_and_prints_what_it_shows(page, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    session, printed = Session(page, monkeypatch), ""
+    session = Session(page, monkeypatch)
+    printed = ""
     for language, text in blocks(page):
         if language == "python":
             session.run(text)

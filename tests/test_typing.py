@@ -59,10 +59,8 @@ def script():
 @pytest.mark.slow
 def test_a_users_script_has_no_errors_in_mypy(tmp_path, script):
     (tmp_path / "session.py").write_text(script)
-    options, paths = (
-        ["--follow-imports=silent", "--cache-dir=cache"],
-        {"MYPYPATH": str(ROOT)},
-    )
+    options = ["--follow-imports=silent", "--cache-dir=cache"]
+    paths = {"MYPYPATH": str(ROOT)}
     run_python(
         "-m", "mypy", *options, "session.py", cwd=tmp_path, env={**os.environ, **paths}
     )

@@ -33,7 +33,8 @@ from .signal import Signal
 from .writing import replacing
 
 
-_FORMAT, _VERSION = "hybridjax", 2
+_FORMAT = "hybridjax"
+_VERSION = 2
 _HEADER = "header"
 
 
@@ -114,12 +115,27 @@ class _Field(NamedTuple):
 def _fields_of(kind: type) -> list[_Field]:
     if issubclass(kind, tuple):
         hints = typing.get_type_hints(kind)
-        return [_Field(name, x, x is bool, True) for name, x in hints.items()]
+        return [
+            _Field(
+                name=name,
+                type=x,
+                static=x is bool,
+                required=True,
+            )
+            for name, x in hints.items()
+        ]
     fields = []
     for x in dataclasses.fields(cast(Any, kind)):
         is_static = x.metadata.get("static", False)
         is_required = x.default is dataclasses.MISSING
-        fields.append(_Field(x.name, x.type, is_static, is_required))
+        fields.append(
+            _Field(
+                name=x.name,
+                type=x.type,
+                static=is_static,
+                required=is_required,
+            )
+        )
     return fields
 
 
@@ -165,35 +181,12 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     arrays = dict(arrays)
     values = {}
     for field in _fields_of(kind):
-        name = field.name
-        inner = _module_in(field.type)
-        item = _item_of(field.type)
-        if field.static:
-            if name in static:
-                values[name] = static.pop(name)
-                if not _matches(values[name], field.type):
-                    raise ValueError(f"{name} is {reprlib.repr(values[name])}")
-            elif field.required:
-                raise other
-        elif typing.get_origin(field.type) is list:
-            count = static.pop(name, None)
-            if not _matches(count, int):
-                raise other
-            values[name] = []
-            for k in range(count):
-                if f"{name}.{k}" not in arrays:
-                    raise other
-                values[name].append(arrays.pop(f"{name}.{k}"))
-        elif item is not None:
-            values[name] = tuple(
-                put_together(item, x, {}) for x in static.pop(name, ())
-            )
-        elif inner is not None and name in static:
-            parts = [k for k in arrays if k.startswith(f"{name}.")]
-            part = {k.removeprefix(f"{name}."): arrays.pop(k) for k in parts}
-            values[name] = put_together(inner, static.pop(name), part)
-        else:
-            values[name] = arrays.pop(name, None)
+        if not field.static:
+            values[field.name] = _taken(field, static, arrays, other)
+        elif field.name in static:
+            values[field.name] = _setting(field, static.pop(field.name))
+        elif field.required:
+            raise other
     if static or arrays:
         raise other
     module = kind(**values)
@@ -201,6 +194,46 @@ def put_together(kind: type, static: Any, arrays: Mapping[str, np.ndarray]) -> A
     if wrong is not None:
         raise ValueError(wrong)
     return module
+
+
+def _setting(field: _Field, value: Any) -> Any:
+    """The value of a static field.
+
+    **Raises:** `ValueError` for a value that is not what the annotation says.
+    """
+    if not _matches(value, field.type):
+        raise ValueError(f"{field.name} is {reprlib.repr(value)}")
+    return value
+
+
+def _taken(
+    field: _Field,
+    static: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    other: ValueError,
+) -> Any:
+    """The value of a field of arrays or modules, whose parts leave `static` and `arrays`.
+
+    **Raises:** `other` if parts of a list are missing.
+    """
+    name = field.name
+    inner = _module_in(field.type)
+    item = _item_of(field.type)
+    if typing.get_origin(field.type) is list:
+        count = static.pop(name, None)
+        if not _matches(count, int):
+            raise other
+        names = [f"{name}.{k}" for k in range(count)]
+        if any(x not in arrays for x in names):
+            raise other
+        return [arrays.pop(x) for x in names]
+    if item is not None:
+        return tuple(put_together(item, x, {}) for x in static.pop(name, ()))
+    if inner is not None and name in static:
+        names = [x for x in arrays if x.startswith(f"{name}.")]
+        part = {x.removeprefix(f"{name}."): arrays.pop(x) for x in names}
+        return put_together(inner, static.pop(name), part)
+    return arrays.pop(name, None)
 
 
 def options_of(hint: Any) -> tuple[Any, ...]:

@@ -176,7 +176,8 @@ def host_first(
     Inside of a transformation of JAX this is `quick_jit`, or that `derived`.
     """
     compiled: Any = quick_jit(function)
-    transformed, hosted = derived(compiled), on_the_host(function)
+    transformed = derived(compiled)
+    hosted = on_the_host(function)
     spent: dict[tuple, float] = collections.defaultdict(float)
     programs: dict[tuple, Callable] = {}
 
@@ -222,7 +223,9 @@ def kind(arguments) -> tuple:
     """All that a program is compiled for: everything of the arguments but the values of arrays, and
     JAX's settings (in a thread: those of all threads)."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
-    types = ((x.shape, x.dtype) if _is_array(x) else (type(x), x) for x in leaves)
+    types = []
+    for x in leaves:
+        types.append((x.shape, x.dtype) if _is_array(x) else (type(x), x))
     return structure, *jax_compat.settings_of_programs(), *types
 
 
@@ -491,7 +494,8 @@ def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
         return x.repeat(filled, axis=-1)
     if filled == L:
         return x
-    return np.concatenate([x, np.repeat(x[..., :1], filled - L, axis=-1)], axis=-1)
+    padding = np.repeat(x[..., :1], filled - L, axis=-1)
+    return np.concatenate([x, padding], axis=-1)
 
 
 def _is_array(x: Any) -> bool:

@@ -161,9 +161,11 @@ def solve(matrices: Array, right: Array) -> Array:
     """
     if on_host(matrices):
         return np.linalg.solve(matrices, right)
-    right = jnp.broadcast_to(right, (*matrices.shape[:-2], *right.shape[-2:]))
+    shape = (*matrices.shape[:-2], *right.shape[-2:])
+    right = jnp.broadcast_to(right, shape)
     rows = [x.reshape(-1, *x.shape[-2:]) for x in (matrices, right)]
-    return jax.lax.map(lambda row: jnp.linalg.solve(*row), rows).reshape(right.shape)
+    solutions = jax.lax.map(lambda row: jnp.linalg.solve(*row), rows)
+    return solutions.reshape(right.shape)
 
 
 def svdvals(x: Any) -> Any:

@@ -58,9 +58,12 @@ def facts(pairs: Mapping[str, str]) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first rows of a table, and how many more there are."""
     rows = list(rows)
-    lines = [_row("th", head), *(_row("td", row) for row in rows[:_ROWS])]
-    if len(rows) > _ROWS:
-        lines.append(_row("td", [f"and {len(rows) - _ROWS} more"]))
+    lines = [_row("th", head)]
+    for row in rows[:_ROWS]:
+        lines.append(_row("td", row))
+    more = len(rows) - _ROWS
+    if more > 0:
+        lines.append(_row("td", [f"and {more} more"]))
     return f'<table class="plain">{"".join(lines)}</table>'
 
 
@@ -118,9 +121,11 @@ def unit_circle(
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
     curves = [Curve(np.real(circle), np.imag(circle), color=COLORS[-1])]
     for z in regions:
-        x, y = np.real(z).clip(-3, 3), np.imag(z).clip(-3, 3)
+        x = np.real(z).clip(-3, 3)
+        y = np.imag(z).clip(-3, 3)
         curves.append(Curve(x, y, color=COLORS[0]))
-    x, y = np.real(values), np.imag(values)
+    x = np.real(values)
+    y = np.imag(values)
     curves.append(Curve(x, y, color=COLORS[1], points=True))
     return picture(curves, "real part", "imaginary part", square=True)
 

@@ -90,7 +90,9 @@ def by_lane(
     def call(*arguments):
         lanes = max(x.shape[-1] for x in arguments)
         common = tuple(x.shape[-1] < lanes for x in arguments)
-        points = [x[..., 0] if x.shape[-1] < lanes else x for x in arguments]
+        points = []
+        for x, is_common in zip(arguments, common, strict=True):
+            points.append(x[..., 0] if is_common else x)
         many = lanes >= _VECTOR_LANES and not quick
         return program(common, many)(arrays, *points)
 
@@ -210,7 +212,8 @@ def lane_jvp(
 
     # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]
-    rows += [jnp.broadcast_to(t.reshape(-1, 1), (t.size, 1)) for t in leaves(t_common)]
+    for leaf in leaves(t_common):
+        rows.append(jnp.broadcast_to(leaf.reshape(-1, 1), (leaf.size, 1)))
     lanes = max(x.shape[-1] for x in leaves(columns))
     weights = jnp.concatenate([jnp.broadcast_to(r, (r.shape[0], lanes)) for r in rows])
 
@@ -314,8 +317,10 @@ def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:
     if on_host(x) or len(rows) > _FEW:
         place = np.full(max(rows, default=0) + 2, -1)  # the last for -1
         place[np.array(rows, int)] = np.arange(len(rows))
-        k = xp.asarray(place)[xp.minimum(which, len(place) - 1)]
-        return xp.where(k >= 0, x[k, np.arange(x.shape[1])], 0.0)
+        last = len(place) - 1
+        k = xp.asarray(place)[xp.minimum(which, last)]
+        own = x[k, np.arange(x.shape[1])]
+        return xp.where(k >= 0, own, 0.0)
     out = xp.zeros_like(x[0])
     for k, row in enumerate(rows):
         out = xp.where(which == row, x[k], out)

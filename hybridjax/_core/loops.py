@@ -95,7 +95,8 @@ def pushed(
         return end, (rest, noted)
 
     def push(by_constants, column):
-        primals, directions = (c_moving, x_moving), (by_constants, column)
+        primals = (c_moving, x_moving)
+        directions = (by_constants, column)
         return jax.jvp(of, primals, directions, has_aux=True)
 
     each = jax.vmap(push, out_axes=(None, 0, None))

@@ -306,7 +306,7 @@ def _require_the_same(
         again = _traced(x, arrays, reading, anew)
         if again == programs:
             continue
-        (name, *_) = different(programs, again)
+        name, *_ = different(programs, again)
         raise DefinitionError(
             f"{name} of {type(x).__name__} computes another value each time (it draws a random "
             "number, or reads a clock or a file): compute the value before, and let the function "

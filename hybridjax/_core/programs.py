@@ -121,7 +121,9 @@ def digest_of_array(x: Any) -> str:
 
 def _digest_of_values(x: Any) -> str:
     is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    values = np.asarray(jax.random.key_data(x) if is_key else x)
+    if is_key:
+        x = jax.random.key_data(x)
+    values = np.asarray(x)
     flat = np.ascontiguousarray(values).reshape(-1)
     # (Where processors have instructions for it, SHA-1 takes a third of the time of BLAKE2.)
     numbers: Any = flat.view(np.uint8)  # (mypy knows no array as a buffer)

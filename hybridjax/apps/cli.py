@@ -344,25 +344,7 @@ def _sweep(options) -> int:
 
 
 def _identify(options) -> int:
-    if options.phase is None and (options.center or options.scale):
-        options.parser.error(
-            "--center and --scale are of the angle of --phase, which is not given"
-        )
-    named = [*options.inputs, *options.references, *options.outputs]
-    twice = ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1)
-    if twice:
-        options.parser.error(
-            f"{twice}: name it once (omit --references without a controller)"
-        )
-    beside = {*options.inputs} & {*(options.phase or (options.crossing or ())[:1])}
-    if beside:
-        options.parser.error(
-            f"{', '.join(beside)} is an input: define the phase by another signal"
-        )
-    if options.references and not options.inputs:
-        options.parser.error(
-            "--references act on a controller that makes the inputs: name --inputs, too"
-        )
+    _require_signals(options)
     if bool(options.files) == bool(options.table):
         options.parser.error("give either files of one subject or --table TABLE.csv")
     if not (options.outputs or options.event or options.timing):
@@ -377,6 +359,32 @@ def _identify(options) -> int:
     from .identify import run
 
     return _status(run(options))
+
+
+def _require_signals(options) -> None:
+    """End with an error for names of signals that do not agree."""
+    if options.phase is None and (options.center or options.scale):
+        options.parser.error(
+            "--center and --scale are of the angle of --phase, which is not given"
+        )
+    named = [*options.inputs, *options.references, *options.outputs]
+    twice = ", ".join(x for x in dict.fromkeys(named) if named.count(x) > 1)
+    if twice:
+        options.parser.error(
+            f"{twice}: name it once (omit --references without a controller)"
+        )
+    of_phase = options.phase
+    if not of_phase:
+        of_phase = (options.crossing or ())[:1]
+    beside = {*options.inputs} & {*of_phase}
+    if beside:
+        options.parser.error(
+            f"{', '.join(beside)} is an input: define the phase by another signal"
+        )
+    if options.references and not options.inputs:
+        options.parser.error(
+            "--references act on a controller that makes the inputs: name --inputs, too"
+        )
 
 
 def _reproduce(options) -> int:

@@ -341,9 +341,13 @@ def _doubts(findings: Sequence[Finding]) -> list[str]:
 
 def _about_data(result: Results) -> list[str]:
     """Return the parts of a page about data that were left out, the phase and the sections."""
-    left_out = {x: f"{amount:.3g}" for x, amount in _left_out(result).items() if amount}
+    left_out = {}
+    for reason, amount in _left_out(result).items():
+        if amount:
+            left_out[reason] = f"{amount:.3g}"
+    about = "" if left_out else "nothing"
+    parts = [html.card("Left out", about, html.facts(left_out))]
     notes = "".join(f"<li>{_sentence(x.text)}</li>" for x in result.recording.findings)
-    parts = [html.card("Left out", "" if left_out else "nothing", html.facts(left_out))]
     if notes:
         parts.append(f"<ul>{notes}</ul>")
     parts.append(html.card("Phase", "", html.text(repr(result.phase))))

@@ -92,7 +92,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     )
     a = iso.rational
     b = kin.rational
-    moved = np.max(np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles)), axis=1)
+    poles = np.sort_complex(a.poles)
+    moved = np.max(np.abs(poles - np.sort_complex(b.poles)), axis=1)
     text = f"distance of the fitted poles in z: {_pairs(moved)}"
     note(
         "the choice of phase leaves the poles where they are",
@@ -104,7 +105,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     note("the choice of phase moves the zeros", np.any(moved > 1e-2), text)
     for name, family in families.items():
         f = np.asarray(family.exact.frequencies)
-        size = np.log(np.abs(np.asarray(family.exact[0])[:, :, 0]))
+        H_0 = np.asarray(family.exact[0])[:, :, 0]
+        size = np.log(np.abs(H_0))
         peaks = [
             f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))
         ]
@@ -115,10 +117,12 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         ]
         text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
         note(f"{name}: bumps of H_0 around f = 2", any(map(len, peaks)), text)
-        power = np.sum(np.abs(np.asarray(family.estimate.H)[..., 0]) ** 2, axis=1)
+        H = np.asarray(family.estimate.H)[..., 0]
+        power = np.sum(np.abs(H) ** 2, axis=1)
         order = np.abs(np.array(family.estimate.harmonics))
         within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
-        second = np.maximum(top(family, 2), top(family, -2)) / top(family, 0)
+        second = np.maximum(top(family, 2), top(family, -2))
+        second = second / top(family, 0)
         text = (
             f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
         )

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from .. import __version__, plot
 from .._core import html
@@ -303,13 +303,16 @@ def _failures(jobs: Mapping[str, Callable[[], str]], client: Any) -> dict[str, s
 
 def _population(frame: Any, root: Path) -> tuple[Population, tuple[SeriesFit, ...]]:
     """The fits in the reports of a table's rows, and a population of them."""
-    folders = [root / name for name in frame["report"]]
-    fits: Any = tuple(load(folder / "fit.npz") for folder in folders)
-    summaries = [json.loads((x / "summary.json").read_text()) for x in folders]
+    fits = []
+    summaries = []
+    for name in frame["report"]:
+        folder = root / name
+        fits.append(cast(Any, load(folder / "fit.npz")))
+        summaries.append(json.loads((folder / "summary.json").read_text()))
     for name, key in _COLUMNS.items():
         frame[name] = [float(summary[key]) for summary in summaries]
     facts = frame.drop(columns=["file", "trial"], errors="ignore")
-    return Population.from_fits(fits, facts), fits
+    return Population.from_fits(fits, facts), tuple(fits)
 
 
 def _rows(path: Path) -> Any:

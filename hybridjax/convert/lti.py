@@ -71,12 +71,15 @@ def to_lti(model: LDTP) -> LDTP:
         # The state at section n: from that at section 0, and from the inputs since then.
         from_state, from_inputs = carry
         n, A, B, C, D = section
-        outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs).at[:, n].set(D)
-        states = jnp.einsum("ij,jkl->ikl", A, from_inputs).at[:, n].set(B)
+        outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs)
+        outputs = outputs.at[:, n].set(D)
+        states = jnp.einsum("ij,jkl->ikl", A, from_inputs)
+        states = states.at[:, n].set(B)
         return (A @ from_state, states), (C @ from_state, outputs)
 
     carry = jnp.eye(d), jnp.zeros((d, N, nu))
-    (A, B), (C, D) = jax.lax.scan(advance, carry, (jnp.arange(N), A, B, C, D))
+    sections = (jnp.arange(N), A, B, C, D)
+    (A, B), (C, D) = jax.lax.scan(advance, carry, sections)
     first = d if is_traced(model.dims) else int(np.asarray(model.dims)[0])
     return LDTP(
         A[None, :first, :first],
@@ -132,7 +135,8 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     pairs = itertools.product(thing.harmonics, thing.outputs)
     outputs = [f"{y}[{m}]" for m, y in pairs]
     inputs = list(map(str, thing.inputs))
-    H = np.moveaxis(np.asarray(thing.H), 1, -1).reshape(len(outputs), len(inputs), -1)
+    H = np.moveaxis(np.asarray(thing.H), 1, -1)
+    H = H.reshape(len(outputs), len(inputs), -1)
     frequencies = 2 * np.pi * np.asarray(thing.frequencies) / period
     return package("control").FrequencyResponseData(
         H, frequencies, inputs=inputs, outputs=outputs, sysname="HTF"
@@ -158,11 +162,15 @@ class HarmonicStateSpace(NamedTuple):
         """Responses of all harmonics to inputs of `frequencies` (F,) in cycles per period."""
         M = 2 * self.order + 1
         # (Inputs have the harmonic 0 only.)
-        B, D = (x.reshape(len(x), M, -1)[:, self.order] for x in (self.B, self.D))
-        rates = 2j * np.pi * np.asarray(frequencies).reshape(-1, 1, 1) / period
+        B = self.B.reshape(len(self.B), M, -1)[:, self.order]
+        D = self.D.reshape(len(self.D), M, -1)[:, self.order]
+        f = np.asarray(frequencies).reshape(-1, 1, 1)
+        rates = 2j * np.pi * f / period
         resolvent = rates * np.eye(len(self.A)) - self.A
-        H = self.C @ np.linalg.solve(resolvent, B[None]) + D
-        return H.reshape(len(rates), M, len(self.C) // M, D.shape[-1])
+        states = np.linalg.solve(resolvent, B[None])
+        H = self.C @ states + D
+        ny = len(self.C) // M
+        return H.reshape(len(rates), M, ny, D.shape[-1])
 
 
 # Orders that are tried, and frequencies of the comparison, in cycles per period. More:
@@ -213,7 +221,8 @@ def to_harmonic_state_space(
     period = map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
     flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
-    sizes = flow.size[:, None] / np.roll(flow.size, -1, axis=0)[:, :, None]
+    size_after = np.roll(flow.size, -1, axis=0)
+    sizes = flow.size[:, None] / size_after[:, :, None]
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
         raise DefinitionError(
@@ -233,8 +242,16 @@ def to_harmonic_state_space(
     for n in orders:
         m = np.arange(-n, n + 1)
         A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
-        A = A - np.diag(np.repeat(2j * np.pi * m / period, s.d))
-        space = HarmonicStateSpace(A, B, C, D, n, error=np.nan)
+        rotation = np.repeat(2j * np.pi * m / period, s.d)
+        A = A - np.diag(rotation)
+        space = HarmonicStateSpace(
+            A=A,
+            B=B,
+            C=C,
+            D=D,
+            order=n,
+            error=np.nan,
+        )
         truncated = space.transfer(_TRIED, period)[:, n - 1 : n + 2]
         error = np.abs(truncated - exact).max() / np.abs(exact).max()
         space = space._replace(error=float(error))

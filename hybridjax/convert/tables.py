@@ -211,10 +211,11 @@ def _(thing: LimitCycle) -> Any:
 @_columns.register
 def _(thing: ExperimentData) -> Any:
     S, n, _ = thing.u.shape
-    first: dict[str, Any] = {"experiment": np.repeat(np.arange(S), n)}
+    experiment = np.repeat(np.arange(S), n)
     sample = np.tile(np.arange(n), S)
-    signals = np.concatenate([thing.u, thing.y], axis=2).reshape(S * n, -1)
-    return first | _samples(thing, sample, signals)
+    signals = np.concatenate([thing.u, thing.y], axis=2)
+    columns = _samples(thing, sample, signals.reshape(S * n, -1))
+    return {"experiment": experiment} | columns
 
 
 @_columns.register

@@ -36,7 +36,8 @@ ENOUGH = 0.02
 _MAX_STEPS = 300
 # Steps between two certificates, and of the iteration for the prices of several limits. Fewer of
 # the latter: the limits are not met, and the criterion may rise.
-_CHECK, _PRICES = 5, 8
+_CHECK = 5
+_PRICES = 8
 # Factor by which the length of steps (the multiple of their logarithm) grows; it is halved where a
 # step raises the criterion. Larger: more steps in vain. Smaller: more steps.
 _LONGER = 1.15
@@ -75,7 +76,8 @@ def certify(
     limits = limits.tangent(power, level)
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
-    best = linprog(-gain / gain.max(), limits.cost * alone, np.ones(len(limits.cost)))
+    one = np.ones(len(limits.cost))
+    best = linprog(-gain / gain.max(), limits.cost * alone, one)
     if best.x is None:
         # The tangent of a quadratic limit may leave some powers unbounded.
         return Certificate(np.inf, np.full(len(power), np.nan))
@@ -211,6 +213,8 @@ def _balanced(share: Float[np.ndarray, "K E"], use: Powers) -> Float[np.ndarray,
     those that are negligible."""
     experiments = share.shape[1]
     for _ in range(_SWEEPS):
-        share = share * (use.sum() / experiments / share.sum(axis=0))
+        of_experiment = use.sum() / experiments
+        share = share * (of_experiment / share.sum(axis=0))
         share = share * (use / share.sum(axis=1))[:, None]
-    return np.where(share < _WEAK * share.max(axis=1, keepdims=True), 0.0, share)
+    largest = share.max(axis=1, keepdims=True)
+    return np.where(share < _WEAK * largest, 0.0, share)

@@ -114,9 +114,11 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
     squares: Squares = {}
     for i, name in enumerate(model.inputs):
-        squares[name] = (cosines.channel == i).astype(float)
-        squares[f"rate of {name}"] = squares[name] * change
-    outputs = (np.abs(cosines.responses(model)) ** 2).sum(axis=1)
+        own = (cosines.channel == i).astype(float)
+        squares[name] = own
+        squares[f"rate of {name}"] = own * change
+    power = np.abs(cosines.responses(model)) ** 2
+    outputs = power.sum(axis=1)
     return squares | dict(zip(model.outputs, outputs.T, strict=True))
 
 
@@ -221,7 +223,12 @@ def measured_htfs(
             inputs=htf.inputs[i : i + 1],
             outputs=tuple(htf.outputs[k] for k in noise.outputs),
         )
-        yield Measured(htf, members, int(i), float(np.sqrt(larger)))
+        yield Measured(
+            htf=htf,
+            cosines=members,
+            channel=int(i),
+            weight=float(np.sqrt(larger)),
+        )
 
 
 @checked

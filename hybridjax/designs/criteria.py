@@ -89,7 +89,13 @@ def _multipliers(
         channels += _channels(measured, c, goal.extra_lags)
     wanted, names, part = wanted_parts(goal, multipliers, c)
     unknowns = tuple(f"c{k}" for k in range(1, len(c) + 1))
-    return LinearCriterion(names, unknowns, tuple(channels), wanted, part)
+    return LinearCriterion(
+        names=names,
+        unknowns=unknowns,
+        channels=tuple(channels),
+        wanted=wanted,
+        part=part,
+    )
 
 
 def wanted_parts(
@@ -156,7 +162,13 @@ def _parameters(
         cosine = np.broadcast_to(members[:, None], shape).ravel()
         channels.append(Channel(cosine, weight * data.sensitivity))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]
-    return LinearCriterion(wanted, free, tuple(channels), rows, np.arange(len(wanted)))
+    return LinearCriterion(
+        names=wanted,
+        unknowns=free,
+        channels=tuple(channels),
+        wanted=rows,
+        part=np.arange(len(wanted)),
+    )
 
 
 def _channels(
@@ -169,9 +181,11 @@ def _channels(
     """
     for group in grouped(x.htf, len(c), extra_lags):
         delay = group.period_delay[:, None]
-        powers = range(1, len(c) + 1)
-        slopes = [group.weighted(c, delay**j * group.data) for j in powers]
-        size = np.tile(group.weight / np.abs(chi(group.period_delay, c)), 2)
+        slopes = []
+        for j in range(1, len(c) + 1):
+            slopes.append(group.weighted(c, delay**j * group.data))
+        size = group.weight / np.abs(chi(group.period_delay, c))
+        size = np.tile(size, 2)
         cosines = np.tile(x.cosines[group.line], 2)
         slope = x.weight * np.concatenate(slopes, axis=1)
         yield Channel(cosines, slope, size[:, None] * group.basis)

@@ -340,7 +340,8 @@ class Products(NamedTuple):
     ) -> Float[np.ndarray, "O k k"]:
         """Return the expected mean square, in units of the limit, as a form of the mean powers of
         cosines whose power in each experiment is a `share` of it."""
-        expected = self.expected[:, kept][:, :, kept] / (self.level**2)[:, None, None]
+        expected = self.expected[:, kept][:, :, kept]
+        expected = expected / (self.level**2)[:, None, None]
         return expected * (share.T @ share) / len(share)
 
 
@@ -375,4 +376,5 @@ def _convex(form: Float[np.ndarray, "K K"], unit: Powers) -> Float[np.ndarray, "
     in units of each cosine's power. (In units in which each alone distorts alike the bound of the
     hopper is up to two times as large where power belongs.)"""
     values, vectors = np.linalg.eigh(form * unit[:, None] * unit)
-    return (vectors * np.maximum(values, 0)) @ vectors.T / unit[:, None] / unit
+    positive = (vectors * np.maximum(values, 0)) @ vectors.T
+    return positive / unit[:, None] / unit

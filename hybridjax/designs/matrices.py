@@ -63,7 +63,13 @@ class Matrices(NamedTuple):
         unknowns = tuple(
             f"combination {k} of the matrices" for k in range(wanted.shape[1])
         )
-        return LinearCriterion(names, unknowns, (self.channel,), wanted, part)
+        return LinearCriterion(
+            names=names,
+            unknowns=unknowns,
+            channels=(self.channel,),
+            wanted=wanted,
+            part=part,
+        )
 
 
 def ldtp_matrices(
@@ -111,13 +117,14 @@ def _rows(
     """Yield derivatives of the measurements of some cosines, in units of their standard deviations
     at power 1."""
     for htf, cosines, channel, unit in htfs:
+        f = np.asarray(htf.frequencies)
         weight = unit * error_weights(htf, scale)[..., 0] * scale
-        for chunk, slopes in transfer_slopes(
-            coordinates, np.asarray(htf.frequencies), htf.harmonics
-        ):
+        for chunk, slopes in transfer_slopes(coordinates, f, htf.harmonics):
             rows = slopes[..., channel] * weight[:, chunk]
             rows = np.ascontiguousarray(rows.transpose(2, 0, 1, 3))
-            yield cosines[chunk], rows.reshape(*rows.shape[:2], -1).view(float)
+            lines, P = rows.shape[:2]
+            rows = rows.reshape(lines, P, -1).view(float)
+            yield cosines[chunk], rows
 
 
 def _flat(rows: Float[np.ndarray, "lines P rows"]) -> Float[np.ndarray, "P lines*rows"]:
@@ -136,7 +143,7 @@ def response_criterion(
     **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
     """
     N = cosines.n_sections
-    (low, high) = goal.frequencies
+    low, high = goal.frequencies
     if high > N / 2:
         raise DefinitionError(
             f"`frequencies` must lie within 0 and {N / 2:g}, not {goal.frequencies}."
@@ -158,7 +165,10 @@ def response_criterion(
     each = each.reshape(len(names), -1, matrices.coordinates.size)
     # As few rows of each quantity as have the same sum of squares, up to rounding.
     _, values, vectors = np.linalg.svd(each, full_matrices=False)
-    kept = values**2 > np.finfo(float).eps * values[:, :1] ** 2
-    rows = [s[k, None] * v[k] for s, v, k in zip(values, vectors, kept, strict=True)]
+    largest = values[:, :1] ** 2
+    kept = values**2 > np.finfo(float).eps * largest
+    rows = []
+    for s, v, k in zip(values, vectors, kept, strict=True):
+        rows.append(s[k, None] * v[k])
     part = np.repeat(np.arange(len(rows)), [len(x) for x in rows])
     return matrices.criterion(np.concatenate(rows), tuple(names), part)

@@ -160,7 +160,8 @@ class OptimalDesign(Showable, eqx.Module):
             for name, a, b in errors
         ]
         rms = ((n, x) for n, x in self.usual_rms.items() if x > 0)
-        rows += [(f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}") for n, x in rms]
+        for n, x in rms:
+            rows.append((f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}"))
         bounded = any(n.startswith("distortion of ") for n in self.rms)
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum):\n  "
@@ -325,7 +326,13 @@ def optimal_design(
         distortion.require_those_of(models[0])
         limits = limits._replace(curved=distortion.bound)
     limits.require_limits()
-    rules = Rules(linear, distortion, cosines, dict(given.peak), seed)
+    rules = Rules(
+        linear=linear,
+        distortion=distortion,
+        cosines=cosines,
+        peak=dict(given.peak),
+        seed=seed,
+    )
     usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]

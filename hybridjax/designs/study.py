@@ -230,13 +230,21 @@ class SequentialDesign(Showable, eqx.Module):
             )
         errors_so_far = [*self.standard_errors, errors]
         width = max(map(len, errors_so_far))
-        padded = [np.append(x, np.full(width - len(x), np.nan)) for x in errors_so_far]
+        padded = []
+        for row in errors_so_far:
+            padding = np.full(width - len(row), np.nan)
+            padded.append(np.append(row, padding))
         cycles = sum(block.cycles for block in blocks)
         if best.objection:
             plan = None
         else:
             plan = self._next(best, errors, cycles, len(blocks))
-        history = History(blocks, np.array(padded), best, plan)
+        history = History(
+            blocks=blocks,
+            standard_errors=np.array(padded),
+            estimate=best,
+            plan=plan,
+        )
         return eqx.tree_at(
             lambda s: s._history, self, history, is_leaf=lambda x: x is None
         )
@@ -283,8 +291,11 @@ class SequentialDesign(Showable, eqx.Module):
         # Precisions of independent blocks add.
         now = (errors**2).sum()
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
-        missing = plan.cycles * (plan.standard_errors**2).sum() * (1 / wanted - 1 / now)
-        count = int(np.ceil(min(missing * (1 + _SPARE), _GROWTH * cycles) / periods))
+        squares = (plan.standard_errors**2).sum()
+        missing = plan.cycles * squares * (1 / wanted - 1 / now)
+        at_most = _GROWTH * cycles
+        cycles_more = min(missing * (1 + _SPARE), at_most)
+        count = int(np.ceil(cycles_more / periods))
         count = min(
             max(count, self.first.experiments), len(Candidates.of(self.first).f)
         )

@@ -11,6 +11,7 @@ from .._core.executor import from_host, to_host
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
+from ..identify.multiplier_estimate import MultiplierFit
 from ..identify.multipliers import (
     NoiseRatios,
     StructuredFit,
@@ -66,7 +67,8 @@ def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
     N = data.n_sections
     P = data.periods
     line = np.concatenate([sums.line for sums in each])
-    power = np.concatenate([np.real(sums.gram[:, 0, 0]) for sums in each])[:, None]
+    gram = [np.real(sums.gram[:, 0, 0]) for sums in each]
+    power = np.concatenate(gram)[:, None]
     along = np.concatenate([sums.along[:, 0] for sums in each])
     H = (along.swapaxes(0, 1) / power)[..., None]
     variance = np.broadcast_to((N * P / repeats / power)[..., None], H.shape)
@@ -170,22 +172,33 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
         return noise_ratios(fewer, htf, coefficients)
 
     most, _ = supported(ratios, order)
-    objection = ""
+    return Estimate(
+        fit=fit,
+        by_level=by_level,
+        noise=noise,
+        supported=most,
+        objection=_objection(fit, most, order),
+    )
+
+
+def _objection(fit: MultiplierFit, most: int, order: int) -> str:
+    """Return why a fit of this order cannot be used, where the data support at `most` so many
+    multipliers; empty for one that can."""
     if not most:
-        objection = (
+        return (
             "the data show no multiplier above the noise (if that remains so, take a first design "
             "of more power or of more experiments)"
         )
-    elif most < order:
-        objection = (
+    if most < order:
+        return (
             f"the data support {most} multipliers, not {order} (if that remains so, lower `order` "
             "in a new study)"
         )
-    elif (np.abs(fit.multipliers) >= 1).any():
-        objection = (
+    if (np.abs(fit.multipliers) >= 1).any():
+        return (
             "the estimate is unstable, and an unstable system has no periodic response"
         )
-    return Estimate(fit, by_level, noise, most, objection)
+    return ""
 
 
 def refuse_transient(
@@ -212,12 +225,16 @@ def refuse_transient(
     if not before:
         return
     k = min(1, before - 1)
-    cycles = y[:, : y.shape[1] // N * N].reshape(len(y), -1, N, y.shape[2])
+    whole = y.shape[1] // N * N
+    cycles = y[:, :whole].reshape(len(y), -1, N, y.shape[2])
     early = cycles[:, k]
     late = cycles[:, k + P]
-    excess = np.mean((early - late) ** 2, axis=(0, 1)) - 2 * noise**2
-    threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / early[..., 0].size)
-    size = np.sqrt(np.maximum(excess, 0) / np.mean(y**2, axis=(0, 1)))
+    difference = np.mean((early - late) ** 2, axis=(0, 1))
+    excess = difference - 2 * noise**2
+    numbers = early[..., 0].size
+    threshold = _BEYOND_NOISE * 2 * noise**2 * np.sqrt(2 / numbers)
+    square = np.mean(y**2, axis=(0, 1))
+    size = np.sqrt(np.maximum(excess, 0) / square)
     decay = np.abs(multipliers).max() ** (before - k)
     left = np.where(excess > threshold, size, 0).max() * decay
     if left > allowed:

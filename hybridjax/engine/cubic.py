@@ -55,58 +55,91 @@ def first_crossing(
     be as far from the cubic as the `margin`.
     """
     xp = namespace(v1)
-    rise = v1 - v0
-    b = 3 * rise - 2 * d0 - d1
-    c = d0 + d1 - 2 * rise
+    cubic = _Cubic.of(v0, v1, d0, d1)
+    sa, sb = cubic.extrema()
+    va = xp.where(sa < 1, cubic.value(sa), v1)
+    vb = xp.where(sb < 1, cubic.value(sb), v1)
 
-    def cubic(s):
-        return v0 + s * (d0 + s * (b + s * c))
-
-    def slope(s):
-        return d0 + s * (2 * b + s * 3 * c)
-
-    # Extrema: roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
-    disc = b * b - 3 * c * d0
-    pivot = -(b + xp.where(b < 0, -1.0, 1.0) * xp.sqrt(xp.maximum(disc, 0.0)))
-    r1 = _divide(pivot, 3 * c)
-    r2 = _divide(d0, pivot)
-    r1 = xp.where((disc > 0) & (r1 > 0) & (r1 < 1), r1, 1.0)
-    r2 = xp.where((disc > 0) & (r2 > 0) & (r2 < 1), r2, 1.0)
-    sa = xp.minimum(r1, r2)
-    sb = xp.maximum(r1, r2)
-    va = xp.where(sa < 1, cubic(sa), v1)
-    vb = xp.where(sb < 1, cubic(sb), v1)
-
+    # The monotone piece that falls through zero first.
     first = armed & (va <= 0)
     second = (va > 0) & (vb <= 0) & (sb > sa)
     third = (vb > 0) & (v1 <= 0) & (sb < 1)
-    lo = xp.where(first, 0.0, xp.where(second, sa, sb))
-    hi = xp.where(first, sa, xp.where(second, sb, 1.0))
+    begin_of_others = xp.where(second, sa, sb)
+    end_of_others = xp.where(second, sb, 1.0)
+    lo = xp.where(first, 0.0, begin_of_others)
+    hi = xp.where(first, sa, end_of_others)
     crosses = first | second | third
 
     s = 0.5 * (lo + hi)
     for _ in range(10):  # Newton's steps within a bracket that shrinks, to rounding
-        value = cubic(s)
+        value = cubic.value(s)
         lo = xp.where(value > 0, s, lo)
         hi = xp.where(value > 0, hi, s)
-        guess = s - _divide(value, slope(s))
-        s = xp.where((guess >= lo) & (guess <= hi), guess, 0.5 * (lo + hi))
+        guess = s - _divide(value, cubic.slope(s))
+        in_bracket = (guess >= lo) & (guess <= hi)
+        s = xp.where(in_bracket, guess, 0.5 * (lo + hi))
 
     position = xp.where(crosses, s, xp.inf)
     scale = xp.maximum(xp.abs(v0), xp.abs(v1))
     small = TOUCH * scale
     touch = xp.zeros_like(armed)
     near = xp.zeros_like(armed)
-    for node, value, before in ((sa, va, armed & (v0 > 0)), (sb, vb, va > 0)):
-        dips = before & (node < 1) & (b + 3 * c * node > 0)
+    was_positive = armed & (v0 > 0)
+    for node, value, before in ((sa, va, was_positive), (sb, vb, va > 0)):
+        is_minimum = cubic.b + 3 * cubic.c * node > 0
+        dips = before & (node < 1) & is_minimum
+        is_small = xp.abs(value) <= small
         sure = _beside(node, margin) <= small
-        touch = touch | (dips & (xp.abs(value) <= small) & sure)
-        near = near | (dips & (value > small) & (value < NEAR * scale))
+        touch = touch | (dips & is_small & sure)
+        is_near = (value > small) & (value < NEAR * scale)
+        near = near | (dips & is_near)
     # Before the first crossing, the guard may have another sign than the cubic.
     for node in (sa, sb, *_POINTS):
-        unsure = xp.abs(cubic(node)) < _beside(node, margin)
-        near = near | (unsure & (node > 0) & (node < 1) & (node < position))
+        unsure = xp.abs(cubic.value(node)) < _beside(node, margin)
+        within = (node > 0) & (node < 1) & (node < position)
+        near = near | (unsure & within)
     return CubicCrossing(position, touch, near)
+
+
+class _Cubic(NamedTuple):
+    """The cubic v0 + d0 s + b s^2 + c s^3 on [0, 1]."""
+
+    v0: Values
+    d0: Values
+    b: Values
+    c: Values
+
+    @classmethod
+    def of(cls, v0: Values, v1: Values, d0: Values, d1: Values) -> "_Cubic":
+        """The cubic with values v0, v1 and slopes d0, d1 at the ends."""
+        rise = v1 - v0
+        b = 3 * rise - 2 * d0 - d1
+        c = d0 + d1 - 2 * rise
+        return cls(v0, d0, b, c)
+
+    def value(self, s):
+        return self.v0 + s * (self.d0 + s * (self.b + s * self.c))
+
+    def slope(self, s):
+        return self.d0 + s * (2 * self.b + s * 3 * self.c)
+
+    def extrema(self) -> tuple[Array, Array]:
+        """Where the cubic has its extrema within (0, 1), in order; 1 for one that is not there.
+
+        They are the roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
+        """
+        _, d0, b, c = self
+        xp = namespace(b)
+        disc = b * b - 3 * c * d0
+        sign = xp.where(b < 0, -1.0, 1.0)
+        pivot = -(b + sign * xp.sqrt(xp.maximum(disc, 0.0)))
+        r1 = _divide(pivot, 3 * c)
+        r2 = _divide(d0, pivot)
+        has_first = (disc > 0) & (r1 > 0) & (r1 < 1)
+        has_second = (disc > 0) & (r2 > 0) & (r2 < 1)
+        r1 = xp.where(has_first, r1, 1.0)
+        r2 = xp.where(has_second, r2, 1.0)
+        return xp.minimum(r1, r2), xp.maximum(r1, r2)
 
 
 def _beside(s, margin):
@@ -117,32 +150,32 @@ def _beside(s, margin):
 
 def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     """The zero of the cubic with values v0, v1 and slopes d0, d1 that Newton finds from s = 1."""
-    xp = namespace(v1)
-    rise = v1 - v0
-    b = 3 * rise - 2 * d0 - d1
-    c = d0 + d1 - 2 * rise
-    s = xp.ones_like(v1)
+    cubic = _Cubic.of(v0, v1, d0, d1)
+    s = namespace(v1).ones_like(v1)
     for _ in range(4):
-        s = s - _divide(v0 + s * (d0 + s * (b + s * c)), d0 + s * (2 * b + s * 3 * c))
+        s = s - _divide(cubic.value(s), cubic.slope(s))
     return s
 
 
 def interpolate(x, h, q0, q1, f0, f1):
     """The cubic at fraction x of a step of length h, from the states at its ends and the fields
     there, for arrays of either executor."""
-    return (
-        q0 * (1 + 2 * x) * (1 - x) ** 2
-        + q1 * x**2 * (3 - 2 * x)
-        + h * x * (1 - x) * (f0 * (1 - x) - f1 * x)
-    )
+    left = 1 - x
+    by_first = q0 * (1 + 2 * x) * left**2
+    by_last = q1 * x**2 * (3 - 2 * x)
+    by_fields = h * x * left * (f0 * left - f1 * x)
+    return by_first + by_last + by_fields
 
 
 def halfway_cubic(q0, q1, f0, f1, h) -> tuple[Array, Array]:
     """The cubic and its rate halfway through a step of length h, from the states at its ends and
     the fields there."""
     xp = namespace(q1)
-    state = 0.5 * (q0 + q1) + 0.125 * h * (f0 - f1)
-    rate = 1.5 * (q1 - q0) / xp.where(h == 0, 1.0, h) - 0.25 * (f0 + f1)
+    mean_state = 0.5 * (q0 + q1)
+    state = mean_state + 0.125 * h * (f0 - f1)
+    length = xp.where(h == 0, 1.0, h)
+    mean_rate = 1.5 * (q1 - q0) / length
+    rate = mean_rate - 0.25 * (f0 + f1)
     return state, rate
 
 
@@ -152,13 +185,19 @@ def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
     xp = namespace(v1)
     first = v0 + d0 / 4
     last = v1 - d1 / 4
-    middle = 0.5 * (v0 + v1) + (d0 - d1) / 6
+    mean = 0.5 * (v0 + v1)
+    middle = mean + (d0 - d1) / 6
     beside = 8 / 3 * margin
-    low = xp.minimum(xp.minimum(v0, first), xp.minimum(last, v1))
-    high = xp.maximum(xp.maximum(v0, first), xp.maximum(last, v1))
+    low_begin = xp.minimum(v0, first)
+    low_end = xp.minimum(last, v1)
+    low = xp.minimum(low_begin, low_end)
+    high_begin = xp.maximum(v0, first)
+    high_end = xp.maximum(last, v1)
+    high = xp.maximum(high_begin, high_end)
     return xp.minimum(low, middle - beside), xp.maximum(high, middle + beside)
 
 
 def _divide(a, b):
     xp = namespace(b)
-    return xp.where(b == 0, xp.inf, a / xp.where(b == 0, 1.0, b))
+    divisor = xp.where(b == 0, 1.0, b)
+    return xp.where(b == 0, xp.inf, a / divisor)

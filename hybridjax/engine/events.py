@@ -49,7 +49,9 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     no event, and not armed until it is positive again.
     """
     zero = width(lanes.t, span, watched.rate)
-    armed = (lanes.armed & (watched.value >= -zero)[:-1]) | (watched.value > zero)[:-1]
+    is_above = (watched.value > zero)[:-1]
+    is_not_below = (watched.value >= -zero)[:-1]
+    armed = (lanes.armed & is_not_below) | is_above
     armed = armed & belongs(s, lanes.chart)[:-1]
     waiting = await_schedules(s, lanes.armed, lanes.t, lanes.t)
     return lanes._replace(armed=with_schedules(s, armed, waiting))
@@ -90,7 +92,9 @@ def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
     A piece of flow between two events at the same time has no `span`: that of its clock is left.
     """
     late = SAME_TIME * span + ROUNDING * abs(t)
-    return watched.value[:-1] < -late * abs(watched.rate[:-1])
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
+    return value < -late * abs(rate)
 
 
 def rival_of(
@@ -103,9 +107,12 @@ def rival_of(
 
     **Arguments:** `lanes`, `watched`: before the resets.
     """
-    other = (np.arange(len(s.transitions))[:, None] != fired) & (fired >= 0)
+    index = np.arange(len(s.transitions))[:, None]
+    other = (index != fired) & (fired >= 0)
     by_guard = (s.clocks < 0)[:, None]
-    falls = falls_within(watched.value[:-1], watched.rate[:-1], TOGETHER * span)
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
+    falls = falls_within(value, rate, TOGETHER * span)
     due = lanes.armed & other & by_guard & falls
 
     return _first_enabled(s, lanes, u, due)
@@ -120,13 +127,17 @@ def due_at_once(
     A flow that begins there does not know of them: `arm` takes a guard beyond zero for one that the
     input has led there.
     """
-    xp = namespace(lanes.t)
-    falls = falls_within(watched.value[:-1], watched.rate[:-1], TOGETHER * span)
-    by_guard = (s.clocks < 0)[:, None] & (falls | overdue(watched, lanes.t, span))
-    none = xp.zeros_like(lanes.armed)
-    is_over = await_schedules(s, none, lanes.t, lanes.t)
-    by_clock = (s.clocks >= 0)[:, None] & ~is_over
-    due = lanes.armed & (by_guard | by_clock) & belongs(s, lanes.chart)[:-1]
+    t = lanes.t
+    clock = s.clocks[:, None]
+    value = watched.value[:-1]
+    rate = watched.rate[:-1]
+    falls = falls_within(value, rate, TOGETHER * span)
+    by_guard = (clock < 0) & (falls | overdue(watched, t, span))
+    none = namespace(t).zeros_like(lanes.armed)
+    is_over = await_schedules(s, none, t, t)
+    by_clock = (clock >= 0) & ~is_over
+    in_chart = belongs(s, lanes.chart)[:-1]
+    due = lanes.armed & (by_guard | by_clock) & in_chart
     return _first_enabled(s, lanes, u, due)
 
 
@@ -140,9 +151,11 @@ def _first_enabled(
     def first():
         which = none
         for g in range(len(s.transitions)):
-            candidate = xp.where(due[g] & (which < 0), np.int32(g), np.int32(-1))
+            is_first = due[g] & (which < 0)
+            candidate = xp.where(is_first, np.int32(g), np.int32(-1))
             holds = enabled(s, lanes.t, lanes.q, u, candidate)
-            which = xp.where(holds & (candidate >= 0), candidate, which)
+            happens = holds & (candidate >= 0)
+            which = xp.where(happens, candidate, which)
         return which
 
     return cond(due.any(), first, lambda: none)
@@ -150,9 +163,8 @@ def _first_enabled(
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
     """Test whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
-    source = np.array([s.chart_index(tr.source) for tr in s.transitions] + [-1])[
-        :, None
-    ]
+    sources = [s.chart_index(transition.source) for transition in s.transitions]
+    source = np.array([*sources, -1])[:, None]
     return (source == chart) | (source == -1)
 
 
@@ -193,13 +205,17 @@ def rearm(
     zero = width(lanes.t, span, rate) + guard_noise(s, lanes, u, fired >= 0)
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     falls = rate < 0
+    is_new = ~entry.known
     late = overdue(watched, lanes.t, span) & (value < -zero)
     at_zero = xp.abs(value) <= zero
     due = together & other & at_zero & falls
-    put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
-    late = late & (entry.armed | (falls & ~entry.known))
-    armed = ((value > zero) | due | put | late) & belongs(s, lanes.chart)[:-1]
-    armed = with_schedules(s, armed, lanes.armed & ~_over(s, lanes.t, fired))
+    was_not_crossed = entry.armed | is_new
+    put = other & falls & (value <= zero) & ~late & was_not_crossed
+    late = late & (entry.armed | (falls & is_new))
+    armed = (value > zero) | due | put | late
+    armed = armed & belongs(s, lanes.chart)[:-1]
+    still_waiting = lanes.armed & ~_over(s, lanes.t, fired)
+    armed = with_schedules(s, armed, still_waiting)
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
 
@@ -211,13 +227,17 @@ def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
     over = xp.zeros((G, t.shape[0]), bool)
     clocks = [g for g in range(G) if s.clocks[g] >= 0]
     for g, h in itertools.product(clocks, clocks):
-        own, others = s.transitions[g].guard, s.transitions[h].guard
+        own = s.transitions[g].guard
+        others = s.transitions[h].guard
         assert isinstance(own, Scheduled) and isinstance(others, Scheduled)
         offset, period = own.numbers(t)
-        later, other = others.numbers(t)
-        earlier = xp.round((t - offset) / period) < xp.round((t - later) / other)
-        same = (s.clocks[g] == s.clocks[h]) | ((period == other) & earlier)
-        over = put(over, g, over[g] | ((fired == h) & same))
+        offset_of_others, period_of_others = others.numbers(t)
+        number = xp.round((t - offset) / period)
+        number_of_others = xp.round((t - offset_of_others) / period_of_others)
+        is_earlier = (period == period_of_others) & (number < number_of_others)
+        same_clock = s.clocks[g] == s.clocks[h]
+        ends = (fired == h) & (same_clock | is_earlier)
+        over = put(over, g, over[g] | ends)
     return over
 
 
@@ -234,10 +254,10 @@ def guard_noise(
         t = only(here, lanes.t)
         q = only(here, lanes.q[: s.dims[a]])
         first = xp.asarray(np.zeros(1, np.int32))
-        watched = kernels.watched(s, a, None, t, q, only(here, u), first)
-        slopes = watched[:, 1 : 2 + len(q)]
-        terms = slopes * xp.concatenate([t[None], q])
-        size = xp.sum(xp.abs(terms), axis=1)
+        expanded = kernels.watched(s, a, None, t, q, only(here, u), first)
+        by_point = expanded[:, 1 : 2 + len(q)]
+        point = xp.concatenate([t[None], q])
+        size = xp.sum(xp.abs(by_point * point), axis=1)
         return put_rows(out, rows, here, ROUNDING * size)
 
     xp = namespace(lanes.t)
@@ -260,9 +280,10 @@ def apply_resets(
             xp = namespace(q)
             point = (only(here, t), only(here, q[:n]), only(here, u))
             system, point = needed(here, (s, point))
-            new = kernels.reset(system, Member(kind, place), *point, some=here)[:, 0]
-            new = put(xp.zeros_like(q), slice(s.dims[b]), new)
-            return xp.where(here, new, q), xp.where(here, b, chart)
+            member = Member(kind, place)
+            expanded = kernels.reset(system, member, *point, some=here)
+            after = put(xp.zeros_like(q), slice(s.dims[b]), expanded[:, 0])
+            return xp.where(here, after, q), xp.where(here, b, chart)
 
         q, chart = cond(some(chosen), work, lambda carry: carry, (q, chart))
     return q, chart
@@ -278,7 +299,8 @@ def enabled(s: Structure, t: Times, q: Padded, u: Inputs, which: Index) -> Mask:
             chosen, place = _within(kind, which)
             n = s.dims[s.chart_index(transition.source)]
             point = only(chosen, t), only(chosen, q[:n]), only(chosen, u)
-            out = xp.where(chosen, kernels.enabled(s, Member(kind, place), *point), out)
+            holds = kernels.enabled(s, Member(kind, place), *point)
+            out = xp.where(chosen, holds, out)
     return out
 
 
@@ -286,10 +308,12 @@ def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
     """Test whether the transitions g (-1: none) are of a kind, and their indices there (else 0)."""
     xp = namespace(g)
     if len(kind) == 1:
-        return g == kind[0], xp.asarray(np.zeros(1, np.int32))
+        first = xp.asarray(np.zeros(1, np.int32))
+        return g == kind[0], first
     places = np.full(max(kind) + 2, -1, np.int32)  # the last for -1
     places[list(kind)] = np.arange(len(kind))
-    place = xp.asarray(places)[xp.minimum(g, len(places) - 1)]
+    last = len(places) - 1
+    place = xp.asarray(places)[xp.minimum(g, last)]
     return place >= 0, xp.maximum(place, 0)
 
 
@@ -309,15 +333,18 @@ def next_schedule(
         if not isinstance(transition.guard, Scheduled):
             continue
         offset, period = transition.guard.numbers(t)
+        same_time = SAME_TIME * period
         k = xp.floor((t - offset) / period + SAME_TIME)
         past = offset + k * period
         later = offset + (k + 1) * period
-        now = armed[g] & (xp.abs(t - past) <= SAME_TIME * period)
+        now = armed[g] & (xp.abs(t - past) <= same_time)
         time = xp.where(now, xp.maximum(past, t), later)
-        time = xp.where(xp.abs(time - end) <= SAME_TIME * period, end, time)
+        at_end = xp.abs(time - end) <= same_time
+        time = xp.where(at_end, end, time)
         # (Of several that are due now, the one of an earlier period is first.)
         rank = xp.where(now, k, xp.inf)
-        sooner = (time < best) | ((time == best) & (rank < first))
+        is_before = (time == best) & (rank < first)
+        sooner = (time < best) | is_before
         sooner = sooner & (chart == s.chart_index(transition.source))
         best = xp.where(sooner, time, best)
         which = xp.where(sooner, g, which)
@@ -348,16 +375,21 @@ def keep_pace(
     since, gap, streak, total = pace
     since = since + moved
     # (Events at one time, which take each other's place, are apart by rounding.)
-    since = xp.where(event & (since <= INSTANT * span), 0.0, since)
+    at_one_time = event & (since <= INSTANT * span)
+    since = xp.where(at_one_time, 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)
     # (Not the first interval after events at one time.)
     shrinks = (since < gap) | (since == 0)
-    streak = xp.where(event, xp.where(shrinks, streak + 1, 0.0), streak)
-    total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
+    longer_streak = xp.where(shrinks, streak + 1, 0.0)
+    streak = xp.where(event, longer_streak, streak)
+    larger_total = xp.where(shrinks, total + since, 0.0)
+    total = xp.where(event, larger_total, total)
+    # The sum of the intervals to come, as a geometric series.
     series = since * ratio / xp.where(shrinks, 1 - ratio, 1.0)
     to_come = xp.where(shrinks, series, xp.inf)
-    zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
-    zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
+    converges = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
+    stops = slow & (streak >= _ZENO_SLOW)
+    zeno = event & (converges | stops)
     gap = xp.where(event, since, gap)
     since = xp.where(event, 0.0, since)
     return xp.stack([since, gap, streak, total]), zeno

@@ -316,11 +316,13 @@ class Tangents(Structure):
         of_lanes = self.once((function, form, static), trees, make)
 
         def call(*point, some=None):
+            t, q, inputs, *further = point
             tangents = [point[k].imag / TINY for k in moving]
-            u, x = np.split(point[2], [self.nu])
-            further = [y.real for y in point[3:]]
-            both = of_lanes(point[0].real, point[1].real, u, *further, *tangents, x)
-            return both[0] + 1j * TINY * both[1]
+            u, x = np.split(inputs, [self.nu])
+            further = [y.real for y in further]
+            both = of_lanes(t.real, q.real, u, *further, *tangents, x)
+            value, change = both
+            return value + 1j * TINY * change
 
         return call
 
@@ -337,9 +339,13 @@ class Systems(Structure):
             return np.asarray(x)[..., 0] if eqx.is_array(x) else x
 
         leaves = jax.tree_util.tree_leaves(eqx.filter(source.tree, eqx.is_array))
-        arrays = [np.asarray(x) for x in leaves]
-        self._numbers = np.concatenate([x.reshape(-1, x.shape[-1]) for x in arrays])
-        self._single = Structure(from_host(jax.tree_util.tree_map(first, source.tree)))
+        rows = []
+        for leaf in leaves:
+            array = np.asarray(leaf)
+            rows.append(array.reshape(-1, array.shape[-1]))
+        self._numbers = np.concatenate(rows)
+        single = jax.tree_util.tree_map(first, source.tree)
+        self._single = Structure(from_host(single))
 
     def at(self, lane):
         other = copy.copy(self)
@@ -482,8 +488,10 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
         tangents = [
             jnp.broadcast_to(x.reshape(*shape, 1), (*shape, L)) for x, shape in parts
         ]
-        (value, f), (tangent, _) = jax.jvp(end, (t, q, u, h), tuple(tangents))
+        point = (t, q, u, h)
+        (value, f), (tangent, _) = jax.jvp(end, point, tuple(tangents))
         return value, f, tangent
 
-    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(jnp.eye(split[-1] + 1))
+    unit = jnp.eye(split[-1] + 1)
+    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(unit)
     return jnp.concatenate([value[:, None], f[:, None], columns], axis=1)

@@ -37,7 +37,14 @@ def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
     # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
     zero = chart * 0
     armed = np.zeros((len(s.transitions), t.shape[0]), bool)
-    return Lanes(t, chart, q, namespace(t).asarray(armed), zero, pace_of(zero))
+    return Lanes(
+        t=t,
+        chart=chart,
+        q=q,
+        armed=namespace(t).asarray(armed),
+        events=zero,
+        pace=pace_of(zero),
+    )
 
 
 def pace_of(events: Index) -> Float[Array, "4 L"]:
@@ -154,7 +161,8 @@ def side_by_side(tree):
     """An axis of pieces of the flow of lanes, joined with that of lanes, if there is one."""
 
     def join(x):
-        return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
+        *others, rows, columns = x.shape
+        return x.reshape(*others, rows * columns)
 
     def move(x):
         return join(namespace(x).moveaxis(x, 0, -2)) if x.ndim > 1 else x
@@ -228,7 +236,8 @@ def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
     """Arrays of several tapes, the shorter ones with further rows without moves."""
     rows = max(map(len, parts))
     blank = IDLE if parts[0].dtype.kind == "i" else 0
-    out = np.full((len(parts), rows, *parts[0].shape[1:]), blank, parts[0].dtype)
+    shape = (len(parts), rows, *parts[0].shape[1:])
+    out = np.full(shape, blank, parts[0].dtype)
     for whole, part in zip(out, parts, strict=True):
         whole[: len(part)] = part
     return out

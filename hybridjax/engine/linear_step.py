@@ -42,18 +42,22 @@ def _explicit(method: Method, s: Structure, a: int, t, q, u, h):
         state, by_state = _state(a_rows[i, :i], rates, by_rates, q, h)
         rates[i], by_rates[i] = _rate(s, a, method.c[i], t, u, h, state, by_state)
     end, by_end = _state(np.array(method.b), rates, by_rates, q, h)
-    rate = kernels.field(s, a, t + h, end.T, u)[:, 0].T
+    field_at_end = kernels.field(s, a, t + h, end.T, u)
+    rate = field_at_end[:, 0].T
     values = np.stack([end, rate], axis=2)
-    return np.moveaxis(np.concatenate([values, by_end], axis=2), 0, -1)
+    expanded = np.concatenate([values, by_end], axis=2)
+    return np.moveaxis(expanded, 0, -1)
 
 
 def _state(weights, rates, by_rates, q, h):
     """The state q + h sum_j weights_j rates_j after the first stages, and its derivatives."""
+    n = len(q)
     slope = _weighted(weights, rates)
+    state = q.T + h[:, None] * slope
     by_state = h[:, None, None] * _weighted(weights, by_rates)
-    by_state[:, :, 1 : 1 + len(q)] += np.eye(len(q))
+    by_state[:, :, 1 : 1 + n] += np.eye(n)
     by_state[:, :, -1] += slope
-    return q.T + h[:, None] * slope, by_state
+    return state, by_state
 
 
 def _weighted(weights, stages):
@@ -65,10 +69,13 @@ def _weighted(weights, stages):
 def _rate(s: Structure, a: int, c: float, t, u, h, state, by_state):
     """The field at a stage, and its derivatives."""
     n = state.shape[1]
-    expanded = np.moveaxis(kernels.field(s, a, t + c * h, state.T, u), -1, 0)
+    expanded = kernels.field(s, a, t + c * h, state.T, u)
+    expanded = np.moveaxis(expanded, -1, 0)
+    rate = expanded[:, :, 0]
     by = by_point(expanded, n)
+    by_time = by.by_t[:, :, 0]
     by_rate = by.by_q @ by_state
-    by_rate[:, :, 0] += by.by_t[:, :, 0]
+    by_rate[:, :, 0] += by_time
     by_rate[:, :, 1 + n : -1] += by.by_u
-    by_rate[:, :, -1] += c * by.by_t[:, :, 0]
-    return expanded[:, :, 0], by_rate
+    by_rate[:, :, -1] += c * by_time
+    return rate, by_rate

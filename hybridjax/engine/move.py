@@ -115,7 +115,15 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
         lanes, stride, result = carry
         time, index, event, limit = (namespace(x).atleast_1d(x) for x in end)
         limit = namespace(time).minimum(limit, lanes.t + patience)
-        target = Target(time, index, event, limit, sequence, levels, missed)
+        target = Target(
+            time=time,
+            index=index,
+            event=event,
+            limit=limit,
+            event_sequence=sequence,
+            levels=levels,
+            missed=missed,
+        )
         moved, tape = flow(s, lanes, u, target, settings, stride, result, options)
         carry = moved.lanes, stride._replace(h=moved.h), moved.result
         return carry, (lanes, moved, tape)
@@ -260,7 +268,8 @@ def _columns(s, lanes, target, tape, of_states):
     def push(tangent):
         return jax.jvp(flow, (point,), (tangent,))
 
-    point = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, L))])
+    unpushed = jnp.zeros((s.nu, L))
+    point = jnp.concatenate([lanes.t[None], lanes.q, unpushed])
     directions = jnp.eye(len(point))
     if of_states:
         directions = directions[states]

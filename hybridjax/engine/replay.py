@@ -99,13 +99,14 @@ def _replayed(
             t, q, chart = carry
             by_clock = (code >= 0) & scheduled[code]
             due = scheduled_time(s, code, t + h)
-            h1 = jnp.where(by_clock, due - t, h)
-            h1 = jnp.where(code == ARRIVE_TIME, target.time - t, h1)
+            length = jnp.where(by_clock, due - t, h)
+            length = jnp.where(code == ARRIVE_TIME, target.time - t, length)
             which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            t, q = _advance(s, begin, code != IDLE, u, target, h1, which)
-            after, chart = apply_resets(s, t, chart, q, u, jnp.maximum(code, -1))
+            t, q = _advance(s, begin, code != IDLE, u, target, length, which)
+            event = jnp.maximum(code, -1)
+            after, chart = apply_resets(s, t, chart, q, u, event)
             return (t, after, chart), kept(t, q, after)
 
         def stay(carry):
@@ -162,7 +163,8 @@ def _advance(
         n = s.dims[a]
         system, levels = needed(here, (s, target.levels))
         goal = levels, only(here, target.index)
-        t0, q0, u0, h0 = needed(here, [only(here, x) for x in (t, q[:n], u, h)])
+        start = [only(here, x) for x in (t, q[:n], u, h)]
+        t0, q0, u0, h0 = needed(here, start)
         flow = ChartFlow(system, a, u0, *goal)
         still = ChartFlow(fixed(system), a, fixed(u0), *goal)
         # (The charts, which may hold traced values, are made here, and not within a branch.)
@@ -224,7 +226,8 @@ def chain(
     moves = recorded_moves(lanes, tape)
     end, by = linear_moves(s, moves, target)
     if across is not None:
-        f = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+        u = np.zeros((s.nu, 1))
+        f = slopes(s, moves.t, moves.chart, moves.q, u).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
         project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
         by[flows, :, 1:n] = by[flows, :, 1:n] @ project
@@ -238,11 +241,13 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
     """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
     n, m = by.shape[1:]
     columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
+    by_start = by[:, :, :n]
+    by_input = by[:, :, n:]
     for order in range(1 + max(moves.order, default=-1)):
         now = moves.order == order
         lane = moves.lane[now]
-        columns[lane] = by[now, :, :n] @ columns[lane]
-        columns[lane, :, n:] += by[now, :, n:]
+        columns[lane] = by_start[now] @ columns[lane]
+        columns[lane, :, n:] += by_input[now]
     return columns
 
 
@@ -273,27 +278,33 @@ class Variation:
         def many(x):
             return np.repeat(x, n + P, axis=-1)
 
-        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), len(moves.t))
+        M = len(moves.t)
+        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), M)
         along = Moves(*map(many, moves))
-        lane = along.lane * (n + P) + np.arange(len(along.t)) % (n + P)
+        direction = np.arange(len(along.t)) % (n + P)
+        lane = along.lane * (n + P) + direction
         t = along.t + aside[0]
         q = along.q + aside[1:]
         h = _until_ticks(s, along, t, q, lane)
         along = along._replace(t=t, q=q, h=h, lane=lane)
         # A direction that moves only the start of the flow needs no lanes of its own: the start of
         # each move is varied anyway.
-        self._unit = np.eye(P)[s.moving | times.any(axis=1) | (np.arange(P) == 0)]
+        moves_more = s.moving | times.any(axis=1)
+        is_first = np.arange(P) == 0
+        self._unit = np.eye(P)[moves_more | is_first]
         needed = np.append(np.full(n, twice), self._unit.any(axis=0))
-        along = Moves(*(x[..., np.tile(needed, len(moves.t))] for x in along))
-        later = np.concatenate([np.zeros((n, len(lanes.t))), times]).T.ravel()
+        along = Moves(*(x[..., np.tile(needed, M)] for x in along))
+        unmoved = np.zeros((n, len(lanes.t)))
+        later = np.concatenate([unmoved, times]).T.ravel()
+        index = np.broadcast_to(target.index, target.time.shape)
         target = dataclasses.replace(
             target,
             time=many(target.time) + 1j * kernels.TINY * later,
-            index=many(np.broadcast_to(target.index, target.time.shape)),
+            index=many(index),
         )
         end, by = linear_moves(s, along, target)
-        by = by.reshape(len(moves.t), -1, *by.shape[1:])
-        end = end.reshape(len(moves.t), -1, n)
+        by = by.reshape(M, -1, *by.shape[1:])
+        end = end.reshape(M, -1, n)
         self._by = np.real(by[:, 0])
         self._change = np.imag(by) / kernels.TINY
         kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
@@ -320,26 +331,32 @@ class Variation:
         along = np.concatenate([tangents[:-1], unit], axis=1)
         by_direction = self._change.reshape(*along.shape[:2], n * m)
         change = np.moveaxis(along, 1, 2) @ by_direction
-        by = self._by[:, None] + 1j * kernels.TINY * change.reshape(M, P, n, m)
+        change = change.reshape(M, P, n, m)
+        by = self._by[:, None] + 1j * kernels.TINY * change
         if sizes is not None:
             f = slopes(self._s, *self.points(tangents, np.arange(M)))
             f = f.T.reshape(M, P, n - 1)
             flows = ~moves.at_once
-            project = projections(f[flows], sizes[moves.chart[flows]][:, None])
+            size = sizes[moves.chart[flows]]
+            project = projections(f[flows], size[:, None])
             by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
-        lane = np.repeat(moves.lane, P) * P + np.arange(M * P) % P
+        direction = np.arange(M * P) % P
+        lane = np.repeat(moves.lane, P) * P + direction
         each = moves._replace(lane=lane, order=np.repeat(moves.order, P))
         columns = _products(each, by.reshape(-1, n, m), len(self.first) * P)
         return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
         """Times, charts, states and inputs where some moves start, in each direction."""
+        moves = self._moves
         n, P = tangents.shape[1:]
-        aside = 1j * kernels.TINY * np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
-        t = np.repeat(self._moves.t[move], P)
-        chart = np.repeat(self._moves.chart[move], P)
-        q = np.repeat(self._moves.q[:, move], P, axis=-1)
-        inputs = self._s.pushed(np.arange(len(t)) % P)
+        by_direction = np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
+        aside = 1j * kernels.TINY * by_direction
+        t = np.repeat(moves.t[move], P)
+        chart = np.repeat(moves.chart[move], P)
+        q = np.repeat(moves.q[:, move], P, axis=-1)
+        direction = np.arange(len(t)) % P
+        inputs = self._s.pushed(direction)
         return t + aside[0], chart, q + aside[1:], inputs
 
 
@@ -353,7 +370,8 @@ def _until_ticks(
         if isinstance(transition.guard, Scheduled) and at.any():
             end = (t + h).real[at] + 0j
             u = kernels.unpushed(s, lane[at])
-            h[at] = end + kernels.due(s, g, end, q[:, at], u)[0, 0] - t[at]
+            late = kernels.due(s, g, end, q[:, at], u)[0, 0]
+            h[at] = end + late - t[at]
     return h
 
 
@@ -363,12 +381,14 @@ def linear_moves(
     """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
     n = 1 + s.d
     M = len(moves.t)
-    end = np.zeros((M, n), target.time.dtype)
-    by = np.zeros((M, n, n + s.nu), target.time.dtype)
+    number = target.time.dtype
+    end = np.zeros((M, n), number)
+    by = np.zeros((M, n, n + s.nu), number)
     for a in np.unique(moves.chart).tolist():
         here = np.flatnonzero(moves.chart == a)
         of_chart = Moves(*(x[..., here] for x in moves))
-        end[here], by[here] = _linear(s.at(of_chart.lane), a, of_chart, target)
+        system = s.at(of_chart.lane)
+        end[here], by[here] = _linear(system, a, of_chart, target)
     return end, by
 
 
@@ -378,8 +398,10 @@ def projections(
     """Projections of states along the flow f, orthogonal in sizes."""
     xp = namespace(f)
     f = f / sizes
-    f = f / xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
-    project = np.eye(f.shape[-1]) - f[..., :, None] * f[..., None, :]
+    length = xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    f = f / length
+    along = f[..., :, None] * f[..., None, :]
+    project = np.eye(f.shape[-1]) - along
     return project * sizes[..., :, None] / sizes[..., None, :]
 
 
@@ -389,16 +411,17 @@ def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
     first = np.diff(lane, prepend=-1) > 0
     last = np.roll(row, 1)  # the move before, but for the first of a lane
     begins = np.flatnonzero(first)
-    order = np.arange(len(lane)) - np.repeat(begins, np.diff(begins, append=len(lane)))
+    counts = np.diff(begins, append=len(lane))
+    order = np.arange(len(lane)) - np.repeat(begins, counts)
     return Moves(
-        np.where(first, lanes.t[lane], tape.t[last, lane]),
-        np.where(first, lanes.chart[lane], tape.chart[last, lane]),
-        np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
-        np.asarray(tape.h)[row, lane],
-        np.asarray(tape.code)[row, lane],
-        lane,
-        order,
-        np.asarray(tape.at_once)[row, lane],
+        t=np.where(first, lanes.t[lane], tape.t[last, lane]),
+        chart=np.where(first, lanes.chart[lane], tape.chart[last, lane]),
+        q=np.where(first, lanes.q[:, lane], tape.after[last, :, lane].T),
+        h=np.asarray(tape.h)[row, lane],
+        code=np.asarray(tape.code)[row, lane],
+        lane=lane,
+        order=order,
+        at_once=np.asarray(tape.at_once)[row, lane],
     )
 
 
@@ -443,13 +466,22 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
     # (Only a varied parameter moves a schedule.)
     varied = s.schedules(a) if isinstance(s, Varied) else []
-    for g in np.intersect1d(code, varied).astype(int).tolist():
+    moved = np.intersect1d(code, varied).astype(int)
+    for g in moved.tolist():
         now = np.flatnonzero(code == g)
         due = kernels.due(s, g, t[now], q[:, now], u[:, now])[0]
-        longer[now, 0, 1 + n :] = due[2 + n :].T
+        by_parameter = due[2 + n :].T
+        longer[now, 0, 1 + n :] = by_parameter
     dt = longer.copy()
     dt[:, 0, 0] += 1.0
-    return _Ends(t, q, field, dt, by_start + by_length * longer)
+    dq = by_start + by_length * longer
+    return _Ends(
+        t=t,
+        q=q,
+        field=field,
+        dt=dt,
+        dq=dq,
+    )
 
 
 def _at_zeros(
@@ -467,8 +499,15 @@ def _at_zeros(
     crossed = crossed[lands]
     index = np.broadcast_to(target.index, target.time.shape)[moves.lane[lands]]
     landing = s.at(lands)
-    flow = ChartFlow(landing, a, u[:, lands], target.levels, index)
-    zero = flow.locate(ends.t[lands], ends.q[:, lands], ends.field[:, lands], crossed)
+    flow = ChartFlow(
+        s=landing,
+        a=a,
+        u=u[:, lands],
+        levels=target.levels,
+        index=index,
+    )
+    at_end = ends.t[lands], ends.q[:, lands], ends.field[:, lands]
+    zero = flow.locate(*at_end, crossed)
     t = ends.t.copy()
     q = ends.q.copy()
     t[lands] += zero.past
@@ -476,20 +515,31 @@ def _at_zeros(
     at = t[lands], q[:, lands], u[:, lands]
     expanded = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
     field = expanded[:, :, :1]
+    by_field = by_point(expanded, n)
+
+    # Each move has its own function that is zero.
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
-    row = np.argmax(np.array(flow.rows)[:, None] == crossed, axis=0)
+    is_crossed = np.array(flow.rows)[:, None] == crossed
+    row = np.argmax(is_crossed, axis=0)
     watched = watched[row, :, np.arange(len(lands))][:, None]
+
     # (Over the time past: nothing but rounding errors, with derivatives.)
     past = zero.past[:, None, None]
     before = ends.dq[lands]
     dt = ends.dt[lands]
-    moved = before + past * chained(by_point(expanded, n), dt, before)
+    moved = before + past * chained(by_field, dt, before)
     delay = delay_of_zero(by_point(watched, n), field, dt, moved)
     all_dt = ends.dt.copy()
     all_dq = ends.dq.copy()
     all_dt[lands] = dt + delay
     all_dq[lands] = moved + field @ delay
-    return _Ends(t, q, ends.field, all_dt, all_dq)
+    return _Ends(
+        t=t,
+        q=q,
+        field=ends.field,
+        dt=all_dt,
+        dq=all_dq,
+    )
 
 
 def _after_resets(
@@ -500,7 +550,8 @@ def _after_resets(
     n = len(ends.q)
     end = np.zeros((M, 1 + s.d), ends.dq.dtype)
     by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
-    columns = np.r_[: 1 + n, 1 + s.d : 1 + s.d + s.nu]
+    inputs = slice(1 + s.d, 1 + s.d + s.nu)
+    columns = np.r_[: 1 + n, inputs]
     end[:, 0] = ends.t
     by[:, :1, columns] = ends.dt
     event = np.maximum(moves.code, -1)
@@ -511,13 +562,15 @@ def _after_resets(
         after = ends.q[:, now]
         by_start = ends.dq[now]
         if kind != (-1,):
-            place = np.argmax(np.array(kind)[:, None] == event[now], axis=0)
+            is_member = np.array(kind)[:, None] == event[now]
+            place = np.argmax(is_member, axis=0)
             member = Member(kind, place.astype(np.int32))
             reset = kernels.reset(s.at(now), member, ends.t[now], after, u[:, now])
             after = reset[:, 0]
             by_reset = by_point(np.moveaxis(reset, -1, 0), n)
             by_start = chained(by_reset, ends.dt[now], by_start)
         m = len(after)
+        rows = np.arange(1, 1 + m)
         end[now, 1 : 1 + m] = after.T
-        by[np.ix_(now, np.arange(1, 1 + m), columns)] = by_start
+        by[np.ix_(now, rows, columns)] = by_start
     return end, by

@@ -72,13 +72,13 @@ def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> 
     shape = time.shape
     later = xp.nextafter(stop_gradient(time), xp.inf)
     return Target(
-        time,
-        xp.zeros(shape, xp.int32),
-        xp.full(shape, event, xp.int32),
-        xp.where(xp.isfinite(time), later, limit),
-        None,
-        None,
-        Result.SECTION_MISSED,
+        time=time,
+        index=xp.zeros(shape, xp.int32),
+        event=xp.full(shape, event, xp.int32),
+        limit=xp.where(xp.isfinite(time), later, limit),
+        event_sequence=None,
+        levels=None,
+        missed=Result.SECTION_MISSED,
     )
 
 

@@ -118,7 +118,14 @@ class Trajectory(Showable, eqx.Module):
             before = s.by_name(s.chart_index(tr.source), self.before[k])
             after = s.by_name(s.chart_index(tr.target), self.after[k])
             events.append(
-                Event(float(self.t[k]), tr.name, tr.source, tr.target, before, after)
+                Event(
+                    time=float(self.t[k]),
+                    name=tr.name,
+                    source=tr.source,
+                    target=tr.target,
+                    before=before,
+                    after=after,
+                )
             )
         return events
 
@@ -223,7 +230,8 @@ def observed(
         if all(item in states for item in items):  # (without compiling a function)
             values[:, at] = q[at].T[[states.index(item) for item in items]]
             continue
-        point = t[at], q[at, : s.dims[a]].T, np.zeros((s.nu, 1))
+        u = np.zeros((s.nu, 1))
+        point = t[at], q[at, : s.dims[a]].T, u
         values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
     return values
 
@@ -369,7 +377,8 @@ def recorded(
 ) -> Trajectory:
     """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
     under another one in each piece (nu, pieces)."""
-    rows = [(begin.t, begin.q.T, begin.q.T, begin.chart, np.full(1, -1))]
+    state = begin.q.T
+    rows = [(begin.t, state, state, begin.chart, np.full(1, -1))]
     for tape in tapes:
         lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = lane.t, lane.before, lane.after, lane.chart, lane.code
@@ -380,7 +389,8 @@ def recorded(
     u_before = u
     u_after = u
     if u.shape[1] > 1:
-        of_step = np.repeat(u, [len(x) for x, *_ in rows[1:]], axis=1)
+        counts = [len(x) for x, *_ in rows[1:]]
+        of_step = np.repeat(u, counts, axis=1)
         u_before = np.hstack([of_step[:, :1], of_step])
         u_after = np.hstack([of_step, of_step[:, -1:]])
     with at_ease():
@@ -449,7 +459,8 @@ def guards_reached(
     first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, lane.t, q, u, first)[..., 0]
     point = np.append(lane.t, q)
-    flow = np.append(1.0, kernels.field(s, a, lane.t, q, u)[:, 0, 0])
+    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    flow = np.append(1.0, rate)
     for g, row in zip(guards, rows, strict=True):
         if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
             continue
@@ -477,8 +488,10 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
         sizes = np.abs(after[:, :n]).max(axis=0)
         state = after[rows, :n].T
         guard = _guards_at(s, a, t[rows], state, u)
-        value_before = _guards_at(s, a, t[rows], before[rows, :n].T, u)[:, 0]
-        value_later = _guards_at(s, a, t[rows + 1], before[rows + 1, :n].T, u)[:, 0]
+        begin = before[rows, :n].T
+        end = before[rows + 1, :n].T
+        value_before = _guards_at(s, a, t[rows], begin, u)[:, 0]
+        value_later = _guards_at(s, a, t[rows + 1], end, u)[:, 0]
         value = guard[:, 0]
         slope = guard[:, 2 : 2 + n]
         field = kernels.field(s, a, t[rows], state, u)[:, 0]

@@ -59,7 +59,8 @@ def program_of(s: Structure, a: int, function: Callable | None = None):
     if function is None:
         function = ft.partial(s.field, a)
     shapes = (), (s.dims[a],), (s.nu,)
-    point = [jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in shapes]
+    real = jnp.result_type(float)
+    point = [jax.ShapeDtypeStruct(shape, real) for shape in shapes]
     return jax.make_jaxpr(function)(*point).jaxpr
 
 
@@ -105,8 +106,10 @@ def passed_over(
     """
     s = path.structure
     passed = []
-    for a in np.unique(path.chart[:-1]).tolist():
-        rows = np.flatnonzero((path.chart[:-1] == a) & (np.diff(path.t) > 0))
+    is_step = np.diff(path.t) > 0
+    chart = path.chart[:-1]
+    for a in np.unique(chart).tolist():
+        rows = np.flatnonzero((chart == a) & is_step)
         if len(rows) and may_have_pulses(s, a):
             wrong = np.argwhere(_passing(path, a, rows, u, settings, linear))
             for k, j in wrong[:1].tolist():
@@ -127,22 +130,13 @@ def _passing(
     with_guards = bool(may_be_sudden(s, a, _guards))
     parts = []
     for k in np.split(rows, range(_POINTS, len(rows), _POINTS)):
-        h = np.diff(path.t)[k, None, None]
-        q = interpolate(
-            samples.nodes,
-            h,
-            path.after[k, None, :n],
-            path.before[k + 1, None, :n],
-            path.slope_after[k, None, :n],
-            path.slope_before[k + 1, None, :n],
-        )
-        points = np.concatenate([path.t[k, None, None] + h * samples.nodes, q], axis=2)
+        points = _points_within(path, k, samples.nodes, n)
         values = values_at(s, a, points.reshape(-1, 1 + n), u, with_guards)
         values = values.reshape(*points.shape[:2], -1)
         seen = values[:, :8, :m]
         rates = values[:, 8:, :m]
         beside = rates - samples.polynomial @ seen
-        duration = h[:, 0]
+        duration = np.diff(path.t)[k, None]
         lacks = duration * np.abs(samples.weights @ beside)
         if linear and len(k) > 1 and not only_poles:
             gains = rates[:, :, n:]
@@ -228,13 +222,33 @@ class _Part(NamedTuple):
     """Whether a guard falls below zero."""
 
 
+def _points_within(
+    path: Any, k: np.ndarray, nodes: np.ndarray, n: int
+) -> Float[np.ndarray, "K F 1+n"]:
+    """Times and states at nodes of the steps that begin at rows k of a path."""
+    begin = path.t[k, None, None]
+    h = np.diff(path.t)[k, None, None]
+    q = interpolate(
+        nodes,
+        h,
+        path.after[k, None, :n],
+        path.before[k + 1, None, :n],
+        path.slope_after[k, None, :n],
+        path.slope_before[k + 1, None, :n],
+    )
+    t = begin + h * nodes
+    return np.concatenate([t, q], axis=2)
+
+
 def _falls(values: np.ndarray) -> np.ndarray:
     """Test whether guards fall below zero in steps, where they are enabled: (K, F, guards and
     predicates)."""
     guards, enabled = np.split(values, 2, axis=2)
-    low = guards < -_NEAR * np.abs(guards).max(axis=(0, 1))
+    largest = np.abs(guards).max(axis=(0, 1))
+    is_low = guards < -_NEAR * largest
     was_positive = np.maximum.accumulate(guards, 1) > 0
-    return (low & was_positive & (enabled > 0)).any(axis=1)
+    falls = is_low & was_positive & (enabled > 0)
+    return falls.any(axis=1)
 
 
 def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -248,12 +262,15 @@ def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarr
         stages = begin + length * np.array(method.c)
         inside = (t > begin) & (t < begin + length)
         # (The value at a stage lies between those of two samples.)
-        left = np.clip(np.searchsorted(t, stages) - 1, 0, len(t) - 2)
+        left = np.searchsorted(t, stages) - 1
+        left = np.clip(left, 0, len(t) - 2)
+        right = left + 1
         of_stage = length * np.array(method.b)
-        of_right = of_stage * (stages - t[left]) / (t[left + 1] - t[left])
+        of_right = of_stage * (stages - t[left]) / (t[right] - t[left])
+        of_left = of_stage - of_right
         row = -np.tile(weights, 2) * inside
-        np.add.at(row, left, of_stage - of_right)
-        np.add.at(row, left + 1, of_right)
+        np.add.at(row, left, of_left)
+        np.add.at(row, right, of_right)
         rows.append(row)
     return np.stack(rows)
 
@@ -267,7 +284,9 @@ def column_name(s: Structure, a: int, j: int) -> str:
     row, column = divmod(j - n, max(s.nu, 1))
     if row < n and s.nu:
         return f"gain from '{s.inputs[column]}' to the rate of '{states[row]}'"
-    return f"guard of '{s.transitions[s.guards(a)[j - n * (1 + s.nu)]].name}'"
+    guard = j - n * (1 + s.nu)
+    transition = s.transitions[s.guards(a)[guard]]
+    return f"guard of '{transition.name}'"
 
 
 def values_at(
@@ -279,15 +298,20 @@ def values_at(
     lanes = kernels.POINTS if may_have_pulses(s, a) <= POLES else kernels.WIDE
 
     def at(x):
-        point = (x[:, 0], x[:, 1:].T, u[:, None])
+        t = x[:, 0]
+        q = x[:, 1:].T
+        point = (t, q, u[:, None])
         n = s.dims[a]
         by = kernels.field(s, a, *point, lanes=lanes)
-        rows = [by[:, 0], by[:, 2 + n :].reshape(-1, len(x))]
+        by_input = by[:, 2 + n :]
+        rows = [by[:, 0], by_input.reshape(-1, len(x))]
         if guards:
-            members = map(s.member, s.guards(a))
             first = np.zeros(1, int)
-            rows += [kernels.watched(s, a, None, *point, first, lanes=lanes)[:, 0]]
-            rows += [kernels.enabled(s, x, *point, lanes=lanes)[None] for x in members]
+            watched = kernels.watched(s, a, None, *point, first, lanes=lanes)
+            rows.append(watched[:, 0])
+            for guard in s.guards(a):
+                enabled = kernels.enabled(s, s.member(guard), *point, lanes=lanes)
+                rows.append(enabled[None])
         return np.concatenate(rows).T
 
     blocks = np.split(points, range(_POINTS, len(points), _POINTS))
@@ -320,15 +344,22 @@ def jumps(
     def at(points):
         return values_at(s, a, points, np.zeros(s.nu))[:, :m]
 
+    def limits(first):
+        """Magnitudes of the field and the gains, relative to which changes are judged."""
+        shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
+        # (A quantile: not the change at a jump.)
+        rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)
+        largest = np.nanmax(np.abs(first), axis=0)
+        limit = np.maximum(largest, rounding / _JUMP)
+        limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
+        largest_gain = limit[n:].max(initial=0.0)
+        limit[n:] = np.maximum(limit[n:], _SAME_GAIN * largest_gain)
+        limit[n:] += np.finfo(float).tiny
+        return limit
+
     first = at(low)
     last = at(high)
-    shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
-    # (A quantile: not the change at a jump.)
-    rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)
-    limit = np.maximum(np.nanmax(np.abs(first), axis=0), rounding / _JUMP)
-    limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
-    limit[n:] = np.maximum(limit[n:], _SAME_GAIN * limit[n:].max(initial=0.0))
-    limit[n:] += np.finfo(float).tiny
+    limit = limits(first)
     for _ in range(_QUARTERS):
         between = low + quarters * (high - low)
         points = np.stack([low, *between, high])
@@ -336,7 +367,8 @@ def jumps(
         values = np.nan_to_num(np.stack([first, *inside, last]))
         changes = np.diff(values, axis=0)
         change = np.abs(changes) / limit
-        distance = np.abs(np.diff(points, axis=0) / sizes).max(axis=2, keepdims=True)
+        lengths = np.abs(np.diff(points, axis=0) / sizes)
+        distance = lengths.max(axis=2, keepdims=True)
         uneven = np.abs(changes - changes.mean(axis=0)) / limit
         # The quarter of each interval in which the field changes most unlike in the others.
         worst = uneven.max(axis=2).argmax(axis=0)
@@ -347,7 +379,8 @@ def jumps(
         last = values[worst + 1, here]
         is_jump = (change > _JUMP) & (change > _STEEP * distance)
         for i, j in np.argwhere(is_jump[worst, here]):
-            yield low[i, 0], j, change[worst[i], i, j] * limit[j]
+            largest_change = change[worst[i], i, j] * limit[j]
+            yield low[i, 0], j, largest_change
         keep = uneven.max(axis=(0, 2)) > _JUMP
         low, high, first, last = (x[keep] for x in (low, high, first, last))
         if not keep.any():
@@ -363,10 +396,15 @@ def has_kinks(s: Structure) -> bool:
 def lines_of_jumps(s: Structure, a: int) -> list[str]:
     """The lines of code by which the field of a chart may jump: those that decide, if there are
     any."""
-    found = [x for x in sudden(program_of(s, a)) if x[0] != "power"]
-    decisions = [x for x in found if x[0] == "decision"]
-    lines = [_line_of(equation) for _, equation in decisions or found]
-    return [line for line in dict.fromkeys(lines) if line]
+    decisions = []
+    others = []
+    for name, equation in sudden(program_of(s, a)):
+        if name == "decision":
+            decisions.append(_line_of(equation))
+        elif name != "power":
+            others.append(_line_of(equation))
+    lines = dict.fromkeys(decisions or others)
+    return [line for line in lines if line]
 
 
 def _line_of(equation: Any) -> str:

@@ -172,14 +172,26 @@ class ChartFlow(NamedTuple):
         q, error = short_step(field, t, q, f, step)
         f = field(t + step, q)
         last = newton(t + step, q, f)
-        return Located(step + last, q + last * f, f, last, error)
+        return Located(
+            past=step + last,
+            q=q + last * f,
+            f=f,
+            last=last,
+            error=error,
+        )
 
 
 def chart_flow(
     s: Structure, a: int, here: Mask, u: Inputs, target: Target
 ) -> ChartFlow:
     """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
-    flow = ChartFlow(s, a, only(here, u), target.levels, only(here, target.index))
+    flow = ChartFlow(
+        s=s,
+        a=a,
+        u=only(here, u),
+        levels=target.levels,
+        index=only(here, target.index),
+    )
     return flow.only(here)
 
 
@@ -188,7 +200,8 @@ def slopes(s: Structure, t: Times, chart: Index, q: Padded, u: AnyInputs) -> Pad
 
     def work(a, here, out):
         n = s.dims[a]
-        f = chart_field(s, a, only(here, u))(only(here, t), only(here, q[:n]))
+        field = chart_field(s, a, only(here, u))
+        f = field(only(here, t), only(here, q[:n]))
         return put(out, slice(n), xp.where(here, f, out[:n]))
 
     xp = namespace(q)

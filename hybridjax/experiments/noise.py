@@ -198,7 +198,8 @@ def add_noise(
         raise DefinitionError("add_noise needs either `std` or `snr`.")
     if snr is not None:
         data.require_ok()
-        std = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1))) * 10 ** (-snr / 20)
+        rms = np.sqrt(np.mean(data.y[data.ok] ** 2, axis=(0, 1)))
+        std = rms * 10 ** (-snr / 20)
     std = np.asarray(std)
     N = data.n_sections
     ny = data.y.shape[2]

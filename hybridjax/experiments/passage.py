@@ -130,7 +130,8 @@ def follow_table(
         return tuple(carry), (outputs, answers)
 
     begin = moves.begin(start, S)
-    (end, _), (y, answers) = jax.lax.scan(turn, (begin, Kept.of(begin)), held)
+    carry = (begin, Kept.of(begin))
+    (end, _), (y, answers) = jax.lax.scan(turn, carry, held)
 
     def to_experiments(x):
         return jnp.moveaxis(x, -1, 0).reshape(S, n, -1)
@@ -139,12 +140,12 @@ def follow_table(
     finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
     left = end.left | ~finite | (end.place != BEGIN)
     response = Response(
-        y,
-        jnp.zeros(S, jnp.int32),
-        jnp.full(S, -1),
-        ROUNDING + plan.least + end.largest,
-        jnp.concatenate([end.t[None], end.q]).T,
-        None if feedback is None else to_experiments(answers),
+        y=y,
+        result=jnp.zeros(S, jnp.int32),
+        failed_at=jnp.full(S, -1),
+        error=ROUNDING + plan.least + end.largest,
+        end=jnp.concatenate([end.t[None], end.q]).T,
+        feedback=None if feedback is None else to_experiments(answers),
     )
     return response, left
 
@@ -313,7 +314,8 @@ class _Moves:
     def _stepped(self, a: int, u, t, q, h):
         """The state after a step, and its error relative to what is allowed."""
         # (The step of diffrax's solver takes twice as long: it writes stages as `K.at[k].set`.)
-        end, error = looped_step(self.s.method(a), self._field(a, u), t, q, h)
+        field = self._field(a, u)
+        end, error = looped_step(self.s.method(a), field, t, q, h)
         allowed = self.settings.rtol * size(self.settings, a, q, end)
         return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
 
@@ -390,9 +392,12 @@ class _Moves:
         guards = len(self.s.guards(a))
         signs = row.signs[:, None]
         # (Comparisons with NaN are false.)
-        other = ((signs != 0) & ~(jnp.sign(value) * signs > 0))[:count]
+        is_known = signs != 0
+        same = jnp.sign(value) * signs > 0
+        other = (is_known & ~same)[:count]
         before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
-        returns = dips(before, Watched(x.h, value, rate), signs) & (signs != 0)
+        now = Watched(x.h, value, rate)
+        returns = dips(before, now, signs) & is_known
         return other.any(axis=0) | returns[:guards].any(axis=0)
 
 

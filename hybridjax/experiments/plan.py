@@ -129,7 +129,8 @@ def make_plan(
     J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
     ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
-    error = np.moveaxis(ways.ends[:, :-1] - ways.ends[:, -1:], 0, -1)
+    reference = ways.ends[:, -1:]
+    error = np.moveaxis(ways.ends[:, :-1] - reference, 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
 
@@ -143,7 +144,8 @@ def make_plan(
     least = np.zeros(())
     if ways.estimate.shape[1] > 1:
         after = np.roll(section, -1)
-        own = (ways.ends[1:, -1, 0] - placed.lanes.q[:, after]) / scale[after, 1:].T
+        off = ways.ends[1:, -1, 0] - placed.lanes.q[:, after]
+        own = off / scale[after, 1:].T
         least = largest[best, section].sum() + np.abs(own).max()
 
     # The cycle itself comes first, and then the larger deviations.
@@ -157,7 +159,8 @@ def make_plan(
     weight = weight * np.maximum(together, 1 / _MOST_CANCELLATION)
 
     # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
-    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0) / len(section)
+    share = np.minimum(accuracy * estimate[0] / impact[0], 1.0)
+    share = share / len(section)
     spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
     of_equal_steps = np.maximum(spare * estimate[0], share)
     slack = ways.slack[best]
@@ -172,7 +175,8 @@ def _impacts(ways: "_Ways", J, error, scale) -> Float[np.ndarray, "K M N"]:
     impact = np.where(np.isnan(impact), np.inf, impact)
     reference = ways.ends[0, -1]
     deviates = np.arange(len(reference))[:, None] > 0
-    return np.where(np.isnan(reference) & deviates, 0.0, impact)
+    has_no_reference = np.isnan(reference) & deviates
+    return np.where(has_no_reference, 0.0, impact)
 
 
 def _require_ways(impact: Float[np.ndarray, "K N"]) -> None:
@@ -225,10 +229,12 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
         return np.zeros((1, nu))
     time = 0 if placed.cycle.clocked else 1
     after = np.roll(scale, -1, axis=0)[:, :, None]
-    largest = np.abs(by_input / after)[:, time:].max(axis=(0, 1))
+    relative = np.abs(by_input / after)[:, time:]
+    largest = relative.max(axis=(0, 1))
     unit = np.divide(1.0, largest, where=largest > 0, out=np.zeros(nu))
+    none = np.zeros((1, nu))
     kicks = [size * np.diag(unit) for size in _KICKS]
-    return np.concatenate([np.zeros((1, nu)), *kicks])
+    return np.concatenate([none, *kicks])
 
 
 @host_first
@@ -276,7 +282,9 @@ def _try_ways(
         s, lanes, u, target, tolerance, start, options=Options(tape=implicit)
     )
     ends = xp.concatenate([moved.lanes.t[None], moved.lanes.q])
-    ends = xp.where(moved.result == Result.OK, ends, xp.nan).reshape(1 + s.d, W, M, N)
+    arrives = moved.result == Result.OK
+    ends = xp.where(arrives, ends, xp.nan)
+    ends = ends.reshape(1 + s.d, W, M, N)
     tolerances = rtol[:K, None, None] / settings.rtol
     estimate = moved.error.reshape(W, M, N)[:K] * tolerances
     first = longest / divide[:K, None]
@@ -285,7 +293,13 @@ def _try_ways(
         taken = xp.take_along_axis(tape.h, accepted, axis=0)
         shortest = taken.reshape(W, M, N)[:K].min(axis=1)
         first = xp.where(shortest < 0.9 * first, shortest, longest)
-    return _Ways(ends, estimate, first, xp.asarray(slack[:K]), lead)
+    return _Ways(
+        ends=ends,
+        estimate=estimate,
+        first=first,
+        slack=xp.asarray(slack[:K]),
+        lead=lead,
+    )
 
 
 def _lead(placed: PlacedSections, target):
@@ -311,18 +325,23 @@ def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
     N = len(scale)
     after = np.roll(scale, -1, axis=0)
     # (All errors of a section side by side: one product of matrices for each.)
-    x = (error / after).reshape(-1, *scale.shape).transpose(1, 2, 0)
+    x = (error / after).reshape(-1, *scale.shape)
+    x = x.transpose(1, 2, 0)
     J = J * scale[:, None] / after[:, :, None]
     section = np.arange(N)
     worst = np.zeros((_PERIODS, N, x.shape[2]))
     for m in range(_PERIODS * N):
         period = worst[m // N]
-        np.maximum(period, np.abs(x).max(axis=1), out=period)
+        largest = np.abs(x).max(axis=1)
+        np.maximum(period, largest, out=period)
         x = J[(section + 1 + m) % N] @ x
+    # Later periods continue the last two as a geometric series.
     *_, before, last = worst
-    ratio = np.clip(last / np.where(before > 0, before, 1.0), 0.0, 0.999)
+    divisor = np.where(before > 0, before, 1.0)
+    ratio = np.clip(last / divisor, 0.0, 0.999)
     later = last * ratio / (1 - ratio)
-    return (worst.sum(axis=0) + later).T.reshape(error.shape[:-1])
+    total = worst.sum(axis=0) + later
+    return total.T.reshape(error.shape[:-1])
 
 
 def _accumulated(J, error, scale) -> float:
@@ -332,7 +351,8 @@ def _accumulated(J, error, scale) -> float:
     largest = 0.0
     for m in range(_PERIODS * N):
         total = J[m % N] @ total + error[m % N]
-        largest = max(largest, np.max(np.abs(total) / scale[(m + 1) % N]))
+        relative = np.abs(total) / scale[(m + 1) % N]
+        largest = max(largest, np.max(relative))
     return largest
 
 
@@ -366,7 +386,12 @@ def plan_flow(placed: PlacedSections, accuracy: float) -> Stepping:
         sizes = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
         scales = np.concatenate([time, sizes], axis=1)
         plan = make_plan(placed, settings, accuracy, scales)
-        return Stepping(plan, settings, scales, accuracy)
+        return Stepping(
+            plan=plan,
+            settings=settings,
+            scales=scales,
+            accuracy=accuracy,
+        )
 
     # A plan is no part of the program that JAX traces.
     inside = is_inside_program() and not is_traced(placed)

@@ -202,6 +202,7 @@ def _with_known_inputs(record: SectionSeries) -> Iterator[SectionSeries]:
     finite = np.isfinite(record.u).all(axis=1)
     edges = np.flatnonzero(np.diff(finite.astype(int), prepend=0, append=0))
     for first, stop in edges.reshape(-1, 2).tolist():
-        part = record.part(first, stop)
-        part.y[max(len(part.y) - record.lead, 0) :] = np.nan  # (`part` copies)
+        part = record.part(first, stop)  # (a copy)
+        known = max(len(part.y) - record.lead, 0)
+        part.y[known:] = np.nan
         yield part

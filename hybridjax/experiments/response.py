@@ -80,7 +80,9 @@ class Feedback(NamedTuple):
         """Return what the controller adds to the inputs at section i, and its next state."""
         A, B, C, D, _ = (x[i] for x in self.matrices)
         deviation = y - self.on_cycle[i][:, None]
-        return -(C @ state + D @ deviation), A @ state + B @ deviation
+        answer = -(C @ state + D @ deviation)
+        later = A @ state + B @ deviation
+        return answer, later
 
 
 class Course(eqx.Module):
@@ -188,7 +190,8 @@ def flow_batch(
         events = moved.lanes.events - turns * one_turn
         lanes = moved.lanes._replace(t=t, events=events)
         ok = result == Result.OK
-        share = jnp.where(ok & (moved.error > 0), moved.error * plan.weight[i], 0.0)
+        counts = ok & (moved.error > 0)
+        share = jnp.where(counts, moved.error * plan.weight[i], 0.0)
         return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
 
     xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
@@ -203,7 +206,14 @@ def flow_batch(
     end = jnp.concatenate([lanes.t[None], lanes.q])
     end = jnp.where(result == Result.OK, end, jnp.nan)
     answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
-    return Response(jnp.moveaxis(y, -1, 0), result, failed_at, error, end.T, answers)
+    return Response(
+        y=jnp.moveaxis(y, -1, 0),
+        result=result,
+        failed_at=failed_at,
+        error=error,
+        end=end.T,
+        feedback=answers,
+    )
 
 
 @checked_methods

@@ -352,7 +352,8 @@ class _Writer:
         if before is None:
             return float(self.t[k]), self.at_sections, k
         turn, number = divmod(before, len(self.events))
-        t = self.events[number].t + turn * float(self.placed.cycle.period)
+        period = float(self.placed.cycle.period)
+        t = self.events[number].t + turn * period
         return t, self.after, number
 
     def _to_section(self, k: int, count: int) -> None:
@@ -488,7 +489,8 @@ class _Writer:
             n = s.dims[a]
             here = np.flatnonzero(chart == a)
             index = (section[here] + 1) % self.N
-            point = t[here], q[:n, here], np.zeros((s.nu, 1))
+            u = np.zeros((s.nu, 1))
+            point = t[here], q[:n, here], u
             columns = kernels.watched(s, a, self.levels, *point, index)
             field = kernels.field(s, a, *point)[:, 0]
             value = columns[:, 0]

@@ -198,7 +198,12 @@ class Campaign:
         def make() -> _AtSections:
             z = self.placed.structure().resolve_outputs(self.outputs)
             on_cycle = np.asarray(self.placed.observe(tuple(z.items)))
-            return _AtSections(z, course(self.placed, z.items), on_cycle, self.outputs)
+            return _AtSections(
+                outputs=z,
+                course=course(self.placed, z.items),
+                on_cycle=on_cycle,
+                given=self.outputs,
+            )
 
         return _resolved.recall(self.placed, names, make)
 
@@ -430,7 +435,8 @@ def check_inputs(
     )  # may lie on disk (`numpy.memmap`), so never all of it is read at once
     require_shape(u.shape, n_sections, len(inputs))
     for k in range(0, len(u), CHUNK):
-        finite = np.isfinite(np.asarray(u[k : k + CHUNK], float)).all(axis=(1, 2))
+        chunk = np.asarray(u[k : k + CHUNK], float)
+        finite = np.isfinite(chunk).all(axis=(1, 2))
         if not finite.all():
             raise DefinitionError(
                 f"`design` has NaN or infinity in experiment {k + int(np.argmin(finite))}."

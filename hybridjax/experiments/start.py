@@ -48,9 +48,12 @@ def periodic_start(
 ) -> Float[np.ndarray, "m S"]:
     """Return times and states on section 0 in the periodic response that `model` predicts to inputs
     that repeat the `window`."""
-    embed = to_host(placed).frames()[0][0, :, : model.A.shape[1]]
-    x0 = model.periodic_states(window, window.shape[1] // placed.n_sections)
-    return to_host(placed).section_zero[:, None] + embed @ np.asarray(x0).T
+    placed = to_host(placed)
+    embed, *_ = placed.frames()
+    embed = embed[0, :, : model.A.shape[1]]
+    periods = window.shape[1] // placed.n_sections
+    x0 = model.periodic_states(window, periods)
+    return placed.section_zero[:, None] + embed @ np.asarray(x0).T
 
 
 def steady_start(

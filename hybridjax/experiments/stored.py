@@ -258,7 +258,14 @@ def run_experiments(
     """
     if outputs is None:
         outputs = default_outputs(cycle.structure)
-    options = RunOptions(start, discard, process_noise, accuracy, execution, feedback)
+    options = RunOptions(
+        start=start,
+        discard=discard,
+        process_noise=process_noise,
+        accuracy=accuracy,
+        execution=execution,
+        feedback=feedback,
+    )
     if store is not None:
         _check_storable(options)
         # (Batches as for one thread: their size does not depend on the machine.)
@@ -327,7 +334,12 @@ class ExperimentJob:
         }
         coordinates = "input", "output"
         return self, Layout(
-            ("experiment",), self.blocks, variables, constants, coordinates, text
+            dims=("experiment",),
+            blocks=self.blocks,
+            variables=variables,
+            constants=constants,
+            coordinates=coordinates,
+            description=text,
         )
 
     def arrays(self) -> list[np.ndarray]:

@@ -56,7 +56,8 @@ def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     roots = np.roots([1.0, *coefficients]).astype(complex)
     at_zero = len(coefficients) - len(roots)  # numpy drops these
     roots = np.pad(roots, (0, at_zero))
-    return roots[np.lexsort((-np.imag(roots), -np.abs(roots)))]
+    order = np.lexsort((-np.imag(roots), -np.abs(roots)))
+    return roots[order]
 
 
 class Covariance(NamedTuple):
@@ -102,7 +103,8 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     # (Sums over fewer pairs scatter more.)
-    return int(min(np.ceil(np.log(_FORGOTTEN) / np.log(slowest)), cycles // 4))
+    forgotten = np.ceil(np.log(_FORGOTTEN) / np.log(slowest))
+    return int(min(forgotten, cycles // 4))
 
 
 def fading(c: Coefficients) -> Coefficients:
@@ -126,9 +128,10 @@ def inverse_of_remainder(
     taken: Float[np.ndarray, "B k k"], power: float = 1.0
 ) -> Float[np.ndarray, "B k k"]:
     """Return (1 - taken)^-power, `taken` being the share of a block's errors that a fit takes."""
-    values, vectors = np.linalg.eigh(np.eye(taken.shape[1]) - taken)
-    left = np.maximum(values, _SMALLEST_REMAINDER)[:, None] ** power
-    return vectors / left @ vectors.mT
+    remainder = np.eye(taken.shape[1]) - taken
+    values, vectors = np.linalg.eigh(remainder)
+    values = np.maximum(values, _SMALLEST_REMAINDER)
+    return vectors / values[:, None] ** power @ vectors.mT
 
 
 def block_freedom(
@@ -143,6 +146,9 @@ def block_freedom(
     to one.
     """
     d = score.shape[1]
-    part = np.einsum("bi,ij,bj->b", score, np.linalg.pinv(score.T @ score), score) / d
+    inverse = np.linalg.pinv(score.T @ score)
+    part = np.einsum("bi,ij,bj->b", score, inverse, score) / d
     normal = np.linalg.trace(share) / d
-    return float(1 / max(((part - normal) ** 2).sum() * d / 2, (normal**2).sum()))
+    by_dispersion = ((part - normal) ** 2).sum() * d / 2
+    of_gaussian = (normal**2).sum()
+    return float(1 / max(by_dispersion, of_gaussian))

@@ -112,7 +112,8 @@ class Fit(WithMultipliers, eqx.Module):
         reach = special.ndtri(tail)
         if np.isfinite(self.covariance_dof):
             reach = special.stdtrit(self.covariance_dof, tail)
-        return values[:, None] + reach * errors[:, None] * np.array([-1.0, 1.0])
+        margins = reach * errors
+        return np.stack([values - margins, values + margins], axis=1)
 
     def __repr__(self) -> str:
         return "\n".join(filter(None, [self._summary(), self._shown_findings()]))

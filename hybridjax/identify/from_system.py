@@ -43,7 +43,8 @@ _DEVIATION = 1e-3
 _PER_STEP = 8
 # Periods of the design, and its versions with other random phases. More: time. Fewer: few lines,
 # and variances that are uncertain.
-_PERIODS, _REALIZATIONS = 16, 4
+_PERIODS = 16
+_REALIZATIONS = 4
 
 
 class ModelIdentification(WithMultipliers, eqx.Module):
@@ -154,7 +155,8 @@ def _small_design(
     lines = np.unique(plain.line / plain.periods)
     H = np.asarray(model.htf(lines).H)
     # (The response to inputs of rms 1: of all harmonics together, on average over the lines.)
-    gain = np.sqrt((np.abs(H) ** 2).sum(axis=(0, 3)).mean(axis=0))
+    power = (np.abs(H) ** 2).sum(axis=(0, 3))
+    gain = np.sqrt(power.mean(axis=0))
     orbit = cycle.trajectory()
     values = observed(orbit.structure, outputs, *orbit.dense(_PER_STEP))
     reach = np.array([np.nanmax(x) - np.nanmin(x) for x in values]) / 2

@@ -231,7 +231,8 @@ def _roundness(
     turned = sums.turned[rows].transpose(2, 0, 3, 1)
     square = energy - np.abs(H) ** 2 * power
     square = np.where(square > ROUNDING * energy, square, 0.0)
-    return roundness(square, turned - H**2 * power, sums.present[rows][None, :, None])
+    present = sums.present[rows][None, :, None]
+    return roundness(square, turned - H**2 * power, present)
 
 
 def roundness(

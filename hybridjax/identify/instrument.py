@@ -143,7 +143,8 @@ def spectral_products(
         unit = positive(size)
     else:
         unit = like.unit
-    bins = (np.arange(P // 2 + 1)[:, None] + P * np.arange(N)) % (N * P)
+    classes = np.arange(P // 2 + 1)
+    bins = (classes[:, None] + P * np.arange(N)) % (N * P)
     windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
     spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
@@ -201,7 +202,8 @@ def excited_classes(
     size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
-    least = np.linalg.eigvalsh(power / scale[:, :, None] / scale[:, None])[:, 0]
+    relative = power / scale[:, :, None] / scale[:, None]
+    least = np.linalg.eigvalsh(relative)[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
     if whole.any():
         return np.flatnonzero(whole)
@@ -303,10 +305,12 @@ def _solve_classes(
 
     def variance(G, rows):
         """Return the variances of H for errors Y - H U with these products, of so many rows."""
-        cross = block(y, u, G) @ _adjoint(H)
+        adjoint = _adjoint(H)
+        cross = block(y, u, G) @ adjoint
         square = block(y, y, G) - cross - _adjoint(cross)
-        square = square + H @ block(u, u, G) @ _adjoint(H)
-        mean = np.maximum(_diagonal(square), 0)[:, :, None] / rows
+        square = square + H @ block(u, u, G) @ adjoint
+        of_outputs = np.maximum(_diagonal(square), 0)
+        mean = of_outputs[:, :, None] / rows
         return mean * by_input[:, None]
 
     noise = None
@@ -320,7 +324,12 @@ def _solve_classes(
         )
     if kind == "noise" or dof[0] <= 0:
         dof[:] = sums.experiments * (repeats - 1)
-        return _ClassEstimates(H, noise, None, dof)
+        return _ClassEstimates(
+            H=H,
+            variance=noise,
+            noise=None,
+            dof=dof,
+        )
     # The error of P multiplies all of U in E, of which the references explain only a part. The
     # other part adds errors of entries of P to E: of one at the edge of its disc, where they
     # count three times, and of all others, whose scatter takes degrees of freedom.
@@ -329,7 +338,12 @@ def _solve_classes(
     counted = dof + _diagonal(left).sum(axis=1)
     total = variance(G, counted[:, None, None] + 2 * edge[:, None])
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
-    return _ClassEstimates(H, total, noise, 1 / (1 / dof + taken))
+    return _ClassEstimates(
+        H=H,
+        variance=total,
+        noise=noise,
+        dof=1 / (1 / dof + taken),
+    )
 
 
 def _require_answers(

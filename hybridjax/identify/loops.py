@@ -151,5 +151,6 @@ def _without(sums: Sums, rows: np.ndarray) -> Sums:
     """Return products of what is left of all signals without what those in these rows explain."""
     total = sums.total
     power = total[:, rows[:, None], rows]
-    left = total[:, :, rows] @ np.linalg.pinv(power, hermitian=True) @ total[:, rows]
+    inverse = np.linalg.pinv(power, hermitian=True)
+    left = total[:, :, rows] @ inverse @ total[:, rows]
     return sums._replace(total=total - left, experiments=sums.experiments - len(rows))

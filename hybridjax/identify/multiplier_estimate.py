@@ -167,7 +167,8 @@ class MultiplierFit(Fit):
         d = len(self.coefficients)
         if not np.isfinite(self.covariance).all():
             return np.full((d, 2, 2), np.inf)
-        powers = self.multipliers[:, None] ** np.arange(d - 1, -1, -1)
+        exponents = np.arange(d - 1, -1, -1)
+        powers = self.multipliers[:, None] ** exponents
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
         is_real = np.imag(self.multipliers) == 0
         # The slope is zero where two multipliers coincide.
@@ -213,7 +214,8 @@ class MultiplierFit(Fit):
     def _distance_of(self, multipliers: Complex[np.ndarray, " k"]) -> tuple[float, int]:
         """Return the squared distance from the hypothesis that all of these are multipliers, and
         the number of independent equations."""
-        powers = multipliers[:, None] ** np.arange(len(self.coefficients), -1, -1)
+        exponents = np.arange(len(self.coefficients), -1, -1)
+        powers = multipliers[:, None] ** exponents
         is_complex = np.imag(multipliers) != 0
         equations = np.concatenate([powers.real, powers[is_complex].imag])
         missed = equations @ [1.0, *self.coefficients]
@@ -265,7 +267,8 @@ class MultiplierFit(Fit):
         axes = vectors * np.sqrt(np.maximum(values, 0))
         angle = np.linspace(0, 2 * np.pi, _BORDER_POINTS)
         circle = np.stack([np.cos(angle), np.sin(angle)])
-        x, y = np.sqrt(self._radius(level, equations)) * (axes @ circle)
+        radius = np.sqrt(self._radius(level, equations))
+        x, y = radius * (axes @ circle)
         return self.multipliers[index] + x + 1j * y
 
     @checked
@@ -301,7 +304,9 @@ class MultiplierFit(Fit):
         if not np.isfinite(self.covariance).all():
             return None
         # (Of a conjugate pair one is enough.)
-        distinct = true[(np.imag(true) >= 0) | ~np.isin(np.conj(true), true)]
+        is_upper = np.imag(true) >= 0
+        is_alone = ~np.isin(np.conj(true), true)
+        distinct = true[is_upper | is_alone]
         distance, equations = self._distance_of(distinct)
         return _tail(distance, equations, self.covariance_dof)
 

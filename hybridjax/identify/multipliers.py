@@ -170,7 +170,8 @@ def fit_multipliers(
     H = np.asarray(htf.H)
     misfit = divided_by_chi(numerators, c, f, htf.n_sections) - H
     scale = rms[:, None]
-    residual = np.sqrt(np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))) / rms
+    square = np.mean(np.abs(misfit) ** 2, axis=(0, 1, 3))
+    residual = np.sqrt(square) / rms
     exact = htf.variance is None and residual.max() < ROUNDING
 
     def ratios(k: int) -> NoiseRatios:
@@ -201,9 +202,15 @@ def fit_multipliers(
         fewer = max(solution.size - 1 - order * htf.n_sections, 0)
         size = varpro.numerator_size(htf, order, fewer)
         groups = varpro.group_htf(htf, solution.weight, size)
-        start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
+        more = order - len(fit.coefficients)
+        start = np.pad(fit.coefficients, (0, more))
         c, _ = varpro.maximum_likelihood(groups, order, start, rough=True)
-        return c, lambda: varpro.summarize(groups, c, covariance)[0]
+
+        def covariance_there():
+            of_coefficients, *_ = varpro.summarize(groups, c, covariance)
+            return of_coefficients
+
+        return c, covariance_there
 
     # One more multiplier, or a pair.
     higher = [functools.partial(of_order, order + k) for k in (1, 2) if check]
@@ -233,17 +240,21 @@ def _solve(
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)
     c, converged = varpro.maximum_likelihood(groups, order)
-    if htf.variance is not None:
-        return _Solution(groups, weight, size, c, converged)
-    lines = weights.line_variances(htf)
-    for _ in range(_REWEIGHTINGS):
-        variance = varpro.error_spectrum(
-            groups, c, np.asarray(htf.frequencies), lines, len(rms)
-        )
-        weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
-        groups = varpro.group_htf(htf, weight, size)
-        c, converged = varpro.maximum_likelihood(groups, order, c)
-    return _Solution(groups, weight, size, c, converged)
+    if htf.variance is None:
+        f = np.asarray(htf.frequencies)
+        lines = weights.line_variances(htf)
+        for _ in range(_REWEIGHTINGS):
+            variance = varpro.error_spectrum(groups, c, f, lines, len(rms))
+            weight = np.broadcast_to(weights.weights_of(variance, rms), htf.H.shape)
+            groups = varpro.group_htf(htf, weight, size)
+            c, converged = varpro.maximum_likelihood(groups, order, c)
+    return _Solution(
+        groups=groups,
+        weight=weight,
+        size=size,
+        c=c,
+        converged=converged,
+    )
 
 
 # Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
@@ -251,7 +262,8 @@ def _solve(
 _ROUNDING_VARIES = 1e6
 # Probability that noise alone is taken for a multiplier, and the random matrices from which its
 # quantile is taken. Smaller: weak multipliers are missed; larger: orders are too high.
-_FALSE_ALARMS, _DRAWS = 0.01, 20000
+_FALSE_ALARMS = 0.01
+_DRAWS = 20000
 
 
 class OrderSelection(Showable, eqx.Module):
@@ -362,7 +374,8 @@ def _left_over(
     number = np.zeros(outputs)
     for group in groups:
         residual = varpro.misfit_of(group, c).residual
-        np.add.at(square, group.channel[:, 0], (residual**2).sum(axis=(0, 1)))
+        of_channel = (residual**2).sum(axis=(0, 1))
+        np.add.at(square, group.channel[:, 0], of_channel)
         np.add.at(number, group.channel[:, 0], group.dof)
     return np.sqrt(square / number)
 
@@ -376,7 +389,8 @@ def _largest_of_noise(size: int) -> float:
     """
     draws = np.random.default_rng(0).normal(size=(_DRAWS, size, size))
     symmetric = (draws + draws.mT) / 2
-    return float(np.quantile(np.linalg.eigvalsh(symmetric)[:, -1], 1 - _FALSE_ALARMS))
+    largest = np.linalg.eigvalsh(symmetric)[:, -1]
+    return float(np.quantile(largest, 1 - _FALSE_ALARMS))
 
 
 NoiseRatios = tuple[Float[np.ndarray, " d1"], float]

@@ -125,7 +125,12 @@ class PeriodicModel(NamedTuple):
         """
         fixed_A = [np.zeros((len(A), 0)) for A in self.A]
         fixed_C = [np.zeros((len(C), 0)) for C in self.C]
-        coordinates = LocalCoordinates(self, fixed_A, fixed_C, direct)
+        coordinates = LocalCoordinates(
+            model=self,
+            to_A=fixed_A,
+            to_C=fixed_C,
+            direct=direct,
+        )
         step, _ = linearize(coordinates).step(0.0)
         return coordinates.moved(step)
 
@@ -189,7 +194,8 @@ class LocalCoordinates(NamedTuple):
             }
             later_K = K + change["K"]
             later_gain = later_K if later_K.shape[1] else gain
-            later_F = F + (self.to_A[n] - gain @ self.to_C[n]) @ change["Y"]
+            to_F = self.to_A[n] - gain @ self.to_C[n]
+            later_F = F + to_F @ change["Y"]
             later_C = C + self.to_C[n] @ change["Y"]
             later_D = D + change.get("D", 0.0)
             later_A = later_F + later_gain @ later_C
@@ -224,7 +230,12 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         orthogonal = np.linalg.qr(columns, mode="complete")[0][:, d:]
         to_C.append(orthogonal[states:])
         to_A.append(orthogonal[:states] / rho + K @ orthogonal[states:])
-    return LocalCoordinates(normal, to_A, to_C, direct)
+    return LocalCoordinates(
+        model=normal,
+        to_A=to_A,
+        to_C=to_C,
+        direct=direct,
+    )
 
 
 def _gramians(model: PeriodicModel, rho: float) -> Blocks:
@@ -288,8 +299,10 @@ def characteristic_slopes(
     for n, entering in zip(reversed(sections), reversed(before), strict=True):
         place = places[n]
         by_A = after.T @ np.array(by_phi) @ entering.T
-        slopes[:, place["Y"]] = (coordinates.to_A[n].T @ by_A).reshape(d, -1)
+        by_Y = coordinates.to_A[n].T @ by_A
+        slopes[:, place["Y"]] = by_Y.reshape(d, -1)
         if model.K[n].shape[1]:
-            slopes[:, place["K"]] = (by_A @ model.C[n].T).reshape(d, -1)
+            by_K = by_A @ model.C[n].T
+            slopes[:, place["K"]] = by_K.reshape(d, -1)
         after = after @ model.A[n]
     return np.array(c), slopes

@@ -237,9 +237,14 @@ def _fit_one(
     rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
-    powers = np.exp(-2j * np.pi * f[:, None] * (1 + np.arange(zeros + 1)))
+    exponents = 1 + np.arange(zeros + 1)
+    powers = np.exp(-2j * np.pi * f[:, None] * exponents)
     response = FittedResponse(
-        (0, -1), 1.0, (0, 0), h / rms, np.full(len(h), len(h) ** -0.5)
+        harmonic=(0, -1),
+        share=1.0,
+        channel=(0, 0),
+        values=h / rms,
+        weight=np.full(len(h), len(h) ** -0.5),
     )
     (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [response])
     linearize = functools.partial(residuals_of, [group])
@@ -259,7 +264,12 @@ def _fit_one(
     cost, converged, a = next((end for end in good if end[1]), good[0])
     b = numerators_of(group, a)[:, 0] * rms
     result = Result.OK if converged else Result.NOT_CONVERGED
-    return _Fitted(b, np.append(1.0, a), cost, int(result))
+    return _Fitted(
+        numerator=b,
+        denominator=np.append(1.0, a),
+        residual=cost,
+        result=int(result),
+    )
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
@@ -275,6 +285,6 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)
-        a = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])[0]
+        a, *_ = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])
         if step in _STARTS:
             yield a

@@ -132,5 +132,6 @@ def shifted(bases: Matrices, ny: int) -> tuple[Matrices, Matrices]:
     """Return A and C from O[n]: its first rows are C[n], the others O[n+1] A[n]."""
     A = []
     for now, later in zip(bases, [*bases[1:], bases[0]], strict=True):
-        A.append(np.linalg.lstsq(later[:-ny], now[ny:])[0])
+        step, *_ = np.linalg.lstsq(later[:-ny], now[ny:])
+        A.append(step)
     return A, [basis[:ny] for basis in bases]

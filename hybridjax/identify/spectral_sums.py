@@ -35,7 +35,9 @@ SILENT_LINE = 1e-6
 # Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
 # lines. Fewer signals or redraws: random phases count as optimized more often, by chance; fewer
 # lines: chance does as well as any choice of phases.
-_TESTED, _REDRAWS, _FEWEST_LINES = 12, 200, 8
+_TESTED = 12
+_REDRAWS = 200
+_FEWEST_LINES = 8
 
 
 class Setup(NamedTuple):
@@ -172,10 +174,10 @@ def _sums_of_part(
     if first or len(lines) < len(line):  # lines were measured several times
         tested = _compare_crest_factors(data.u[:, data.window])
     return SpectralSums(
-        Setup.of(data),
-        harmonics,
-        lines,
-        mirrored,
+        setup=Setup.of(data),
+        harmonics=harmonics,
+        line=lines,
+        mirrored=mirrored,
         gram=total(products),
         count=total(np.ones(len(U), int)),
         along=total(X.conj()[:, :, None, None] * Y[:, None]),

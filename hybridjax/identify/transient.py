@@ -104,7 +104,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     data.require_ok()
     # Inputs have units of their own.
     u = data.u[data.ok]
-    u = u / np.maximum(np.abs(u).max(axis=(0, 1)), np.finfo(float).tiny)
+    largest = np.abs(u).max(axis=(0, 1))
+    u = u / np.maximum(largest, np.finfo(float).tiny)
     _require_repetition(data, u)
     everything = cycles - P >= 2 * (order or _LARGEST_ORDER)
     if everything:
@@ -115,11 +116,13 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     clean = data.y[:, N:].copy()
     clean[data.ok] -= transients
     removed = np.full((len(clean), clean.shape[2]), np.nan)
-    removed[data.ok] = np.sqrt(np.mean(transients[:, -N * P :] ** 2, axis=1))
+    window = transients[:, -N * P :]
+    removed[data.ok] = np.sqrt(np.mean(window**2, axis=1))
     simulated = None
     if data.simulated is not None:
         # Events, some of which lie in the cycles that were cut off, are left out.
-        failed_at = np.where(data.failed_at >= 0, np.maximum(data.failed_at - N, 0), -1)
+        later = np.maximum(data.failed_at - N, 0)
+        failed_at = np.where(data.failed_at >= 0, later, -1)
         simulated = Simulated(failed_at, data.error)
     data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
@@ -156,7 +159,11 @@ def _decays(
     blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
     numbers = sum(z.size for z in left)
     series = records[:, 0].size
-    tried = range(1, min(_LARGEST_ORDER, least - 1) + 1) if order is None else [order]
+    if order is None:
+        most = min(_LARGEST_ORDER, least - 1)
+        tried = range(1, most + 1)
+    else:
+        tried = range(order, order + 1)
     fits = []
     for d in tried:
         c, cost = _fit(blocks, _start(records, free, d))
@@ -176,7 +183,8 @@ def _decays(
 def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) -> None:
     """**Raises:** `DefinitionError` for an input that does not repeat after P periods."""
     length = data.n_sections * data.periods
-    change = np.abs(u[:, length:] - u[:, :-length]).max(axis=(1, 2))
+    later = u[:, length:]
+    change = np.abs(later - u[:, :-length]).max(axis=(1, 2))
     worst = int(np.argmax(change))
     if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
         raise DefinitionError(
@@ -189,7 +197,8 @@ def _excited_classes(
     data: ExperimentData, u: Float[np.ndarray, "S n nu"]
 ) -> list[Int[np.ndarray, " k"]]:
     """Return the classes of the lines that each experiment excites, and class 0."""
-    size = np.abs(np.fft.rfft(u[:, data.window], axis=1)).max(axis=2)
+    spectrum = np.fft.rfft(u[:, data.window], axis=1)
+    size = np.abs(spectrum).max(axis=2)
     excited = size > SILENT_LINE * size.max(axis=1, keepdims=True)
     lines = map(np.flatnonzero, excited)
     return [np.unique(np.append(line_class(x, data.periods), 0)) for x in lines]
@@ -211,7 +220,9 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
     """Return rows that are orthogonal to the sinusoids of these classes at one section."""
     angle = 2 * np.pi / P * np.outer(np.arange(cycles), classes)
     inner = (classes > 0) & (2 * classes < P)
-    signals = np.concatenate([np.cos(angle), np.sin(angle[:, inner])], axis=1)
+    cosines = np.cos(angle)
+    sines = np.sin(angle[:, inner])
+    signals = np.concatenate([cosines, sines], axis=1)
     return linalg.null_space(signals.T).T
 
 
@@ -224,7 +235,8 @@ def _start(records, free, d: int) -> Coefficients:
         # The same sinusoids, d periods fewer.
         sinusoids = linalg.null_space(Q)[d:]
         keep = linalg.null_space(sinusoids.T).T
-        now, *earlier = (keep @ record[d - i : cycles - i] for i in range(d + 1))
+        delayed = [keep @ record[d - i : cycles - i] for i in range(d + 1)]
+        now, *earlier = delayed
         earlier = np.stack(earlier)
         normal += np.tensordot(earlier, earlier, ((1, 2), (1, 2)))
         right -= np.tensordot(earlier, now, 2)

@@ -140,10 +140,8 @@ class Validation(Showable, eqx.Module):
         tests = f"{'white':>11}  {'independent':>11}"
         rows = [f"{'output':>{width}}  {'fit':>9}  {'rms left':>9}  {tests}"]
         for i, name in enumerate(names):
-            white, independent = (
-                p_value(self.whiteness[i]),
-                p_value(self.independence[i]),
-            )
+            white = p_value(self.whiteness[i])
+            independent = p_value(self.independence[i])
             rows.append(
                 f"{name:>{width}}  {self.fit[i]:7.2f} %  {self.noise[i]:9.2e}  "
                 f"{white:>11}  {independent:>11}"
@@ -346,7 +344,8 @@ def _simulated(model: LDTP | Fit, record: SectionSeries) -> LDTP | SeriesFit | L
 def _as_series_fit(fit: StructuredFit) -> SeriesFit:
     """Return the same model with numerators at sections, whose errors are not known."""
     N = fit.n_sections
-    waves = np.exp(2j * np.pi * np.outer(np.arange(N), fit.harmonics) / N)
+    lags = np.outer(np.arange(N), fit.harmonics)
+    waves = np.exp(2j * np.pi * lags / N)
     numerators = np.einsum("nm,mrij->nrij", waves, fit.numerators).real
     _, R, ny, nu = numerators.shape
     return SeriesFit(
@@ -405,4 +404,5 @@ def _no_better(y: Signals, error: Signals) -> Float[np.ndarray, " ny"]:
     alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
     by_cycle = np.nansum(alone**2 - error**2, axis=2)
     gain = by_cycle[sampled.any(axis=(2, 3))]
-    return stats.norm.sf(gain.mean(axis=0) * np.sqrt(len(gain)), scale=gain.std(axis=0))
+    deviate = gain.mean(axis=0) * np.sqrt(len(gain))
+    return stats.norm.sf(deviate, scale=gain.std(axis=0))

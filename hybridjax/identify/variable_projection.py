@@ -36,7 +36,8 @@ from .weights import check_values, error_weights
 EQUAL_WEIGHTS = 9
 # Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
 # that ends them. More, smaller: a closer start, which the descent does not need.
-_MAX_REWEIGHTINGS, _SETTLED_START = 6, 1e-3
+_MAX_REWEIGHTINGS = 6
+_SETTLED_START = 1e-3
 
 
 class HTFGroup(NamedTuple):
@@ -86,7 +87,8 @@ class HTFGroup(NamedTuple):
         self, c: Coefficients
     ) -> tuple[Float[np.ndarray, "2*E r"], Float[np.ndarray, "r r"]]:
         """Return an orthonormal basis of the numerators' weighted values, and its QR's triangle."""
-        return np.linalg.qr(np.tile(self._weight_by_chi(c), 2)[:, None] * self.basis)
+        weight = np.tile(self._weight_by_chi(c), 2)
+        return np.linalg.qr(weight[:, None] * self.basis)
 
     def _weight_by_chi(self, c: Coefficients) -> Float[np.ndarray, " E"]:
         return self.weight / np.abs(chi(self.period_delay, c))
@@ -122,10 +124,12 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     target = group.weighted(c, below * group.data)
     explained = q @ (q.T @ target)
     # The delays divided by chi (up to its phase, which all rows share).
-    delays = group.period_delay[:, None] ** np.arange(1, d + 1)[:, None, None] / below
+    powers = np.arange(1, d + 1)[:, None, None]
+    delays = group.period_delay[:, None] ** powers / below
 
     def filtered(rows):
-        return without(q, split(delays * (rows[:E] + 1j * rows[E:])))
+        values = rows[:E] + 1j * rows[E:]
+        return without(q, split(delays * values))
 
     by_noise = np.zeros((d, d))
     if noise:
@@ -133,7 +137,8 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
         by_noise = leaks @ leaks.T
     residual = (target - explained).reshape(2, E, -1)
     slopes = filtered(explained).reshape(d, *residual.shape)
-    return Misfit(residual, slopes, by_noise, (q**2).sum(axis=1).reshape(2, E))
+    leverage = (q**2).sum(axis=1).reshape(2, E)
+    return Misfit(residual, slopes, by_noise, leverage)
 
 
 def late_columns(
@@ -150,8 +155,9 @@ def late_columns(
     for j in range(len(c) + 1):
         rows = group.weighted(c, delay**j * group.data)
         columns.append(without(q, rows).ravel())
-    left = 2 - (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
-    return np.stack(columns, axis=1), left / np.abs(chi(group.period_delay, c)) ** 2
+    taken = (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
+    left = (2 - taken) / np.abs(chi(group.period_delay, c)) ** 2
+    return np.stack(columns, axis=1), left
 
 
 def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.ndarray]:
@@ -167,7 +173,8 @@ def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.n
     for group in groups:
         delayed, left = late_columns(group, c)
         columns.append(delayed)
-        by_delay = (left * (group.period_delay ** delays[:, None]).real).sum(axis=1)
+        powers = group.period_delay ** delays[:, None]
+        by_delay = (left * powers.real).sum(axis=1)
         noise_gram += by_delay[apart] * group.size
     noise = np.linalg.cholesky(noise_gram)
     _, triangle = np.linalg.qr(np.concatenate(columns))
@@ -176,9 +183,14 @@ def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.n
 
 def residuals_of(groups: Groups, c: Coefficients) -> Gradient:
     """Return the residuals of all groups, and their Jacobian."""
-    parts = [misfit_of(group, c) for group in groups]
-    jacobian = np.concatenate([p.jacobian.reshape(len(c), -1) for p in parts], axis=1)
-    return np.concatenate([p.residual.ravel() for p in parts]), jacobian.T
+    residuals = []
+    jacobians = []
+    for group in groups:
+        misfit = misfit_of(group, c)
+        residuals.append(misfit.residual.ravel())
+        jacobians.append(misfit.jacobian.reshape(len(c), -1))
+    jacobian = np.concatenate(jacobians, axis=1)
+    return np.concatenate(residuals), jacobian.T
 
 
 def cost_of(groups: Groups, c: Coefficients) -> tuple[float, int]:
@@ -267,8 +279,10 @@ def summarize(
 def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"]:
     """Return the best numerators for c, of data that are not scaled."""
     q, triangle = group.numerator_space(c)
-    target = group.weighted(c, chi(group.period_delay, c)[:, None] * group.data)
-    return group.to_powers @ np.linalg.solve(triangle, q.T @ target) / group.scale
+    below = chi(group.period_delay, c)[:, None]
+    target = group.weighted(c, below * group.data)
+    in_basis = np.linalg.solve(triangle, q.T @ target)
+    return group.to_powers @ in_basis / group.scale
 
 
 def unfold(
@@ -318,7 +332,8 @@ def group_htf(
     """
     f = np.asarray(htf.frequencies)
     N = htf.n_sections
-    powers = np.exp(-2j * np.pi / N * f[:, None] * np.arange(size))
+    delay = -2j * np.pi / N * f[:, None]
+    powers = np.exp(delay * np.arange(size))
     turned = np.concatenate([powers, 1j * powers], axis=1)
     conjugate = np.concatenate([powers, -1j * powers], axis=1)
     matrices = {
@@ -484,7 +499,8 @@ def error_spectrum(
         # squares of the residuals, for errors with the variances `parts[l]`.
         q, _ = group.numerator_space(c)
         rows = np.concatenate([parts, parts], axis=1)
-        along = np.stack([q.T @ (row[:, None] * q) for row in rows]).reshape(2, -1)
+        along = np.stack([q.T @ (row[:, None] * q) for row in rows])
+        along = along.reshape(2, -1)
         left = 1 - 2 * (q**2).sum(axis=1)
         products = rows * left @ rows.T + along @ along.T
         for k, i in enumerate(group.channel[:, 0]):
@@ -499,7 +515,9 @@ def _components(
     delay: Complex[np.ndarray, " E"], c: Coefficients
 ) -> Float[np.ndarray, "2 E"]:
     """Return the spectra of white noise and of noise that passes the system."""
-    return np.stack([np.ones(len(delay)), 1 / np.abs(chi(delay, c)) ** 2])
+    white = np.ones(len(delay))
+    filtered = 1 / np.abs(chi(delay, c)) ** 2
+    return np.stack([white, filtered])
 
 
 def amounts(
@@ -513,4 +531,5 @@ def amounts(
     if both.min() >= 0:
         return both
     only = int(both.argmax())
-    return np.where(np.arange(2) == only, square[only] / expected[only, only], 0.0)
+    alone = square[only] / expected[only, only]
+    return np.where(np.arange(2) == only, alone, 0.0)

@@ -59,11 +59,12 @@ def error_weights(
     for the power of the inputs.
     """
     if htf.variance is None:
-        weight = 1 / (rms[:, None] * np.sqrt(line_variances(htf)))
-        return np.broadcast_to(weight, htf.H.shape)
+        deviation = rms[:, None] * np.sqrt(line_variances(htf))
+        return np.broadcast_to(1 / deviation, htf.H.shape)
     variance = np.asarray(htf.variance)
     if htf.variance_dof is not None and variance.all():
-        variance = _separated(htf.harmonics, variance, np.asarray(htf.variance_dof.dof))
+        dof = np.asarray(htf.variance_dof.dof)
+        variance = _separated(htf.harmonics, variance, dof)
     return weights_of(variance, rms)
 
 
@@ -77,7 +78,8 @@ def _separated(
     size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
     for _ in range(20):  # more sweeps change nothing in 6 digits
         by_line = (variance / size[same]).mean(axis=0)
-        mean = np.average(variance / by_line, axis=1, weights=dof)
+        relative = variance / by_line
+        mean = np.average(relative, axis=1, weights=dof)
         for k in range(len(size)):
             size[k] = mean[same == k].mean(axis=0)
     return size[same] * by_line
@@ -131,7 +133,8 @@ def neighbor_correlation(
     """Return the correlation of errors at neighboring frequencies, in which errors that are
     rounding beside the `values` count as zero."""
     ordered = error[:, np.argsort(f)]
-    neighbors = np.real(ordered[:, 1:] * ordered[:, :-1].conj()).mean()
+    products = ordered[:, 1:] * ordered[:, :-1].conj()
+    neighbors = np.real(products).mean()
     square = (np.abs(error) ** 2).mean()
     rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
     return float(neighbors / np.maximum(square, rounding))

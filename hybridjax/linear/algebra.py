@@ -75,11 +75,14 @@ def connect(
     A, B, C, D = (_side_by_side(x, y) for x, y in pairs)
     d = C.shape[2]
     outside = xp.broadcast_to(L, (len(D), *L.shape))
-    to_inputs = solve(xp.eye(len(K)) - K @ D, xp.concatenate([K @ C, outside], 2))
+    loop = xp.eye(len(K)) - K @ D
+    to_inputs = solve(loop, xp.concatenate([K @ C, outside], 2))
     by_state = to_inputs[..., :d]
     by_input = to_inputs[..., d:]
     # Padding goes behind the states of both, which stay in their order.
-    is_padding = [xp.arange(x.A.shape[1]) >= x.dims[:, None] for x in (a, b)]
+    is_padding = []
+    for x in (a, b):
+        is_padding.append(xp.arange(x.A.shape[1]) >= x.dims[:, None])
     key = xp.concatenate(is_padding, axis=1) * d + xp.arange(d)
     order = xp.argsort(key, axis=1)
     before = order[:, None, :]
@@ -101,16 +104,20 @@ def _side_by_side(
     xp = namespace(x)
     _, a, b = x.shape
     _, c, d = y.shape
-    return xp.pad(x, ((0, 0), (0, c), (0, d))) + xp.pad(y, ((0, 0), (a, 0), (b, 0)))
+    upper_left = xp.pad(x, ((0, 0), (0, c), (0, d)))
+    lower_right = xp.pad(y, ((0, 0), (a, 0), (b, 0)))
+    return upper_left + lower_right
 
 
 def require_well_posed(D: Float[Array, "N ny nu"], F: Float[Array, "N nu ny"]) -> None:
     """**Raises:** `DefinitionError` where a section answers itself without bounds by -F."""
     if is_traced(D, F):
         return
-    answer = np.eye(D.shape[1]) + np.asarray(D) @ np.asarray(F)
+    loop = np.asarray(D) @ np.asarray(F)
+    answer = np.eye(D.shape[1]) + loop
     size = np.linalg.svd(answer, compute_uv=False)
-    singular = size[:, -1] < _WELL_POSED * np.maximum(size[:, 0], 1)
+    least = _WELL_POSED * np.maximum(size[:, 0], 1)
+    singular = size[:, -1] < least
     if singular.any():
         raise DefinitionError(
             f"direct feed-through answers itself at section {np.argmax(singular)} (I + D of plant "
@@ -135,8 +142,9 @@ class Lines(NamedTuple):
         start = np.sort(np.minimum(f % 1, -f % 1))
         is_new = np.insert(np.diff(start) > SAME_FREQUENCY, 0, True)
         wanted = start[is_new][:, None] + np.arange(N)
-        apart = np.abs(_centered(f - wanted[..., None], N))
-        from_mirror = np.abs(_centered(f + wanted[..., None], N))
+        each = wanted[..., None]
+        apart = np.abs(_centered(f - each, N))
+        from_mirror = np.abs(_centered(f + each, N))
         there = apart.min(axis=2) < SAME_FREQUENCY
         mirrored = from_mirror.min(axis=2) < SAME_FREQUENCY
         lost = wanted[~(there | mirrored)]
@@ -152,23 +160,27 @@ class Lines(NamedTuple):
         """Return the harmonic matrices of values (N, F, ny, nu), in the order of all harmonics."""
         xp = namespace(x)
         K, N = self.row.shape
+        _, _, ny, nu = x.shape
         m = np.arange(N)[:, None] - np.arange(N)
         sign = np.where(self.mirrored, -1, 1)[:, None]
-        values = x[(sign * m + N // 2) % N, self.row[:, None]]  # (K, a, b, ny, nu)
+        harmonic = (sign * m + N // 2) % N
+        values = x[harmonic, self.row[:, None]]  # (K, a, b, ny, nu)
         conjugated = self.mirrored[:, None, :, None, None]
         values = xp.where(conjugated, xp.conj(values), values)
-        return values.swapaxes(2, 3).reshape(K, N * x.shape[2], N * x.shape[3])
+        return values.swapaxes(2, 3).reshape(K, N * ny, N * nu)
 
     def entries(self, matrices: Array) -> Complex[Array, "N F ny nu"]:
         """Return the values of all lines, whose harmonic matrices these are."""
         xp = namespace(matrices)
         K, N = self.row.shape
-        values = matrices.reshape(K, N, matrices.shape[1] // N, N, -1).swapaxes(2, 3)
+        ny = matrices.shape[1] // N
+        values = matrices.reshape(K, N, ny, N, -1).swapaxes(2, 3)
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
         mirrored = self.mirrored[k, b]
         m = np.arange(N)[:, None] - N // 2
-        values = values[k, (b + np.where(mirrored, -m, m)) % N, b]
+        a = (b + np.where(mirrored, -m, m)) % N
+        values = values[k, a, b]
         return xp.where(mirrored[:, None, None], xp.conj(values), values)
 
 
@@ -199,7 +211,8 @@ def feedback(P, F):
     xp = namespace(P)
     before = xp.linalg.inv(xp.eye(P.shape[1]) + P @ F)
     R = before @ P
-    return R, [(before, xp.eye(P.shape[2]) - F @ R), (R, R)]
+    after = xp.eye(P.shape[2]) - F @ R
+    return R, [(before, after), (R, R)]
 
 
 def variance_of(pairs: list[tuple], variances: list[Array]) -> Array:

@@ -99,7 +99,8 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     dX = _states(A, columns, f).reshape(N, F, d, P, nu)
     dX = np.moveaxis(dX, -2, 0)
     dG = (dC @ X + C[:, None] @ dX) / z + dD
-    return (np.fft.fft(dG, axis=1) / N).reshape(*lead, N, F, len(C[0]), nu)
+    dG = np.fft.fft(dG, axis=1) / N
+    return dG.reshape(*lead, N, F, len(C[0]), nu)
 
 
 def _unit_roots(A: Array, f: Array) -> Array:
@@ -142,5 +143,6 @@ def harmonic_transfer(
     **Returns:** `H` with harmonic `m` at index `m mod N` (the order of the FFT).
     """
     z = _unit_roots(A, f)
-    G = C[:, None] @ _states(A, z * B[:, None], f) / z + D[:, None]
+    x = _states(A, z * B[:, None], f)
+    G = C[:, None] @ x / z + D[:, None]
     return namespace(A).fft.fft(G, axis=0) / len(A)

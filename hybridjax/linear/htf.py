@@ -386,7 +386,8 @@ class HTF(Showable, eqx.Module):
         H = to_host(self.H)
         xp = namespace(H)
         mirror = np.array([self._index(-m) for m in self.harmonics])
-        H = xp.concatenate([H, H[mirror].conj()], axis=1)[:, distance.argmin(axis=1)]
+        both = xp.concatenate([H, H[mirror].conj()], axis=1)
+        H = both[:, distance.argmin(axis=1)]
         parts = xp.einsum("mkij,kj->mki", H, U[lines])
         Y = xp.zeros((n, len(self.outputs)), complex)
         for m, part in zip(self.harmonics, parts, strict=True):
@@ -407,7 +408,8 @@ class HTF(Showable, eqx.Module):
         require_same("HTFs to be compared", self, other, fields)
         _require_same_lines(self, other)
         H, reference, zero = to_host((self.H, other.H, other[0]))
-        return from_host(abs(H - reference).max((1, 3)) / abs(zero).max((0, 2)))
+        difference = abs(H - reference).max((1, 3))
+        return from_host(difference / abs(zero).max((0, 2)))
 
     def error(self, other: "HTF") -> Float[Array, " ny"]:
         """The largest of `harmonic_errors`, per output."""

@@ -105,7 +105,12 @@ class LDTP(WithMultipliers, eqx.Module):
         nu = B.shape[2]
         through = jnp.zeros((n_sections, ny, nu)) if D is None else from_host(D)
         matrices = {"A": A, "B": B, "C": C, "D": through}
-        shapes = {"A": (d, d), "B": (d, nu), "C": (ny, d), "D": (ny, nu)}
+        shapes = {
+            "A": (d, d),
+            "B": (d, nu),
+            "C": (ny, d),
+            "D": (ny, nu),
+        }
         for name, array in matrices.items():
             shape = (n_sections, *shapes[name])
             if array.shape != shape or 0 in shape:
@@ -282,7 +287,8 @@ class LDTP(WithMultipliers, eqx.Module):
         by name and unit, or the numbers of sections differ.
         """
         require_chain("@", other.outputs, self.inputs, self, other)
-        (ny, nu), (inner, nr) = (np.shape(x.D)[1:] for x in (self, other))
+        ny, nu = np.shape(self.D)[1:]
+        inner, nr = np.shape(other.D)[1:]
         K = np.zeros((nu + nr, ny + inner))
         L = np.zeros((nu + nr, nr))
         M = np.eye(ny, ny + inner)
@@ -360,7 +366,15 @@ class LDTP(WithMultipliers, eqx.Module):
         A, B, C, D, dims = algebra.connect(self.matrices, other, K, L, M)
         # Without common padding.
         d = A.shape[1] if is_traced(dims) else int(np.asarray(dims).max())
-        return LDTP(A[:, :d, :d], B[:, :d], C[:, :, :d], D, dims, inputs, outputs)
+        return LDTP(
+            A=A[:, :d, :d],
+            B=B[:, :d],
+            C=C[:, :, :d],
+            D=D,
+            dims=dims,
+            inputs=inputs,
+            outputs=outputs,
+        )
 
     def monodromy(self, section: int = 0) -> Float[Array, "d d"]:
         """The padded product `A[i+N-1] ... A[i]` over one period from section `i`."""
@@ -486,7 +500,8 @@ class LDTP(WithMultipliers, eqx.Module):
             return
         multipliers = self.multipliers
         f = np.asarray(f)
-        distance = np.abs(np.exp(2j * np.pi * f)[:, None] - multipliers)
+        on_circle = np.exp(2j * np.pi * f)
+        distance = np.abs(on_circle[:, None] - multipliers)
         if distance.size and distance.min() < _RESONANCE:
             line, index = np.unravel_index(np.argmin(distance), distance.shape)
             why = "Leave this frequency out."

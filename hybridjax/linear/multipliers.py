@@ -35,7 +35,8 @@ def product_rank(factors: Sequence[Matrix], rtol: float) -> int:
 
     **Raises:** `ComputationError` for NaN and infinity.
     """
-    basis, _ = _carry_range(_balanced(factors), np.eye(factors[0].shape[1]), rtol)
+    unit = np.eye(factors[0].shape[1])
+    basis, _ = _carry_range(_balanced(factors), unit, rtol)
     return basis.shape[1]
 
 
@@ -129,7 +130,8 @@ def _diagonal_blocks(factors):
             basis, triangle = np.linalg.qr(factor @ basis)
             triangles.append(triangle)
         turn = start.T @ basis  # the basis after one turn in that before
-        below = np.array([np.linalg.norm(turn[k:, :k]) for k in range(1, d)])
+        blocks = [turn[k:, :k] for k in range(1, d)]
+        below = np.array([np.linalg.norm(block) for block in blocks])
         settled = below < _SETTLED
         alike = (below < _STALLED * before) & (before < _STALLED * below)
         stalls = stalls + 1 if (settled | alike).all() else 0

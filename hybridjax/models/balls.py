@@ -89,7 +89,7 @@ class PaddleJuggler(HybridSystem):
     def transitions(self):
         def bounce(t, q, u):
             a = self.restitution
-            (_, speed) = self.paddle(t)
+            _, speed = self.paddle(t)
             return q[0], -a * q[1] + (1 + a) * (speed + u[0])
 
         def above(t, q, u):
@@ -130,7 +130,8 @@ class ChainContact(eqx.Module):
         e = self.chain.restitution
         n = self.chain.n
         _, speed = self.table(t)
-        return q.at[n + self.i].set((1 + e) * speed - e * q[n + self.i])
+        speed_after = (1 + e) * speed - e * q[n + self.i]
+        return q.at[n + self.i].set(speed_after)
 
 
 class BouncingChain(HybridSystem):
@@ -189,6 +190,7 @@ class BouncingChain(HybridSystem):
         first, lift, v, _ = PaddleJuggler(
             self.A, self.T, self.g, self.restitution
         ).exact()
-        past = -(first + jnp.arange(self.n) * self.T / self.n) % self.T
+        delays = jnp.arange(self.n) * self.T / self.n
+        past = -(first + delays) % self.T
         y = lift + v * past - self.g * past**2 / 2
         return Guess("flight", jnp.concatenate([y, v - self.g * past]))

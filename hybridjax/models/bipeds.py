@@ -43,7 +43,9 @@ def chain(
 
     def kinetic(q, v):
         speeds = jax.jvp(places, (q,), (v,))[1]
-        return 0.5 * jnp.sum(masses * speeds**2) + 0.5 * jnp.sum(inertias * v[:n] ** 2)
+        of_motion = 0.5 * jnp.sum(masses * speeds**2)
+        of_rotation = 0.5 * jnp.sum(inertias * v[:n] ** 2)
+        return of_motion + of_rotation
 
     return Mechanism(kinetic, lambda q: g * jnp.sum(masses * places(q)[1]), links)
 
@@ -115,9 +117,32 @@ class TorsoWalker(HybridSystem):
     def mechanism(self) -> Mechanism:
         """The walker by three angles, and for the floating base also by the position (x, y) of the
         stance foot."""
-        legs = self.r / 2 * np.array([[1, 0, 0], [2, -1, 0], [2, 0, 0], [2, 0, 0]])
-        arms = legs + self.l * np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])
-        ends = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, 0, 1]])
+        # Each mass is so many half legs and torsos away from the stance foot.
+        half_legs = np.array(
+            [
+                [1, 0, 0],
+                [2, -1, 0],
+                [2, 0, 0],
+                [2, 0, 0],
+            ]
+        )
+        torsos = np.array(
+            [
+                [0, 0, 0],
+                [0, 0, 0],
+                [0, 0, 0],
+                [0, 0, 1],
+            ]
+        )
+        arms = self.r / 2 * half_legs + self.l * torsos
+        ends = np.array(
+            [
+                [0, 0, 0],
+                [1, 0, 0],
+                [1, -1, 0],
+                [1, 0, 1],
+            ]
+        )
         ends = ends * jnp.stack([self.r, self.r, self.l])
         drawn = {
             "stance": ends[:2],
@@ -154,13 +179,16 @@ class TorsoWalker(HybridSystem):
         )
 
     def _touchdown(self, t, state, u):
-        q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:3], state[3:]))
+        origin = jnp.zeros(2)
+        q = jnp.concatenate([state[:3], origin])
+        v = jnp.concatenate([state[3:], origin])
         after = self.mechanism().impact(q, v, self._swing_foot).velocity
         swapped = np.array([1, 0, 2])
         return jnp.concatenate([q[swapped], after[swapped]])
 
     def _swing_foot(self, q):
-        return q[3:] + tips(self.r * np.array([[1.0, -1.0, 0.0]]), q[:3])[:, 0]
+        legs = self.r * np.array([[1.0, -1.0, 0.0]])
+        return q[3:] + tips(legs, q[:3])[:, 0]
 
     def draw(self, chart, t, q):
         return self.mechanism().draw(jnp.stack(list(q.values())[:3]), _GROUND, "stance")
@@ -262,17 +290,21 @@ class FiveLinkBiped(HybridSystem):
                 [1, 1, 0, -1, 0],
             ]
         )
-        arms = self.length * links + center[:, None] * np.diag([-1, -1, 1, -1, -1])
+        below = np.diag([-1, -1, 1, -1, -1])
+        arms = self.length * links + center[:, None] * below
         ends = self.length * np.vstack(
             [0 * links[0], links[:2], links[4], [1, 1, 0, -1, -1]]
         )
-        torso = jnp.stack([ends[2], ends[2] + 2 * self.torso_center * np.eye(5)[2]])
+        along_torso = np.eye(5)[2]
+        top = ends[2] + 2 * self.torso_center * along_torso
+        torso = jnp.stack([ends[2], top])
         drawn = {"stance": ends[:3], "swing": ends[2:], "torso": torso}
         return chain(arms, m, about_joint - m * center**2, self.g, drawn)
 
     def _swing_foot(self, q):
         """Position (x, y) of the swing foot relative to the stance foot."""
-        return tips(self.length * np.array([[1.0, 1.0, 0.0, -1.0, -1.0]]), q[:5])[:, 0]
+        legs = self.length * np.array([[1.0, 1.0, 0.0, -1.0, -1.0]])
+        return tips(legs, q[:5])[:, 0]
 
     def outputs(self):
         """`leg`: the angle of the line from stance foot to hip, which grows all the time."""
@@ -348,7 +380,9 @@ class FiveLinkBiped(HybridSystem):
         return (landing,)
 
     def _touchdown(self, t, state, u):
-        q, v = (jnp.concatenate([x, jnp.zeros(2)]) for x in (state[:5], state[5:]))
+        origin = jnp.zeros(2)
+        q = jnp.concatenate([state[:5], origin])
+        v = jnp.concatenate([state[5:], origin])
 
         def foot(q):
             return q[5:] + self._swing_foot(q[:5])
@@ -366,5 +400,7 @@ class FiveLinkBiped(HybridSystem):
         rate = 1.5
         bend = 2 * self.lift / self.stride
         angles = -s + k, -s - k, self.lean, s - k, s + k
-        rates = rate, rate, 0.0, -rate * (1 + bend / 2), -rate * (1 - bend / 2)
+        swing = rate * (1 + bend / 2)
+        knee = rate * (1 - bend / 2)
+        rates = rate, rate, 0.0, -swing, -knee
         return Guess("step", (*angles, *rates), after="touchdown")

@@ -53,7 +53,8 @@ class VerticalHopper(HybridSystem):
 
     def leg(self, t: Array, yM: Array, ym: Array | float) -> Array:
         """Force of the leg on the body."""
-        return self.k * (self.l0 - (yM - ym)) + self.a * jnp.sin(self.omega * t)
+        spring = self.k * (self.l0 - (yM - ym))
+        return spring + self.a * jnp.sin(self.omega * t)
 
     def charts(self):
         def pushed(t, q, u):
@@ -200,8 +201,8 @@ class HopperPair(VerticalHopper):
             bodies = []
             feet = []
             for i, between in enumerate((pull, -pull)):
-                (y, v) = whole[2 * i : 2 * i + 2]
-                (ym, vm) = whole[2 * i + 4 : 2 * i + 6]
+                y, v = whole[2 * i : 2 * i + 2]
+                ym, vm = whole[2 * i + 4 : 2 * i + 6]
                 leg = self.leg(t - i * self.lag, y, ym)
                 bodies += [v, (leg + between + u[i]) / self.M - self.g]
                 feet += [vm, -(leg + self.b * vm) / self.m - self.g]

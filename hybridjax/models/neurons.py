@@ -23,7 +23,8 @@ class DrivenNeuron(HybridSystem):
     T: AbstractVar[Parameter]
 
     def total_current(self, t, u):
-        return self.current + self.amplitude * jnp.cos(2 * jnp.pi * t / self.T) + u[0]
+        drive = self.amplitude * jnp.cos(2 * jnp.pi * t / self.T)
+        return self.current + drive + u[0]
 
     @abc.abstractmethod
     def after_spike(self, t, q, u):

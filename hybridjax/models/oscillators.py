@@ -117,7 +117,7 @@ class RotorFlap(HybridSystem):
         return {"blade": FieldChart(self._blade, ("b", "vb"), ("rad", ""))}
 
     def _blade(self, t, q, u):
-        (b, vb) = q
+        b, vb = q
         lock = self.lock / 8
         mu = self.mu
         damping = lock * (1 + 4 / 3 * mu * jnp.sin(t))
@@ -217,7 +217,8 @@ class BeltOscillator(HybridSystem):
     def _slips(self, side: float) -> FieldChart:
         def field(t, q, u):
             friction = self.friction / (1 + self.decay * side * (q[1] - self.belt))
-            return q[1], (u[0] - self.k * q[0] - side * friction) / self.m
+            spring = self.k * q[0]
+            return q[1], (u[0] - spring - side * friction) / self.m
 
         return FieldChart(field, ("x", "v"), ("m", "m/s"))
 

@@ -72,11 +72,13 @@ class TwoLeggedBar(HybridSystem):
         """Rate of `length`."""
         _, v, _, p = state
         rate = 2 * jnp.pi / self.T
-        return v + self.hip(leg) * p - self.A * rate * jnp.cos(rate * t)
+        offset = self.hip(leg) * p
+        return v + offset - self.A * rate * jnp.cos(rate * t)
 
     def force(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Force of a standing leg on the bar."""
-        return -self.k * self.length(leg, t, state) - self.b * self.speed(leg, t, state)
+        spring = self.k * self.length(leg, t, state)
+        return -spring - self.b * self.speed(leg, t, state)
 
     def charts(self):
         return {name: self._support(legs) for legs, name in _CHARTS.items()}
@@ -131,7 +133,10 @@ class TwoLeggedBar(HybridSystem):
     def draw(self, chart, t, q):
         """The table, the bar, and legs that have their rest length in the air."""
         table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
-        hips = [(self.hip(leg), q["y"] + self.hip(leg) * q["q"]) for leg in _LEGS]
+        hips = []
+        for leg in _LEGS:
+            hip = self.hip(leg)
+            hips.append((hip, q["y"] + hip * q["q"]))
         lines: dict = {"ground": [(-1.0, table), (1.0, table)], "bar": hips}
         for leg, (x, y) in zip(_LEGS, hips, strict=True):
             lines[leg] = Drawing.spring(
@@ -205,8 +210,12 @@ class SLIPRunner(HybridSystem):
     ) -> Array:
         """Energy of the mass, and in stance of the spring."""
         *x, y, vx, vy = q
-        spring = 0.5 * self.k * (self.l0 - jnp.hypot(x[0], y)) ** 2 if x else 0.0
-        return self.m * (self.g * y + (vx**2 + vy**2) / 2) + spring
+        spring = 0.0
+        if x:
+            compression = self.l0 - jnp.hypot(x[0], y)
+            spring = 0.5 * self.k * compression**2
+        kinetic = (vx**2 + vy**2) / 2
+        return self.m * (self.g * y + kinetic) + spring
 
     def outputs(self):
         return (Output("energy", self.energy, "J"),)

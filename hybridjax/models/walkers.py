@@ -215,7 +215,8 @@ class CompassGait(HybridSystem):
         c = jnp.cos(s - n)
         d = coupling * jnp.sin(s - n)
         gravity = self.g * (mH * length + m * a + m * length)
-        torque_n = -d * vs**2 - m * self.g * b * jnp.sin(n) + u[0]
+        weight = m * self.g * b * jnp.sin(n)
+        torque_n = -d * vs**2 - weight + u[0]
         torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
         # The inverse of [[A, B], [B, D]].
         A = m * b**2
@@ -256,11 +257,14 @@ class CompassGait(HybridSystem):
         )
         leg = -m * a * b * vs
         A = m * b * (b - length * c)
-        B = m * length * (length - b * c) + m * a**2 + mH * length**2
+        swinging = m * length * (length - b * c)
+        B = swinging + m * a**2 + mH * length**2
         C = m * b**2
         D = -m * b * length * c
         det = A * D - B * C
-        return s, n, (D * whole - B * leg) / det, (A * leg - C * whole) / det
+        stance = (D * whole - B * leg) / det
+        swing = (A * leg - C * whole) / det
+        return s, n, stance, swing
 
     def draw(self, chart, t, q):
         return _two_legs(self.slope, self.l, q["s"], q["n"])

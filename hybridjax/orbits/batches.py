@@ -61,7 +61,9 @@ def _settle(map: ReturnMap, periods: int):
     """The ends of a simulation of some periods, at the guess's phase or section (NaN for systems
     that do not get there), and expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * periods, map.settings.scale)
-    s, anchor, expected = map.structure, map.anchor, map.expected
+    s = map.structure
+    anchor = map.anchor
+    expected = map.expected
     u = np.zeros((s.nu, len(expected)))
     moved = move(s, anchor, u, until(anchor.t + periods * expected), patient).moved
     if map.base is not None:
@@ -123,7 +125,8 @@ class Tiles(NamedTuple):
         then from that cycle."""
         numbers = numbers_of(self.systems)
         order = np.random.default_rng(0).permutation(S)
-        known, rest = self.known, order
+        known = self.known
+        rest = order
         parts: list[Rounds] = []
         with working("cycles", S) as call, uncollected():
             call.done = 0
@@ -132,7 +135,12 @@ class Tiles(NamedTuple):
                 out = self._newton(first, *self._given(first), FEW_STEPS)
                 if not (out.result == Result.OK).any():
                     out = self._again(first, out, self._given, _SETTLE)
-                known = Known(numbers[first], out.anchor, out.period, out.result)
+                known = Known(
+                    numbers=numbers[first],
+                    anchor=out.anchor,
+                    period=out.period,
+                    result=out.result,
+                )
                 parts.append(out)
             for k in range(0, len(rest), self.size):
                 call.done = S - len(rest) + k
@@ -140,10 +148,18 @@ class Tiles(NamedTuple):
                 begin = self._nearest(numbers[rows], known)
                 parts.append(self._newton(rows, *begin, FEW_STEPS))
         out = _join(*parts)
-        found = Known(numbers[order], out.anchor, out.period, out.result)
+        found = Known(
+            numbers=numbers[order],
+            anchor=out.anchor,
+            period=out.period,
+            result=out.result,
+        )
         known = found if self.known is None else _join(found, known)
         if (known.result == Result.OK).any():
-            nearest = lambda rows: self._nearest(numbers[rows], known)  # noqa: E731
+
+            def nearest(rows):
+                return self._nearest(numbers[rows], known)
+
             out = self._again(order, out, nearest, _SETTLE)
         return _pick(out, np.argsort(order))
 
@@ -169,7 +185,8 @@ class Tiles(NamedTuple):
                 )
             arrived = np.isfinite(begin[0].q).all(axis=(1, 2))
             if arrived.any():
-                failed, (anchor, period) = failed[arrived], _pick(begin, arrived)
+                failed = failed[arrived]
+                anchor, period = _pick(begin, arrived)
                 part = self._newton(rows[failed], anchor, period, FEW_STEPS)
                 part = part._replace(steps=part.steps + out.steps[failed])
                 out = _replace(out, failed, part)
@@ -219,10 +236,20 @@ class Tiles(NamedTuple):
         # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
         other = (turn.result == Result.OK) & (turn.end.chart != anchor.chart)[:, 0]
         anchor = anchor._replace(q=q[..., None])
-        anchor.q[other], anchor.chart[other] = turn.end.q[other], turn.end.chart[other]
+        anchor.q[other] = turn.end.q[other]
+        anchor.chart[other] = turn.end.chart[other]
         size[extra | other] = np.inf
         once = np.ones(len(rows), int)
-        return Rounds(anchor, size, period, turn, codes, together, -once, once)
+        return Rounds(
+            anchor=anchor,
+            excess=size,
+            period=period,
+            turn=turn,
+            codes=codes,
+            together=together,
+            result=-once,
+            steps=once,
+        )
 
     def _turn(self, rows, anchor: Lanes, period):
         """Anchors, expected periods, turns, codes of events, and whether two coincide."""
@@ -284,9 +311,18 @@ def tiles_of(
     )
     periods = None
     if map.base is None:
-        of_one = lambda system: map.multiplicity * jnp.asarray(system.period(), float)  # noqa: E731
+
+        def of_one(system):
+            return map.multiplicity * jnp.asarray(system.period(), float)
+
         periods = np.asarray(eqx.filter_vmap(of_one)(systems))
-    return Tiles(systems, to_host(map), periods, size or 4 * WIDE, workers)
+    return Tiles(
+        systems=systems,
+        map=to_host(map),
+        periods=periods,
+        size=size or 4 * WIDE,
+        workers=workers,
+    )
 
 
 def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
@@ -302,7 +338,8 @@ def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
 def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
     """The numbers of systems, one row for each."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
-    return np.concatenate([np.asarray(x).reshape(len(x), -1) for x in arrays], axis=1)
+    rows = [np.asarray(x).reshape(len(x), -1) for x in arrays]
+    return np.concatenate(rows, axis=1)
 
 
 def nearest(
@@ -316,7 +353,8 @@ def nearest(
     apart = (finite - finite.mean(axis=0)).filled(0.0)
     spread = np.sqrt(np.mean(apart**2, axis=0))
     points = apart / np.where(spread > 0, spread, 1.0)
-    distance, place = KDTree(points[: len(known)]).query(points[len(known) :])
+    tree = KDTree(points[: len(known)])
+    distance, place = tree.query(points[len(known) :])
     return distance, np.asarray(place)
 
 
@@ -334,7 +372,10 @@ def _of_one_width(parts):
     width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
     if all(x.ndim != 2 or x.shape[1] == width for x in parts):
         return parts
-    fill = lambda x: ((0, 0), (0, width - x.shape[1]))  # noqa: E731
+
+    def fill(x):
+        return (0, 0), (0, width - x.shape[1])
+
     return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
 
 
@@ -353,6 +394,9 @@ def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     """Codes of events moved to the front of each row, without the columns that are empty."""
     row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
     count = np.bincount(row, minlength=len(codes))
-    out = np.full((len(codes), max(count.max(initial=0), 1)), -1, codes.dtype)
-    out[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = codes[row, column]
+    width = max(count.max(initial=0), 1)
+    out = np.full((len(codes), width), -1, codes.dtype)
+    begins = np.cumsum(count) - count
+    place = np.arange(len(row)) - begins[row]
+    out[row, place] = codes[row, column]
     return out

@@ -72,7 +72,8 @@ def _shrunk(cycle: LimitCycle) -> End | None:
     scale = np.asarray(cycle.settings.scale)
     a = int(path.chart[0])
     n = cycle.structure.dims[a]
-    ranges = np.ptp(path.after[:, :n], axis=0) / scale[a, :n]
+    states = path.after[:, :n]
+    ranges = np.ptp(states, axis=0) / scale[a, :n]
     if ranges.max() > _SMALL:
         return None
     text = "the cycle shrinks to an equilibrium, as it does at a Hopf point"
@@ -92,7 +93,8 @@ def _touched_section(cycle: LimitCycle) -> End | None:
     q = map.anchor.q[:n]
     u = np.zeros((s.nu, 1))
     first = np.zeros(1, np.int32)
-    row = kernels.watched(s, a, target.levels, t, q, u, first)[-1, :, 0]
+    expanded = kernels.watched(s, a, target.levels, t, q, u, first)
+    row = expanded[-1, :, 0]
     field = kernels.field(s, a, t, q, u)[:, 0, 0]
     if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
         return None
@@ -129,7 +131,8 @@ def _touched_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 def _is_slow(row, field, sizes, period: float) -> bool:
     """True if a function changes slowly along the flow, given its derivatives in a row."""
     slope = row[2 : 2 + len(field)]
-    possible = abs(row[1]) + np.abs(slope) @ np.maximum(np.abs(field), sizes / period)
+    fastest = np.maximum(np.abs(field), sizes / period)
+    possible = abs(row[1]) + np.abs(slope) @ fastest
     return bool(abs(row[1] + slope @ field) < _SLOW * possible)
 
 
@@ -161,7 +164,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             continue
         u = np.zeros((s.nu, 1))
         first = np.zeros(1, np.int32)
-        rows = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)[:, 0]
+        expanded = kernels.watched(s, visit.chart, None, visit.t, visit.q, u, first)
+        rows = expanded[:, 0]
         for g, level in zip(guards, rows, strict=True):
             near = _CLOSE * np.ptp(level)
             if len(level) < 3 or near == 0:

@@ -112,7 +112,11 @@ class Branch(Showable, eqx.Module):
         """Floquet multipliers of every cycle, by decreasing modulus, padded with zeros."""
         rows = [self[k].multipliers for k in range(len(self))]
         width = max(map(len, rows))
-        return np.array([np.pad(x.astype(complex), (0, width - len(x))) for x in rows])
+        padded = []
+        for row in rows:
+            missing = width - len(row)
+            padded.append(np.pad(row.astype(complex), (0, missing)))
+        return np.array(padded)
 
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
@@ -225,7 +229,12 @@ def continuation(
             f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
             f"{curve.value:.6g}: {first.message}. Find it anew."
         )
-    trace = _Trace(curve, np.sort(values), step, max_points)
+    trace = _Trace(
+        curve=curve,
+        values=np.sort(values),
+        step=step,
+        max_points=max_points,
+    )
     sense = np.sign(values[-1] - values[0])
     back, begin = trace.run(first.oriented(-sense))
     ahead, end = trace.run(first.oriented(sense))
@@ -279,7 +288,12 @@ def _branch(
     begin = _explained(cycles[0], begin)
     end = _explained(cycles[len(points) - 1], end)
     marked = tuple(
-        BranchPoint(point.kind, k, point.value, cycles[k].multipliers)
+        BranchPoint(
+            kind=point.kind,
+            index=k,
+            value=point.value,
+            multipliers=cycles[k].multipliers,
+        )
         for k, point in enumerate(points)
         if point.kind
     )
@@ -338,7 +352,8 @@ class _Trace(NamedTuple):
         length = self.step
         before: Point | None = None
         moved: Point | None = None
-        last_value = self.values[-1] if start.tangent[-1] > 0 else self.values[0]
+        rises = start.tangent[-1] > 0
+        last_value = self.values[-1 if rises else 0]
         over = bool(start.value == last_value)
         while not over and len(points) < self.max_points:
             last = points[-1]

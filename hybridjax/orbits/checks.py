@@ -172,7 +172,8 @@ def _compare(
     change = np.abs(np.stack(later) - now).max(axis=0)
     by_point = np.abs(now[:, 1 : 1 + len(size)])
     rounding = ROUNDING * np.sum(by_point * size[:, None], axis=1)
-    values_differ = change[:, 0] > SAME * np.abs(now[:, 0]) + rounding
+    tolerance = SAME * np.abs(now[:, 0]) + rounding
+    values_differ = change[:, 0] > tolerance
     by_inputs = np.abs(now[:, 1 + len(size) :])
     largest = by_inputs.max(initial=0.0)
     gains_differ = change[:, 1 + len(size) :] > SAME * largest
@@ -307,7 +308,8 @@ def check_jumps(cycle: LimitCycle) -> None:
     for a in charts:
         if not unresolved.may_jump(s, a):
             continue
-        inside = (chart[1:] == a) & (chart[:-1] == a) & (np.diff(t) > 0)
+        in_chart = (chart[1:] == a) & (chart[:-1] == a)
+        inside = in_chart & (np.diff(t) > 0)
         before = np.flatnonzero(inside)
         if not len(before):
             continue
@@ -354,6 +356,29 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
     """The reason why a search failed that expected this period and has settled, with advice."""
     code = Result(int(cycle.result))
+    about_orbit = _about_orbit(cycle, code, turn)
+    if about_orbit:
+        return about_orbit
+    name = type(cycle.system).__name__
+    reason = code.message
+    if code == Result.STEP_LIMIT:
+        reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
+        reason = f"{reason} from {cycle.settings.max_steps} {reached}"
+    if code == Result.NOT_CONVERGED:
+        reason = _why_not_converged(cycle, turn)
+    better = (
+        " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
+        f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
+    )
+    s = cycle.structure
+    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
+    if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
+        advice += _about_decisions(s)
+    return f"no limit cycle of {name} was found: {reason}.{advice or better}"
+
+
+def _about_orbit(cycle: LimitCycle, code: Result, turn: Turn) -> str:
+    """The reason why the orbit that a search ended on is no cycle to work with; empty for none."""
     map = cycle.return_map
     if code == Result.EVENT_ORDER and map.event >= 0:
         follows = int(map.followed(turn.end))
@@ -376,21 +401,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
             f"{cycle.multiplicity} periods of `multiplicity`: leave that out, or give a guess "
             "nearer to the longer cycle, with `settle` if it is stable."
         )
-    reason = code.message
-    if code == Result.STEP_LIMIT:
-        reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
-        reason = f"{reason} from {cycle.settings.max_steps} {reached}"
-    if code == Result.NOT_CONVERGED:
-        reason = _why_not_converged(cycle, turn)
-    better = (
-        " Try a better guess, or if the cycle is stable let it settle for longer, e.g. "
-        f"`settle={settle + 60 * expected:.3g}` (with a `Guess`, not a cycle)."
-    )
-    s = cycle.structure
-    advice = _about_steps(s, cycle, turn, expected) + _about_guards(s, turn, better)
-    if code in (Result.STEP_LIMIT, Result.STEP_COLLAPSE):
-        advice += _about_decisions(s)
-    return f"no limit cycle of {name} was found: {reason}.{advice or better}"
+    return ""
 
 
 def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
@@ -458,7 +469,8 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
             throw=False,
         )
         if path.result != Result.OK:
-            return f" It stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}'."
+            where = s.names[path.chart[-1]]
+            return f" It stopped at t = {path.t[-1]:.6g} in chart '{where}'."
     rate = rate_of_short_steps(s, turn, expected)
     if rate == 0.0:
         return ""

@@ -147,7 +147,12 @@ def _coincidence(
     t = float(path.t[k])
     a = int(path.chart[k - 1])
     n = s.dims[a]
-    before = _Order((), a, path.before[k, :n], np.eye(n))
+    before = _Order(
+        events=(),
+        chart=a,
+        state=path.before[k, :n],
+        derivative=np.eye(n),
+    )
     due = 10 * TOGETHER * period
     orders = list(_orders(s, t, before, due))
     names = tuple(
@@ -155,7 +160,12 @@ def _coincidence(
     )
     derivatives = tuple(order.derivative for order in orders)
     commute = _commute(scale, a, orders)
-    return SimultaneousEvents(t, names, derivatives, commute)
+    return SimultaneousEvents(
+        time=t,
+        orders=names,
+        derivatives=derivatives,
+        commute=commute,
+    )
 
 
 def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
@@ -183,12 +193,14 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     by_t = guard[1]
     by_q = guard[2 : 2 + m]
     by_u = guard[2 + m :]
-    rate = by_t + by_q @ kernels.field(s, chart, time, after, u)[:, 0, 0]
+    field = kernels.field(s, chart, time, after, u)[:, 0, 0]
+    rate = by_t + by_q @ field
     if value < -TOGETHER * period * abs(rate):
         return True
     # The guard after the reset, by the time, the state before it and the inputs: zero up to
     # rounding, if it is zero in each neighbor.
-    by_reset = kernels.reset(s, s.member(g), time, before, u)[:, 1:, 0]
+    expanded = kernels.reset(s, s.member(g), time, before, u)
+    by_reset = expanded[:, 1:, 0]
     direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
     size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
@@ -214,7 +226,8 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
     if all(s.clocks[g] >= 0 for g in group):
         return set()
     happened = {int(s.clocks[g]) for g in group}
-    codes, times = np.array(group), np.full(len(group), t)
+    codes = np.array(group)
+    times = np.full(len(group), t)
     return {
         g
         for g in np.flatnonzero(s.clocks >= 0).tolist()
@@ -229,14 +242,17 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
     a = int(path.chart[k - 1])
     n = s.dims[a]
     times = path.t[[k - 1, k]]
-    states = np.stack([path.after[k - 1, :n], path.before[k, :n]])
+    begin = path.after[k - 1, :n]
+    end = path.before[k, :n]
+    states = np.stack([begin, end])
     u = np.zeros((s.nu, 1))
     found = set()
     for g in s.guards(a):
         event = jump(s, g, times, states, u)
         was_positive = event.level[0] > TOGETHER * period * abs(event.rate[0])
         falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
-        holds = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u).all()
+        predicate = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u)
+        holds = predicate.all()
         if g not in events and was_positive and falls and holds:
             found.add(g)
     return found
@@ -255,7 +271,10 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     if len(orders) < 2 or len(ends) > 1:
         return False
     m, n = orders[0].derivative.shape
-    rows = [np.column_stack([x.state, x.derivative * scale[a, :n]]) for x in orders]
+    rows = []
+    for order in orders:
+        derivative = order.derivative * scale[a, :n]
+        rows.append(np.column_stack([order.state, derivative]))
     apart = np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]
     return bool(np.max(apart) < SAME)
 
@@ -286,7 +305,12 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
             continue
         b = s.chart_index(s.transitions[g].target)
         events = (*before.events, g)
-        order = _Order(events, b, event.after[0], saltation @ before.derivative)
+        order = _Order(
+            events=events,
+            chart=b,
+            state=event.after[0],
+            derivative=saltation @ before.derivative,
+        )
         is_last = False
         yield from _orders(s, t, order, due)
     if is_last and before.events:

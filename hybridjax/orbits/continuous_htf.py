@@ -48,21 +48,32 @@ def linear_outputs(
     s: Structure, flow: LinearFlow, z: Outputs
 ) -> tuple[Array, Array, Array]:
     """Outputs at the nodes (P, K, ny), and their derivatives by states and inputs."""
-    outputs = lambda a, *point: kernels.outputs(s, a, tuple(z.items), *point)  # noqa: E731
+
+    def outputs(a, *point):
+        return kernels.outputs(s, a, tuple(z.items), *point)
+
     make = ft.partial(flow.evaluated, s, outputs, len(z.names))
     # (Other functions than states may have changed.)
-    kept = on_host(flow.q) and all(isinstance(x, str) for x in z.items)
-    by = _kept.recall(flow, z.names, make) if kept else make()
-    return by[..., 0], by[..., 2 : 2 + s.d], by[..., 2 + s.d :]
+    are_states = all(isinstance(x, str) for x in z.items)
+    if on_host(flow.q) and are_states:
+        expanded = _kept.recall(flow, z.names, make)
+    else:
+        expanded = make()
+    value = expanded[..., 0]
+    by_state = expanded[..., 2 : 2 + s.d]
+    by_input = expanded[..., 2 + s.d :]
+    return value, by_state, by_input
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
     """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
     root of 2, so that calls with similar frequencies share a linearization."""
-    fastest = max(1.25 * np.max(np.abs(f)), np.max(np.abs(harmonics)), 0.1)
-    longest = float(
-        2.0 ** (np.floor(2 * np.log2(min(_TURNS / (2 * np.pi * fastest), 1.0))) / 2)
-    )
+    of_inputs = 1.25 * np.max(np.abs(f))
+    of_outputs = np.max(np.abs(harmonics))
+    fastest = max(of_inputs, of_outputs, 0.1)
+    resolved = min(_TURNS / (2 * np.pi * fastest), 1.0)
+    halvings = np.floor(2 * np.log2(resolved)) / 2
+    longest = float(2.0**halvings)
     if max(len(f), 64) / longest > _LARGEST:
         raise DefinitionError(
             f"{len(f)} frequencies up to {np.abs(f).max():.3g} per period and harmonics up to "
@@ -94,10 +105,8 @@ def continuous_htf(
     inputs: SignalNames | None,
 ) -> HTF:
     """Harmonic transfer functions of a cycle (see `LimitCycle.htf`)."""
-    harmonics, frequencies = (
-        check_harmonics(harmonics, 0),
-        np.asarray(f, float).reshape(-1),
-    )
+    harmonics = check_harmonics(harmonics, 0)
+    frequencies = np.asarray(f, float).reshape(-1)
     if not len(frequencies):
         raise DefinitionError("`frequencies` holds no frequency: give one or more.")
     map = cycle.return_map
@@ -117,15 +126,18 @@ def _interpolation(
     """
     middle = (np.max(f) + np.min(f)) / 2
     half = np.ptp(f) / 2
-    n = int(np.pi * half + _EXTRA * np.cbrt(1 + np.pi * half))
+    turns = np.pi * half
+    n = int(turns + _EXTRA * np.cbrt(1 + turns))
     if n >= len(f) or not half:
         return f, f, np.eye(len(f))
     k = np.arange(n)
     x = np.cos(np.pi * (k + 0.5) / n)
     coarse = middle + half * x
     chebvander = np.polynomial.chebyshev.chebvander
-    coefficients = chebvander(x, n - 1).T * (2 - (k == 0))[:, None] / n
-    mix = chebvander((f - middle) / half, n - 1) @ coefficients
+    twice = np.where(k == 0, 1, 2)[:, None]
+    coefficients = chebvander(x, n - 1).T * twice / n
+    at_f = chebvander((f - middle) / half, n - 1)
+    mix = at_f @ coefficients
 
     def turn(x):
         return np.exp(1j * np.pi * x)
@@ -161,15 +173,20 @@ def _transfer(
     H = _integrals(map, flow, z, harmonics, inside, begin, delay)
 
     H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1)
-    at_f = (fine @ H.reshape(len(coarse), -1)).reshape(len(f), rows + d, -1)
+    at_f = fine @ H.reshape(len(coarse), -1)
+    at_f = at_f.reshape(len(f), rows + d, -1)
     H, end = xp.split(at_f, [rows], axis=1)
 
     # The deviation at phase 0 is that one period later.
     size = map.sizes
-    scaled = whole * size / size[:, None]
-    turned = xp.eye(d) - xp.exp(-2j * np.pi * f)[:, None, None] * scaled
-    start = solve(turned, end[..., :nu] / size[:, None]) * size[:, None]
-    H = H[..., :nu] + H[..., nu:] @ start
+    column = size[:, None]
+    scaled = whole * size / column
+    back_a_period = xp.exp(-2j * np.pi * f)[:, None, None]
+    turned = xp.eye(d) - back_a_period * scaled
+    start = solve(turned, end[..., :nu] / column) * column
+    by_input = H[..., :nu]
+    by_start = H[..., nu:]
+    H = by_input + by_start @ start
     H = H.reshape(-1, len(harmonics), len(z.names), nu)
     return xp.moveaxis(H, 0, 1) / map.expected
 
@@ -181,7 +198,8 @@ def _require_no_pole(
 ) -> None:
     """**Raises:** `DefinitionError` for a frequency at which the HTF is infinite."""
     turns = np.exp(2j * np.pi * f)
-    apart = np.abs(turns[:, None] - np.linalg.eigvals(monodromy)).min(axis=1)
+    multipliers = np.linalg.eigvals(monodromy)
+    apart = np.abs(turns[:, None] - multipliers).min(axis=1)
     if (apart < _POLE).any():
         where = "every whole number" if map.base else "its multipliers of modulus 1"
         raise DefinitionError(
@@ -210,26 +228,35 @@ def _integrals(
     rows = len(harmonics) * len(z.names)
     values, by_state, by_input = linear_outputs(map.structure, flow, z)
     orders = np.asarray(harmonics)[:, None, None]
-    waves = xp.exp(-2j * np.pi * orders * flow.after(map) / map.expected)
+    rates = -2j * np.pi * orders
+    waves = xp.exp(rates * flow.after(map) / map.expected)
     weighted = waves * flow.length[:, None] * rule().weights
     back = xp.conj(inside)
 
     # By deviations where pieces begin.
-    free = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ flow.forward[0])
-    free = (free.reshape(P, -1, K) @ back).reshape(P, rows, d, -1)
-    free = free.transpose(3, 1, 0, 2).reshape(-1, rows, P * d)
-    of_begin = free @ xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
+    by_begin, _ = flow.forward
+    free = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ by_begin)
+    free = free.reshape(P, -1, K) @ back
+    free = free.reshape(P, rows, d, -1).transpose(3, 1, 0, 2)
+    free = free.reshape(-1, rows, P * d)
+    begins = xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
+    of_begin = free @ begins
 
     # By inputs within pieces.
-    pushed = (by_state @ flow.pushed.reshape(P, K, d, -1)).reshape(*by_input.shape, K)
-    pushed = pushed + by_input[..., None] * xp.eye(K)[:, None, None]
-    pushed = (pushed.reshape(P, -1, K) @ inside).reshape(P, K, -1, inside.shape[2])
+    pushed = by_state @ flow.pushed.reshape(P, K, d, -1)
+    pushed = pushed.reshape(*by_input.shape, K)
+    at_once = by_input[..., None] * xp.eye(K)[:, None, None]
+    pushed = (pushed + at_once).reshape(P, -1, K) @ inside
+    pushed = pushed.reshape(P, K, -1, inside.shape[2])
     pushed = (pushed * back[:, :, None]).reshape(P * K, -1)
-    forced = (weighted.reshape(-1, P * K) @ pushed).reshape(rows, nu, -1)
+    forced = weighted.reshape(-1, P * K) @ pushed
+    forced = forced.reshape(rows, nu, -1)
     forced = xp.pad(forced, [(0, 0), (0, d), (0, 0)])
 
     # Events whose time moves: the jump of the output at the moment of the event.
-    jump = values[:, -1] - xp.roll(values[:, 0], -1, axis=0)
+    after_event = xp.roll(values[:, 0], -1, axis=0)
+    jump = values[:, -1] - after_event
     jumps = (waves[:, None, :, -1] * jump.T).reshape(rows, P)
-    moved = (jumps @ delay.reshape(P, -1)).reshape(forced.shape)
-    return of_begin + xp.moveaxis(forced + moved, -1, 0)
+    moved = jumps @ delay.reshape(P, -1)
+    of_inputs = forced + moved.reshape(forced.shape)
+    return of_begin + xp.moveaxis(of_inputs, -1, 0)

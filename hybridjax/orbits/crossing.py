@@ -81,7 +81,10 @@ class Crossing(Definition):
             return
         output: Any = self.signal
         if not isinstance(output, Output):
-            of_state = lambda t, q, u, f=output: f(t, q)  # noqa: E731
+
+            def of_state(t, q, u, f=output):
+                return f(t, q)
+
             output = Output(str(self), dict.fromkeys(self.charts or s.names, of_state))
         list(check_output(s, output, "section"))
 

@@ -205,7 +205,8 @@ class Curve:
         if self.map.base is not None or not len(events):
             return None
         k = far_from_events(pieces.t, events, float(point.turn.period))
-        phase = pieces.t[k : k + 1] / point.turn.period * float(self.map.expected)
+        begin = pieces.t[k : k + 1] / point.turn.period
+        phase = begin * float(self.map.expected)
         anchor = point.anchor._replace(t=phase, chart=pieces.chart[[k]])
         if k == 0:
             return None
@@ -241,7 +242,14 @@ class Curve:
             failure = self._failure(turn, z)
             if failure is not None:
                 return failure
-            point = Point(anchor, z, size, forward, turn, k)
+            point = Point(
+                anchor=anchor,
+                z=z,
+                size=size,
+                tangent=forward,
+                turn=turn,
+                steps=k,
+            )
             equations = np.vstack([point.scaled, row * size])
             residual = np.append(turn.residual / size[:-1], row @ (z - z0))
             (change,) = newton_steps(equations[None], residual[None], rounding)
@@ -317,12 +325,15 @@ def _cubic(
         along = p.tangent * p.size
         return along * (row @ chord) / (row @ along) - chord
 
-    return a.z + x * chord + x * (1 - x) * ((1 - x) * off(a) - x * off(b))
+    on_chord = a.z + x * chord
+    beside = (1 - x) * off(a) - x * off(b)
+    return on_chord + x * (1 - x) * beside
 
 
 def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
     """Which of the times of a cycle is farthest from all events."""
-    apart = np.mod(t[:, None] - events + 0.5 * period, period) - 0.5 * period
+    since = t[:, None] - events
+    apart = np.mod(since + 0.5 * period, period) - 0.5 * period
     return int(np.abs(apart).min(axis=1).argmax())
 
 
@@ -344,4 +355,5 @@ def away_from_events(cycle: LimitCycle) -> LimitCycle:
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:
     """Events of a turn, from the same one on wherever the turn begins."""
     events = tuple(sequence)
-    return min((events[k:] + events[:k] for k in range(len(events))), default=())
+    rotations = [events[k:] + events[:k] for k in range(len(events))]
+    return min(rotations, default=())

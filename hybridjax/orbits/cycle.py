@@ -219,7 +219,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         dims = self.dims
         scale = np.asarray(self.settings.scale)[np.asarray(self.pieces.chart)]
         after = np.roll(np.arange(len(dims)), -1)
-        factors = np.asarray(self.factors) * scale[:, None, :] / scale[after, :, None]
+        factors = np.asarray(self.factors)
+        factors = factors * scale[:, None, :] / scale[after, :, None]
         return [
             factor[: dims[end], : dims[begin]]
             for begin, (end, factor) in enumerate(zip(after, factors, strict=True))
@@ -625,7 +626,8 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
         parts = basis_after.T, derivative * size / size_after[:, None], basis
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
-        least = np.finfo(float).eps * np.prod([np.linalg.norm(x) for x in parts])
+        norms = [np.linalg.norm(x) for x in parts]
+        least = np.finfo(float).eps * np.prod(norms)
         factor = np.where(np.abs(factor) > least, factor, 0.0)
         merged = factor @ factors[-1] if factors else factor
         if factors and weakest(merged) > WEAKEST:
@@ -639,7 +641,8 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
     """Sizes of the time and the states at the beginning of each move, and a basis of deviations in
     these sizes: for an autonomous system, across the flow at equal times."""
     s = map.structure
-    fields = slopes(s, moves.t, moves.chart, moves.q, np.zeros((s.nu, 1))).T
+    u = np.zeros((s.nu, 1))
+    fields = slopes(s, moves.t, moves.chart, moves.q, u).T
     frames: list[tuple[np.ndarray, Matrix]] = []
     for chart, field, at_once in zip(moves.chart, fields, moves.at_once, strict=True):
         n = s.dims[chart]
@@ -649,7 +652,8 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
         elif at_once:  # (there is no flow before it)
             basis = np.eye(1 + n)[:, 1:]
         else:
-            across = np.linalg.svd(field[None, :n] / sizes)[2][1:].T
+            _, _, directions = np.linalg.svd(field[None, :n] / sizes)
+            across = directions[1:].T
             basis = np.pad(across, [(1, 0), (0, 0)])
         frames.append((np.append(map.expected, sizes), basis))
     return frames

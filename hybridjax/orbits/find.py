@@ -649,7 +649,8 @@ def _is_distant(map: ReturnMap, solution: Solution) -> bool:
     s = map.structure
     a = int(np.asarray(map.anchor.chart)[0])
     own = sizes_on(s, solution.turn.pieces, float(solution.turn.period))
-    guess = np.abs(np.asarray(map.anchor.q)[: s.dims[a], 0])
+    q = np.asarray(map.anchor.q)
+    guess = np.abs(q[: s.dims[a], 0])
     names = s.charts[a].states
     return any(
         size > _DISTANT * own[str(name)]

@@ -304,7 +304,9 @@ def requested(
     check_schedules(s)
     if isinstance(start, Flow):
         _require_start(start, s)
-        lanes, many, result = start.lanes, start.request.many, start.lane_results
+        lanes = start.lanes
+        many = start.request.many
+        result = start.lane_results
     else:
         lanes, many = _lanes_of(s, start)
         result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)
@@ -657,8 +659,18 @@ def _on_host(request: _Request) -> Flow:
         padded(path.event * 0 - 1, -1),
     )
     nothing = np.zeros(1)
-    none = Samples(np.zeros((0, 1), np.int32), np.zeros((0, s.d, 1)))
-    passage = Passage(Moved(end, nothing, nothing, code), events, none)
+    charts = np.zeros((0, 1), np.int32)
+    none = Samples(charts, np.zeros((0, s.d, 1)))
+    passage = Passage(
+        Moved(
+            lanes=end,
+            h=nothing,
+            error=nothing,
+            result=code,
+        ),
+        events,
+        none,
+    )
     return _result(request, passage, path)
 
 

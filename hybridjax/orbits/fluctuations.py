@@ -165,28 +165,37 @@ def _noisy(
     pieces = _pieces(flow, events, columns, scatter)
     n = pieces.forward.shape[-1]
     d = flow.q.shape[-1]
+
+    # One turn without fluctuations at its beginning.
     (turn, noise), (begin, *_) = _around(pieces, xp.zeros((n, n)))
     valid = xp.append(map.valid, xp.ones(n - d, bool))
     turn = xp.where(valid[:, None], turn, 0.0)
     field = flow.field[0, 0]
     _, phase = loop(map, turn[:d, :d], field)
     diffusion = _diffusion(map, phase, noise[:d, :d])
+
     # (A state ahead of the cycle meets the next events earlier.)
     ahead = xp.concatenate([-field, xp.ones(1), xp.zeros(n - d - 1)])
-    across = xp.eye(n) + ahead[:, None] * xp.append(phase, xp.zeros(n - d))
+    wide_phase = xp.append(phase, xp.zeros(n - d))
+    across = xp.eye(n) + ahead[:, None] * wide_phase
     step = across @ turn
     noise = across @ noise @ across.T
     joint = _stationary(step, noise, d)
+
+    # One turn with the stationary ones.
     _, (_, before_pieces, before_events) = _around(pieces, joint)
     before_events = before_events[:, :d, :d]
     at_nodes = _within_pieces(flow, columns, before_pieces[:, :d, :d])
     unresolved = _largest_difference(at_nodes, before_events)
     to_end = flow.covectors(xp.eye(d))
-    along = flow.field[..., None] * (to_end @ phase)[..., None, :]
+    phase_at_nodes = (to_end @ phase)[..., None, :]
+    along = flow.field[..., None] * phase_at_nodes
     across_nodes = np.eye(d) - along
     at_nodes = across_nodes @ at_nodes @ xp.swapaxes(across_nodes, -1, -2)
     sizes = map.scale[flow.chart]
     free, _ = flow.forward
+    from_begin = across_nodes @ free @ begin[:, None, :d, :d]
+    to_section = across[:d, :d] @ xp.swapaxes(to_end, -1, -2)
     return Fluctuations(
         diffusion,
         tuple(names),
@@ -198,8 +207,8 @@ def _noisy(
         _varying_durations(events, before_events, sizes),
         _without_rounding(at_nodes, sizes),
         unresolved,
-        across_nodes @ free @ begin[:, None, :d, :d],
-        across[:d, :d] @ xp.swapaxes(to_end, -1, -2),
+        from_begin,
+        to_section,
     )
 
 
@@ -222,11 +231,19 @@ def _events(cycle: Any, flow: LinearFlow, levels: np.ndarray) -> _Events:
     delay = flow.jumps.delay_by_state
     if map.base is not None and not cycle.event_sequence:
         hit = put(hit, -1, True)
-        delay = put(delay, -1, section_delay(map, flow.field[0, 0])[0])
-    delay_by_noise = xp.asarray(levels)[flow.event] * flow.jumps.delay_by_level
+        delay_of_section, *_ = section_delay(map, flow.field[0, 0])
+        delay = put(delay, -1, delay_of_section)
+    level_of_event = xp.asarray(levels)[flow.event]
+    delay_by_noise = level_of_event * flow.jumps.delay_by_level
     count = len(_names_of_events(cycle))
-    slot = (xp.cumsum(hit)[:, None] - 1 == np.arange(count)) & hit[:, None]
-    return _Events(hit, delay, delay_by_noise, slot)
+    number_of_event = xp.cumsum(hit)[:, None] - 1
+    slot = (number_of_event == np.arange(count)) & hit[:, None]
+    return _Events(
+        hit=hit,
+        delay=delay,
+        delay_by_noise=delay_by_noise,
+        slot=slot,
+    )
 
 
 def _pieces(
@@ -245,7 +262,8 @@ def _pieces(
     weight = (flow.length[:, None] * rule().weights)[..., None, None]
     collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
     free, _ = flow.forward
-    forward = _pad(free[:, -1], n) + np.diag(np.arange(n) >= d)
+    stays = np.arange(n) >= d
+    forward = _pad(free[:, -1], n) + np.diag(stays)
     # An event begins a delay of its own, and ends a duration, from the delay before to its own.
     none = xp.zeros((P, d, 1 + E))
     each = events.slot[..., None]
@@ -260,8 +278,10 @@ def _pieces(
     )
     by_delay = xp.concatenate([flow.jumps.slip, xp.ones((P, 1)), events.slot], axis=1)
     late = events.delay_by_noise[:, None] * by_delay
-    scattered = xp.asarray(scatter)[flow.event][:, :, None] ** 2 * np.eye(d)
-    added = late[:, :, None] * late[:, None] + _pad(scattered, n)
+    deviations = xp.asarray(scatter)[flow.event]
+    scattered = deviations[:, :, None] ** 2 * np.eye(d)
+    by_noise = late[:, :, None] * late[:, None]
+    added = by_noise + _pad(scattered, n)
     return _Pieces(forward, _pad(collected, n), jump, added)
 
 
@@ -325,10 +345,14 @@ def _within_pieces(
     xp = namespace(before)
     free, _ = flow.forward
     inward = solve(free, columns)
-    rate = flow.length[:, None, None, None] * inward @ xp.swapaxes(inward, -1, -2)
-    integral = np.pad(np.linalg.inv(rule().derivative[1:, 1:]), [(1, 0), (1, 0)])
+    h = flow.length[:, None, None, None]
+    rate = h * inward @ xp.swapaxes(inward, -1, -2)
+    # (Integrals are zero at the first node.)
+    integral = np.linalg.inv(rule().derivative[1:, 1:])
+    integral = np.pad(integral, [(1, 0), (1, 0)])
     collected = xp.einsum("ij,pjab->piab", integral, rate)
-    return free @ (before[:, None] + collected) @ xp.swapaxes(free, -1, -2)
+    from_begin = before[:, None] + collected
+    return free @ from_begin @ xp.swapaxes(free, -1, -2)
 
 
 def _largest_difference(
@@ -339,8 +363,9 @@ def _largest_difference(
     difference = xp.max(xp.abs(at_nodes[:, -1] - ends), axis=0)
     variance = xp.abs(xp.diagonal(at_nodes, axis1=2, axis2=3))
     size = xp.sqrt(xp.max(variance, axis=(0, 1)))
+    products = size[:, None] * size
     # (States that no noise reaches have no size.)
-    return xp.max(difference / xp.maximum(size[:, None] * size, 1e-300))
+    return xp.max(difference / xp.maximum(products, 1e-300))
 
 
 def _without_rounding(
@@ -348,9 +373,11 @@ def _without_rounding(
 ) -> Float[Array, "P K d d"]:
     """Covariances with zeros for states that noise does not reach."""
     xp = namespace(covariance)
-    variance = xp.diagonal(covariance, axis1=2, axis2=3) / sizes[:, None] ** 2
-    random = variance > _ROUNDING**2 * xp.max(variance)
-    return xp.where(random[..., None] & random[..., None, :], covariance, 0.0)
+    variance = xp.diagonal(covariance, axis1=2, axis2=3)
+    in_sizes = variance / sizes[:, None] ** 2
+    random = in_sizes > _ROUNDING**2 * xp.max(in_sizes)
+    both = random[..., None] & random[..., None, :]
+    return xp.where(both, covariance, 0.0)
 
 
 def _varying_durations(
@@ -362,7 +389,8 @@ def _varying_durations(
     variance = xp.sum(by_states * events.delay, axis=-1)
     of_piece = zip(events.delay, before, sizes, strict=True)
     rounding = xp.stack([_rounding(*x) for x in of_piece])
-    varies = events.hit & ((variance > rounding) | (events.delay_by_noise != 0))
+    has_noise = events.delay_by_noise != 0
+    varies = events.hit & ((variance > rounding) | has_noise)
     late_ends = xp.any(varies[:, None] & events.slot, axis=0)
     # A delay of an event counts for the durations before and after it.
     return late_ends | xp.roll(late_ends, 1)
@@ -393,10 +421,14 @@ def _columns(
     """Effects of white noise of strength 1 on the states."""
     xp = namespace(flow.q)
     require_among("state or input", white, [*s.state_names(), *s.inputs], "`white`: ")
-    names = [(*chart.states, *[""] * s.d)[: s.d] for chart in s.charts]
-    of_states = xp.asarray([[white.get(x, 0.0) for x in states] for states in names])
+    of_states = []
+    for chart in s.charts:
+        strengths = [white.get(name, 0.0) for name in chart.states]
+        padding = [0.0] * (s.d - len(strengths))
+        of_states.append(strengths + padding)
     of_inputs = np.array([white.get(x, 0.0) for x in s.inputs])
-    alone = of_states[flow.chart][:, None, :, None] * np.eye(s.d)
+    at_nodes = xp.asarray(of_states)[flow.chart]
+    alone = at_nodes[:, None, :, None] * np.eye(s.d)
     direct = surface(s, flow) @ alone
     return xp.concatenate([direct, flow.by_input * of_inputs], axis=-1)
 

@@ -152,7 +152,8 @@ def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
     """**Raises:** `DefinitionError` for a guess at which the field is not finite."""
     a = int(lane.chart[0])
     u = np.zeros((s.nu, 1))
-    rate = kernels.field(s, a, lane.t, lane.q[: s.dims[a]], u)[:, 0, 0]
+    q = lane.q[: s.dims[a]]
+    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
             f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
@@ -190,7 +191,8 @@ def _time_of_motion(map: ReturnMap, lanes: Lanes) -> float:
     lane = to_host(lanes)
     a = int(lane.chart[0])
     q = lane.q[: s.dims[a]]
-    rates = kernels.field(s, a, lane.t, q, np.zeros((s.nu, 1)))[:, 0, 0]
+    u = np.zeros((s.nu, 1))
+    rates = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         times = np.abs(q[:, 0] / rates)
     return float(np.nanmin(times, initial=np.inf))
@@ -201,7 +203,8 @@ def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     s = map.structure
     lane = to_host(lanes)
     a = int(lane.chart[0])
-    return bool(fastest(s, a, lane.t, lane.q[: s.dims[a]])[0] > 0)
+    (rate,) = fastest(s, a, lane.t, lane.q[: s.dims[a]])
+    return bool(rate > 0)
 
 
 def _on_section(
@@ -299,7 +302,8 @@ def _next_crossing(
     wait = _patience(map, lanes) if max_period is None else max_period
     begin = float(np.asarray(lanes.t)[0])
     for _ in range(_LOOKS):
-        target = toward(np.full(1, np.inf), -1, np.asarray(lanes.t) + wait)
+        no_time = np.full(1, np.inf)
+        target = toward(no_time, -1, np.asarray(lanes.t) + wait)
         moved = _moved(map, lanes, to_section(target, section, map.event))
         waited = float(np.asarray(moved.lanes.t)[0]) - begin
         if not _misses(moved) or max_period is not None:
@@ -366,7 +370,8 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         n = s.dims[a]
         plane = _across(map, a, pieces.q[:n, k], f[:n, k])
         signal: Any = plane.signal
-        point, normal = np.asarray(signal.point), np.asarray(signal.normal)
+        point = np.asarray(signal.point)
+        normal = np.asarray(signal.normal)
         before = normal @ (moves.q[:n] - point[:, None])
         after = normal @ (ends[:n] - point[:, None])
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)
@@ -388,9 +393,11 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
     field = kernels.field(s, a, t, lane.q[:n], u)[..., 0]
-    sizes = np.maximum(np.abs(lane.q[:n, 0]), np.asarray(map.scale)[a, :n])
+    scale = np.asarray(map.scale)[a, :n]
+    sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
     rate = field[:, 0] / sizes
-    jacobian = field[:, 2 : 2 + n] * sizes / sizes[:, None]
+    by_state = field[:, 2 : 2 + n]
+    jacobian = by_state * sizes / sizes[:, None]
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):
@@ -403,7 +410,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     guards = s.guards(a)
     if guards:
         first = np.zeros(1, np.int32)
-        levels = kernels.watched(s, a, None, t, lane.q[:n], u, first)[:, 0, 0]
+        expanded = kernels.watched(s, a, None, t, lane.q[:n], u, first)
+        levels = expanded[:, 0, 0]
         passed = [g for g, level in zip(guards, levels, strict=True) if level < 0]
         beyond = [f"'{s.transitions[g].name}'" for g in passed]
     text = ""
@@ -412,8 +420,9 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
-    known = np.abs(lane.q[:n, 0]) > _REST * np.asarray(map.scale)[a, :n]
-    place = signal_values(s.states(a), np.where(known, lane.q[:n, 0], 0.0))
+    known = np.abs(lane.q[:n, 0]) > _REST * scale
+    place = np.where(known, lane.q[:n, 0], 0.0)
+    place = signal_values(s.states(a), place)
     raise ComputationError(
         f"the flow from the guess leads to an equilibrium of chart '{s.names[a]}', {place}, where "
         f"nothing moves: start elsewhere.{text}"
@@ -424,7 +433,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
 def _at_anchor(map: ReturnMap):
     """The field (d,), and the value and rate of the level of a crossing."""
     watched = map.watch(map.anchor, to_section(until(map.anchor.t), map.base, -1))
-    return map.slopes(map.anchor)[:, 0], watched.value[-1, 0], watched.rate[-1, 0]
+    slope = map.slopes(map.anchor)[:, 0]
+    return slope, watched.value[-1, 0], watched.rate[-1, 0]
 
 
 def _go(map: ReturnMap, doing: str, lanes: Lanes, target: Target) -> Lanes:

@@ -96,8 +96,14 @@ class LimitCycles(Showable, eqx.Module):
 
     def __getitem__(self, i: SupportsIndex) -> LimitCycle:
         """The cycle of system i, found or not (see its `result`)."""
-        take = lambda x: np.asarray(x)[i]  # (JAX compiles a program for each shape)  # noqa: E731
-        pick = lambda tree: from_host(jax.tree_util.tree_map(take, tree))  # noqa: E731
+
+        def take(x):
+            # (By NumPy, since JAX compiles a program for each shape.)
+            return np.asarray(x)[i]
+
+        def pick(tree):
+            return from_host(jax.tree_util.tree_map(take, tree))
+
         arrays, static = eqx.partition(self.systems, eqx.is_array)
         cycle = LimitCycle(
             eqx.combine(pick(arrays), static),
@@ -150,7 +156,8 @@ class LimitCycles(Showable, eqx.Module):
     def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
         values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
-        order = np.lexsort((-np.imag(values), -np.round(np.abs(values), 12)), axis=-1)
+        moduli = np.round(np.abs(values), 12)
+        order = np.lexsort((-np.imag(values), -moduli), axis=-1)
         values = np.take_along_axis(values.astype(complex), order, axis=-1)
         values[~self.ok] = np.nan
         return values
@@ -268,7 +275,13 @@ def solved(
         anchor = to_host(begin.anchor)._replace(t=times[row : row + 1])
         return _search(dataclasses.replace(tiles.map, anchor=anchor, **at_phase))
 
-    many = Many(leaves, times, expected, workers, size or TILE)
+    many = Many(
+        leaves=leaves,
+        t=times,
+        expected=expected,
+        workers=workers,
+        size=size or TILE,
+    )
     solver = Solver(many, tiles.map, search)
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
@@ -300,16 +313,24 @@ def _search(map: ReturnMap) -> ReturnMap | None:
 
 def _some(systems: HybridSystem, rows) -> HybridSystem:
     """Some of many systems."""
-    pick = lambda x: jax.device_put(np.asarray(x)[rows])  # noqa: E731
+
+    def pick(x):
+        return jax.device_put(np.asarray(x)[rows])
+
     return jax.tree_util.tree_map(lambda x: pick(x) if eqx.is_array(x) else x, systems)
 
 
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
     """The cycles that were found on routes; NaN for the others."""
-    found, s, S = solver.found, map.structure, len(solver.found.path)
-    G, K = len(s.transitions), found.pieces_t.shape[1]
-    chart, events = np.zeros((S, K), np.int32), np.zeros((S, K), np.int32)
-    armed, codes = np.zeros((S, G, K), bool), np.full((S, 1), -1)
+    found = solver.found
+    s = map.structure
+    S = len(solver.found.path)
+    G = len(s.transitions)
+    K = found.pieces_t.shape[1]
+    chart = np.zeros((S, K), np.int32)
+    events = np.zeros((S, K), np.int32)
+    armed = np.zeros((S, G, K), bool)
+    codes = np.full((S, 1), -1)
     for path, itinerary in enumerate(solver.itineraries):
         rows = np.flatnonzero(found.path == path)
         if not len(rows):
@@ -321,12 +342,12 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         codes = _wider(codes, more)
     pace = np.array([0.0, np.inf, 0.0, 0.0])
     pieces = Lanes(
-        found.pieces_t,
-        chart,
-        np.swapaxes(found.pieces_q, 1, 2),
-        armed,
-        events,
-        np.tile(pace[:, None], (S, 1, K)),
+        t=found.pieces_t,
+        chart=chart,
+        q=np.swapaxes(found.pieces_q, 1, 2),
+        armed=armed,
+        events=events,
+        pace=np.tile(pace[:, None], (S, 1, K)),
     )
     anchor = jax.tree_util.tree_map(lambda x: x[..., :1], pieces)
     if map.event >= 0:
@@ -354,7 +375,10 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
 def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
     """Codes of events with those of other rows."""
     width = max(codes.shape[1], more.shape[1])
-    fill = lambda x: np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)  # noqa: E731
+
+    def fill(x):
+        return np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)
+
     return np.maximum(fill(codes), fill(more))
 
 
@@ -379,7 +403,12 @@ def _coincide(
 
 def known_from(cycles: LimitCycles) -> Known:
     """Cycles as guesses for others."""
-    return Known(None, cycles.anchor, cycles.period, cycles.result)
+    return Known(
+        numbers=None,
+        anchor=cycles.anchor,
+        period=cycles.period,
+        result=cycles.result,
+    )
 
 
 def _some_known(cycles: LimitCycles) -> Known | None:
@@ -419,7 +448,8 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 
 
 def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
-    turn, map = rounds.turn, tiles.map
+    turn = rounds.turn
+    map = tiles.map
     return LimitCycles(
         tiles.systems,
         map.base,
@@ -509,8 +539,11 @@ def _stacked(systems) -> HybridSystem:
         raise DefinitionError(
             "`systems` must be at least one system, all of the same class."
         )
+
     # (By NumPy: a program of JAX with thousands of arguments compiles for minutes.)
-    stack = lambda x: jax.device_put(np.stack([np.asarray(y) for y in x]))  # noqa: E731
+    def stack(x):
+        return jax.device_put(np.stack([np.asarray(y) for y in x]))
+
     columns = zip(*(leaves for leaves, _ in parts), strict=True)
     stacked = [stack(x) if eqx.is_array(x[0]) else x[0] for x in columns]
     return jax.tree_util.tree_unflatten(parts[0][1], stacked)
@@ -519,7 +552,8 @@ def _stacked(systems) -> HybridSystem:
 def rough(cycle: LimitCycle) -> dict[str, Any]:
     """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
     chart = int(np.asarray(cycle.anchor.chart)[0])
-    q, size = np.asarray(cycle.anchor.q)[:, 0], np.asarray(cycle.settings.scale)[chart]
+    q = np.asarray(cycle.anchor.q)[:, 0]
+    size = np.asarray(cycle.settings.scale)[chart]
     state = [f"{x:.4f}" for x in (q / size).round(4) + 0.0]
     period, time = (f"{float(x):.5g}" for x in (cycle.period, cycle.anchor.t[0]))
     return {"period": period, "time": time, "chart": chart, "state": state}

@@ -61,26 +61,34 @@ class Rule(NamedTuple):
 @ft.lru_cache
 def rule() -> Rule:
     legendre = np.polynomial.legendre
+    unit = np.eye(NODES)
+    derivatives = [legendre.legder(e) for e in unit]
     # (Roots are real here, and complex numbers since NumPy 2.5.)
-    x = np.r_[
-        -1.0, np.sort(legendre.legroots(legendre.legder(np.eye(NODES)[-1])).real), 1.0
-    ]
+    inner = legendre.legroots(derivatives[-1]).real
+    x = np.r_[-1.0, np.sort(inner), 1.0]
     x = (x - x[::-1]) / 2
-    vander = legendre.legvander(x, NODES - 1)
-    slopes = np.stack(
-        [legendre.legval(x, legendre.legder(e)) for e in np.eye(NODES)], axis=1
+    values = legendre.legvander(x, NODES - 1)
+    slopes = np.stack([legendre.legval(x, e) for e in derivatives], axis=1)
+    inverse = np.linalg.inv(values)
+    return Rule(
+        nodes=(x + 1) / 2,
+        weights=inverse[0],
+        derivative=2 * slopes @ inverse,
+        coefficients=inverse,
     )
-    inverse = np.linalg.inv(vander)
-    return Rule((x + 1) / 2, inverse[0], 2 * slopes @ inverse, inverse)
 
 
 def polynomials(x: Float[Array, " p"]) -> Float[Array, "p K"]:
     """Legendre's polynomials at points of [0, 1]."""
+    xp = namespace(x)
     z = 2 * x - 1
-    rows = [namespace(x).ones_like(z), z]
+    rows = [xp.ones_like(z), z]
     for k in range(1, NODES - 1):
-        rows.append(((2 * k + 1) * z * rows[k] - k * rows[k - 1]) / (k + 1))
-    return namespace(x).stack(rows, axis=-1)
+        # Bonnet's recursion.
+        before, last = rows[-2:]
+        following = (2 * k + 1) * z * last - k * before
+        rows.append(following / (k + 1))
+    return xp.stack(rows, axis=-1)
 
 
 class Jumps(NamedTuple):
@@ -126,10 +134,12 @@ class LinearFlow(eqx.Module):
         self, s: Structure, function: Callable, rows: int
     ) -> Float[Array, "P K rows n"]:
         """A function (see `with_derivatives`) at the nodes, and its derivatives."""
-        chart, (P, K, d) = namespace(self.q).repeat(self.chart, NODES), self.q.shape
-        at = chart, self.t.ravel(), self.q.reshape(P * K, d).T
-        by = with_derivatives(s, function, *at, rows)
-        return namespace(by).moveaxis(by, -1, 0).reshape(P, K, rows, -1)
+        P, K, d = self.q.shape
+        chart = namespace(self.q).repeat(self.chart, NODES)
+        q = self.q.reshape(P * K, d).T
+        by = with_derivatives(s, function, chart, self.t.ravel(), q, rows)
+        by = namespace(by).moveaxis(by, -1, 0)
+        return by.reshape(P, K, rows, -1)
 
     def after(self, map: ReturnMap) -> Float[Array, "P K"]:
         """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
@@ -139,41 +149,49 @@ class LinearFlow(eqx.Module):
         self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array
     ):
         """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
+        xp = namespace(self.q)
+        d = self.q.shape[2]
+        D = rule().derivative[rows, rows]
+        n = len(D)
         ratio = size[:, :, None] / size[:, None]
-        d, D = self.q.shape[2], rule().derivative[rows, rows]
-        n, xp = len(D), namespace(self.q)
-        field = (
-            xp.eye(n)[:, None, :, None] * (matrix / ratio[:, None])[:, rows, :, None, :]
-        )
-        whole = D[:, None, :, None] * np.eye(d)[:, None, :]
-        whole = whole + sign * self.length[:, None, None, None, None] * field
-        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d)).reshape(
-            -1, n, d, n, d
-        )
+
+        # Axes: piece, node, state, node, state.
+        same_node = xp.eye(n)[:, None, :, None]
+        same_state = np.eye(d)[:, None, :]
+        in_sizes = matrix / ratio[:, None]
+        field = same_node * in_sizes[:, rows, :, None, :]
+        h = self.length[:, None, None, None, None]
+        whole = D[:, None, :, None] * same_state
+        whole = whole + sign * h * field
+        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d))
+        inverse = inverse.reshape(-1, n, d, n, d)
         return inverse * ratio[:, None, :, None, :]
 
     @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
         """Deviations at the nodes of each piece by that at its beginning, and by forces at the
         nodes (times the length of the piece)."""
-        xp, d = namespace(self.q), self.q.shape[2]
+        xp = namespace(self.q)
+        d = self.q.shape[2]
         inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
-        free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[1:, 0])
-        free = xp.concatenate(
-            [xp.broadcast_to(xp.eye(d), (len(free), 1, d, d)), free], axis=1
-        )
-        return free, xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
+        by_first = rule().derivative[1:, 0]
+        free = -xp.einsum("piajb,j->piab", inverse, by_first)
+        unit = xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))
+        free = xp.concatenate([unit, free], axis=1)
+        forced = xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
+        return free, forced
 
     @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
         """Covectors at the nodes of each piece by that at its end."""
-        xp, d = namespace(self.q), self.q.shape[2]
+        xp = namespace(self.q)
+        d = self.q.shape[2]
         by_state = xp.swapaxes(self.by_state, -1, -2)
         inverse = self._implicit(1.0, slice(0, -1), by_state, 1 / self.size)
-        free = -xp.einsum("piajb,j->piab", inverse, rule().derivative[:-1, -1])
-        return xp.concatenate(
-            [free, xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))], axis=1
-        )
+        by_last = rule().derivative[:-1, -1]
+        free = -xp.einsum("piajb,j->piab", inverse, by_last)
+        unit = xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))
+        return xp.concatenate([free, unit], axis=1)
 
     def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
         """Covectors at the nodes by those at the end of the turn."""
@@ -183,7 +201,9 @@ class LinearFlow(eqx.Module):
             before = jump.T @ after
             return free @ before, before
 
-        _, ends = scan(back, end, (self.jumps.by_state[::-1], self.adjoint[::-1, 0]))
+        # From the last piece to the first.
+        pieces = (self.jumps.by_state[::-1], self.adjoint[::-1, 0])
+        _, ends = scan(back, end, pieces)
         return self.adjoint @ ends[::-1, None]
 
     def at(
@@ -193,12 +213,16 @@ class LinearFlow(eqx.Module):
         xp = jnp if isinstance(phase, jax.Array) else namespace(self.q)
         time = xp.asarray(phase) % 1.0 * period
         # (The last piece that begins there: those before may have the length 0.)
-        turn = xp.asarray(self.turn)
-        k = xp.maximum(xp.searchsorted(turn, time, side="right") - 1, 0)
+        begins = xp.asarray(self.turn)
+        following = xp.searchsorted(begins, time, side="right")
+        k = xp.maximum(following - 1, 0)
         length = xp.asarray(self.length)[k]
-        x = (time - turn[k]) / xp.where(length == 0, 1.0, length)
+        x = (time - begins[k]) / xp.where(length == 0, 1.0, length)
         mix = polynomials(x) @ rule().coefficients
-        mixed = (xp.einsum("pk,pk...->p...", mix, xp.asarray(y)[k]) for y in values)
+        mixed = []
+        for value in values:
+            at_nodes = xp.asarray(value)[k]
+            mixed.append(xp.einsum("pk,pk...->p...", mix, at_nodes))
         return xp.asarray(self.chart)[k], *mixed
 
     @remembered
@@ -243,10 +267,15 @@ class LinearFlow(eqx.Module):
         begin = own[..., None] + 0 * kick[0]
         through = xp.asarray(self.through, dtype=waves.dtype)
         end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
-        by_begin = (jumps.delay_by_state[:, None] @ self.forward[0][:, -1])[:, 0]
-        by_input = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
-        by_input = wide(by_input + jumps.delay_by_input[..., None] * last)
-        delays = xp.einsum("pa,pacf->pcf", by_begin, x) + by_input
+
+        # The delays of events.
+        free, _ = self.forward
+        free_at_end = free[:, -1]
+        delay_by_begin = (jumps.delay_by_state[:, None] @ free_at_end)[:, 0]
+        by_state = xp.einsum("pa,pacf->pcf", delay_by_begin, x)
+        by_arrived = xp.einsum("pa,pauf->puf", jumps.delay_by_state, arrived)
+        by_input = jumps.delay_by_input[..., None] * last
+        delays = by_state + wide(by_arrived + by_input)
         return x, delays / last, end
 
     @remembered
@@ -257,12 +286,13 @@ class LinearFlow(eqx.Module):
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
         """Derivative of the state at the end of the turn by that at its beginning, at fixed times;
         zero outside of the `valid` rows and columns."""
-        return namespace(self.q).where(
-            valid[:, None] & valid, monodromy(self.through), 0.0
-        )
+        both = valid[:, None] & valid
+        return namespace(self.q).where(both, monodromy(self.through), 0.0)
 
 
-_hosted, _flows, _turns = Memory(), Memory(), Memory()
+_hosted = Memory()
+_flows = Memory()
+_turns = Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
@@ -290,7 +320,10 @@ def last_turn(cycle: Any) -> Any:
     """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
     traces the cycle, and the host did not take them."""
     cycle = hosted(cycle)
-    make = lambda: side_by_side(to_host(cycle.return_map).pieces())  # noqa: E731
+
+    def make():
+        return side_by_side(to_host(cycle.return_map).pieces())
+
     return (
         _turns.get(cycle, None)
         if is_hidden(cycle)
@@ -300,12 +333,18 @@ def last_turn(cycle: Any) -> Any:
 
 def begin_later(cycle: Any, k: int) -> Any:
     """A guess for neighbors of a clocked cycle that begins with its piece k, with its last turn."""
-    lanes, tape = jax.tree_util.tree_map(
-        lambda x: np.roll(x, -k, axis=-1), last_turn(cycle)
-    )
-    later = float(cycle.period) * (np.arange(len(lanes.t)) >= len(lanes.t) - k)
+
+    def rolled(x):
+        return np.roll(x, -k, axis=-1)
+
+    lanes, tape = jax.tree_util.tree_map(rolled, last_turn(cycle))
+    count = len(lanes.t)
+    is_next_turn = np.arange(count) >= count - k
+    later = float(cycle.period) * is_next_turn
     anchor = cycle.anchor._replace(
-        t=lanes.t[:1], chart=lanes.chart[:1], q=lanes.q[:, :1]
+        t=lanes.t[:1],
+        chart=lanes.chart[:1],
+        q=lanes.q[:, :1],
     )
     guess = dataclasses.replace(cycle, anchor=anchor)
     turn = lanes._replace(t=lanes.t + later), tape._replace(t=tape.t + later)
@@ -333,7 +372,10 @@ def linear_flow(
     cycle = hosted(cycle)
     if not on_host(cycle.period):
         return _of_cycle(cycle, longest, parameter)
-    make = lambda: _linear_flow(cycle, longest, parameter)  # noqa: E731
+
+    def make():
+        return _linear_flow(cycle, longest, parameter)
+
     return _flows.recall(cycle, (parameter, longest), make)
 
 
@@ -369,24 +411,27 @@ def _pieces(
     after_event = np.roll(moves.code, 1) >= 0
     begins = np.maximum.accumulate(np.where(after_event, k, 0))
     first = np.flatnonzero((k - begins) % most == 0)
-    last = np.append(first[1:], len(k)) - 1
-    length = t[last + 1] - t[first]
+    following = np.append(first[1:], len(k))
+    last = following - 1
+    length = t[following] - t[first]
     event = np.maximum(moves.code[last], -1)
 
     # Each of these is divided into equal parts. (Rounding divides no piece.)
     count = np.ceil(np.real(length[:, 0]) / longest - 1e-9)
     count = np.maximum(count, 1).astype(int)
     whole = np.repeat(np.arange(len(first)), count)
-    part = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)
+    parts_before = np.cumsum(count) - count
+    part = np.arange(len(whole)) - np.repeat(parts_before, count)
     parts = count[whole]
     share = (part[:, None] + rule().nodes) / parts[:, None]
-    time = t[first[whole]][:, None] + share[..., None] * length[whole][:, None]
+    begin = t[first][whole]
+    duration = length[whole]
     is_last = part == parts - 1
     return _Pieces(
         first=first[whole],
         last=last[whole],
-        time=time,
-        length=length[whole] / parts[:, None],
+        time=begin[:, None] + share[..., None] * duration[:, None],
+        length=duration / parts[:, None],
         event=np.where(is_last, event[whole], -1),
     )
 
@@ -401,12 +446,17 @@ def _linear_flow(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
             "a cycle, which `jit` and `vmap` hide: call them outside (`grad` and `jvp` work there)."
         )
-    map, K, directions = cycle.return_map, NODES, 1
-    s, of = map.structure, with_inputs(map.system, parameter)
-    d, period = s.d, float(map.expected)
+    map = cycle.return_map
+    K = NODES
+    directions = 1
+    s = map.structure
+    of = with_inputs(map.system, parameter)
+    d = s.d
+    period = float(map.expected)
     lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
-    t = np.append(moves.t, map.anchor.t[0] + period)[:, None]
+    end = map.anchor.t[0] + period
+    t = np.append(moves.t, end)[:, None]
     q = moves.q.T[..., None]
     if by is not None:
         directions = len(jax.tree_util.tree_leaves(by)[0])
@@ -414,20 +464,21 @@ def _linear_flow(
         of = kernels.Tangents(of, of_by, None, None, directions)
         s = kernels.Tangents(s, by.structure, None, None, directions)
         tangents = 1j * kernels.TINY * _along(s, map, lanes, tape, by)
-        t, q = t + tangents[:, 0], q + tangents[:-1, 1:]
+        t = t + tangents[:, 0]
+        q = q + tangents[:-1, 1:]
     # (A step of an explicit method is short for the polynomials of a piece.)
     most = 1 if has_implicit(s) else _STEPS
     pieces = _pieces(moves, t, most, longest * period)
-    chart, P = moves.chart[pieces.first], len(pieces.first)
+    chart = moves.chart[pieces.first]
+    P = len(pieces.first)
 
     # Lanes: by piece, node and direction. (Directions are lanes of their own, and come last.)
     each = 1 + d + np.arange(P * K * directions) % directions
-    charts, times = np.repeat(chart, K * directions), pieces.time.ravel()
-    step = (
-        np.searchsorted(np.real(t[:-1, 0]), np.real(pieces.time)[..., 0], "right") - 1
-    )
-    step = np.clip(step, pieces.first[:, None], pieces.last[:, None])
-    begin, start = t[step].ravel(), np.moveaxis(q[step], 2, 0).reshape(d, -1)
+    charts = np.repeat(chart, K * directions)
+    times = pieces.time.ravel()
+    step = _step_at(moves, pieces)
+    begin = t[step].ravel()
+    start = np.moveaxis(q[step], 2, 0).reshape(d, -1)
     u = kernels.unpushed(s, each)
     states = _ahead(s, begin, charts, start, u, times - begin)
     field = ft.partial(kernels.field, of)
@@ -442,21 +493,22 @@ def _linear_flow(
     states = lay(states)
     # Ends of pieces: by direction and piece.
     u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(directions), P))
-    events, times_of_ends = np.tile(pieces.event, directions), pieces.time[:, -1].T
-    ends = times_of_ends.ravel(), u, states[:, :, -1].reshape(-1, d)
-    jumps = _jumps(of, events, *ends)
+    events = np.tile(pieces.event, directions)
+    times_of_ends = pieces.time[:, -1].T.ravel()
+    states_at_ends = states[:, :, -1].reshape(-1, d)
+    jumps = _jumps(of, events, times_of_ends, u, states_at_ends)
     jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
     flow = LinearFlow(
-        lay(times),
-        pieces.length.T,
-        None,
-        None,
-        states,
-        lay(by_field[:, 0]),
-        lay(by_field[:, 2 : 2 + d]),
-        lay(by_field[:, 2 + d :]),
-        jumps,
-        np.broadcast_to(map.scale[chart], (directions, P, d)),
+        t=lay(times),
+        length=pieces.length.T,
+        chart=None,
+        event=None,
+        q=states,
+        field=lay(by_field[:, 0]),
+        by_state=lay(by_field[:, 2 : 2 + d]),
+        by_input=lay(by_field[:, 2 + d :]),
+        jumps=jumps,
+        size=np.broadcast_to(map.scale[chart], (directions, P, d)),
     )
     if by is not None:
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, flow)
@@ -464,18 +516,28 @@ def _linear_flow(
     return dataclasses.replace(flow, chart=chart, event=pieces.event)
 
 
+def _step_at(moves: Moves, pieces: _Pieces) -> Int[np.ndarray, "P K"]:
+    """The recorded moves in which the nodes of pieces lie."""
+    time = np.real(pieces.time)[..., 0]
+    step = np.searchsorted(moves.t, time, "right") - 1
+    return np.clip(step, pieces.first[:, None], pieces.last[:, None])
+
+
 def _along(
     s: kernels.Tangents, map: ReturnMap, lanes: Lanes, tape: Tape, by: Any
 ) -> Float[np.ndarray, "M n D"]:
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
-    ends, (begin, longer) = recorded_ends(map, lanes), beginning(by, s.d, s.directions)
+    ends = recorded_ends(map, lanes)
+    begin, longer = beginning(by, s.d, s.directions)
     # A turn that ends on a section ends at a time, too.
-    start, full = map.anchor.t[0], map.expected
+    start = map.anchor.t[0]
+    full = map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
     tape = tape._replace(
         code=np.where(tape.code == ARRIVE_LEVEL, ARRIVE_TIME, tape.code)
     )
-    times = begin[0][:, None] + np.outer(longer, (time - start) / full)
+    delay = np.outer(longer, (time - start) / full)
+    times = begin[0][:, None] + delay
     ends = dataclasses.replace(ends, time=time, levels=None)
     return Variation(s, lanes, ends, tape, times, twice=False).tangents(begin)
 
@@ -483,14 +545,20 @@ def _along(
 def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]:
     """Tangents of (t, q) at the anchor of a cycle, and of its period."""
     begin = np.zeros((1 + d, directions))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
-    begin[1:] = 0.0 if by.anchor.q is None else by.anchor.q[..., 0].T
-    return begin, np.zeros(directions) if by.period is None else by.period
+    if by.anchor.t is not None:
+        begin[0] = by.anchor.t[:, 0]
+    if by.anchor.q is not None:
+        begin[1:] = by.anchor.q[..., 0].T
+    period = by.period
+    if period is None:
+        period = np.zeros(directions)
+    return begin, period
 
 
 def of_flow(tangents: Any) -> Any:
     """The tangents of a cycle on which its flow depends, others replaced by `None`."""
-    nothing, anchor = jax.tree_util.tree_map(lambda _: None, tangents), tangents.anchor
+    nothing = jax.tree_util.tree_map(lambda _: None, tangents)
+    anchor = tangents.anchor
     anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
     moving = dict(system=tangents.system, period=tangents.period, anchor=anchor)
     return dataclasses.replace(nothing, **moving)
@@ -511,21 +579,36 @@ def _ahead(s: Structure, t, chart, q, u, h) -> Float[np.ndarray, "d L"]:
 
     def work(a, here, out):
         n = s.dims[a]
-        out[:n, here] = kernels.step(s, a, t[here], q[:n, here], u[:, here], h[here]).q
+        q_here = q[:n, here]
+        step = kernels.step(s, a, t[here], q_here, u[:, here], h[here])
+        out[:n, here] = step.q
         return out
 
-    return for_each_chart(s, chart, np.ones(len(t), bool), work, np.zeros_like(q))
+    everywhere = np.ones(len(t), bool)
+    return for_each_chart(s, chart, everywhere, work, np.zeros_like(q))
 
 
 def _jumps(s: Structure, code, t, u, q) -> Jumps:
     """The events at the ends of pieces, where the states are q."""
     P, d = q.shape
-    shapes = (P, d, d), (P, d, s.nu), (P, d), (P, s.nu), (P, d), (P,)
-    out = Jumps(*(np.zeros(shape, q.dtype) for shape in shapes))
+    nu = s.nu
+
+    def zeros(*shape):
+        return np.zeros((P, *shape), q.dtype)
+
+    out = Jumps(
+        by_state=zeros(d, d),
+        by_input=zeros(d, nu),
+        delay_by_state=zeros(d),
+        delay_by_input=zeros(nu),
+        slip=zeros(d),
+        delay_by_level=zeros(),
+    )
     out.by_state[:] = np.eye(d)
     for g in np.unique(code[code >= 0]).tolist():
         now = np.flatnonzero(code == g)
-        n = s.dims[s.chart_index(s.transitions[g].source)]
+        source = s.transitions[g].source
+        n = s.dims[s.chart_index(source)]
         event = jump(s, g, t[now], q[now, :n], u[:, now])
         m = event.after.shape[1]
         out.by_state[now] = 0.0
@@ -540,8 +623,15 @@ def _jumps(s: Structure, code, t, u, q) -> Jumps:
 
 def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]):
     """Padded states, or what belongs to them, by name; NaN in charts that lack one."""
-    xp, points = namespace(states), np.arange(len(chart))
+    xp = namespace(states)
+    points = np.arange(len(chart))
     wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)
-    places = [dict(zip(c.states, range(s.d), strict=False)) for c in s.charts]
-    row = lambda name: xp.asarray([x.get(name, s.d) for x in places])[chart]  # noqa: E731
-    return {name: wide[points, row(name)] for name in s.state_names()}
+    named = {}
+    for name in s.state_names():
+        # (Column d is NaN.)
+        column = [s.d] * len(s.charts)
+        for a, chart_states in enumerate(x.states for x in s.charts):
+            if name in chart_states:
+                column[a] = chart_states.index(name)
+        named[name] = wide[points, xp.asarray(column)[chart]]
+    return named

@@ -46,7 +46,8 @@ TILE = 250
 _WORTH = 0.125
 # Rounds in which systems begin from neighbors, and routes that searches find for systems that no
 # route suits. More: hopeless systems cost more. Fewer: more are left to the search.
-_ROUNDS, _SEARCHES = 4, 6
+_ROUNDS = 4
+_SEARCHES = 6
 
 
 class Found(NamedTuple):
@@ -135,7 +136,8 @@ class Solver:
         """**Arguments:** `map`: that of a known cycle. `search`: a function of the number of a
         system, of that of one near it whose cycle is known, and of this solver, that returns the
         return map of a cycle that it finds, or None."""
-        S, d = len(many.t), map.anchor.q.shape[0]
+        S = len(many.t)
+        d = map.anchor.q.shape[0]
         self.many, self._search = many, search
         key = _key(map, many.leaves)
         if key in _routes:
@@ -150,7 +152,10 @@ class Solver:
         self._finite = np.isfinite(self._numbers).all(axis=1)
         self.pending = np.flatnonzero(self._finite)
         self._ends: dict[int, np.ndarray] = {}
-        blank = lambda *shape: np.full((S, *shape), np.nan)  # noqa: E731
+
+        def blank(*shape):
+            return np.full((S, *shape), np.nan)
+
         pieces = blank(PIECES), blank(PIECES, d), blank(PIECES, d, d)
         none = np.full(S, -1)
         self.found = Found(none, blank(d), blank(), *pieces, blank(), none + 1)
@@ -168,7 +173,8 @@ class Solver:
             map = self._search(int(self.pending[first]), int(near[first]), self)
             if map is None:
                 return
-            before, route = len(self.pending), route_of(map)
+            before = len(self.pending)
+            route = route_of(map)
             if not route.first.certain:
                 return
             self.routes.append(route)
@@ -183,10 +189,12 @@ class Solver:
 
     def _take(self, number: int) -> None:
         """Find the cycles of the systems without one on a route."""
-        route, rows = self.routes[number], self.pending
+        route = self.routes[number]
+        rows = self.pending
         if not len(rows) or not route.first.certain:
             return
-        many, expected = self.many, float(route.map.expected)
+        many = self.many
+        expected = float(route.map.expected)
         q = np.repeat(route.map.anchor.q.T, len(rows), axis=0)
         grown = many.expected[rows] / expected
         ends = many.t[rows, None] + route.first.ends * grown[:, None]
@@ -204,15 +212,19 @@ class Solver:
             if not len(rows) or not len(known):
                 break
             _, near = self.nearest(rows, known)
-            q, ends = self.found.q[near], self._ends[number][near]
+            q = self.found.q[near]
+            ends = self._ends[number][near]
         self.pending = np.flatnonzero(self._finite & (self.found.path < 0))
 
     def _keep(self, number: int, attempt: _Attempt, finer: bool = False) -> None:
         """Keep the cycles that an attempt has found."""
-        ok, route = np.flatnonzero(attempt.code == Result.OK), self.routes[number]
+        ok = np.flatnonzero(attempt.code == Result.OK)
+        route = self.routes[number]
         itinerary = route.finer if finer else route.first
-        rows, found = attempt.rows[ok], attempt.found
-        passage, out = found.passage, self.found
+        rows = attempt.rows[ok]
+        found = attempt.found
+        passage = found.passage
+        out = self.found
         out.path[rows] = 2 * number + finer
         out.q[rows] = found.q[ok]
         out.period[rows] = (passage.t - self.many.t[attempt.rows])[ok]
@@ -222,7 +234,8 @@ class Solver:
         out.factors[rows] = factors[ok]
         out.distance[rows] = found.distance[ok]
         out.turns[rows] = found.turns[ok]
-        S, E = len(self.many.t), passage.ends.shape[1]
+        S = len(self.many.t)
+        E = passage.ends.shape[1]
         ends = self._ends.setdefault(number, np.full((S, E), np.nan))
         ends[rows] = passage.ends[ok]
 

@@ -59,7 +59,8 @@ _WORTH_COMPILING = 3
 # The same for derivatives outside of programs of users: compilation takes as long as so many
 # derivatives on the host.
 _DERIVATIVES_WORTH_COMPILING = 24
-_routes, _beside = Memory(), Memory()
+_routes = Memory()
+_beside = Memory()
 _calls: collections.Counter = collections.Counter()
 
 
@@ -74,7 +75,10 @@ def route_near(guess: LimitCycle) -> Route | None:
         guess = hosted(guess)
         if verdict(guess).refused:  # (flags compare with what was recorded)
             return None
-        make = lambda: route_of(guess.return_map, last_turn(guess))  # noqa: E731
+
+        def make():
+            return route_of(guess.return_map, last_turn(guess))
+
         route = _routes.recall(guess, None, make)
         return route if route.first.certain else None
 
@@ -193,7 +197,8 @@ def _found(
 def _result(route: Route, map: ReturnMap, found: Corrected):
     """The code of a cycle."""
     still = jax.lax.stop_gradient
-    t, expected = still(map.anchor.t[0]), still(map.expected)
+    t = still(map.anchor.t[0])
+    expected = still(map.expected)
     result = judge(route, still(found), t, expected)
     together = _coincide(route, map, still(found.passage))
     result = update_result(result, together, Result.SIMULTANEOUS)
@@ -220,7 +225,8 @@ def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     if _calls[key] < _WORTH_COMPILING:
         return None
     begin = [np.asarray(x) for x in _beginning(route, map)]
-    t, expected = np.asarray(map.anchor.t[0]), np.asarray(map.expected)
+    t = np.asarray(map.anchor.t[0])
+    expected = np.asarray(map.expected)
     with on_the_cpu():
         for itinerary in (route.first, route.finer):
             program = whole(_correct, (), (map,), loops=True)
@@ -254,12 +260,12 @@ def _cycle(
     """The cycle that Newton's method has found on an itinerary of a route."""
     passage = found.passage
     pieces = Lanes(
-        passage.pieces_t,
-        itinerary.charts,
-        passage.pieces_q.T,
-        itinerary.armed,
-        itinerary.begins,
-        pace_of(itinerary.begins),
+        t=passage.pieces_t,
+        chart=itinerary.charts,
+        q=passage.pieces_q.T,
+        armed=itinerary.armed,
+        events=itinerary.begins,
+        pace=pace_of(itinerary.begins),
     )
     anchor = map.anchor._replace(q=found.q[:, None])
     return LimitCycle(

@@ -133,8 +133,12 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
     """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
     recorded turn."""
-    (map, _, factors, _), (by, *_), solution = arguments, directions, _solve(*arguments)
-    turn, ends, sizes = solution.turn, map.ends(), map.sizes
+    map, _, factors, _ = arguments
+    by, *_ = directions
+    solution = _solve(*arguments)
+    turn = solution.turn
+    ends = map.ends()
+    sizes = map.sizes
     if map.conserved or not solution.is_fixed_point:
         raise NotOnHostError
     P = len(jax.tree_util.tree_leaves(by)[0])
@@ -149,17 +153,17 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     times = np.where(np.isfinite(ends.time), along, 0.0)
     orbit = Variation(s, turn.pieces, ends, side_by_side(turn.tapes), times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
-    moved = np.where(map.valid, orbit.tangents(begin)[-1, 1:].T, 0.0) / sizes
+    end = orbit.tangents(begin)[-1, 1:].T
+    moved = np.where(map.valid, end, 0.0) / sizes
     jacobian = turn.jacobian * sizes / sizes[:, None]
-    begin[1:] = (newton_steps(np.tile(jacobian, (P, 1, 1)), moved) * sizes).T
+    each = np.tile(jacobian, (P, 1, 1))
+    begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
     moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
     if factors:
-        pieces, by_factor = (
-            turn.pieces,
-            orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)],
-        )
+        pieces = turn.pieces
+        by_factor = orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
         if map.base is not None:
             f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(
                 *by_factor.shape[:3]
@@ -291,8 +295,10 @@ def _step_from(
     map: ReturnMap, x: np.ndarray, travelled: Any = None
 ) -> tuple[Turn, np.ndarray]:
     """The turn from a state, in sizes, and the Newton step."""
-    turn, sizes = map.turn_with_jacobian(x * map.sizes, travelled=travelled), map.sizes
-    jacobian, residual = turn.jacobian * sizes / sizes[:, None], turn.residual / sizes
+    turn = map.turn_with_jacobian(x * map.sizes, travelled=travelled)
+    sizes = map.sizes
+    jacobian = turn.jacobian * sizes / sizes[:, None]
+    residual = turn.residual / sizes
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
@@ -327,7 +333,9 @@ def _damped(map: ReturnMap) -> tuple[np.ndarray, Turn, np.ndarray]:
 def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _Descent:
     """Levenberg-Marquardt steps on the host from a state, in sizes, with the constants of
     optimistix. They end at a residual of `enough`."""
-    sizes, least, best = map.sizes, np.inf, None
+    sizes = map.sizes
+    least = np.inf
+    best = None
     history: list[float] = []
     step = np.zeros_like(x)
     work = 0
@@ -336,7 +344,10 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
         residual = turn.residual / sizes
         size = float(np.linalg.norm(residual))
         if size < least:
-            x, least, damping, best = x + step, size, damping / 3.5, turn
+            x = x + step
+            least = size
+            damping = damping / 3.5
+            best = turn
             jacobian = np.vstack(
                 [turn.jacobian * sizes / sizes[:, None], np.eye(len(x))]
             )
@@ -356,7 +367,13 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             break
         if steps == 2 * MAX_STEPS:
             break
-    return _Descent(x, best or turn, least, damping, steps)
+    return _Descent(
+        x=x,
+        turn=best or turn,
+        residual=least,
+        damping=damping,
+        steps=steps,
+    )
 
 
 def _moves(turn: Turn) -> int:
@@ -391,12 +408,17 @@ def _root(map, max_steps):
 def _root_jvp(primals, tangents):
     """The implicit derivative: 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp. (The derivative of
     optimistix cannot be taken twice, since JAX cannot vectorize that of `flow_jacobian`.)"""
-    map, t_map, sizes = primals[0], tangents[0], primals[0].sizes
+    map = primals[0]
+    t_map = tangents[0]
+    sizes = primals[0].sizes
     q, turn, steps = root(*primals)
     fixed = jax.tree_util.tree_map(lambda _: None, map.settings)
     t_map = eqx.tree_at(lambda m: m.settings, t_map, fixed, is_leaf=lambda x: x is None)
+
     # (The steps of the last turn are taken again: a search would take as long to compile.)
-    again = lambda map: map.turn(q, turn.record).residual  # noqa: E731
+    def again(map):
+        return map.turn(q, turn.record).residual
+
     _, by_parameters = eqx.filter_jvp(again, (map,), (t_map,))
     jacobian = (
         map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]

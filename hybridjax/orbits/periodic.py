@@ -42,7 +42,8 @@ def has_period(
         here = (chart == a)[:, None]
         known = here & ~jnp.isnan(now)
         size = jnp.max(jnp.where(known, jnp.abs(now), 0.0), axis=0)
-        rounding = ROUNDING * jnp.abs(rate) * (jnp.abs(times) + period)[:, None]
+        largest_time = (jnp.abs(times) + period)[:, None]
+        rounding = ROUNDING * jnp.abs(rate) * largest_time
         differs = jnp.abs(later - now) > _SAME * size + rounding
         same = same & ~(here & differs).any()
     return same

@@ -55,7 +55,8 @@ _OTHER = 0.83
 # Largest distance, in sizes of the states, of the end of the second integration from its beginning,
 # and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
 # Smaller: errors of the second integration refuse cycles.
-_APART, _ROUGH = 1e-6, 1e3
+_APART = 1e-6
+_ROUGH = 1e3
 # Largest last correction of an event's time, as a part of the period. Larger: an event that the
 # corrections have not reached passes. Smaller: rounding errors of times do not.
 _LAST_CORRECTION = 1e-10
@@ -97,7 +98,8 @@ class Plan(eqx.Module):
         whether they have kept the itinerary, with steps that are fine enough."""
         xp = namespace(passage.t)
         ends = passage.ends
-        durations = ends - xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        begins = xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        durations = ends - begins
         # (Rounding makes legs that last no time negative.)
         forwards = durations >= -ROUNDING * period[..., None]
         unused = np.arange(ends.shape[-1]) > self.last
@@ -115,7 +117,10 @@ def _number(x: Any) -> Array:
 
 def on_device(tree: Any) -> Any:
     """`tree` with arrays of JAX."""
-    move = lambda x: jnp.asarray(x) if on_host(x) else x  # noqa: E731
+
+    def move(x):
+        return jnp.asarray(x) if on_host(x) else x
+
     return jax.tree_util.tree_map(move, tree)
 
 
@@ -153,14 +158,21 @@ def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     """
     map = to_host(map)
     pieces = side_by_side(to_host(map.pieces())) if turn is None else turn
-    s, levels = map.structure, levels_of(map)
+    s = map.structure
+    levels = levels_of(map)
     densities = _IMPLICIT_DENSITIES if has_implicit(s) else _DENSITIES
     densities = *densities, densities[0] * _OTHER
     first, finer, other = (recorded(s, pieces, levels, x) for x in densities)
     begin = map.anchor.t[0]
     ends = begin + first.ends
     together = coincide_on(map, first.events, ends, begin, ends[first.last])
-    return Route(map, first, finer, other, together)
+    return Route(
+        map=map,
+        first=first,
+        finer=finer,
+        other=other,
+        together=together,
+    )
 
 
 class Corrected(NamedTuple):
@@ -217,13 +229,21 @@ class Maps(NamedTuple):
 
     def each(self, function: Callable, *arrays: Array) -> Any:
         """`function(map, *arrays)` of each lane."""
-        one = lambda numbers, *lane: function(self.of(numbers), *lane)  # noqa: E731
+
+        def one(numbers, *lane):
+            return function(self.of(numbers), *lane)
+
         return (jax.vmap(one) if self.many else one)(self.numbers, *arrays)
 
 
 def maps_of(map: ReturnMap) -> Maps:
     """The return map of one system."""
-    return Maps(map, leaves_of(map.system), map.anchor.t[0], map.expected)
+    return Maps(
+        map=map,
+        numbers_of_system=leaves_of(map.system),
+        t=map.anchor.t[0],
+        expected=map.expected,
+    )
 
 
 def leaves_of(system: Any) -> tuple[Array, ...]:
@@ -242,10 +262,10 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
         is_last = jnp.arange(ends.shape[-1]) >= plan.last
         known = jnp.where(is_last, end, jnp.inf)
     travelers = Travelers(
-        lambda numbers: maps.of(numbers).structure,
-        maps.numbers,
-        maps.many,
-        maps.map.structure,
+        of=lambda numbers: maps.of(numbers).structure,
+        numbers=maps.numbers,
+        many=maps.many,
+        structure=maps.map.structure,
     )
     passage = follow(
         travelers,
@@ -273,7 +293,8 @@ def _newton(map: ReturnMap, factors, residual, q):
     jacobian = product - jnp.eye(len(q)) - map.held(q)[1]
     sizes = map.sizes
     step = -solve_by_columns(jacobian * sizes / sizes[:, None], residual / sizes)
-    excess = jnp.max(jnp.abs(step) / (ATOL + RTOL * jnp.abs(q / sizes)))
+    tolerance = ATOL + RTOL * jnp.abs(q / sizes)
+    excess = jnp.max(jnp.abs(step) / tolerance)
     return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
 
 
@@ -288,7 +309,14 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         passage, residual = turn(maps, plan, q, before.passage.ends)
         steps = maps.each(_newton, passage.factors, residual, q)
         jacobian, step, excess, distance = steps
-        found = Corrected(q, passage, jacobian, distance, excess, before.turns + 1)
+        found = Corrected(
+            q=q,
+            passage=passage,
+            jacobian=jacobian,
+            distance=distance,
+            excess=excess,
+            turns=before.turns + 1,
+        )
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
         closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
@@ -307,17 +335,31 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
 
 def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     """The beginning of Newton's method."""
-    lanes, d, K = q.shape[:-1], q.shape[-1], PIECES
-    zeros = lambda *shape: jnp.zeros((*lanes, *shape))  # noqa: E731
+    lanes = q.shape[:-1]
+    d = q.shape[-1]
+    K = PIECES
+
+    def zeros(*shape):
+        return jnp.zeros((*lanes, *shape))
+
     pieces = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
     inside = jnp.zeros(lanes, bool)
     passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
-    unsolved, turns = zeros() + jnp.inf, jnp.zeros(lanes, int)
-    return Corrected(q, passage, zeros(d, d), zeros(), unsolved, turns)
+    unsolved = zeros() + jnp.inf
+    turns = jnp.zeros(lanes, int)
+    return Corrected(
+        q=q,
+        passage=passage,
+        jacobian=zeros(d, d),
+        distance=zeros(),
+        excess=unsolved,
+        turns=turns,
+    )
 
 
 def _where(mask: Bool[Array, "*L"], yes: Array, no: Array) -> Array:
-    return jnp.where(mask.reshape(mask.shape + (1,) * (yes.ndim - mask.ndim)), yes, no)
+    missing = (1,) * (yes.ndim - mask.ndim)
+    return jnp.where(mask.reshape(mask.shape + missing), yes, no)
 
 
 @eqx.filter_custom_jvp
@@ -335,7 +377,8 @@ def _solved_jvp(primals, tangents):
     maps, plan, *_ = primals
     by_maps = _without_settings(tangents[0])
     found = _solved(*primals)
-    q, factors = found.q, found.passage.factors
+    q = found.q
+    factors = found.passage.factors
     ends = jax.lax.stop_gradient(found.passage.ends)
 
     def around(maps, q):
@@ -382,7 +425,8 @@ def _root_and_period_jvp(primals, tangents):
     that Newton's method has used."""
     maps, plan, *_ = primals
     found = _root_and_period(*primals)
-    q, passage = found.q, found.passage
+    q = found.q
+    passage = found.passage
     late, moved = _at_fixed_state(maps, tangents[0], plan, q, passage.ends)
     _, step, *_ = maps.each(_newton, passage.factors, moved, q)
     before = monodromy(passage.factors[:-1])
@@ -419,10 +463,14 @@ def factors_across(
     direction of the flow."""
     if map.base is None:
         return passage.factors
-    xp, lanes = namespace(passage.q), passage.q.ndim - 1
+    xp = namespace(passage.q)
+    lanes = passage.q.ndim - 1
     sizes = xp.asarray(map.scale)[itinerary.charts]
     sizes = xp.broadcast_to(sizes, passage.rates.shape)
-    first = lambda x: xp.moveaxis(x, lanes, 0)  # noqa: E731
+
+    def first(x):
+        return xp.moveaxis(x, lanes, 0)
+
     factors = across(first(passage.rates), first(sizes), first(passage.factors))
     return xp.moveaxis(factors, 0, lanes)
 
@@ -463,7 +511,8 @@ def periodic(maps: Maps, charts: Int[Array, " K"], passage: Passage):
 def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
     """The codes of lanes with these times of the anchor and expected periods: whether Newton's
     method converged, whether the route was kept, and whether its steps were fine enough."""
-    passage, xp = found.passage, namespace(found.q)
+    passage = found.passage
+    xp = namespace(found.q)
     converged = xp.isfinite(found.excess) & (found.excess <= 1)
     converged = converged & (found.distance <= CLOSED)
     code = xp.zeros_like(found.turns, dtype=xp.int32)
@@ -478,7 +527,8 @@ def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
 def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
     """Whether cycles are isolated, last as long as expected if a clock drives them, and are no
     equilibria."""
-    passage, xp = found.passage, namespace(found.q)
+    passage = found.passage
+    xp = namespace(found.q)
     # (On a cycle that is not isolated, Newton's method ends anywhere.)
     sizes = route.map.sizes
     defect = found.jacobian * sizes / sizes[:, None]

@@ -72,7 +72,8 @@ class PhaseCurve(Showable, eqx.Module):
     @property
     def unit(self) -> str:
         """The unit of the values."""
-        unit, time = unit_of(self.input), self.time_unit or "time"
+        unit = unit_of(self.input)
+        time = self.time_unit or "time"
         return f"cycles / ({unit} {time})" if unit else f"cycles / {time} / input"
 
 
@@ -107,8 +108,10 @@ class Coupling(Showable, eqx.Module):
     coefficients: Complex[Array, " n"]
 
     def __call__(self, lead: Phases) -> Float[Array, " p"]:
-        xp, n = namespace(self.coefficients), np.arange(len(self.coefficients))
-        waves = xp.exp(2j * np.pi * xp.asarray(lead)[..., None] * n)
+        xp = namespace(self.coefficients)
+        n = np.arange(len(self.coefficients))
+        angle = 2j * np.pi * xp.asarray(lead)[..., None]
+        waves = xp.exp(angle * n)
         return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
 
     __repr__ = fields
@@ -140,13 +143,21 @@ class Coupling(Showable, eqx.Module):
 
         steps = 16 * len(self.coefficients)
         grid = (np.arange(steps + 1) - 0.5) / steps
-        sign, value = np.sign(self(grid)), lambda x: float(self([x])[0])
+        sign = np.sign(self(grid))
+
+        def value(x):
+            return float(self([x])[0])
+
         crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
         roots = [
             optimize.brentq(value, *grid[k : k + 2], full_output=True)[0]
             for k in crossed
         ]
-        return tuple(Locked(x % 1.0, float(self._slope([x])[0])) for x in roots)
+        locked = []
+        for x in roots:
+            slope = float(self._slope([x])[0])
+            locked.append(Locked(x % 1.0, slope))
+        return tuple(locked)
 
 
 # When responses were made, for messages.
@@ -221,7 +232,9 @@ class Responses(Showable, eqx.Module):
         """The responses of the phase (in time), or of the amplitude of a mode, to inputs that act
         at events."""
         require_as_made(self.structure.system, _MADE)
-        xp, jumps, s = namespace(self.period), self.flow.jumps, self.structure
+        xp = namespace(self.period)
+        jumps = self.flow.jumps
+        s = self.structure
         after = xp.roll(self._covector(mode)[:, 0], -1, axis=0)
         weight = xp.einsum("pi,piu->pu", after, jumps.by_input)
         place = xp.argsort(self.flow.event < 0, stable=True)
@@ -245,9 +258,12 @@ class Responses(Showable, eqx.Module):
         signal, pushed = self._pushed(input)
         if any(x.weight[signal] != 0 for x in self.impulses()):
             raise DefinitionError(f"'{signal}' acts at events alone: see `impulses()`.")
-        flow, period = to_host(self.flow), float(self.period)
+        flow = to_host(self.flow)
+        period = float(self.period)
         phase = (flow.t - flow.t[0, 0]) / period
-        tail = np.where(flow.event >= 0, np.nan, pushed[:, -1]) / period
+        # (A piece that ends in an event is separated from the next one.)
+        end = np.where(flow.event >= 0, np.nan, pushed[:, -1])
+        tail = end / period
         pairs = (phase, phase[:, -1]), (pushed / period, tail)
         phase, values = (
             np.concatenate([x, y[:, None]], axis=1).ravel() for x, y in pairs
@@ -270,12 +286,17 @@ class Responses(Showable, eqx.Module):
         **Raises:** `DefinitionError` for names that do not exist, too few harmonics, and a cycle
         that is driven by a clock.
         """
-        flow, xp, period = self.flow, namespace(self.flow.q), self.period
+        flow = self.flow
+        xp = namespace(self.flow.q)
+        period = self.period
         signal, pushed = self._pushed(input)
         # Nodes within parts of pieces that resolve the fastest wave.
-        parts, (x, weight) = 1 + harmonics // 2, np.polynomial.legendre.leggauss(NODES)
-        x = ((np.arange(parts)[:, None] + (x + 1) / 2) / parts).ravel()
-        phase = ((flow.turn[:, None] + flow.length[:, None] * x) / period).ravel()
+        parts = 1 + harmonics // 2
+        x, weight = np.polynomial.legendre.leggauss(NODES)
+        begin_of_part = np.arange(parts)[:, None]
+        x = ((begin_of_part + (x + 1) / 2) / parts).ravel()
+        times = flow.turn[:, None] + flow.length[:, None] * x
+        phase = (times / period).ravel()
         weight = (
             flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)
         ).ravel()
@@ -286,10 +307,13 @@ class Responses(Showable, eqx.Module):
         else:
             wave = xp.asarray(push(phase), float)
         n = np.arange(harmonics + 1)
-        weight = xp.exp(-2j * np.pi * n[:, None] * phase) * weight
-        wave, response = weight @ wave, weight @ Z
+        waves = xp.exp(-2j * np.pi * n[:, None] * phase)
+        weight = waves * weight
+        wave = weight @ wave
+        response = weight @ Z
         for x in self.impulses():
-            response += xp.exp(-2j * np.pi * n * x.phase) * x.weight[signal] / period
+            wave_there = xp.exp(-2j * np.pi * n * x.phase)
+            response += wave_there * x.weight[signal] / period
         c = xp.conj(response) * wave / period
         if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
             raise DefinitionError(
@@ -340,7 +364,8 @@ class Responses(Showable, eqx.Module):
     def _named(
         self, covector: Inexact[Array, "P K d"], phase: Phases, scale: Array = 1.0
     ) -> dict[str, Array]:
-        flow, s = self.flow, self.structure
+        flow = self.flow
+        s = self.structure
         xp = namespace(flow.q)
         pushed = xp.einsum("pki,pkiu->pku", covector, flow.by_input)
         covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
@@ -356,8 +381,11 @@ def responses(cycle: Any, modes: int | None) -> Responses:
 
 @one_program
 def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
-    host, xp, map = on_host(flow.t), namespace(flow.t), cycle.return_map
-    period, clocked = map.expected, map.base is None
+    host = on_host(flow.t)
+    xp = namespace(flow.t)
+    map = cycle.return_map
+    period = map.expected
+    clocked = map.base is None
     whole = flow.monodromy(map.valid)
     _, Z = loop(map, whole, flow.field[0, 0])
     whole = whole - flow.field[0, 0, :, None] * Z
@@ -400,10 +428,13 @@ def asymptotic_phase(
     cycle: Any, chart: str, state: Float[np.ndarray, " n"], turns: int
 ) -> float:
     """The asymptotic phase of a state (see `LimitCycle.asymptotic_phase`)."""
-    map, period = cycle.return_map, float(cycle.period)
-    s, a = map.structure, map.structure.chart_index(chart)
+    map = cycle.return_map
+    period = float(cycle.period)
+    s = map.structure
+    a = map.structure.chart_index(chart)
     lanes = begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
-    phase, size = responses(cycle, 0)._covector(None)[0, 0], map.sizes
+    phase = responses(cycle, 0)._covector(None)[0, 0]
+    size = map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase
     surface = getattr(s.charts[a], "surface", None)
     if surface is not None and abs(float(surface(map.anchor.t[0], state))) > near:
@@ -434,7 +465,8 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
 
     **Raises:** `ComputationError` if it is not simple.
     """
-    xp, size = namespace(f), map.sizes
+    xp = namespace(f)
+    size = map.sizes
     if map.base is None:
         return monodromy - xp.eye(len(f)), xp.zeros_like(f)
     along = f / size**2
@@ -455,9 +487,11 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
 
     **Raises:** `ComputationError` for multipliers that coincide.
     """
-    xp, scaled = namespace(M), M * size / size[:, None]
+    xp = namespace(M)
+    scaled = M * size / size[:, None]
     values, right = xp.linalg.eig(stop_gradient(scaled))
-    order = xp.argsort(-xp.abs(values) + 1e-9 * (xp.imag(values) < 0), stable=True)
+    lower_last = 1e-9 * (xp.imag(values) < 0)
+    order = xp.argsort(-xp.abs(values) + lower_last, stable=True)
     if on_host(M):
         kept = int(np.sum(np.abs(values) > _LEAST))
         count = kept if count is None else count
@@ -465,7 +499,9 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
             raise DefinitionError(
                 f"{count} modes were asked for; {kept} have amplitudes."
             )
-    modes = [_mode(scaled, size, values[k], right[:, k]) for k in order[:count]]
+    modes = []
+    for k in order[:count]:
+        modes.append(_mode(scaled, size, values[k], right[:, k]))
     if not modes:
         return values[:0], right[:0], right[:0]
     return tuple(xp.stack(x) for x in zip(*modes, strict=True))
@@ -477,29 +513,31 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
 
     **Raises:** `ComputationError` for one that coincides with another.
     """
-    xp, n = namespace(M), len(M)
+    xp = namespace(M)
+    n = len(M)
     still = stop_gradient(M)
 
     def pair(M, still, x):
-        matrix = xp.concatenate([still - value * np.eye(n), xp.conj(x)[None]])
+        shifted = still - value * np.eye(n)
+        matrix = xp.concatenate([shifted, xp.conj(x)[None]])
         column = xp.append(-x, 0.0)[:, None]
         off = xp.append(M @ x - value * x, 0.0)
         step = xp.linalg.solve(xp.concatenate([matrix, column], axis=1), off)
         return x - step[:n], value - step[n]
 
     *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
-    (right, root), (left, _) = (
-        pair(M, still, right),
-        pair(M.T, still.T, xp.conj(rows[-1])),
-    )
+    right, root = pair(M, still, right)
+    left, _ = pair(M.T, still.T, xp.conj(rows[-1]))
     if on_host(M):
-        apart = np.abs(left @ right) / (np.linalg.norm(left) * np.linalg.norm(right))
+        lengths = np.linalg.norm(left) * np.linalg.norm(right)
+        apart = np.abs(left @ right) / lengths
         if not apart > SINGULAR:
             raise ComputationError(
                 "two multipliers coincide, and their modes have no amplitudes of their own: "
                 "ask for the phase alone by `modes=0`, or change a parameter."
             )
-    largest, left = left[xp.argmax(xp.abs(left))], left / size
+    largest = left[xp.argmax(xp.abs(left))]
+    left = left / size
     left = (
         left * xp.conj(largest) / xp.abs(largest) / xp.sqrt(xp.sum(xp.abs(left) ** 2))
     )
@@ -515,7 +553,8 @@ def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"]:
 
 
 def _returned(a: int, s: Structure, t, q, u):
-    chart, effect = s.charts[a], jnp.eye(len(q))
+    chart = s.charts[a]
+    effect = jnp.eye(len(q))
     if isinstance(chart, SlidingChart):
         effect = chart.returned(t, q, s.chart_input(a, t, u))
     return jnp.pad(effect, (0, s.d - len(q))).ravel()

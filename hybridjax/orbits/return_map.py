@@ -69,7 +69,8 @@ SINGULAR = 1e-7
 CLOSED = 2e-8
 # A turn closes at most at this multiple of the accuracy of the flow, or of the derivative of the
 # turn. Smaller: rounding rejects cycles. Larger: errors of the cycle exceed the accuracy asked for.
-_ACCURACIES, _ROUNDED = 20.0, 1e-12
+_ACCURACIES = 20.0
+_ROUNDED = 1e-12
 # Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
 # for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
@@ -217,8 +218,10 @@ class ReturnMap(eqx.Module):
 
     def watch(self, lanes: Lanes, target: Target) -> Watch:
         """Guards and levels at lanes, without input."""
-        xp, L = namespace(lanes.t), lanes.t.shape[0]
-        u, everywhere = xp.zeros((self.structure.nu, L)), xp.ones(L, bool)
+        xp = namespace(lanes.t)
+        L = lanes.t.shape[0]
+        u = xp.zeros((self.structure.nu, L))
+        everywhere = xp.ones(L, bool)
         s = self._structure_of(lanes)
         return watch(s, lanes.t, lanes.chart, lanes.q, u, target, everywhere)
 
@@ -229,14 +232,17 @@ class ReturnMap(eqx.Module):
 
     def _structure_of(self, lanes: Lanes) -> Structure:
         """The structure, for each piece of its turn if `lanes` are the pieces of all turns."""
-        turns, count = len(self.anchor.t), len(lanes.t)
+        turns = len(self.anchor.t)
+        count = len(lanes.t)
         if turns == count:
             return self.structure
         return self.structure.at(np.arange(count) % turns)
 
     def departure(self, q: Float[Array, " d"]) -> Lanes:
         """The lane at the beginning of a turn; an event that has just happened is not armed."""
-        s, anchor, xp = self.structure, self.anchor, namespace(q)
+        s = self.structure
+        anchor = self.anchor
+        xp = namespace(q)
         lanes = start_lanes(s, anchor.t, anchor.chart, xp.atleast_2d(q).T)
         span = xp.atleast_1d(self.expected)
         lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), span)
@@ -246,7 +252,8 @@ class ReturnMap(eqx.Module):
     def turn(self, q: Float[Array, " d"], record: Recorded | None = None) -> Return:
         """One turn from a state on the section; by the steps of a `record`, from a state close to
         its start."""
-        s, u = self.structure, namespace(q).zeros((self.structure.nu, 1))
+        s = self.structure
+        u = namespace(q).zeros((self.structure.nu, 1))
 
         def flow(lanes, target, h, result, piece):
             return follow(s, lanes, u, target, piece).moved, None
@@ -326,7 +333,13 @@ class ReturnMap(eqx.Module):
             return moved, (lanes, factor, tape, Recorded(moved, steps))
 
         end, (pieces, factors, tapes, record) = self.travel(q, flow, record)
-        return _Linear(end, pieces, factors, tapes, record)
+        return _Linear(
+            end=end,
+            pieces=pieces,
+            factors=factors,
+            tapes=tapes,
+            record=record,
+        )
 
     def _linear_on_host(
         self,
@@ -345,15 +358,23 @@ class ReturnMap(eqx.Module):
         lanes, tape, ends = side_by_side((pieces, tapes, ends))
         ends = ends.with_levels(levels)
         d = self.structure.d
+        by_parameter = None
         if varied is None:
             s = self._structure_of(lanes)
             by, _ = tape_jacobian(s, lanes, ends, tape, True)
             factors = by[:, 1:].reshape(PIECES, *q.shape, d)
-            return _Linear(end, pieces, factors, tapes, gap=gap)
-        by, at = tape_jacobian(varied, lanes, ends, tape, False)
-        by_parameter = self._by_parameter(varied, by[:, 1:], at)
-        factors = by[:, 1:, 1 : 1 + d]
-        return _Linear(end, pieces, factors, tapes, None, gap, by_parameter)
+        else:
+            by, at = tape_jacobian(varied, lanes, ends, tape, False)
+            by_parameter = self._by_parameter(varied, by[:, 1:], at)
+            factors = by[:, 1:, 1 : 1 + d]
+        return _Linear(
+            end=end,
+            pieces=pieces,
+            factors=factors,
+            tapes=tapes,
+            gap=gap,
+            by_parameter=by_parameter,
+        )
 
     def _by_parameter(
         self,
@@ -375,7 +396,8 @@ class ReturnMap(eqx.Module):
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
-        sizes, xp = self.sizes, namespace(q)
+        sizes = self.sizes
+        xp = namespace(q)
         defect = self._defect(q, turn)
         existing = self.valid.sum(axis=-1)[..., None]
         counts = np.arange(self.structure.d) < existing
@@ -418,14 +440,17 @@ class ReturnMap(eqx.Module):
         """Test whether a turn stays where it begins, as at an equilibrium."""
         xp = namespace(q)
         same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
-        apart = xp.abs(turn.pieces.q - q[..., None]) / self.sizes[..., None]
-        farthest = xp.max(xp.where(same, xp.max(apart, axis=-2), np.inf), axis=-1)
+        apart = xp.abs(turn.pieces.q - q[..., None])
+        apart = apart / self.sizes[..., None]
+        farthest_state = xp.max(apart, axis=-2)
+        farthest = xp.max(xp.where(same, farthest_state, np.inf), axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
         """True if a guard has the sign that it has after its event at the beginnings of all pieces
         in its chart: it was crossed by none of them, so that it was never armed."""
-        s, shape = self.structure, turn.distance.shape
+        s = self.structure
+        shape = turn.distance.shape
         if not any(s.guards(a) for a in range(len(s.charts))):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
@@ -437,7 +462,8 @@ class ReturnMap(eqx.Module):
                 )
             )
         watched = self.watch(lanes, until(lanes.t))
-        value, rate = watched.value[:-1], watched.rate[:-1]
+        value = watched.value[:-1]
+        rate = watched.rate[:-1]
         error = CLOSED * xp.max(self.expected) * xp.abs(rate)
         here = belongs(s, lanes.chart)[:-1]
         u = xp.zeros((s.nu, len(lanes.t)))
@@ -478,14 +504,16 @@ class ReturnMap(eqx.Module):
         Conserved quantities do not change along P(q) - q. So P(q) - q and this step can add up to
         zero only if both are zero; and J - I is regular once the derivative is subtracted from it.
         """
-        xp, sizes = namespace(q), self.sizes
+        xp = namespace(q)
+        sizes = self.sizes
         if not self.conserved:
             return xp.zeros_like(q), xp.zeros(
                 (*q.shape, q.shape[-1] + (varied is not None))
             )
         values, gradient = self.outputs(q, tuple(self.conserved), varied)
         excess = values - xp.stack(list(self.conserved.values()))
-        scaled = gradient[..., : q.shape[-1]] * sizes[..., None, :]
+        by_state = gradient[..., : q.shape[-1]]
+        scaled = by_state * sizes[..., None, :]
         steep = xp.linalg.norm(scaled, axis=-1, keepdims=True)
         steep = xp.where(steep > 0, steep, 1.0)
         back = (
@@ -504,13 +532,18 @@ class ReturnMap(eqx.Module):
     ) -> tuple[Float[Array, " c"], Float[Array, "c n"]]:
         """Outputs at the anchor's time in its chart, and their derivatives by the state, and the
         parameter of `varied`."""
-        s, (t, chart, *_) = varied or self.structure, self.anchor
-        outputs = lambda a, *point: kernels.outputs(s, a, names, *point)  # noqa: E731
+        s = varied or self.structure
+        t, chart, *_ = self.anchor
+
+        def outputs(a, *point):
+            return kernels.outputs(s, a, names, *point)
+
         q = namespace(q).atleast_2d(q).T
         by = self.each(
             with_derivatives(s, outputs, chart, t, q, len(names)).transpose(2, 0, 1)
         )
-        return by[..., 0], by[..., 2 : 2 + s.d + (varied is not None)]
+        columns = 2 + s.d + (varied is not None)
+        return by[..., 0], by[..., 2:columns]
 
     def travel(
         self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
@@ -520,23 +553,30 @@ class ReturnMap(eqx.Module):
 
         The pieces end at K - 1 times, then on the section on which the turn began.
         """
-        xp, ends = namespace(q), self.ends()
+        xp = namespace(q)
+        ends = self.ends()
 
         def follow_piece(carry, end):
             lanes, h, result = carry
             *end, piece = end
             time, index, event, limit = (xp.atleast_1d(x) for x in end)
-            target = Target(time, index, event, limit, None, ends.levels, ends.missed)
+            target = Target(
+                time=time,
+                index=index,
+                event=event,
+                limit=limit,
+                event_sequence=None,
+                levels=ends.levels,
+                missed=ends.missed,
+            )
             moved, extra = flow(lanes, target, h, result, piece)
             return (moved.lanes, moved.h, moved.result), extra
 
         lanes, each = self.departure(q), self.each  # (no `events` is `Result.OK`)
         h = xp.atleast_1d(0.5 * self.expected / PIECES)
         if isinstance(flow, Options):
-            u, begin = (
-                xp.zeros((self.structure.nu, len(h))),
-                (lanes, stride(h), lanes.events),
-            )
+            u = xp.zeros((self.structure.nu, len(h)))
+            begin = (lanes, stride(h), lanes.events)
             (end, _, result), extra = through(
                 self.structure, begin, u, ends, self.settings, flow
             )
@@ -544,9 +584,16 @@ class ReturnMap(eqx.Module):
             rows = ends.time, ends.index, ends.event, ends.limit, record
             (end, _, result), extra = scan(follow_piece, (lanes, h, lanes.events), rows)
         same = each((result == Result.OK) & (end.chart == self.anchor.chart))
-        residual = xp.where(self.valid, each(end.q.T), 0.0) - q - self.held(q)[0]
+        returned = xp.where(self.valid, each(end.q.T), 0.0)
+        off, _ = self.held(q)
+        residual = returned - q - off
         residual = xp.where(same[..., None], residual, np.nan)
-        return Return(residual, each(end.t - self.anchor.t), each(result), end), extra
+        return Return(
+            residual=residual,
+            period=each(end.t - self.anchor.t),
+            result=each(result),
+            end=end,
+        ), extra
 
     def pieces(self) -> tuple[Lanes, Tape]:
         """The starts and tapes of the pieces of one turn."""
@@ -557,16 +604,15 @@ class ReturnMap(eqx.Module):
 
     def ends(self) -> Target:
         """The ends of the pieces, as lanes; of several lanes, by piece and lane."""
-        t0, expected, xp = (
-            self.each(self.anchor.t),
-            self.expected,
-            namespace(self.expected),
-        )
+        t0 = self.each(self.anchor.t)
+        expected = self.expected
+        xp = namespace(self.expected)
         k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
         if self.base is None:
             return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
-        time = xp.where(k < PIECES, t0 + free * expected * k / (PIECES - 1), np.inf)
+        grid = t0 + free * expected * k / (PIECES - 1)
+        time = xp.where(k < PIECES, grid, np.inf)
         section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
         last = k == PIECES
         return dataclasses.replace(
@@ -576,14 +622,16 @@ class ReturnMap(eqx.Module):
         )
 
     def _meetings(self, pieces: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
-        xp, shape = namespace(codes), codes.shape[:-2]
+        xp = namespace(codes)
+        shape = codes.shape[:-2]
         if self.base is None:
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
             return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
         level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
         level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
-        falls = (level[1:-1] > 0) & (level[2:] <= 0) & (events[1:-1] == events[2:])
+        crosses = (level[1:-1] > 0) & (level[2:] <= 0)
+        falls = crosses & (events[1:-1] == events[2:])
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 
 
@@ -615,13 +663,16 @@ def with_derivatives(
 
     **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`. `u`: Default: 0.
     """
-    xp, L = namespace(t), len(t)
+    xp = namespace(t)
+    L = len(t)
     u = xp.zeros((s.nu, 1)) if u is None else u
 
     def work(a, here, out):
         n = s.dims[a]
-        by = function(a, only(here, t), only(here, q[:n]), only(here, u))
-        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, 2 + s.d : 2 + s.d + s.nu])
+        point = only(here, t), only(here, q[:n]), only(here, u)
+        by = function(a, *point)
+        inputs = slice(2 + s.d, 2 + s.d + s.nu)
+        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, inputs])
         return put(out, index, xp.where(here, by, out[index]))
 
     begin = xp.zeros((rows, 2 + s.d + s.nu, L), t.dtype)

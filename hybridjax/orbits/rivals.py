@@ -31,19 +31,24 @@ class Events(NamedTuple):
 def events_on(map: ReturnMap, tape: Tape) -> Events:
     """The events on the tape of a turn, or of turns side by side, after the one with which the turn
     begins."""
-    parts = tape.code, tape.t, tape.at_once, tape.rival
-    rows = Events(*(stop_gradient(x.reshape(-1, *map.expected.shape)) for x in parts))
+
+    def by_row(x):
+        return stop_gradient(x.reshape(-1, *map.expected.shape))
+
+    rows = Events(
+        codes=by_row(tape.code),
+        times=by_row(tape.t),
+        at_once=by_row(tape.at_once),
+        rivals=by_row(tape.rival),
+    )
     if on_host(rows.codes):  # (most rows are moves without an event)
         happens = (rows.codes.reshape(len(rows.codes), -1) >= 0).any(axis=1)
         rows = Events(*(x[happens] for x in rows))
     xp = namespace(rows.codes)
     last = xp.where(rows.codes >= 0, rows.times, xp.inf)
     order = xp.argsort(last, axis=0, stable=True)
-    return _after_beginning(
-        map,
-        Events(*(xp.take_along_axis(x, order, axis=0) for x in rows)),
-        map.each(map.anchor.t),
-    )
+    in_order = Events(*(xp.take_along_axis(x, order, axis=0) for x in rows))
+    return _after_beginning(map, in_order, map.each(map.anchor.t))
 
 
 def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
@@ -72,11 +77,13 @@ def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]
     codes = events.codes
     happens = codes >= 0
     times = xp.where(happens, events.times, 0.0)
-    by_clock = xp.asarray(np.append(s.clocks >= 0, False))[xp.maximum(codes, -1)]
+    is_schedule = np.append(s.clocks >= 0, False)  # (the last one is for no event)
+    by_clock = xp.asarray(is_schedule)[xp.maximum(codes, -1)]
 
     both_happen = happens[1:] & happens[:-1]
     both_by_clock = by_clock[1:] & by_clock[:-1]
-    close = at_one_time(times[1:], times[:-1], period) & both_happen & ~both_by_clock
+    close = at_one_time(times[1:], times[:-1], period)
+    close = close & both_happen & ~both_by_clock
     follows = xp.concatenate([xp.zeros_like(happens[:1]), close])
     before = xp.concatenate([codes[:1], codes[:-1]])
     out = xp.where(follows, before, xp.maximum(events.rivals, -1))
@@ -96,7 +103,8 @@ def is_due(s: Structure, g: int, codes, times, period) -> Bool[Array, "E *S"]:
     touches = np.array([*touches, False])  # (the last one is for no event)
     xp = namespace(times)
     within = xp.asarray(touches)[xp.maximum(codes, -1)]
-    return within & at_one_time(schedule.nearest(times), times, period)
+    due = at_one_time(schedule.nearest(times), times, period)
+    return within & due
 
 
 def coincide(s: Structure, events: Events, period: Array) -> Bool[Array, "*S"]:
@@ -113,10 +121,17 @@ def coincide_on(
     """
     xp = namespace(ends)
     times = ends[: len(sequence)]
-    codes = np.array(sequence, np.int32).reshape(-1, *[1] * (times.ndim - 1))
+    codes = np.array(sequence, np.int32)
+    each_turn = (1,) * (times.ndim - 1)
+    codes = codes.reshape(-1, *each_turn)
     codes = xp.broadcast_to(codes, times.shape)
     no = xp.zeros_like(times, bool)
-    events = Events(codes, times, no, xp.full_like(codes, -1))
+    events = Events(
+        codes=codes,
+        times=times,
+        at_once=no,
+        rivals=xp.full_like(codes, -1),
+    )
     events = _after_beginning(map, events, begin)
     return rivals_of(map.structure, events, end - begin) >= 0
 

@@ -8,7 +8,7 @@ as they do a state that a symmetry keeps at zero, the size is large enough to to
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,15 +65,21 @@ def sizes_near(
     **Arguments:** `chart`, index of the guess's chart; `q`, padded; `period` of the clock.
     """
     points = _reached(s, chart, t, q)
-    reached = np.flatnonzero(np.isfinite(points).all(axis=1))
+    is_reached = np.isfinite(points).all(axis=1)
+    reached = np.flatnonzero(is_reached)
     # The guess's chart comes first.
-    reached = np.roll(reached, -int(np.argmax(reached == chart)))
-    # Of the clock's phases an odd number, since an even one may repeat a symmetry.
-    phases = np.zeros(1) if period is None else period * np.arange(7) / 7
+    place_of_guess = int(np.argmax(reached == chart))
+    reached = np.roll(reached, -place_of_guess)
     R = len(reached)
+
+    # Of the clock's phases an odd number, since an even one may repeat a symmetry.
+    phases = np.zeros(1)
+    if period is not None:
+        phases = period * np.arange(7) / 7
     times = np.repeat(float(t) + phases, R)
     charts = np.tile(reached, len(phases))
     fields = _fields(s, charts, times, points[charts].T)
+
     states = points[reached].T
     near = _Fields(*(x[..., :R] for x in fields))
     time = _time_scale(states, near)
@@ -81,17 +87,25 @@ def sizes_near(
     if period is not None:
         turn = period
         time = min(time, period / (2 * np.pi))
-    size = np.abs(states) + time * np.abs(near.f) + time**2 * np.abs(near.change)
+
+    by_rate = time * np.abs(near.f)
+    by_change = time**2 * np.abs(near.change)
+    size = np.abs(states) + by_rate + by_change
     floor = _TIMES_ROUNDING * turn * fields.rounding
-    largest = floor.reshape(s.d, len(phases), R).max(axis=1)
-    return GuessSizes(_by_name(s, reached, np.maximum(size, largest)), time, points)
+    floor = floor.reshape(s.d, len(phases), R).max(axis=1)
+    sizes = _by_name(s, reached, np.maximum(size, floor))
+    return GuessSizes(sizes, time, points)
 
 
 def sizes_on(s: Structure, lanes: Lanes, period: float) -> Sizes:
     """Sizes of all states, from points of a cycle."""
-    t, chart, q = (np.asarray(x) for x in lanes[:3])
-    floor = _TIMES_ROUNDING * period * _fields(s, chart, t, q).rounding
-    return _by_name(s, chart, np.maximum(np.abs(q), floor))
+    t = np.asarray(lanes.t)
+    chart = np.asarray(lanes.chart)
+    q = np.asarray(lanes.q)
+    rounding = _fields(s, chart, t, q).rounding
+    floor = _TIMES_ROUNDING * period * rounding
+    size = np.maximum(np.abs(q), floor)
+    return _by_name(s, chart, size)
 
 
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
@@ -112,10 +126,14 @@ def scale_of(
     take those of another such array, or 1."""
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
-        scale[a, : s.dims[a]] = [sizes.get(name, np.nan) for name in chart.states]
-    others: ArrayLike = 1.0 if otherwise is None else to_host(otherwise)
+        for row, name in enumerate(chart.states):
+            scale[a, row] = sizes.get(name, np.nan)
+    others: ArrayLike = 1.0
+    if otherwise is not None:
+        others = to_host(otherwise)
     xp = jnp if is_tracer(others) else np
-    return real(xp.where(np.isnan(scale), others, scale))
+    is_missing = np.isnan(scale)
+    return real(xp.where(is_missing, others, scale))
 
 
 def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
@@ -124,7 +142,8 @@ def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
     # (A state that several charts have takes the size of the first.)
     for a in reversed(range(len(s.charts))):
         names = s.charts[a].states
-        sizes |= dict(zip(names, np.asarray(scale)[a].tolist(), strict=False))
+        values = np.asarray(scale)[a].tolist()
+        sizes |= dict(zip(names, values, strict=False))
     return sizes
 
 
@@ -135,7 +154,8 @@ def stiff_charts(s: Structure, pieces: Lanes, period: float) -> dict[str, float]
     step = period / len(np.ravel(pieces.t))
     for a, t, q in points(s, pieces):
         rates = fastest(s, a, t, q)
-        if step * rates.sum() > STIFF and not is_implicit(s, a):
+        decay = step * rates.sum()
+        if decay > STIFF and not is_implicit(s, a):
             stiff[s.names[a]] = float(rates.max())
     return stiff
 
@@ -144,7 +164,8 @@ def fastest(
     s: Structure, a: int, t: Float[np.ndarray, " P"], q: Float[np.ndarray, "n P"]
 ) -> Float[np.ndarray, " P"]:
     """The rates at which the fastest modes of chart a decay; 0 if none does."""
-    return -np.real(_modes(s, a, t, q)).min(axis=1, initial=0.0)
+    rates = np.real(_modes(s, a, t, q))
+    return -rates.min(axis=1, initial=0.0)
 
 
 def is_implicit(s: Structure, a: int) -> bool:
@@ -166,23 +187,32 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     for a, state in enumerate(states):
         q = state[: s.dims[a]]
         if is_implicit(s, a) and np.isfinite(q).all():
-            rates = np.abs(_modes(s, a, np.array([t]), q[:, None])[0])
-            times.append(1 / rates[rates > ROUNDING * rates.max()].min(initial=np.inf))
+            (modes,) = _modes(s, a, np.array([t]), q[:, None])
+            rates = np.abs(modes)
+            decays = rates > ROUNDING * rates.max()
+            slowest = rates[decays].min(initial=np.inf)
+            times.append(1 / slowest)
     return max(times)
 
 
 def points(s: Structure, pieces: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Charts, times and states at the beginnings of the pieces of a turn, until it failed."""
-    t, chart, q = map(np.asarray, (pieces.t, pieces.chart, pieces.q))
-    for a in np.unique(chart):
-        rows = (chart == a) & np.isfinite(q).all(axis=0)
+    t = np.asarray(pieces.t)
+    chart = np.asarray(pieces.chart)
+    q = np.asarray(pieces.q)
+    is_reached = np.isfinite(q).all(axis=0)
+    for a in np.unique(chart).tolist():
+        n = s.dims[a]
+        rows = (chart == a) & is_reached
         if rows.any():
-            yield int(a), t[rows], q[: s.dims[a], rows]
+            yield a, t[rows], q[:n, rows]
 
 
 def _modes(s: Structure, a: int, t, q) -> np.ndarray:
     """Eigenvalues of the field's derivative at points of chart a."""
-    derivative = kernels.field(s, a, t, q, np.zeros((s.nu, 1)))[:, 2 : 2 + len(q)]
+    u = np.zeros((s.nu, 1))
+    expanded = kernels.field(s, a, t, q, u)
+    derivative = expanded[:, 2 : 2 + len(q)]
     return np.linalg.eigvals(np.moveaxis(derivative, -1, 0))
 
 
@@ -200,12 +230,16 @@ class _Fields(NamedTuple):
 
 def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
     zeros = np.zeros(q.shape)
-    out = _Fields(zeros, zeros.copy(), np.zeros((s.d, *q.shape)), zeros.copy())
-    for a in np.unique(chart):
+    derivative = np.zeros((s.d, *q.shape))
+    out = _Fields(zeros, zeros.copy(), derivative, zeros.copy())
+    for a in np.unique(chart).tolist():
+        n = s.dims[a]
         rows = np.flatnonzero(chart == a)
-        parts = _fields_of_chart(s, int(a), t[rows], q[: s.dims[a], rows])
-        for whole, part in zip(out, parts, strict=True):
-            whole[cast(Any, (*map(slice, part.shape[:-1]), rows))] = part
+        of_chart = _fields_of_chart(s, a, t[rows], q[:n, rows])
+        out.f[:n, rows] = of_chart.f
+        out.change[:n, rows] = of_chart.change
+        out.derivative[:n, :n, rows] = of_chart.derivative
+        out.rounding[:n, rows] = of_chart.rounding
     return out
 
 
@@ -213,41 +247,55 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     n, K = q.shape
     times, states = _shifted(t, q)
     u = np.zeros((s.nu, 1))
-    rows = kernels.field(s, a, times.ravel(), states.reshape(n, -1), u)
-    rows = rows.reshape(n, -1, K, times.shape[1])
-    values = rows[:, 0]
-    by_time = rows[:, 1, :, 0]
-    derivative = rows[:, 2 : 2 + n, :, 0]
+    expanded = kernels.field(s, a, times.ravel(), states.reshape(n, -1), u)
+    expanded = expanded.reshape(n, -1, K, times.shape[1])
+    values = expanded[:, 0]
+    # (The first point is not shifted.)
     f = values[..., 0]
+    by_time = expanded[:, 1, :, 0]
+    derivative = expanded[:, 2 : 2 + n, :, 0]
     change = by_time + np.einsum("ijk,jk->ik", derivative, f)
 
     # The change of the field by the shifts, less that of a smooth field.
-    by_state = np.einsum("ijk,jks->iks", derivative, states - q[..., None])
-    smooth = by_state + by_time[..., None] * (times - t[:, None])
-    off = np.abs(values - f[..., None] - smooth)
-    in_state, in_time = np.split(off, [1 + len(_SHIFTS)], axis=-1)
+    shifts = states - q[..., None]
+    delays = times - t[:, None]
+    by_shifts = np.einsum("ijk,jks->iks", derivative, shifts)
+    by_delays = by_time[..., None] * delays
+    smooth = by_shifts + by_delays
+    error = np.abs(values - f[..., None] - smooth)
+    in_state, in_time = np.split(error, [1 + len(_SHIFTS)], axis=-1)
 
     # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
-    in_time = in_time - 2 * np.finfo(float).eps * np.abs(by_time * t)[..., None]
+    of_time = 2 * np.finfo(float).eps * np.abs(by_time * t)
+    in_time = in_time - of_time[..., None]
     # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
     earlier, later = np.split(in_time, 2, axis=-1)
-    with_time = np.minimum(earlier.max(axis=-1), later.max(axis=-1))
-    rounding = np.maximum(in_state.max(axis=-1), with_time)
-    return _Fields(f, change, derivative, rounding)
+    with_earlier = earlier.max(axis=-1)
+    with_later = later.max(axis=-1)
+    with_time = np.minimum(with_earlier, with_later)
+    with_state = in_state.max(axis=-1)
+    return _Fields(
+        f=f,
+        change=change,
+        derivative=derivative,
+        rounding=np.maximum(with_state, with_time),
+    )
 
 
 def _shifted(t: Float[np.ndarray, " K"], q: Float[np.ndarray, "n K"]):
     """Times (K, S) and states (n, K, S) without a shift, with shifted states, and with shifted
     times."""
+    eps = np.finfo(float).eps
     none = np.zeros(len(_SHIFTS))
     of_time = np.concatenate([[0.0], none, _SHIFTS])
-    # (Not all states by the same part, which may cancel.)
-    of_state = [
-        np.concatenate([[0.0], np.roll(_SHIFTS, k), none]) for k in range(len(q))
-    ]
-    eps = np.finfo(float).eps
+    of_states = []
+    for k in range(len(q)):
+        # (Not all states by the same part, which may cancel.)
+        shifts = np.roll(_SHIFTS, k)
+        of_states.append(np.concatenate([[0.0], shifts, none]))
+    parts = 1 + eps * np.array(of_states)
     times = t[:, None] * (1 + eps * of_time)
-    states = q[..., None] * (1 + eps * np.array(of_state)[:, None])
+    states = q[..., None] * parts[:, None]
     return times, states
 
 
@@ -264,7 +312,8 @@ def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
             b = s.chart_index(transition.target)
             if a in reached and b not in reached:
                 before = states[a, : s.dims[a], None]
-                after = kernels.reset(s, s.member(g), time, before, u)[:, 0, 0]
+                expanded = kernels.reset(s, s.member(g), time, before, u)
+                after = expanded[:, 0, 0]
                 states[b] = np.pad(after, (0, s.d - len(after)))
                 reached.add(b)
     return states
@@ -274,13 +323,19 @@ def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
     """The time of the fastest mode of the field's derivative at the first point that has one (the
     guess comes first); in free flight, the time in which a state changes by its size."""
     for derivative in np.moveaxis(near.derivative, -1, 0):
-        rate = np.max(np.abs(np.linalg.eigvals(derivative)))
-        if rate > 0:
-            return 1 / float(rate)
-    q, f, change = (np.abs(x[:, 0]) for x in (q, near.f, near.change))
+        modes = np.linalg.eigvals(derivative)
+        fastest_rate = np.max(np.abs(modes))
+        if fastest_rate > 0:
+            return 1 / float(fastest_rate)
+    size = np.abs(q[:, 0])
+    speed = np.abs(near.f[:, 0])
+    acceleration = np.abs(near.change[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        times = np.concatenate([np.sqrt(q / change), q / f])
-    return float(min(times[(times > 0) & (times < np.inf)], default=1.0))
+        by_acceleration = np.sqrt(size / acceleration)
+        by_speed = size / speed
+    times = np.concatenate([by_acceleration, by_speed])
+    moves = (times > 0) & (times < np.inf)
+    return float(min(times[moves], default=1.0))
 
 
 def _by_name(
@@ -289,7 +344,11 @@ def _by_name(
     """The largest size of each state in any chart; 1 for one that is zero everywhere."""
     sizes = dict.fromkeys(s.state_names(), 0.0)
     for a, column in zip(chart, size.T, strict=True):
-        for name, x in zip(s.charts[a].states, column, strict=False):
+        states = s.charts[a].states
+        for name, x in zip(states, column.tolist(), strict=False):
             if np.isfinite(x):
-                sizes[name] = max(sizes[name], float(x))
-    return {name: size if size > 0 else 1.0 for name, size in sizes.items()}
+                sizes[name] = max(sizes[name], x)
+    for name, largest in sizes.items():
+        if largest == 0:
+            sizes[name] = 1.0
+    return sizes

@@ -81,16 +81,17 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
 
 @one_program
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
-    map, period, events = cycle.return_map, cycle.period, cycle.event_sequence
-    s, xp, f0, clocked = (
-        map.structure,
-        namespace(flow.q),
-        flow.field[0, 0],
-        map.base is None,
-    )
+    map = cycle.return_map
+    period = cycle.period
+    events = cycle.event_sequence
+    s = map.structure
+    xp = namespace(flow.q)
+    f0 = flow.field[0, 0]
+    clocked = map.base is None
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
     starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
-    whole = xp.where(map.valid[:, None] & map.valid, total[:, 1:], 0.0)
+    both = map.valid[:, None] & map.valid
+    whole = xp.where(both, total[:, 1:], 0.0)
     closed, Z = loop(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
@@ -104,10 +105,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
                 "branch by `continuation`."
             )
     begin = xp.linalg.solve(closed, -(total[:, 0] + f0 * longer))
-    starts, late = (
-        starts[..., 0] + starts[..., 1:] @ begin,
-        late[:, 0] + late[:, 1:] @ begin,
-    )
+    starts = starts[..., 0] + starts[..., 1:] @ begin
+    late = late[:, 0] + late[:, 1:] @ begin
     change = xp.einsum("pkab,pb->pka", flow.forward[0], starts)
     change = change + xp.sum(flow.pushed[..., 0, :], axis=-1)
     if not clocked:  # phase 0 stays on the section
@@ -116,7 +115,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
         else:
             by_state, by_parameter = section_delay(map, f0, parameter=varied.parameter)
             ahead = by_state @ begin + by_parameter
-        change, late = change + ahead * flow.field, late - ahead
+        change = change + ahead * flow.field
+        late = late - ahead
     change = change + flow.field * (flow.after(map) / period * longer)[..., None]
     place = xp.argsort(flow.event < 0, stable=True)[: len(events)]
     times = late[place]
@@ -133,8 +133,15 @@ def section_delay(
     """The time by which a changed state at phase 0 comes later to the section, per change of the
     state and of the first input."""
     assert map.base is not None
-    levels, index = ListLevels((map.base,)), np.zeros(1, np.int32)
-    of, (t, chart, q, *_) = with_inputs(map.system, parameter), map.anchor
-    level = lambda a, t, q, u: kernels.watched(of, a, levels, t, q, u, index)[-1:]  # noqa: E731
+    levels = ListLevels((map.base,))
+    index = np.zeros(1, np.int32)
+    of = with_inputs(map.system, parameter)
+    t, chart, q, *_ = map.anchor
+
+    def level(a, t, q, u):
+        return kernels.watched(of, a, levels, t, q, u, index)[-1:]
+
     by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
-    return by[:-1] / -(by[:-1] @ f), by[-1] / -(by[:-1] @ f)
+    by_state = by[:-1]
+    rate = -(by_state @ f)
+    return by_state / rate, by[-1] / rate

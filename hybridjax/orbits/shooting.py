@@ -27,7 +27,8 @@ from .scale import has_implicit
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
 # Larger: it ends one step too early. Smaller: rounding keeps it from ending.
-ATOL, RTOL = 1e-12, 1e-11
+ATOL = 1e-12
+RTOL = 1e-11
 
 
 def newton_steps(
@@ -38,10 +39,10 @@ def newton_steps(
     """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
     NaN for systems that are not finite."""
     step = np.full(residual.shape, np.nan)
-    good = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
-    step[good] = -(
-        np.linalg.pinv(jacobian[good], rcond=rcond) @ residual[good, :, None]
-    )[..., 0]
+    good = np.isfinite(residual).all(axis=1)
+    good = good & np.isfinite(jacobian).all(axis=(1, 2))
+    inverse = np.linalg.pinv(jacobian[good], rcond=rcond)
+    step[good] = -np.matvec(inverse, residual[good])
     return step
 
 
@@ -49,7 +50,8 @@ def excess(
     q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]
 ) -> Float[np.ndarray, " S"]:
     """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
-    return np.max(np.abs(step) / (ATOL + RTOL * np.abs(q)), axis=1)
+    tolerance = ATOL + RTOL * np.abs(q)
+    return np.max(np.abs(step) / tolerance, axis=1)
 
 
 def fixed_point(
@@ -69,7 +71,8 @@ def fixed_point(
     before = np.inf
     while (moves.order == 0).sum() == PIECES:
         step, shift, h = _shift(map, moves, x, target)
-        length = np.max(np.abs(shift[:, 1:] / map.scale[moves.chart]))
+        in_sizes = shift[:, 1:] / map.scale[moves.chart]
+        length = np.max(np.abs(in_sizes))
         if not length <= 0.5 * before:
             break
         x = x + step
@@ -77,7 +80,8 @@ def fixed_point(
         q = moves.q + shift[:, 1:].T
         moves = moves._replace(t=t, q=q, h=h)
         # (The error after a step is about its square.)
-        if length <= np.maximum(CLOSED, np.asarray(map.settings.rtol)):
+        rtol = np.asarray(map.settings.rtol)
+        if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
         before = length
     return otherwise, None
@@ -88,15 +92,19 @@ def _shift(
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
     """The Newton step of the state at the anchor, in sizes, the changes of (t, q) where moves start
     that close the gaps between moves, and the lengths of the moves after them."""
+    n = 1 + len(x)
     end, by = linear_moves(map.structure, moves, target)
-    by_point = by[:, :, : 1 + len(x)]
+    by_point = by[:, :, :n]
     starts = np.concatenate([moves.t[None], moves.q]).T
-    gaps = np.concatenate([end[:-1] - starts[1:], end[-1:]])
-    changes = _changes(by_point, gaps, map.anchor.t[0] - starts[0, 0])
+    between = end[:-1] - starts[1:]
+    gaps = np.concatenate([between, end[-1:]])
+    late = map.anchor.t[0] - starts[0, 0]
+    changes = _changes(by_point, gaps, late)
     step = _step_of(map, x, changes[-1, 1:])
     shift = changes[:-1] @ np.append(step * map.sizes, 1.0)
-    end_after = end + (by_point @ shift[:, :, None])[:, :, 0]
-    h = (end_after - starts - shift)[:, 0]
+
+    end_after = end + np.matvec(by_point, shift)
+    h = end_after[:, 0] - starts[:, 0] - shift[:, 0]
     return step, shift, h
 
 
@@ -106,10 +114,11 @@ def _changes(
     """Changes of (t, q) where moves start, and at the last end, by the state at the first start,
     and in the last column by the gaps between moves. The first one is `late`."""
     n = by.shape[1]
-    changes = [np.eye(n, k=-1)]
-    changes[0][0, -1] = late
+    change = np.eye(n, k=-1)
+    change[0, -1] = late
+    changes = [change]
     for of_move, gap in zip(by, gaps, strict=True):
-        change = of_move @ changes[-1]
+        change = of_move @ change
         change[:, -1] += gap
         changes.append(change)
     return np.stack(changes)
@@ -121,11 +130,15 @@ def _step_of(
     """The Newton step, in sizes of the states, by the changes of the state at the end of a turn
     (see `_changes`)."""
     sizes = map.sizes
-    off, held = map.held(x * sizes)
-    residual = np.where(map.valid, end[:, -1], 0.0) - x * sizes - off
-    returned = np.where(map.valid[:, None], end[:, :-1], 0.0)
-    jacobian = (returned - np.eye(len(x)) - held) * sizes / sizes[:, None]
-    (step,) = newton_steps(jacobian[None], (residual / sizes)[None])
+    q = x * sizes
+    off, held = map.held(q)
+    returned = np.where(map.valid, end[:, -1], 0.0)
+    valid = map.valid[:, None]
+    by_start = np.where(valid, end[:, :-1], 0.0)
+    residual = returned - q - off
+    jacobian = by_start - np.eye(len(x)) - held
+    in_sizes = jacobian * sizes / sizes[:, None]
+    (step,) = newton_steps(in_sizes[None], (residual / sizes)[None])
     return step
 
 
@@ -133,7 +146,9 @@ def _forwards(moves: Moves) -> Moves | None:
     """The moves without those that end before they start, in whose places the moves before them
     end; None where an event or another piece comes before."""
     back = np.flatnonzero(moves.h < 0)
-    if (moves.order[back] == 0).any() or (moves.code[back - 1] != MOVE).any():
+    is_first = moves.order[back] == 0
+    follows_event = moves.code[back - 1] != MOVE
+    if is_first.any() or follows_event.any():
         return None
     h = moves.h.copy()
     code = moves.code.copy()
@@ -154,11 +169,18 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     if gap > CLOSED:
         return None
     end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
-    residual = np.where(map.valid, end.q[:, 0], 0.0) - q - map.held(q)[0]
+    returned = np.where(map.valid, end.q[:, 0], 0.0)
+    off, _ = map.held(q)
+    residual = returned - q - off
     residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
-    period = end.t[0] - map.anchor.t[0]
-    turn = Return(residual, period, np.asarray(moved.result[-1]), end)
-    return turn, jax.tree_util.tree_map(one_by_one, (pieces, None, tape)), gap
+    turn = Return(
+        residual=residual,
+        period=end.t[0] - map.anchor.t[0],
+        result=np.asarray(moved.result[-1]),
+        end=end,
+    )
+    path = jax.tree_util.tree_map(one_by_one, (pieces, None, tape))
+    return turn, path, gap
 
 
 def one_by_one(x: np.ndarray) -> np.ndarray:
@@ -179,13 +201,15 @@ def follow_moves(
     """
     moves = expected
     lanes = _starts(map, begin, moves)
-    followed = _searched(map, lanes, moves, _targets(moves, ends), ends)
+    targets = _targets(moves, ends)
+    followed = _searched(map, lanes, moves, targets, ends)
     if followed is None:
         return None
     lanes, moved, tape = followed
     gap = _largest_gap(map, begin, lanes, moved.lanes)
     first = np.flatnonzero(np.diff(moves.lane, prepend=-1))
-    last = np.append(first[1:], len(moves.lane)) - 1
+    after_last = np.append(first[1:], len(moves.lane))
+    last = after_last - 1
     pieces = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
     moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
     # (Moves on the way to an end are lanes here, each to a time that is known.)
@@ -196,8 +220,10 @@ def follow_moves(
 
 def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:
     """Lanes where moves start; the first one is that with which the turn begins."""
-    lanes = start_lanes(map.structure, moves.t, moves.chart.astype(np.int32), moves.q)
-    lanes = arm(map.structure, lanes, map.watch(lanes, until(lanes.t)), map.expected)
+    s = map.structure
+    lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
+    watched = map.watch(lanes, until(lanes.t))
+    lanes = arm(s, lanes, watched, map.expected)
     lanes.armed[:, :1] = begin.armed
     happens = moves.code >= 0
     events_until = np.cumsum(happens, dtype=np.int32)
@@ -214,12 +240,14 @@ def _targets(moves: Moves, ends: Target) -> Target:
     after_time = np.nextafter(time, np.inf)
     late = moves.t + 2 * moves.h
     shape = ends.time.shape
-    event = np.broadcast_to(ends.event, shape)[piece]
+    index = np.broadcast_to(ends.index, shape)[piece]
+    event_at_end = np.broadcast_to(ends.event, shape)[piece]
+    event = np.where(code >= 0, code, event_at_end)
     return dataclasses.replace(
         ends,
         time=time,
-        index=np.broadcast_to(ends.index, shape)[piece],
-        event=np.where(code >= 0, code, event).astype(np.int32),
+        index=index,
+        event=event.astype(np.int32),
         limit=np.where(np.isfinite(time), after_time, late),
     )
 
@@ -238,7 +266,8 @@ def _searched(
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
         end = moved.lanes
-        armed = (end.armed[:, :-1] == lanes.armed[:, 1:])[here].all()
+        same = end.armed[:, :-1] == lanes.armed[:, 1:]
+        armed = same[here].all()
         if armed:
             break
         lanes.armed[:, 1:] = end.armed[:, :-1]
@@ -265,16 +294,19 @@ def _setout(
     # (A deviation goes on until a piece ends or an event happens.)
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
+    by_state = by[:, 1:, 1 : 1 + s.d]
     goes_on = (np.diff(moves.lane) == 0) & (moves.code[:-1] < 0)
     for k in np.flatnonzero(goes_on):
-        along[:, k + 1] = by[k, 1:, 1 : 1 + s.d] @ along[:, k]
+        along[:, k + 1] = by_state[k] @ along[:, k]
     return setout._replace(along=along)
 
 
 def _largest_gap(map: ReturnMap, begin: Lanes, lanes: Lanes, end: Lanes) -> float:
     """The largest gap between the end of a move and the start of the next one, in sizes of the
     states and in periods."""
-    late = np.append(begin.t, end.t[:-1]) - lanes.t
-    apart = np.column_stack([begin.q, end.q[:, :-1]]) - lanes.q
+    times = np.append(begin.t, end.t[:-1])
+    states = np.column_stack([begin.q, end.q[:, :-1]])
     sizes = np.maximum(map.scale[lanes.chart], np.abs(lanes.q.T))
-    return max(np.abs(late / map.expected).max(), np.abs(apart.T / sizes).max())
+    late = (times - lanes.t) / map.expected
+    apart = (states - lanes.q).T / sizes
+    return max(np.abs(late).max(), np.abs(apart).max())

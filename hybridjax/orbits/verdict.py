@@ -178,7 +178,11 @@ def _verdict(cycle) -> Verdict:
     scale = np.asarray(cycle.settings.scale)
     path = _walk_along(cycle)
     visits = _visits(s, path)
-    long = [visit for visit in visits if visit.t[-1] - visit.t[0] > _SHORT * period]
+    long = []
+    for visit in visits:
+        duration = visit.t[-1] - visit.t[0]
+        if duration > _SHORT * period:
+            long.append(visit)
     never = set(range(len(s.transitions))) - set(cycle.event_sequence)
     findings = [*path.findings, *_beyond_guards(s, long, never, scale)]
     for visit in long:
@@ -222,7 +226,16 @@ def _walk_along(cycle) -> _Path:
     between = np.diff(t)
     same = np.abs(moves.h - between) <= 1e-14 * np.abs(t[1:])
     length = np.where(same, moves.h, between)
-    walked = walk(s, Stretch(t[:-1], length, moves.chart, moves.q), scale)
+    walked = walk(
+        s,
+        Stretch(
+            t=t[:-1],
+            length=length,
+            chart=moves.chart,
+            q=moves.q,
+        ),
+        scale,
+    )
     chart = moves.chart.copy()
     q = walked.q.copy()
     by_state = np.moveaxis(walked.by_state, -1, 0).copy()
@@ -291,7 +304,8 @@ def _jump(
     led to this state, where its guard is at zero, or beyond. `span`: the period."""
     transition = s.transitions[g]
     n = s.dims[a]
-    event = jump(s, g, np.array([t]), q[None, :n], np.zeros((s.nu, 1)))
+    u = np.zeros((s.nu, 1))
+    event = jump(s, g, np.array([t]), q[None, :n], u)
     delay = np.zeros(s.d)
     if isinstance(transition.guard, Scheduled):
         findings = [] if at_once else _off_schedule(transition, t)
@@ -314,7 +328,14 @@ def _jump(
     slip[:m] = event.slip[0]
     by_state[:m, :n] = event.by_state[0]
     chart = s.chart_index(transition.target)
-    return _Jump(chart, after, by_state, slip, delay, findings)
+    return _Jump(
+        chart=chart,
+        q=after,
+        by_state=by_state,
+        slip=slip,
+        delay=delay,
+        findings=findings,
+    )
 
 
 def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
@@ -370,13 +391,21 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
         for k in moves:
             own = path.walked.lane == k % M
             later = period if k >= 0 else 0.0
-            times.append(later + np.append(path.t[k % M], path.walked.t[own]))
+            own_times = np.append(path.t[k % M], path.walked.t[own])
+            times.append(later + own_times)
             points = path.begin[:, k % M], path.walked.points[:, own]
             states.append(np.column_stack(points))
         a = int(path.chart[moves[0]])
         q = np.concatenate(states, axis=1)[: s.dims[a]]
         event = int(path.event[moves[-1]])
-        visits.append(Visit(a, np.concatenate(times), q, event))
+        visits.append(
+            Visit(
+                chart=a,
+                t=np.concatenate(times),
+                q=q,
+                event=event,
+            )
+        )
     return visits
 
 
@@ -399,8 +428,10 @@ def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
     u = np.zeros((s.nu, 1))
     first = np.zeros(1, np.int32)
     rows = kernels.watched(s, a, None, visit.t, visit.q, u, first)
-    noise = _noise(np.moveaxis(rows[:, 2 : 2 + n], 0, 1), scale[a, :n])
-    return np.where(np.abs(rows[:, 0]) > noise, rows[:, 0], 0.0)
+    derivative = rows[:, 2 : 2 + n]
+    noise = _noise(np.moveaxis(derivative, 0, 1), scale[a, :n])
+    level = rows[:, 0]
+    return np.where(np.abs(level) > noise, level, 0.0)
 
 
 def _beyond_guards(
@@ -439,7 +470,8 @@ def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
 def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
     """Points at which a guard is below zero for the first time after it was above."""
     points = np.flatnonzero(level)
-    falls = (level[points][1:] < 0) & (level[points][:-1] > 0)
+    at_points = level[points]
+    falls = (at_points[1:] < 0) & (at_points[:-1] > 0)
     return points[1:][falls]
 
 
@@ -449,7 +481,9 @@ def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
     before = int(np.flatnonzero(level[:point])[-1])
     part = level[before] / (level[before] - level[point])
     t = visit.t[before] + part * (visit.t[point] - visit.t[before])
-    q = visit.q[:, before] + part * (visit.q[:, point] - visit.q[:, before])
+    begin = visit.q[:, before]
+    end = visit.q[:, point]
+    q = begin + part * (end - begin)
     return visit._replace(t=t[None], q=q[:, None])
 
 
@@ -458,12 +492,15 @@ def _may_happen(s: Structure, g: int, visit: Visit, points) -> bool:
     if s.transitions[g].enabled is None:
         return True
     u = np.zeros((s.nu, 1))
-    holds = kernels.enabled(s, s.member(g), visit.t[points], visit.q[:, points], u)
+    t = visit.t[points]
+    q = visit.q[:, points]
+    holds = kernels.enabled(s, s.member(g), t, q, u)
     return bool(holds.any())
 
 
 def _beyond(s: Structure, transition, a: int, level) -> Finding:
-    low, high = sorted(transition.sign * np.array([level.min(), level.max()]))
+    extremes = np.array([level.min(), level.max()])
+    low, high = sorted(transition.sign * extremes)
     text = (
         f"the cycle lies beyond the guard of '{transition.name}' all along its stay in chart "
         f"'{s.names[a]}' (values from {low:.3g} to {high:.3g}; the guard should be "
@@ -488,7 +525,8 @@ def _skipped_schedules(s: Structure, visit: Visit) -> Iterable[Finding]:
         transition = s.transitions[g]
         guard = transition.guard
         assert isinstance(guard, Scheduled)
-        period, offset = float(guard.period), float(guard.offset)
+        period = float(guard.period)
+        offset = float(guard.offset)
         since = (visit.t[0] - offset) / period
         until = (visit.t[-1] - offset) / period
         due = np.floor(since + 10 * SAME_TIME) + 1
@@ -529,7 +567,8 @@ def _rest(s: Structure, path: _Path, scale) -> list[Finding]:
     """A finding on a cycle on which nothing moves but the clock."""
     if (path.event >= 0).any():
         return []
-    apart = np.abs(path.begin - path.begin[:, :1]) / scale[path.chart].T
+    apart = np.abs(path.begin - path.begin[:, :1])
+    apart = apart / scale[path.chart].T
     if np.max(apart, where=_exists(s, path.chart), initial=0.0) > _APART:
         return []
     text = (
@@ -584,9 +623,15 @@ def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
     moves = np.searchsorted(path.t, times) - 1
     begins = path.t[moves]
     chart = path.chart[moves]
-    stretch = Stretch(begins, times - begins, chart, path.begin[:, moves])
+    stretch = Stretch(
+        t=begins,
+        length=times - begins,
+        chart=chart,
+        q=path.begin[:, moves],
+    )
     reached = walk(map.structure, stretch, scale).q
-    distance = np.abs(reached - path.begin[:, :1]) / scale[path.chart[0]][:, None]
+    size = scale[path.chart[0]]
+    distance = np.abs(reached - path.begin[:, :1]) / size[:, None]
     closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])
     return [part for part, closes in zip(parts, closed, strict=True) if closes]
 

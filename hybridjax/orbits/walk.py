@@ -89,17 +89,26 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
             stretch.q[:n, lanes],
             scale[a, :n],
         )
-        q[:n, lanes] = x[..., 0].T
-        by_state[:n, :n, lanes] = np.moveaxis(x[..., 1:], 0, -1)
+        ends = x[..., 0]
+        derivatives = x[..., 1:]
+        q[:n, lanes] = ends.T
+        by_state[:n, :n, lanes] = np.moveaxis(derivatives, 0, -1)
         for within, t, states in path:
             lane.append(lanes[within])
             time.append(t)
             points.append(np.pad(states, [(0, d - n), (0, 0)]))
     all_lanes = np.concatenate(lane)
     times = np.concatenate(time)
+    all_points = np.concatenate(points, axis=1)
     order = np.lexsort((times, all_lanes))
-    all_points = np.concatenate(points, axis=1)[:, order]
-    return Walked(q, by_state, error, all_lanes[order], times[order], all_points)
+    return Walked(
+        q=q,
+        by_state=by_state,
+        error=error,
+        lane=all_lanes[order],
+        t=times[order],
+        points=all_points[:, order],
+    )
 
 
 # In a chart with n states, x (L, n, 1 + n) holds states in its first column, in the others their
@@ -115,10 +124,12 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
     order = len(_EULER_STEPS) if implicit else 2 * len(_MIDPOINT_STEPS) - 1
 
     def field(t, x):
-        rows = kernels.field(s, a, t, x[..., 0].T, np.zeros((s.nu, 1)))
+        u = np.zeros((s.nu, 1))
+        rows = kernels.field(s, a, t, x[..., 0].T, u)
         return np.moveaxis(rows, -1, 0)
 
-    x = np.concatenate([q.T[..., None], np.tile(np.eye(n), (L, 1, 1))], axis=2)
+    unit = np.tile(np.eye(n), (L, 1, 1))
+    x = np.concatenate([q.T[..., None], unit], axis=2)
     past = np.zeros(L)
     h = length.copy()
     error = np.zeros(L)
@@ -133,9 +144,11 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
             end, change = extrapolated(field, by_field[going], t, h[going], x[going])
             off = np.max(np.abs(change) / sizes, axis=1, initial=0.0)
             off = np.where(np.isfinite(off), off, np.inf)
-            longer = _SAFE * (_ACCURATE / np.maximum(off, 1e-300)) ** (1 / order)
+            better = _ACCURATE / np.maximum(off, 1e-300)
+            longer = _SAFE * better ** (1 / order)
             # (Steps as short as rounding of the time go on with the error that they have.)
-            shortest = h[going] <= 1e-13 * np.maximum(np.abs(t), length[going])
+            longest_time = np.maximum(np.abs(t), length[going])
+            shortest = h[going] <= 1e-13 * longest_time
             good = (off <= _ACCURATE) | shortest
             lanes = going[good]
             if len(lanes):
@@ -146,14 +159,16 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
                 within = _between(
                     t[good], h[lanes], x[lanes], end[good], by_field[lanes], by_end
                 )
-                path += [(lanes, time, state.T) for time, state in within]
+                for time, state in within:
+                    path.append((lanes, time, state.T))
                 past[lanes] = ended
                 x[lanes] = end[good]
                 by_field[lanes] = by_end
                 error[lanes] += off[good]
             h[going] *= np.clip(longer, _SHORTER, _LONGER)
             h = np.minimum(h, length - past)
-    return x, np.where(past < length, np.inf, error), path
+    error = np.where(past < length, np.inf, error)
+    return x, error, path
 
 
 def _rates(by_field: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -173,7 +188,8 @@ def _midpoint(field: Callable, by_field, t, length, x) -> tuple[np.ndarray, np.n
         before = x
         now = x + h * rates
         for k in range(1, count):
-            ahead = before + 2 * h * _rates(field(t + k * length / count, now), now)
+            by_now = field(t + k * length / count, now)
+            ahead = before + 2 * h * _rates(by_now, now)
             before = now
             now = ahead
         last = _rates(field(t + length, now), now)
@@ -190,7 +206,8 @@ def _linear_euler(
     n = x.shape[1]
     for count in _EULER_STEPS:
         h = (length / count)[:, None, None]
-        matrix = np.linalg.inv(np.eye(n) - h * by_field[..., 2 : 2 + n])
+        by_state = by_field[..., 2 : 2 + n]
+        matrix = np.linalg.inv(np.eye(n) - h * by_state)
         now = x
         for k in range(1, count + 1):
             rates = _rates(field(t + k * length / count, now), now)
@@ -209,11 +226,13 @@ def _extrapolate(
     for order in range(1, len(table)):
         previous = column[-1]
         weights = divisors[order:] / divisors[:-order] - 1
-        pairs = zip(column[1:], column[:-1], weights, strict=True)
-        column = [
-            finer + (finer - coarser) / weight for finer, coarser, weight in pairs
-        ]
-    return column[-1], column[-1][..., 0] - previous[..., 0]
+        refined = []
+        for k, weight in enumerate(weights):
+            coarser, finer = column[k : k + 2]
+            refined.append(finer + (finer - coarser) / weight)
+        column = refined
+    limit = column[-1]
+    return limit, limit[..., 0] - previous[..., 0]
 
 
 def _between(
@@ -226,8 +245,9 @@ def _between(
 
     def rate_and_bend(by_field):
         f = by_field[..., 0]
-        along = (by_field[..., 2 : 2 + n] @ f[..., None])[..., 0]
-        acceleration = by_field[..., 1] + along
+        by_time = by_field[..., 1]
+        by_state = by_field[..., 2 : 2 + n]
+        acceleration = by_time + (by_state @ f[..., None])[..., 0]
         return h * f, h**2 * acceleration
 
     rate0, bend0 = rate_and_bend(by_begin)
@@ -241,6 +261,7 @@ def _between(
     fifth = 6 * rise - 3 * slope + bend / 2
     path = []
     for z in _FRACTIONS:
+        lower = q0 + rate0 * z + bend0 / 2 * z**2
         higher = third * z**3 + fourth * z**4 + fifth * z**5
-        path.append((t + z * length, q0 + rate0 * z + bend0 / 2 * z**2 + higher))
+        path.append((t + z * length, lower + higher))
     return path

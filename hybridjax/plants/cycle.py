@@ -142,7 +142,8 @@ class PlantCycle(Showable):
                 about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
         # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
-        rows = np.full((*u.shape[:2], len(self.outputs) + 1), np.nan)
+        S, steps = u.shape[:2]
+        rows = np.full((S, steps, len(self.outputs) + 1), np.nan)
         failed_at = np.full(len(u), -1)
         for s, (values, cause) in enumerate(trials):
             rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[-1]))
@@ -155,12 +156,12 @@ class PlantCycle(Showable):
         warn_of(findings)
         result = np.where(failed_at < 0, Result.OK, Result.PLANT_STOPPED)
         simulated = Simulated(
-            failed_at,
-            None,
-            self.sections.label,
-            rows[..., -1],
-            causes,
-            tuple(findings),
+            failed_at=failed_at,
+            error=None,
+            label=self.sections.label,
+            late=rows[..., -1],
+            causes=causes,
+            findings=tuple(findings),
         )
         return ExperimentData(
             u,
@@ -190,7 +191,8 @@ class PlantCycle(Showable):
         s = int(whole[0])
         rows = []
         for part in (0.5, 0.0):
-            values, cause = self.drive.run(self.seed + 1 + s, (part * u[s]).tolist())
+            inputs = part * u[s]
+            values, cause = self.drive.run(self.seed + 1 + s, inputs.tolist())
             if cause:
                 return []
             rows.append(np.array(values)[:, :-1])
@@ -403,7 +405,9 @@ def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:
 
 def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> None:
     half = len(values) // 2
-    change = np.abs(values[:half].mean(axis=0) - values[-half:].mean(axis=0))
+    first = values[:half].mean(axis=0)
+    last = values[-half:].mean(axis=0)
+    change = np.abs(first - last)
     # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
     scatter = 1.6 * values.std(axis=0)
     if (change > np.maximum(1e-4 * size, scatter)).any():

@@ -170,7 +170,12 @@ class Drive:
 
     def here(self) -> At:
         """Return the present time, signals and state."""
-        return At(self.t, self.z, 0.0, self.plant.get_state() if self.sets else None)
+        return At(
+            t=self.t,
+            z=self.z,
+            late=0.0,
+            state=self.plant.get_state() if self.sets else None,
+        )
 
     def restore(self, start: At) -> None:
         """Continue from a state that was kept."""

@@ -229,7 +229,8 @@ class ReturnMap:
         Within a stair of a simulator, returns from nearly equal states have no noise: these have.
         """
         rng = np.random.default_rng(1)
-        move = 2 * _LARGEST_STEP * self.size * rng.choice([-1, 1], len(self.x))
+        signs = rng.choice([-1, 1], len(self.x))
+        move = 2 * _LARGEST_STEP * self.size * signs
         states = []
         signals = []
         for pair in range(1, _GRIDS + 1):
@@ -416,7 +417,8 @@ def measured_returns(map: ReturnMap) -> Returns:
 
 def _slopes_of(map: ReturnMap) -> "_Jacobian":
     """Return the Jacobian of a map and its errors, in units of the ranges."""
-    tolerance = map.tolerance[:, None] / map.h * map.size / map.size[:, None]
+    relative = map.size / map.size[:, None]
+    tolerance = map.tolerance[:, None] / map.h * relative
     return _fitted(map.all_slopes(), tolerance)
 
 
@@ -537,7 +539,8 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     # (Of pair j and eigenvalue i, the share of column k.)
     noise = np.stack([(rows @ error) * right.T for error in jacobian.errors])
     variance = (np.abs(noise) ** 2).sum(axis=0)
-    common = np.abs(rows) ** 2 @ jacobian.tolerance**2 @ np.abs(right) ** 2
+    by_component = np.abs(rows) ** 2 @ jacobian.tolerance**2
+    common = by_component @ np.abs(right) ** 2
     scatter = np.sqrt(variance.sum(axis=1) + np.diagonal(common))
     apart = np.diagonal(rows @ jacobian.apart @ right)
     is_noise = np.abs(apart) <= 2 * jacobian.apart_noise * scatter
@@ -545,7 +548,14 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     condition = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
     rounding = _ROUNDING * np.linalg.norm(J) * condition
     error = np.hypot(scatter + rounding, _BIAS * np.abs(apart))
-    return _Eigenvalues(values, left, right, variance, apart, error)
+    return _Eigenvalues(
+        value=values,
+        left=left,
+        right=right,
+        variance=variance,
+        apart=apart,
+        error=error,
+    )
 
 
 def _resolved(jacobian: _Jacobian) -> _Resolved:
@@ -588,7 +598,8 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
     none."""
     differs = np.abs(found.value) > _RESOLVED * found.error
     for i in np.flatnonzero(differs):
-        twin = int(np.argmin(np.abs(found.value - found.value[i].conj())))
+        distance = np.abs(found.value - found.value[i].conj())
+        twin = int(np.argmin(distance))
         differs[i] = differs[i] and differs[twin]
     rows = np.flatnonzero(differs)
     chosen = found.value[rows]

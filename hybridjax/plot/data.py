@@ -309,8 +309,11 @@ def experiment(
     require_index("experiment", index, S)
     index = index % S
     time = np.arange(n) / data.n_sections
-    rows = [(name, data.u[index, :, k], True) for k, name in enumerate(data.inputs)]
-    rows += [(name, data.y[index, :, k], False) for k, name in enumerate(data.outputs)]
+    rows = []
+    for k, name in enumerate(data.inputs):
+        rows.append((name, data.u[index, :, k], True))
+    for k, name in enumerate(data.outputs):
+        rows.append((name, data.y[index, :, k], False))
     size = {"width": COLUMN, "height": 0.5 + 0.85 * len(rows)}
     with panels(ax, len(rows), 1, **size, sharex=True) as axes:
         for panel, (name, values, is_input) in zip(axes[:, 0], rows, strict=True):
@@ -410,7 +413,8 @@ def validation(
 
 def _stems(ax: Axes, first: float, values, color, limit: float) -> None:
     """Means over the sections of values that have variance 1 each, from a first lag on."""
-    mean = values.sum(axis=0) / np.sqrt(np.maximum((values != 0).sum(axis=0), 1))
+    count = (values != 0).sum(axis=0)
+    mean = values.sum(axis=0) / np.sqrt(np.maximum(count, 1))
     ax.axhspan(-limit, limit, color="0.9", zorder=0)
     ax.vlines(first + np.arange(len(mean)), 0, mean, color=color, lw=1.2)
     ax.axhline(0, color="black", lw=0.5)

@@ -131,10 +131,14 @@ class Explorer:
         begin = {
             name: float(parameter_of(self.cycle.system, name)) for name in self.values
         }
-        share, step, self.message = 0.0, 1.0, ""
+        share = 0.0
+        step = 1.0
+        self.message = ""
         while share < 1:
             at = min(share + step, 1.0)
-            mixed = {n: (1 - at) * x + at * self.values[n] for n, x in begin.items()}
+            mixed = {}
+            for n, x in begin.items():
+                mixed[n] = (1 - at) * x + at * self.values[n]
             system = with_parameters(self.cycle.system, mixed)
             cycle = find_limit_cycle(system, away_from_events(self.cycle), throw=False)
             if cycle.result == Result.OK:
@@ -190,7 +194,8 @@ class Explorer:
         window = pyplot.figure(figsize=(5, 0.5 * len(self._sliders) + 0.3))
         self._widgets = []  # (a slider that nobody holds does not move)
         for k, (name, label, low, high) in enumerate(self._sliders, 1):
-            ax = window.add_axes((0.25, 1 - k / (len(self._sliders) + 1), 0.55, 0.05))
+            bottom = 1 - k / (len(self._sliders) + 1)
+            ax = window.add_axes((0.25, bottom, 0.55, 0.05))
             self._widgets.append(
                 Slider(ax, label, low, high, valinit=self.values[name])
             )

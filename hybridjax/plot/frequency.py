@@ -388,7 +388,14 @@ def _curves(
         for which in inputs:
             pushed = _pick("input", which, htf.inputs)
             label = _curve(output, pushed, htf) if input is None else output
-            curves.append(_Curve(output, pushed, which, label))
+            curves.append(
+                _Curve(
+                    output=output,
+                    input=pushed,
+                    which=which,
+                    label=label,
+                )
+            )
     return curves
 
 
@@ -547,7 +554,8 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
     phase = np.full(len(f), np.nan)
     phase[known] = np.degrees(np.unwrap(np.angle(values[known])))
     if reference is not None and known.any() and len(reference[0]):
-        turns = np.median(np.interp(f[known], *reference) - phase[known]) / 360
+        off = np.interp(f[known], *reference) - phase[known]
+        turns = np.median(off) / 360
         phase += 360 * np.round(turns)
     return phase
 

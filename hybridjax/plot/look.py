@@ -221,6 +221,16 @@ def legend(ax: Axes, place: str, **options: Any) -> None:
     figure.legend(*ax.get_legend_handles_labels(), loc=f"outside {place}", **options)
 
 
+def legend_above(ax: Axes, columns: int = 4) -> None:
+    """A legend over the panel, with its entries side by side."""
+    ax.legend(
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=columns,
+        columnspacing=1.2,
+    )
+
+
 def letters(axes: Any) -> None:
     """Call the Axes of a figure A, B, C, ..."""
     for ax, letter in zip(np.ravel(axes), "ABCDEFGHIJKLMNOPQRSTUVWXYZ", strict=False):

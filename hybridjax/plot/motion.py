@@ -319,9 +319,24 @@ def _tracks(
     count = max(12, round(length / pace * _RATE))
     times = longest.t[0] + np.linspace(0, length, count, endpoint=False)
     title = "" if beside is None else "cycle"
-    tracks = [Track(title, CYCLE[0], path, times, period)]
+    tracks = [
+        Track(
+            title=title,
+            color=CYCLE[0],
+            trajectory=path,
+            times=times,
+            period=period,
+        )
+    ]
     if beside is not None:
-        tracks.append(Track("perturbed", COLORS["red"], beside, times))
+        tracks.append(
+            Track(
+                title="perturbed",
+                color=COLORS["red"],
+                trajectory=beside,
+                times=times,
+            )
+        )
     return tracks, pace, note
 
 
@@ -350,7 +365,8 @@ def _both_halves(cycle: LimitCycle) -> LimitCycle:
     s = cycle.structure
     anchor = to_host(cycle.anchor)
     a = int(anchor.chart[0])
-    at = Guess(s.names[a], anchor.q[: s.dims[a], 0], anchor.t[0])
+    state = anchor.q[: s.dims[a], 0]
+    at = Guess(s.names[a], state, anchor.t[0])
     whole = cycle.system.whole(at) if isinstance(cycle.system, Symmetric) else None
     return cycle if whole is None else find_limit_cycle(*whole)
 
@@ -402,9 +418,12 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     )
     ax.spines[:].set_visible(False)
     (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
-    points = [np.array([_NOWHERE[:2], *x.points.values()]).T for x in scenes]
+    points = []
+    for scene in scenes:
+        points.append(np.array([_NOWHERE[:2], *scene.points.values()]).T)
     parts: list[Part] = [(dots, dots.set_data, points)]
-    colors = itertools.cycle(CYCLE[: 3 if len(scenes[0].lines) <= 4 else 1])
+    is_simple = len(scenes[0].lines) <= 4
+    colors = itertools.cycle(CYCLE[: 3 if is_simple else 1])
     for name in dict.fromkeys(itertools.chain(*(x.lines for x in scenes))):
         lines = [x.lines.get(name, _NOWHERE[None, :2]) for x in scenes]
         if name == "ground":
@@ -453,7 +472,8 @@ def _marks(
     spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
     marks = []
     for line, begin in zip(lines, -pictures.camera(at)[:, 0], strict=True):
-        x = begin % spacing + spacing * np.arange(*np.round(line[[0, -1], 0] / spacing))
+        low, high = np.round(line[[0, -1], 0] / spacing)
+        x = begin % spacing + spacing * np.arange(low, high)
         marks.append(np.stack([x, np.interp(x, *line.T)]))
     return marks
 
@@ -467,7 +487,8 @@ def _traces(
     """Signals over time, where they are now, and the names of events."""
     times = tracks[0].times - tracks[0].times[0]
     unit = tracks[0].trajectory.system.time_unit
-    fine = np.linspace(0, 2 * times[-1] - times[-2], 2000, endpoint=False)
+    end = 2 * times[-1] - times[-2]
+    fine = np.linspace(0, end, 2000, endpoint=False)
     for track in tracks:
         signals = track.observed(names, track.times[0] + fine)
         for ax, values in zip(axes, signals, strict=True):
@@ -571,7 +592,8 @@ def widened(ax: Axes) -> bool:
 
 def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) -> Motion:
     """At most 100 cycles of a branch, one after the other."""
-    rows = np.unique(np.linspace(0, len(branch) - 1, 100).round().astype(int))
+    rows = np.linspace(0, len(branch) - 1, 100)
+    rows = np.unique(rows.round().astype(int))
     cycles = [branch[int(k)] for k in rows]
     values = branch.values[rows]
     plane = plane_of(cycles[0].structure, x, y)

@@ -15,7 +15,7 @@ from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
 from ..sections.placed import PlacedSections
 from ..systems.structure import Structure
-from .look import COLORS, AxesLike, Plot, axis_of, panels
+from .look import COLORS, AxesLike, Plot, axis_of, legend_above, panels
 
 
 CHARTS = [
@@ -113,12 +113,7 @@ def cycle(
                 label="perturbed",
             )
         panel.set(xlabel=axis_of(x), ylabel=axis_of(y))
-        panel.legend(
-            loc="lower center",
-            bbox_to_anchor=(0.5, 1.0),
-            ncols=4,
-            columnspacing=1.2,
-        )
+        legend_above(panel)
     return Plot(axes)
 
 
@@ -169,11 +164,16 @@ def by_chart(
 ) -> dict[int, Float[np.ndarray, "2 p"]]:
     """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
-    cuts = np.flatnonzero((np.diff(t) == 0) | (np.diff(chart) != 0)) + 1
+    is_jump = (np.diff(t) == 0) | (np.diff(chart) != 0)
+    cuts = np.flatnonzero(is_jump) + 1
     curve = np.insert(trajectory(x, y)[1:], cuts, np.nan, axis=1)
     chart = np.insert(chart, cuts, chart[cuts])
-    curves = {a: np.where(chart == a, curve, np.nan) for a in np.unique(chart).tolist()}
-    return {a: x for a, x in curves.items() if np.isfinite(x).all(axis=0).any()}
+    curves = {}
+    for a in np.unique(chart).tolist():
+        in_chart = np.where(chart == a, curve, np.nan)
+        if np.isfinite(in_chart).all(axis=0).any():
+            curves[a] = in_chart
+    return curves
 
 
 def at_events(
@@ -245,7 +245,9 @@ def _side(x: float, below: Any, above: Any) -> Any:
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:
     width, height = ax.get_window_extent().size
-    unit = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()) * width / height])
+    width_of_axes = np.ptp(ax.get_xlim())
+    height_of_axes = np.ptp(ax.get_ylim())
+    unit = np.array([width_of_axes, height_of_axes * width / height])
     bars = []
     step = max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
@@ -270,7 +272,8 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
     items = tuple(s.resolve_outputs(names).items)
     for a in np.unique(charts).tolist():
         mask = charts == a
-        at = times[mask], states[: s.dims[a], mask], np.zeros((s.nu, 1))
+        q = states[: s.dims[a], mask]
+        at = times[mask], q, np.zeros((s.nu, 1))
         flow = kernels.field(s, a, *at)[:, 0]
         values = kernels.outputs(s, a, items, *at)
         points[mask], by_time, *by_state = values.transpose(1, 2, 0)

@@ -13,7 +13,7 @@ from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..orbits.branches import KINDS, Branch
 from ..systems.system import unit_of_parameter
-from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, panels
+from .look import COLORS, CYCLE, AxesLike, Plot, axis_of, legend_above, panels
 
 
 _MARKS = dict(
@@ -94,12 +94,7 @@ def branch(
         (output_name,) = branches[0][0].structure.resolve_outputs(name).names
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
-        panel.legend(
-            loc="lower center",
-            bbox_to_anchor=(0.5, 1.0),
-            ncols=4,
-            columnspacing=1.2,
-        )
+        legend_above(panel)
     return Plot(axes)
 
 
@@ -109,8 +104,11 @@ def _parts(branch: Branch) -> list[tuple[slice, bool]]:
     parts = []
     for a, b in itertools.pairwise(cuts):
         if b > a:
-            inside = branch.stable[a + 1 : b] if b > a + 1 else branch.stable[[a, b]]
-            parts.append((slice(a, b + 1), bool(np.mean(inside) > 0.5)))
+            inside = branch.stable[a + 1 : b]
+            if b <= a + 1:
+                inside = branch.stable[[a, b]]
+            is_stable = bool(np.mean(inside) > 0.5)
+            parts.append((slice(a, b + 1), is_stable))
     return parts
 
 

@@ -28,31 +28,36 @@ class Pictures:
         t, chart, q = trajectory.dense(6)
         drawings = drawn(trajectory.structure, t, chart, q)
         place = np.array([drawing.place for drawing in drawings])
-        self._t = t
-        self._velocity = np.array([drawing.velocity for drawing in drawings])
+        velocity = np.array([drawing.velocity for drawing in drawings])
+
         # Over an event the body stays; between events the origin moves by its velocity.
         durations = np.diff(t)[:, None]
-        mean_velocity = (self._velocity[1:] + self._velocity[:-1]) / 2
+        mean_velocity = (velocity[1:] + velocity[:-1]) / 2
         jumps = place[:-1] - place[1:]
         moves = np.where(durations == 0, jumps, mean_velocity * durations)
-        self._origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
+        origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
+
         length = t[-1] - t[0]
         self.period = min(period, length)
-        self.stride = self._origin[-1] + self._velocity[-1] * (self.period - length)
+        self.stride = origin[-1] + velocity[-1] * (self.period - length)
         if np.isinf(period):
             self.stride += place[-1] - place[0]
-        scenes = self._seen(t, self._origin, drawings)
+        self._t = t
+        self._origin = origin
+        self._velocity = velocity
+        scenes = self._seen(t, origin, drawings)
         corners = np.vstack([_corners(x) for x in scenes])
         self.low = corners.min(axis=0)
         self.high = corners.max(axis=0)
 
     def at(self, t: Float[np.ndarray, " n"]) -> list[Drawing]:
         """The pictures at times of the trajectory."""
-        drawings = drawn(self.trajectory.structure, t, *self.trajectory.at(t))
+        chart, q = self.trajectory.at(t)
+        drawings = drawn(self.trajectory.structure, t, chart, q)
         k = np.searchsorted(self._t, t, side="right") - 1
         since = t - self._t[k]
-        origin = self._origin[k] + self._velocity[k] * since[:, None]
-        return self._seen(t, origin, drawings)
+        moved = self._velocity[k] * since[:, None]
+        return self._seen(t, self._origin[k] + moved, drawings)
 
     def camera(self, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
         """The places of the camera over the ground."""
@@ -98,10 +103,13 @@ def drawn(
 
 def _drawing(form: Any, numbers: Float[np.ndarray, " n"]) -> Any:
     """The drawing of this form with these numbers, which `_flat` has put one after the other."""
-    leaves, structure = jax.tree_util.tree_flatten(form)
-    ends = np.cumsum([x.size for x in leaves])
-    parts = np.split(numbers, ends[:-1])
-    arrays = [part.reshape(x.shape) for part, x in zip(parts, leaves, strict=True)]
+    shapes, structure = jax.tree_util.tree_flatten(form)
+    arrays = []
+    begin = 0
+    for shape in shapes:
+        end = begin + shape.size
+        arrays.append(numbers[begin:end].reshape(shape.shape))
+        begin = end
     return jax.tree_util.tree_unflatten(structure, arrays)
 
 
@@ -110,12 +118,13 @@ def drawing_of(s: Structure, a: int) -> Any:
 
     **Raises:** `DefinitionError` if the system's `draw` raises an error.
     """
-    point = jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((s.dims[a],), float)
+    time = jax.ShapeDtypeStruct((), float)
+    state = jax.ShapeDtypeStruct((s.dims[a],), float)
+
+    def shapes():
+        return jax.eval_shape(lambda t, q: s.drawing(a, t, q), time, state)
+
     with evaluating(f"method `draw(self, chart, t, q)` of {type(s.system).__name__}"):
-
-        def shapes():
-            return jax.eval_shape(lambda t, q: s.drawing(a, t, q), *point)
-
         return s.once(("drawing", a), (), shapes)
 
 

@@ -109,7 +109,8 @@ class _Markers(NamedTuple):
         for border in borders:
             # Of a real multiplier it is an interval, whose ends would not be seen.
             ends = []
-            x, y = np.real(border), np.imag(border)
+            x = np.real(border)
+            y = np.imag(border)
             if np.ptp(y) == 0:
                 ends = [int(x.argmin()), int(x.argmax())]
             edge: Any = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
@@ -172,8 +173,8 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
             reach = 1.5 * np.abs(poles - center).max() or 1.0
             lower.set(xlim=(center - reach, center + reach), ylim=(-reach, reach))
             upper.set_aspect("equal", adjustable="datalim")
-            (x0, x1) = lower.get_xlim()
-            (y0, y1) = lower.get_ylim()
+            x0, x1 = lower.get_xlim()
+            y0, y1 = lower.get_ylim()
             upper.indicate_inset((x0, y0, x1 - x0, y1 - y0), edgecolor="black")
             upper.set_title(output)
             lower.set_title("enlarged: around the poles")
@@ -234,7 +235,15 @@ def _zoom(
     side = 0.36
     far = ax.get_xlim()[1]
     points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
-    places = np.array([0.6 + 0.5j, 0.33 + 0.5j, 0.5 + 0.5j, 0.5 + 0.25j, 0.5 + 0.75j])
+    places = np.array(
+        [
+            0.6 + 0.5j,
+            0.33 + 0.5j,
+            0.5 + 0.5j,
+            0.5 + 0.25j,
+            0.5 + 0.75j,
+        ]
+    )
     apart = points - places[:, None]
     room = np.maximum(np.abs(apart.real), np.abs(apart.imag)).min(axis=1)
     place = places[int(room.argmax())]

@@ -16,7 +16,7 @@ from ..sections.families import ClockPhase
 from ..sections.maps import SectionMap, arrivals, section_map
 from ..sections.place import place_sections
 from ..sections.placed import PlacedSections
-from .look import COLORS, AxesLike, Plot, panels
+from .look import COLORS, AxesLike, Plot, legend_above, panels
 
 
 # States from which the map is drawn. Fewer: corners show in a curved map. More: time, a period of
@@ -115,9 +115,7 @@ def return_map(
             aspect="equal",
         )
         panel.locator_params(nbins=6)
-        panel.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, columnspacing=1.2
-        )
+        legend_above(panel, columns=2)
     return Plot(axes)
 
 

@@ -182,7 +182,7 @@ def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
         raise DefinitionError("a figure has at most two axes, but the maps have more.")
     with panels(ax, width=COLUMN if len(result.axes) == 1 else 0.6 * PAGE) as axes:
         panel = axes[0, 0]
-        (name, *other) = result.axes
+        name, *other = result.axes
         if not other:
             x = result.axes[name]
             low = values - result.reach

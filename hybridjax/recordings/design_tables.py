@@ -75,8 +75,10 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
             first = stretches[0]
             now = first.at(trial.time)
             during = np.isfinite(now)
-            section = np.floor((now[during] - np.ceil(first.phase[0])) * N).astype(int)
-            added[during] = command[s, np.clip(section + 1, 0, command.shape[1] - 1)]
+            first_whole = np.ceil(first.phase[0])
+            section = np.floor((now[during] - first_whole) * N).astype(int)
+            last = command.shape[1] - 1
+            added[during] = command[s, np.clip(section + 1, 0, last)]
         signals = dict(zip(names, added.T, strict=True))
         commanded = Recording(trial.time, signals, name=trial.name)
         measured = recording.with_trials([trial])

@@ -151,7 +151,8 @@ def diagnosis_of(
     )
     # Variances decrease with the number of strides beyond that of the unknowns.
     cycles = (100, 300, 1000, 3000)
-    later = np.array([max(n - (R * nu + d + 1), 0) for n in cycles], float)
+    parameters = R * nu + d + 1
+    later = np.array([max(n - parameters, 0) for n in cycles], float)
     with np.errstate(divide="ignore"):
         smaller = np.sqrt(max(sampled - unknowns, 1) / later)
     return Diagnosis(
@@ -219,7 +220,8 @@ def _about_excitation(
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
         for z in _upper(fit.multipliers):
             at = abs(np.angle(z)) / (2 * np.pi)
-            distance = np.abs((f[:, None] - [at, -at] + 0.5) % 1 - 0.5).min(axis=1)
+            shifted = f[:, None] - [at, -at]
+            distance = np.abs((shifted + 0.5) % 1 - 0.5).min(axis=1)
             near = strength[distance < 0.1].max(initial=0)
             if near < LEAST_POWER * strength.max():
                 yield Finding(

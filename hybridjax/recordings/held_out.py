@@ -170,7 +170,8 @@ def split(data: HasRecords) -> Split:
     """Split the records into a part to be fitted, and a quarter to be held out."""
     n_sections = data.records[0].n_sections
     cycles = sum(len(r.u) for r in data.records) / n_sections
-    ends = [round(len(r.u) * min(1.0, _ENOUGH / cycles)) for r in data.records]
+    share = min(1.0, _ENOUGH / cycles)
+    ends = [round(len(r.u) * share) for r in data.records]
     short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * n_sections]
     held_out = short[3::4]
     # If all records are short, but too few to hold one out, all are cut.
@@ -193,5 +194,6 @@ def split(data: HasRecords) -> Split:
 def _misfit(fit: SeriesFit, grid: CycleGrid) -> float:
     """Return the mean logarithm of the rms errors of the outputs."""
     error = (fit.predicted(grid, free_start=True) - grid.y) * grid.sampled
-    square = (error**2).sum(axis=(0, 1, 2)) / grid.sampled.sum(axis=(0, 1, 2))
+    count = grid.sampled.sum(axis=(0, 1, 2))
+    square = (error**2).sum(axis=(0, 1, 2)) / count
     return float(np.log(square).mean()) / 2

@@ -194,7 +194,8 @@ def _durations(data: SectionData) -> Series:
     N = data.n_sections
     section = [x.first_section + np.arange(len(x.u) - 1) for x in data.records]
     steps = np.concatenate([np.diff(t) for t in data.times])
-    return average_cycle(np.concatenate(section) % N, steps[:, None], N)[:, 0]
+    number = np.concatenate(section) % N
+    return average_cycle(number, steps[:, None], N)[:, 0]
 
 
 def _smeared(h: np.ndarray, push: Series) -> np.ndarray:

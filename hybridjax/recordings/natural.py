@@ -200,7 +200,8 @@ def _moduli(
     moduli = np.abs(draws)
     for k in np.flatnonzero(values.imag > 0):
         twin = int(np.argmin(np.abs(values - values[k].conj())))
-        moduli[:, [k, twin]] = np.sqrt(moduli[:, k] * moduli[:, twin])[:, None]
+        common = np.sqrt(moduli[:, k] * moduli[:, twin])
+        moduli[:, [k, twin]] = common[:, None]
     return moduli
 
 
@@ -469,7 +470,8 @@ def _corrected(z: Draws, length: float) -> Draws:
     own = z[:, :, None]
     other = z[:, None, :]
     product = own * other
-    stable = np.clip(np.abs(product), 0, 0.99) * np.exp(1j * np.angle(product))
+    modulus = np.clip(np.abs(product), 0, 0.99)
+    stable = modulus * np.exp(1j * np.angle(product))
     by_regression = (other * (1 - own**2) / (1 - stable)).sum(axis=2)
     return _largest_first(z + (1 + 2 * z + by_regression) / length)
 

@@ -134,7 +134,9 @@ def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
         # A sampled edge may lie on the level, or on a sample.
         last = np.minimum(after + 1, len(x) - 1)
         first = np.maximum(after - 2, 0)
-        jumps = np.abs(np.stack([x[after] - x[after - 1], x[last] - x[first]]))
+        within = x[after] - x[after - 1]
+        around = x[last] - x[first]
+        jumps = np.abs(np.stack([within, around]))
         shares.append(np.nanmax(jumps, axis=0) / range_)
     jumps_there = np.nanmedian(np.concatenate(shares)) > _SWITCHED
     return bool(jumps_there and min(at_two_values) > _SWITCHED)
@@ -176,7 +178,14 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
             total += len(part)
             t = time[part]
             unseen = gaps(t, bridgeable(t))[1:-1]
-            of_trial.append(Winding(t[rising], mean[rising], False, unseen))
+            of_trial.append(
+                Winding(
+                    time=t[rising],
+                    phase=mean[rising],
+                    linear=False,
+                    gaps=unseen,
+                )
+            )
         stretches.append(tuple(of_trial))
     return Phase(
         tuple(stretches), n_sections=n_sections, backwards=backwards / max(total, 1)
@@ -219,7 +228,10 @@ def _angles(
         angles.append((time, angle_of(*smooth)))
     if isinstance(anchor, Crossing):
         at_anchor = _angle_at(recording, anchor, bandwidth, angles)
-        angles = [(time, np.angle(np.exp(1j * (a - at_anchor)))) for time, a in angles]
+        relative = []
+        for time, a in angles:
+            relative.append((time, np.angle(np.exp(1j * (a - at_anchor)))))
+        angles = relative
     return angles
 
 
@@ -249,7 +261,8 @@ def _plane(
     """Return center and scale, by default from the middle 98 % of the signals over all trials."""
     limits = []
     for name in (family.position, family.velocity):
-        values = np.concatenate([x[np.isfinite(x)] for _, x in recording.samples(name)])
+        finite = [x[np.isfinite(x)] for _, x in recording.samples(name)]
+        values = np.concatenate(finite)
         if not len(values):
             raise DefinitionError(
                 f"{name} is missing at every sample: define the phase by others."
@@ -295,7 +308,8 @@ def _angle_at(
 
 def _turns_per_time(angles: Sequence[_Angle]) -> float:
     """Return the signed rate. **Raises:** `DefinitionError` if the angle does not wind twice."""
-    turns = sum(float(np.unwrap(a)[-1] - a[0]) for _, a in angles) / (2 * np.pi)
+    unwrapped = [np.unwrap(a) for _, a in angles]
+    turns = sum(float(a[-1] - a[0]) for a in unwrapped) / (2 * np.pi)
     span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
         raise DefinitionError(

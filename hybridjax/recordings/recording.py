@@ -121,7 +121,14 @@ class Recording(Showable, eqx.Module):
             happened[key] = np.sort(values[~np.isnan(values)])
             check_events(where, key, happened[key], time)
         values = np.stack(list(columns.values()), axis=1)
-        self.trials = (Trial(time, values, happened, name),)
+        self.trials = (
+            Trial(
+                time=time,
+                values=values,
+                events=happened,
+                name=name,
+            ),
+        )
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
         self.findings = tuple(findings)
@@ -247,7 +254,8 @@ class Recording(Showable, eqx.Module):
             if crossing.direction != "rising":
                 y = -y
             known = np.diff(t) <= bridgeable(t, 0.5 / bandwidth)
-            at = np.flatnonzero((y[:-1] < 0) & (y[1:] >= 0) & known)
+            rises = (y[:-1] < 0) & (y[1:] >= 0)
+            at = np.flatnonzero(rises & known)
             if not len(at):
                 if np.nanmin(x) < level < np.nanmax(x) and bandwidth < np.inf:
                     remedy = (
@@ -415,7 +423,8 @@ def _begins_again(time: Series, bad: int) -> bool:
     so_far = np.ptp(time[:bad])
     after = time[bad : bad + 3]
     goes_on = len(after) > 1 and bool((np.diff(after) > 0).all())
-    return time[bad - 1] - time[bad] > so_far / 2 and goes_on and bad > 2
+    jump_back = time[bad - 1] - time[bad]
+    return jump_back > so_far / 2 and goes_on and bad > 2
 
 
 def signal_of(crossing: Crossing) -> str:

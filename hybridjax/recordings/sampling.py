@@ -359,7 +359,8 @@ def _require_changes(
 def _require_times(part: _Sections, N: int, step: float) -> None:
     """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
     errors depend on the place of a crossing between samples, which are `step` seconds apart."""
-    known = (part.k % N == 0) & np.isfinite(part.values[:, -1])
+    is_anchor = part.k % N == 0
+    known = is_anchor & np.isfinite(part.values[:, -1])
     inner = np.flatnonzero(known)[3:-3]
     # Of fewer cycles, the seven waves below explain too much.
     if len(inner) <= 20:
@@ -367,7 +368,8 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
     t = part.t[inner]
     late = detrend(part.values[inner, -1])
     place = (t - detrend(t)) / step
-    waves = np.exp(2j * np.pi * np.outer(place, np.arange(4))).view(float)
+    angle = 2 * np.pi * np.outer(place, np.arange(4))
+    waves = np.exp(1j * angle).view(float)
     unexplained = late - waves @ np.linalg.lstsq(waves, late)[0]
     # Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.
     if unexplained.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
@@ -393,7 +395,8 @@ def _sample(
         k = _crossed(stretch, N)
         if len(k) <= N:
             continue
-        t = np.clip(stretch.when(k / N), stretch.time[0], stretch.time[-1])
+        t = stretch.when(k / N)
+        t = np.clip(t, stretch.time[0], stretch.time[-1])
         start = t[:-1]
         long_gaps = np.diff(stretch.gaps, axis=1)[:, 0] > plan.period / N
         observed = ~inside(stretch.gaps[long_gaps], start, start)
@@ -406,7 +409,17 @@ def _sample(
             values[:, nu + i] = np.where(observed, output.at(start), np.nan)
             change[:, i] = output.change(start)
         none = np.zeros((0, 0))
-        sections.append(_Sections(trial, k[:-1], start, observed, values, change, none))
+        sections.append(
+            _Sections(
+                trial=trial,
+                k=k[:-1],
+                t=start,
+                observed=observed,
+                values=values,
+                change=change,
+                cycle=none,
+            )
+        )
     return sections
 
 
@@ -485,7 +498,8 @@ def _after_clock(
     """Return times minus those of the clock: a line through the times of each section,
     t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
     N = plan.n_sections
-    begin = parts[0].t[0] / plan.period - parts[0].k[0] / N
+    first = parts[0]
+    begin = first.t[0] / plan.period - first.k[0] / N
     cycles = [
         part.k // N + round(part.t[0] / plan.period - part.k[0] / N - begin)
         for part in parts
@@ -496,8 +510,10 @@ def _after_clock(
     )
     cycle, time = (both - average_cycle(section, both, N)[section]).T
     slope = (cycle @ time) / (cycle @ cycle)
-    late = np.where(np.isnan(np.concatenate(times)), np.nan, time - slope * cycle)
-    return np.split(late, np.cumsum([len(part.k) for part in parts])[:-1])
+    is_missing = np.isnan(np.concatenate(times))
+    late = np.where(is_missing, np.nan, time - slope * cycle)
+    ends = np.cumsum([len(part.k) for part in parts])
+    return np.split(late, ends[:-1])
 
 
 @checked
@@ -527,7 +543,8 @@ def without_drift(
             if len(middle) >= FEWEST and cycles < np.inf:
                 bandwidth = 0.5 / (cycles * phase.period)
                 drift = spline(middle, level - level.mean(), bandwidth)
-                values[:, k] -= drift(np.clip(trial.time, middle[0], middle[-1]))
+                within = np.clip(trial.time, middle[0], middle[-1])
+                values[:, k] -= drift(within)
         trials.append(replace(trial, values=values))
     return recording.with_trials(trials)
 

@@ -35,7 +35,8 @@ _NEIGHBORHOOD = 3 * _LONGEST
 # middle 98 %; for a number that stands for no value, of all samples), and in standard deviations of
 # the noise (or smallest steps of the signal). Larger: spikes stay in. Smaller: steep parts, noise,
 # rounding and the perturbation itself are left out.
-RANGES, _NOISES = 3.0, 6.0
+RANGES = 3.0
+_NOISES = 6.0
 # Spikes are isolated if within so many samples on either side there are no more of them than two
 # longest spikes have. Fewer: ringing after an impact is taken for spikes. More: independent spikes
 # nearby stay in.

@@ -99,7 +99,12 @@ class Draws:
         numbers = np.arange(self.blocks.shape[0])
         number: dict[str, Any] = {"draw": (("draw",), numbers, {})}
         layout = Layout(
-            ("draw",), self.blocks, variables, number, ("draw",), self.description
+            dims=("draw",),
+            blocks=self.blocks,
+            variables=variables,
+            constants=number,
+            coordinates=("draw",),
+            description=self.description,
         )
         return dataclasses.replace(self, variables=variables), layout
 

@@ -42,7 +42,8 @@ from .wanted import Measure, Want, Wanted
 _PIECES = 64
 # Points of a piece, at least, and of one for which users' functions of cycles are evaluated. More:
 # more is lost with a worker. Fewer: many small files.
-_SMALLEST, _MEASURED = 4000, 250
+_SMALLEST = 4000
+_MEASURED = 250
 # Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
 # they save.
 _COARSE = 250
@@ -123,7 +124,9 @@ def sweep(
         )
     space = Space(axes, not isinstance(values, SweepPoints))
     family = Family(model, list(space.axes))
-    middle = {name: float(np.sort(x)[len(x) // 2]) for name, x in space.axes.items()}
+    middle = {}
+    for name, x in space.axes.items():
+        middle[name] = float(np.sort(x)[len(x) // 2])
     system = family.check(middle)
     wanted = Wanted(quantities, system)
     total = math.prod(space.shape)
@@ -140,7 +143,15 @@ def sweep(
         "guess": None if guess is None else rough(guess),
         "piece": list(blocks.block),
     }
-    job = SweepJob(family, system, space, blocks, wanted, guess, description)
+    job = SweepJob(
+        family=family,
+        system=system,
+        space=space,
+        blocks=blocks,
+        wanted=wanted,
+        guess=guess,
+        description=description,
+    )
     return fill(job, store, client).dataset()
 
 
@@ -190,12 +201,12 @@ class SweepJob:
         points = self.space.constants(units)
         states = self.wanted.constants()
         layout = Layout(
-            self.space.dims,
-            self.blocks,
-            variables,
-            {**points, **states},
-            (*points, *states),
-            self.description,
+            dims=self.space.dims,
+            blocks=self.blocks,
+            variables=variables,
+            constants={**points, **states},
+            coordinates=(*points, *states),
+            description=self.description,
         )
         begun = begun._replace(coarse=solved)
         whole = cycles if len(self.blocks) == 1 else None
@@ -225,7 +236,10 @@ class SweepJob:
             cycles = self._solved(self._points(k), workers, known)
         shape = [x.stop - x.start for x in self.blocks.slices(k)]
         values = self.wanted.values(cycles, self.variables)
-        return {name: x.reshape(*shape, *x.shape[1:]) for name, x in values.items()}
+        shaped = {}
+        for name, x in values.items():
+            shaped[name] = x.reshape(*shape, *x.shape[1:])
+        return shaped
 
     def _points(self, k: int) -> tuple[np.ndarray, ...]:
         """Return the indices of the points of piece k."""
@@ -267,7 +281,12 @@ class SweepJob:
         anchor = jax.tree_util.tree_map(
             lambda x: np.repeat(np.asarray(x)[None], n, 0), map.anchor
         )
-        blank = Known(None, anchor, np.zeros(n), np.zeros(n, int))
+        blank = Known(
+            numbers=None,
+            anchor=anchor,
+            period=np.zeros(n),
+            result=np.zeros(n, int),
+        )
         return Begun(map, index, blank)
 
     def _guess(self) -> LimitCycle:

@@ -32,7 +32,8 @@ def flow_along(
     """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
     known times or all at states: what `through` returns. None if a target is not reached once in a
     turn, and for implicit methods, whose steps have errors that decay before the turn ends."""
-    s, begin = map.structure, carry[0]
+    s = map.structure
+    begin = carry[0]
     if has_implicit(s):
         return None
     moves, before = _three_turns(map, turn)
@@ -40,30 +41,54 @@ def flow_along(
     if places is None:
         return None
     walk = _walk(map, moves, begin, places)
+    by_clock = np.isfinite(targets.time[0])
+    arrival = ARRIVE_TIME if by_clock else ARRIVE_LEVEL
     event = np.broadcast_to(targets.event, len(places.key))
-    arrives = walk.at_target[1:] & (event[np.minimum(walk.piece, len(event) - 1)] < 0)
-    arrival = ARRIVE_TIME if np.isfinite(targets.time[0]) else ARRIVE_LEVEL
-    ends_in = moves.code[walk.key[:-1]]
-    h, code = np.diff(walk.t), np.where(arrives, arrival, ends_in)
+    last_piece = len(event) - 1
+    event_at_end = event[np.minimum(walk.piece, last_piece)]
+    arrives = walk.at_target[1:] & (event_at_end < 0)
+    move = walk.key[:-1]
+    ends_in = moves.code[move]
+    h = np.diff(walk.t)
+    code = np.where(arrives, arrival, ends_in)
+    happens = code >= 0
     # (Where events and sections coincide, a search decides which comes first.)
     at_event = arrives & (np.diff(walk.key) > 0) & (ends_in >= 0)
-    if (at_event | (code >= 0) & (h == 0) | (h < 0)).any():
+    at_once = happens & (h == 0)
+    if (at_event | at_once | (h < 0)).any():
         return None
     chart = moves.chart[walk.key]
     ends = _ends_at_targets(map, walk, chart, code, begin.events)
-    pieces = Lanes(
-        *(np.append(x, y[..., :-1], axis=-1) for x, y in zip(begin, ends, strict=True))
-    )
+    begins = []
+    for first, others in zip(begin, ends, strict=True):
+        begins.append(np.append(first, others[..., :-1], axis=-1))
+    pieces = Lanes(*begins)
+
     M = before.shape[1]
-    states = np.where(code >= 0, before[:, walk.key[:-1] % M], walk.q[:, 1:])
-    at_once = np.zeros(len(h), bool)
-    rival = np.full(len(h), -1)
-    events = np.cumsum(code >= 0)
-    ways = states, walk.q[:, 1:]
-    rows = h, code, walk.t[1:], *ways, chart[1:], at_once, rival, events
+    after = walk.q[:, 1:]
+    rows = Tape(
+        h=h,
+        code=code,
+        t=walk.t[1:],
+        before=np.where(happens, before[:, move % M], after),
+        after=after,
+        chart=chart[1:],
+        at_once=np.zeros(len(h), bool),
+        rival=np.full(len(h), -1),
+        events=np.cumsum(happens),
+    )
     tape = lanes.regrouped(Tape(*(x[None] for x in rows)), walk.piece, pieces)
     none = np.zeros(len(event), np.int32)
-    flow = pieces, Moved(ends, none, none, none), tape
+    flow = (
+        pieces,
+        Moved(
+            lanes=ends,
+            h=none,
+            error=none,
+            result=none,
+        ),
+        tape,
+    )
     last = Lanes(*(x[..., -1:] for x in ends))
     return (last, *carry[1:]), jax.tree_util.tree_map(one_by_one, flow)
 
@@ -74,12 +99,15 @@ def _three_turns(
     """The moves of a turn three times, one turn after the other, and the states before the events
     of one. (Targets lie in the first two turns, and what follows them at most at the beginning of a
     third.)"""
-    is_move = turn[1].code.T != IDLE
-    before = turn[1].before.transpose(2, 0, 1)[is_move].T
-    moves = Moves(*(np.concatenate([x] * 3, axis=-1) for x in recorded_moves(*turn)))
-    later = map.expected * np.repeat([0, 1, 2], before.shape[1])
+    starts, tape = turn
+    is_move = tape.code.T != IDLE
+    before = tape.before.transpose(2, 0, 1)[is_move].T
+    once = recorded_moves(starts, tape)
+    moves = Moves(*(np.concatenate([x, x, x], axis=-1) for x in once))
+    number_of_turn = np.repeat([0, 1, 2], before.shape[1])
+    t = moves.t + map.expected * number_of_turn
     code = np.where(moves.code < 0, MOVE, moves.code)
-    return moves._replace(t=moves.t + later, code=code), before
+    return moves._replace(t=t, code=code), before
 
 
 class _Places(NamedTuple):
@@ -110,22 +138,30 @@ class _Walk(NamedTuple):
 
 
 def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
-    late = TOGETHER * map.expected
-    is_replaced = places.t - moves.t[places.key] <= late
-    passed = np.arange(places.first[0] + 1, places.key[-1] + 1)
+    late = places.t - moves.t[places.key]
+    is_replaced = late <= TOGETHER * map.expected
+    first = places.first[0]
+    last = places.key[-1]
+    passed = np.arange(first + 1, last + 1)
     between = np.setdiff1d(passed, places.key[is_replaced])
     keys = np.concatenate([places.first, between, places.key])
     times = np.concatenate([begin.t, moves.t[between], places.t])
     states = np.concatenate([begin.q, moves.q[:, between], places.q], axis=1)
     order = np.lexsort((times, keys))
-    return _Walk(keys[order], times[order], states[:, order], order > len(between))
+    return _Walk(
+        key=keys[order],
+        t=times[order],
+        q=states[:, order],
+        at_target=order > len(between),
+    )
 
 
 def _ends_at_targets(
     map: ReturnMap, walk: _Walk, chart, code, events_before: Int[np.ndarray, "1"]
 ) -> Lanes:
     """Lanes at the targets, with the transitions that are armed there."""
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     at = np.flatnonzero(walk.at_target)
     fired = np.maximum(code[at - 1], -1)
     count = events_before + np.cumsum(code >= 0, dtype=np.int32)
@@ -133,10 +169,17 @@ def _ends_at_targets(
     ends = ends._replace(events=count[at - 1])
     watched = map.watch(ends, until(ends.t))
     armed = arm(s, ends, watched, period)
-    none = np.zeros(len(at), np.int32)
-    u = np.zeros((s.nu, 1))
-    entry = Entry(ends.armed, ends.armed)
-    return rearm(s, armed, watched, fired, none > 0, period, u, none, entry)
+    return rearm(
+        s,
+        armed,
+        watched,
+        fired,
+        together=np.zeros(len(at), bool),
+        span=period,
+        u=np.zeros((s.nu, 1)),
+        residue=np.zeros(len(at), np.int32),
+        entry=Entry(ends.armed, ends.armed),
+    )
 
 
 def _places_on(
@@ -144,9 +187,11 @@ def _places_on(
 ) -> _Places | None:
     """Where the targets, which follow each other, lie on moves whose `ends` are those of one turn;
     None if one is not met once."""
-    s, period = map.structure, map.expected
+    s = map.structure
+    period = map.expected
     late = TOGETHER * period
-    M, K = ends.shape[1], len(targets.time)
+    M = ends.shape[1]
+    K = len(targets.time)
     by_clock = np.isfinite(targets.time[0])
     event = np.broadcast_to(targets.event, K)
 
@@ -166,31 +211,42 @@ def _places_on(
     end = _until_settled(s, moves, targets, move, h, is_inside, by_clock, period)
     if end is None:
         return None
-    time, turns = moves.t[move] + h, 0
+    time = moves.t[move] + h
+    turns = 0
     if not by_clock:
         turns = np.ceil((begin.t[0] + late - time[0]) / period)
         is_next = np.append(False, time[1:] <= time[:-1] + late)
         turns = turns + np.cumsum(is_next)
     time = time + turns * period
-    key = np.where(event < 0, move_at(time), turns * M + move + 1).astype(int)
+    after_event = turns * M + move + 1
+    key = np.where(event < 0, move_at(time), after_event).astype(int)
     state = moves.q[:, key]
     state[:, is_inside] = end[:, 1:].T
-    return _Places(move_at(begin.t), key, time, state)
+    return _Places(
+        first=move_at(begin.t),
+        key=key,
+        t=time,
+        q=state,
+    )
 
 
 def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):
     """The move of one turn in which each target lies, and the time from its start, to first order;
     None if one is not met once."""
-    K, M = len(targets.time), ends.shape[1]
-    level = _levels_on(s, once, ends, targets)
-    falls = (level[0] > 0) & (level[1] <= 0)
-    is_reached = np.where(event[:, None] < 0, falls, once.code == event[:, None])
-    if (is_reached.sum(axis=1) != 1).any():
+    K = len(targets.time)
+    start, end = _levels_on(s, once, ends, targets)
+    falls = (start > 0) & (end <= 0)
+    wanted = event[:, None]
+    is_reached = np.where(wanted < 0, falls, once.code == wanted)
+    times_reached = is_reached.sum(axis=1)
+    if (times_reached != 1).any():
         return None
     move = np.argmax(is_reached, axis=1)
-    start, end = level[:, np.arange(K), move]
+    target = np.arange(K)
+    start = start[target, move]
+    end = end[target, move]
     part = np.where(event < 0, start / (start - end), 1.0)
-    return move, part * lengths[:M][move]
+    return move, part * lengths[move]
 
 
 def _until_settled(
@@ -213,7 +269,8 @@ def _until_settled(
         goal = dataclasses.replace(targets, time=moves.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[inside]), goal)
         last = change
-        change = np.abs(end[:, 0] - start.t - h[inside]).max(initial=0.0)
+        change_of_each = np.abs(end[:, 0] - start.t - h[inside])
+        change = change_of_each.max(initial=0.0)
         if not change <= last:
             return None
         h[inside] = end[:, 0] - start.t
@@ -234,7 +291,9 @@ def _levels_on(
     )
     level = levels_at(s, targets.levels, 1 + max(index), *point)[0]
     start, end = np.split(level, 2, axis=1)
-    start = np.where(np.roll(once.code, 1) < 0, np.roll(end, 1, axis=1), start)
+    end_of_last = np.roll(end, 1, axis=1)
+    no_event = np.roll(once.code, 1) < 0
+    start = np.where(no_event, end_of_last, start)
     return np.stack([start, end])[:, index]
 
 
@@ -252,6 +311,7 @@ def levels_at(
     for a in np.unique(chart).tolist():
         if levels is not None and levels.present(s, a):
             rows = np.flatnonzero(chart == a)
-            both = kernels.levels(s, a, levels, N, t[rows], q[: s.dims[a], rows])
+            q_of_chart = q[: s.dims[a], rows]
+            both = kernels.levels(s, a, levels, N, t[rows], q_of_chart)
             out[:, :, rows] = both.swapaxes(0, 1)
     return out

@@ -53,7 +53,8 @@ def check_placed(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
     crossed twice, or by the clock at the time of an event."""
     _require_reached(placed, [first, *np.asarray(placed.result).tolist()])
-    name, anchor = placed.family.describe, placed.family.anchor
+    name = placed.family.describe
+    anchor = placed.family.anchor
     if isinstance(anchor, Crossing) and len(_met(placed, 0).places) > 1:
         raise ComputationError(
             f"{name(0)} lies at {anchor}, which {_AGAIN}{_remedy(placed, 0)}"
@@ -86,7 +87,9 @@ def check_placed(placed: PlacedSections, first: int) -> None:
 def _require_reached(placed: PlacedSections, results: list[int]) -> None:
     """**Raises:** `ComputationError` for the first result that is not OK: of the flow to section 0,
     and from each section to the next."""
-    N, name, anchor = placed.n_sections, placed.family.describe, placed.family.anchor
+    N = placed.n_sections
+    name = placed.family.describe
+    anchor = placed.family.anchor
     if isinstance(placed.family, families.KinematicPhase) and any(results):
         _require_turns(placed.family, placed.cycle)
     for i, code in enumerate(results):
@@ -128,8 +131,10 @@ def _about_next_event(placed: PlacedSections, i: int) -> str:
 def _require_order(placed: PlacedSections) -> None:
     """**Raises:** `ComputationError` for sections that are met twice in a round, at the same time,
     or in another order."""
-    N, name = placed.n_sections, placed.family.describe
-    period, duration = float(placed.cycle.period), np.asarray(placed.duration)
+    N = placed.n_sections
+    name = placed.family.describe
+    period = float(placed.cycle.period)
+    duration = np.asarray(placed.duration)
     rounds = float(duration.sum()) / period
     if rounds < 1 - SAME:
         raise ComputationError(f"{name(0)} {_AGAIN}{_remedy(placed, 0)}")
@@ -165,21 +170,30 @@ class _Met(NamedTuple):
 def _met(placed: PlacedSections, i: int) -> _Met:
     """Where the level of section i falls."""
     cycle = placed.cycle
-    N, levels = placed.n_sections, placed.bound.levels
+    N = placed.n_sections
+    levels = placed.bound.levels
     items = getattr(placed.family, "items", (placed.family.anchor,))
     item = items[i] if i < len(items) else None
     section = item if isinstance(item, Crossing) else None
     if section is not None:
-        i, N, levels = 0, 1, ListLevels((section,))
+        i = 0
+        N = 1
+        levels = ListLevels((section,))
     s = cycle.structure
     t, chart, q = cycle.trajectory().dense()
     level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
     falls = np.flatnonzero((np.diff(level) < 0) & (np.diff(t) > 0))
-    high, low = level[falls], level[falls + 1]
+    high = level[falls]
+    low = level[falls + 1]
     crossed = falls[(high > 0) & (low <= 0)]
     places = [f"t = {t[k]:.3g} in {s.names[chart[k]]}" for k in crossed]
-    return _Met(section, high, low, places)
+    return _Met(
+        section=section,
+        high=high,
+        low=low,
+        places=places,
+    )
 
 
 def _remedy(placed: PlacedSections, i: int) -> str:
@@ -219,7 +233,8 @@ def _require_turns(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
 def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
     """The number of crossings of each section in one period, and their steepness: the rate of a
     level on its section as a fraction of its fastest rate on the cycle."""
-    event, levels = np.asarray(placed.bound.event), placed.bound.levels
+    event = np.asarray(placed.bound.event)
+    levels = placed.bound.levels
     counts = np.array(
         [placed.cycle.event_sequence.count(g) if g >= 0 else 1 for g in event]
     )
@@ -244,7 +259,8 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     moves = recorded_moves(lanes, placed.tape)
     value, rate = levels_at(s, levels, N, *_along_steps(s, moves, placed.tape))
     level = value.reshape(N, -1, len(moves.t))
-    falls = (level[:, :-1] > 0) & (level[:, 1:] <= 0) & (moves.h > 0)
+    crosses = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
+    falls = crosses & (moves.h > 0)
 
     # Around the section itself, rounding decides the signs.
     begins_at = np.where(moves.order == 0, moves.lane, -1)
@@ -253,7 +269,9 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     falls[:, -1] &= ~np.roll(is_itself, -1, axis=1)
 
     field = slopes(s, lanes.t, lanes.chart, lanes.q, np.zeros((s.nu, 1)))
-    on_section = placed.normal[:, 0] + np.sum(placed.normal[:, 1:] * field.T, axis=1)
+    by_time = placed.normal[:, 0]
+    by_state = placed.normal[:, 1:]
+    on_section = by_time + np.sum(by_state * field.T, axis=1)
     count = np.sum(falls, axis=(1, 2))
     fastest = np.max(np.nan_to_num(np.abs(rate)), axis=1)
     return count, fastest, on_section

@@ -218,8 +218,10 @@ class ArcLength(_Anchored):
         signals = s.resolve_outputs(self.signals)
         rates = jax.vmap(lambda *point: _along(s, signals, *point)[1])(*orbit[1:])
         speed = jnp.linalg.norm(rates / self.scale, axis=1)
-        length = jnp.cumsum(jnp.append(0.0, (speed + jnp.roll(speed, -1)) / 2))
-        times = orbit.t[0] + orbit.period * jnp.linspace(0.0, 1.0, self.points + 1)
+        mean_speed = (speed + jnp.roll(speed, -1)) / 2
+        length = jnp.cumsum(jnp.append(0.0, mean_speed))
+        share = jnp.linspace(0.0, 1.0, self.points + 1)
+        times = orbit.t[0] + orbit.period * share
         equal = length[-1] * jnp.arange(self.n_sections) / self.n_sections
         return BoundSections.at_times(jnp.interp(equal, length, times))
 
@@ -279,10 +281,8 @@ class KinematicPhase(_Anchored):
         self.anchor = _as_anchor(anchor)
 
     def check(self, s: Structure) -> None:
-        where, names = (
-            "KinematicPhase(position, velocity): ",
-            (self.position, self.velocity),
-        )
+        where = "KinematicPhase(position, velocity): "
+        names = (self.position, self.velocity)
         require_among("output", names, s.output_names(), where)
         super().check(s)
 
@@ -310,8 +310,12 @@ def _along(s: Structure, function: Callable, t, chart, q) -> tuple[Array, Array]
     """A function (a, t, q, u) at a point of an orbit, and its rate along the orbit."""
 
     def in_chart(a):
-        state, u = q[: s.dims[a]], jnp.zeros(s.nu)
-        value = lambda t, q: function(a, t, q, u)  # noqa: E731
+        state = q[: s.dims[a]]
+        u = jnp.zeros(s.nu)
+
+        def value(t, q):
+            return function(a, t, q, u)
+
         return jax.jvp(value, (t, state), (jnp.ones_like(t), s.field(a, t, state, u)))
 
     return jax.lax.switch(
@@ -335,7 +339,8 @@ class _AngleLevels(AbstractLevels):
             self._signals(s)(a, t, q, jnp.zeros(s.nu))
         )
         across = self.across[:, i]
-        return jnp.where(i < 0, 1.0, across[0] * position + across[1] * velocity)
+        signal = across[0] * position + across[1] * velocity
+        return jnp.where(i < 0, 1.0, signal)
 
 
 @checked

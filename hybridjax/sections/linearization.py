@@ -95,7 +95,8 @@ def linearize(
     if delay is not None:
         return Delayed.of(cycle, sections, outputs, inputs, delay).to_ldtp()
     cycle.require_found()
-    s, traced = cycle.structure, is_traced(cycle, sections)
+    s = cycle.structure
+    traced = is_traced(cycle, sections)
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
@@ -116,7 +117,9 @@ def linearize(
     if not traced:
         A, B, C, D = jax.device_get((A, B, C, D))
         d = int(np.max(np.asarray(dims)))
-        A, B, C = A[:, :d, :d], B[:, :d], C[:, :, :d]
+        A = A[:, :d, :d]
+        B = B[:, :d]
+        C = C[:, :, :d]
     return LDTP(
         A,
         B[..., columns],
@@ -239,7 +242,8 @@ class _Departures(AbstractSections):
         self.phase.check(s)
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
-        leave, step = self.phase.bind(s, orbit).time - self.delay[1], orbit.period
+        leave = self.phase.bind(s, orbit).time - self.delay[1]
+        step = orbit.period
         change = leave + self.delay.sum() - self.lag * step / self.phase.n_sections
         return BoundSections.at_times(
             jnp.stack([leave, change][: self.parts], axis=1).ravel()
@@ -283,10 +287,12 @@ class Delayed(NamedTuple):
         if together:
             return cls(model, lag, model.inputs)
         A, B, C, D, dims = model.matrices
-        B = jnp.concatenate([B[1::2], A[1::2] @ B[::2]], axis=2)
+        after_both = A[1::2] @ B[::2]
+        B = jnp.concatenate([B[1::2], after_both], axis=2)
         D = jnp.concatenate([0 * D[::2], D[::2]], axis=2)
         names = *model.inputs, *(f"{x} before" for x in model.inputs)
-        model = LDTP(A[1::2] @ A[::2], B, C[::2], D, dims[::2], names, model.outputs)
+        over_both = A[1::2] @ A[::2]
+        model = LDTP(over_both, B, C[::2], D, dims[::2], names, model.outputs)
         return cls(model, lag, names[: len(names) // 2])
 
     def htf(
@@ -308,7 +314,8 @@ class Delayed(NamedTuple):
                 "the delays decide on the number of states: they cannot be traced. To fit delays, "
                 "give them to `ObservedHTF`."
             )
-        nu, wide = len(self.inputs), len(self.model.inputs)
+        nu = len(self.inputs)
+        wide = len(self.model.inputs)
         first = int(self.lag) * nu
         past = first + wide - nu
         if not past:

@@ -133,10 +133,12 @@ def _locate(
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
-    carry = map.anchor, stride((0.1 * period / N)[None]), xp.zeros(1, xp.int32)
+    first_step = stride((0.1 * period / N)[None])
+    carry = map.anchor, first_step, xp.zeros(1, xp.int32)
     before = None
     if isinstance(family.anchor, Crossing):
-        target = toward(xp.full(1, np.inf), -1, map.anchor.t + 1.5 * period)
+        no_time = xp.full(1, np.inf)
+        target = toward(no_time, -1, map.anchor.t + 1.5 * period)
         carry, before = go(carry, to_section(target, family.anchor))
         if not family.at_anchor:
             before = None
@@ -164,7 +166,8 @@ def _locate(
 
 def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) -> Target:
     """The targets on one section after the other, until section 0 is met again."""
-    N, xp = len(bound.time), namespace(bound.time)
+    N = len(bound.time)
+    xp = namespace(bound.time)
     k = xp.arange(int(begins_on_section), N + 1)
     index = k % N
     return Target(
@@ -183,7 +186,8 @@ def _near_events(
 ) -> Array:
     """Test at which of N clock sections an event happens, but for those of the clock: rounding
     would decide on which side of it they lie."""
-    xp, s = namespace(bound.time), map.structure
+    xp = namespace(bound.time)
+    s = map.structure
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     ignored = xp.asarray(
         [*is_scheduled, True]
@@ -198,7 +202,8 @@ def coordinates_on(
     map: ReturnMap, bound: BoundSections, lanes: Lanes
 ) -> tuple[Int[Array, " N"], Int[Array, " N"], Float[Array, "N n"]]:
     """The fields `drop`, `dims` and `normal` of `PlacedSections`."""
-    s, xp = map.structure, namespace(lanes.t)
+    s = map.structure
+    xp = namespace(lanes.t)
     N = len(lanes.t)
     normal = normals(s, bound, lanes, xp.arange(N), xp.zeros((s.nu, 1)))
     field = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
@@ -228,12 +233,15 @@ def _bind(
     s: Structure, map: ReturnMap, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
     """The family evaluated on the cycle; clock sections in the period that begins at the anchor."""
-    period, t, M = map.expected, anchor.t[0], family.points
+    period = map.expected
+    t = anchor.t[0]
+    M = family.points
     xp = namespace(period)
 
     lanes = anchor
     if M > 1:
-        carry = anchor, stride((0.1 * period / M)[None]), xp.zeros(1, xp.int32)
+        first_step = stride((0.1 * period / M)[None])
+        carry = anchor, first_step, xp.zeros(1, xp.int32)
         times = anchor.t + period * xp.arange(1, M + 1) / M
         lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
     bound = bind_at(map, family, lanes)
@@ -244,7 +252,12 @@ def _bind(
 
 def bind_at(map: ReturnMap, family: AbstractSections, points: Lanes) -> BoundSections:
     """The family evaluated on the cycle, from points at equal times."""
-    orbit = Orbit(map.expected, points.t, points.chart, points.q.T)
+    orbit = Orbit(
+        period=map.expected,
+        t=points.t,
+        chart=points.chart,
+        q=points.q.T,
+    )
     if on_host(map.expected):
         return to_host(_bind_program(map, family, orbit))
     return family.bind(map.structure, orbit)
@@ -259,7 +272,8 @@ def _bind_program(
 
 def normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Array:
     """Gradients (N, n) of the levels with respect to (t, q)."""
-    xp, levels = namespace(lanes.t), bound.levels
+    xp = namespace(lanes.t)
+    levels = bound.levels
     out = xp.zeros((1 + s.d, len(index)), lanes.t.dtype)
     if levels is None:
         return out.T
@@ -269,7 +283,8 @@ def normals(s: Structure, bound: BoundSections, lanes: Lanes, index, u) -> Array
         if not levels.present(s, a):
             return out
         point = [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u, index)]
-        by = kernels.watched(s, a, levels, *point)[-1, 1 : 2 + s.dims[a]]
+        expanded = kernels.watched(s, a, levels, *point)[-1]
+        by = expanded[1 : 2 + s.dims[a]]
         return xp.where(mask, put(out, slice(len(by)), by), out)
 
     return for_each_chart(s, lanes.chart, state_based, work, out).T

@@ -137,7 +137,8 @@ def section_map(
     placed = as_placed(cycle, sections)
     for k in (i, j):
         require_index("section", k, placed.n_sections)
-    s, chart = placed.structure(), placed.lanes.chart
+    s = placed.structure()
+    chart = placed.lanes.chart
     dims = (
         (s.d, s.d)
         if is_traced(chart)
@@ -167,8 +168,12 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
 
 def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
     """Arrivals of lanes from states (n, L) under inputs (nu, L) at times (L,)."""
-    placed, i, j = map.placed, map.i, map.j
-    s, xp, lanes = placed.structure(), namespace(q), placed.lanes
+    placed = map.placed
+    i = map.i
+    j = map.j
+    s = placed.structure()
+    xp = namespace(q)
+    lanes = placed.lanes
     n, count = q.shape
     q = put(xp.zeros((s.d, count)), slice(n), q)
     start = jax.tree_util.tree_map(

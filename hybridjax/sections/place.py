@@ -112,7 +112,8 @@ def place_along(
     if np.any(placed.result):
         raise NotOnHostError
     P = len(jax.tree_util.tree_leaves((by_cycle, by_family))[0])
-    s, bound = cycle.structure, placed.bound
+    s = cycle.structure
+    bound = placed.bound
     x, longer = beginning(by_cycle, s.d, P)
 
     def follow(flow, by_levels, times, twice=False):
@@ -128,10 +129,17 @@ def place_along(
         x = tangents[-1]
     # The points of the orbit on which the family depends.
     M = family.points
-    points, moved_points = side_by_side(flows[0][0]), x[None]
-    orbit = Orbit(cycle.period, points.t[:M], points.chart[:M], points.q.T[:M])
+    points = side_by_side(flows[0][0])
+    moved_points = x[None]
+    orbit = Orbit(
+        period=cycle.period,
+        t=points.t[:M],
+        chart=points.chart[:M],
+        q=points.q.T[:M],
+    )
     if M > 1:
-        times = x[0][:, None] + longer[:, None] * np.arange(1, M + 1) / M
+        share = np.arange(1, M + 1) / M
+        times = x[0][:, None] + longer[:, None] * share
         variation, tangents, _ = follow(flows.pop(0), None, times)
         moved_points = tangents[variation.first]
     by_time = np.moveaxis(moved_points[:, 0], 1, 0)
@@ -149,7 +157,10 @@ def place_along(
     times = is_clock[k % N] * (by_time[:, k % N] + later)
     variation, tangents, along = follow(flows[0], by_bound.levels, times, True)
     t, chart, q, u = variation.points(tangents, variation.first[-N:])
-    many = lambda y: np.repeat(y, P)  # noqa: E731
+
+    def many(y):
+        return np.repeat(y, P)
+
     lanes = placed.lanes._replace(t=t, chart=chart, q=q)
     bound = dataclasses.replace(bound, time=many(bound.time), event=many(bound.event))
     normal = normals(along, bound, lanes, many(np.arange(N)), u)
@@ -169,10 +180,14 @@ def _observed_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_observed` on the host, and its derivatives."""
     (cycle, family, outputs, turn), (by_cycle, by_family, *_) = arguments, directions
     placed, s, _ = place_along(cycle, family, turn, by_cycle, by_family)
-    lanes, P = placed.lanes, s.directions
+    lanes = placed.lanes
+    P = s.directions
     u = s.pushed(np.arange(len(lanes.t)) % P)
     y = observe(s, check_outputs(cycle, outputs), lanes, u).T if outputs else None
-    split = lambda x: x.reshape(-1, P, *x.shape[1:])  # noqa: E731
+
+    def split(x):
+        return x.reshape(-1, P, *x.shape[1:])
+
     return kernels.parted(jax.tree_util.tree_map(split, (lanes.t, y)))
 
 
@@ -196,8 +211,19 @@ def _bind_along(
 ):
     def bind(s, family, moving):
         period, t, q = moving
-        return family.bind(s, Orbit(period, t, orbit.chart, q))
+        return family.bind(
+            s,
+            Orbit(
+                period=period,
+                t=t,
+                chart=orbit.chart,
+                q=q,
+            ),
+        )
 
     begin = s, family, (orbit.period, orbit.t, orbit.q)
-    push = lambda tangents: eqx.filter_jvp(bind, begin, tangents)  # noqa: E731
+
+    def push(tangents):
+        return eqx.filter_jvp(bind, begin, tangents)
+
     return eqx.filter_vmap(push, out_axes=(None, 0))(directions)

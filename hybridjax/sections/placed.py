@@ -74,10 +74,12 @@ class PlacedSections(Showable, eqx.Module):
     @property
     def section_zero(self) -> Float[Array, " n"]:
         """Time and padded state at which the cycle meets section 0."""
-        return namespace(self.lanes.t).append(self.lanes.t[0], self.lanes.q[:, 0])
+        lanes = self.lanes
+        return namespace(lanes.t).append(lanes.t[0], lanes.q[:, 0])
 
     def __repr__(self):
-        system, family = type(self.cycle.system).__name__, type(self.family).__name__
+        system = type(self.cycle.system).__name__
+        family = type(self.family).__name__
         head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
@@ -97,10 +99,13 @@ class PlacedSections(Showable, eqx.Module):
         return card("PlacedSections", title, facts(self._facts()), drawn)
 
     def _facts(self) -> dict[str, str]:
-        names, unit = self.cycle.structure.names, self.cycle.system.time_unit
+        names = self.cycle.structure.names
+        unit = self.cycle.system.time_unit
         t, charts, *_ = to_host(self.lanes)
-        durations, dims = np.asarray(self.duration), np.asarray(self.dims)
-        shortest, longest = np.min(durations), np.max(durations)
+        durations = np.asarray(self.duration)
+        dims = np.asarray(self.dims)
+        shortest = np.min(durations)
+        longest = np.max(durations)
         inside = (
             f"{np.sum(charts == a)} in {names[a]}"
             for a in dict.fromkeys(charts.tolist())
@@ -126,7 +131,10 @@ class PlacedSections(Showable, eqx.Module):
         """**Raises:** `DefinitionError` if the system's code has changed since the cycle was found,
         or that of the sections since they were placed."""
         self.cycle.require_current()
-        compare = lambda: require_as_made(self.family, "it was placed on a cycle")  # noqa: E731
+
+        def compare():
+            return require_as_made(self.family, "it was placed on a cycle")
+
         once_in_call(("compared", id(self)), self, compare)
 
     def observe(self, outputs: OutputNames) -> Float[Array, "N ny"]:
@@ -175,7 +183,8 @@ class PlacedSections(Showable, eqx.Module):
     def flow_jacobians(self) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
         """A and B of the flow from each section to the next, padded; NaN if it failed."""
         placed = self if is_hidden(self) else to_host(self)
-        s, sizes = self.structure(), placed.across
+        s = self.structure()
+        sizes = placed.across
         _, _, target = placed.onwards()
         assert placed.tape is not None
         with at_ease():
@@ -189,12 +198,15 @@ class PlacedSections(Showable, eqx.Module):
     ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
         """A and B, padded, from derivatives of (t, q) on each next section by (t, q) and the inputs
         on this one; NaN where the flow failed."""
-        xp, n = namespace(jacobian), self.normal.shape[1]
+        xp = namespace(jacobian)
+        n = self.normal.shape[1]
         failed = self.result != Result.OK
         jacobian = xp.where(failed[:, None, None], xp.nan, jacobian)
         embed, select = self.frames()
         after = xp.roll(select, -1, axis=0)
-        return after @ jacobian[:, :, :n] @ embed, after @ jacobian[:, :, n:]
+        by_state = jacobian[:, :, :n]
+        by_input = jacobian[:, :, n:]
+        return after @ by_state @ embed, after @ by_input
 
     @property
     def across(self) -> Float[Array, "A d"] | None:
@@ -208,7 +220,8 @@ class PlacedSections(Showable, eqx.Module):
     def coordinates(self) -> tuple[tuple[str, ...], ...]:
         """Names of the coordinates on each section: deviations of the time of crossing (`t`) and
         of the chart's states, less the one that the section determines."""
-        charts, names = self.structure().charts, []
+        charts = self.structure().charts
+        names = []
         placed = to_host(self)
         columns = placed.lanes.chart, placed.drop, placed.time_is_state
         for a, drop, timed in np.stack(columns, axis=1):
@@ -241,11 +254,18 @@ def section_target(
 ) -> Target:
     """The target of lanes that flow to section i, `turns` periods after the first turn. They may
     arrive half a period after the cycle itself."""
-    xp, arrival = namespace(t), lanes.t[i] + turns * period
+    xp = namespace(t)
+    arrival = lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
     limit = xp.maximum(arrival, t) + 0.5 * period
     return Target(
-        time, i, bound.event[i], limit, None, bound.levels, Result.SECTION_MISSED
+        time=time,
+        index=i,
+        event=bound.event[i],
+        limit=limit,
+        event_sequence=None,
+        levels=bound.levels,
+        missed=Result.SECTION_MISSED,
     )
 
 
@@ -290,7 +310,8 @@ def observe(
     s: Structure, z: Outputs, lanes: Lanes, u: Float[Array, "nu L"]
 ) -> Float[Array, "ny L"]:
     """Outputs of every lane; NaN if its chart does not define them."""
-    xp, L = namespace(lanes.t), lanes.t.shape[0]
+    xp = namespace(lanes.t)
+    L = lanes.t.shape[0]
 
     def work(a, mask, out):
         point = needed(

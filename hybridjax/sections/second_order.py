@@ -46,16 +46,27 @@ class Quadratic(NamedTuple):
         """The response of second order to inputs that repeat after a whole number of periods."""
         N, n, _ = self.step.shape
         S, steps, _ = u.shape
-        A, folded = self._states, (S, steps // N, N, -1)
-        first = np.asarray(periodic_states(A, self.step[:, :, n:], u.reshape(folded)))
-        w = np.concatenate([self._run(first, np.zeros((S, steps, n)), u), u], axis=2)
+        A = self._states
+        B = self.step[:, :, n:]
+        by_period = (S, steps // N, N, -1)
         section = np.arange(steps) % N
-        forcing = _bent(self.bend[section], w) / 2
+
+        # Deviations of first order.
+        start = np.asarray(periodic_states(A, B, u.reshape(by_period)))
+        nothing = np.zeros((S, steps, n))
+        states = self._run(start, nothing, u)
+        deviations = np.concatenate([states, u], axis=2)
+
+        # Their products force the deviations of second order.
+        forcing = _bent(self.bend[section], deviations) / 2
         unit = np.tile(np.eye(n), (N, 1, 1))
-        second = np.asarray(periodic_states(A, unit, forcing.reshape(folded)))
-        x = self._run(second, forcing, 0 * u)
-        linear = np.einsum("toi,sti->sto", self.show[section][:, :, :n], x)
-        return linear + _bent(self.show_bend[section], w) / 2
+        start = np.asarray(periodic_states(A, unit, forcing.reshape(by_period)))
+        states = self._run(start, forcing, 0 * u)
+
+        C = self.show[section][:, :, :n]
+        linear = np.einsum("toi,sti->sto", C, states)
+        bent = _bent(self.show_bend[section], deviations) / 2
+        return linear + bent
 
     def _run(self, x, forcing, u) -> Float[np.ndarray, "S time n"]:
         """States from a start, with a forcing and inputs."""
@@ -63,7 +74,8 @@ class Quadratic(NamedTuple):
         for k in range(u.shape[1]):
             states.append(x)
             step = self.step[k % len(self.step)]
-            x = np.concatenate([x, u[:, k]], axis=1) @ step.T + forcing[:, k]
+            with_inputs = np.concatenate([x, u[:, k]], axis=1)
+            x = with_inputs @ step.T + forcing[:, k]
         return np.stack(states, axis=1)
 
     def waves(
@@ -71,24 +83,39 @@ class Quadratic(NamedTuple):
     ) -> Complex[np.ndarray, "N m K"]:
         """Linear responses to $e^{2 \\pi i f n/N}$ at an input, divided by it, with that input."""
         N, n, m = self.step.shape
-        unit = (np.arange(m - n)[:, None] == channel).astype(complex)
+        B = self.step[:, :, n:]
+        index = np.arange(m - n)
+        unit = (index[:, None] == channel).astype(complex)
         u = np.broadcast_to(unit, (N, *unit.shape))
-        return np.concatenate([self._steady(self.step[:, :, n:] @ u, f), u], axis=1)
+        states = self._steady(B @ u, f)
+        return np.concatenate([states, u], axis=1)
 
     def _steady(
         self, forcing: Complex[np.ndarray, "N n K"], f: Float[np.ndarray, " K"]
     ) -> Complex[np.ndarray, "N n K"]:
         """States for a periodic forcing times $e^{2 \\pi i f n/N}$, divided by it."""
-        A, back = self._states, np.exp(-2j * np.pi * f / len(self.step))
+        A = self._states
+        back = np.exp(-2j * np.pi * f / len(self.step))
+
+        def ahead(x, section):
+            return (A[section] @ x + forcing[section]) * back
+
+        # The state after a period that begins at zero.
         x = np.zeros(forcing.shape[1:], complex)
-        for step, push in zip(A, forcing, strict=True):
-            x = (step @ x + push) * back
-        turn = np.exp(-2j * np.pi * f)[:, None, None] * monodromy(A)
-        x = np.linalg.solve(np.eye(A.shape[-1]) - turn, x.T[:, :, None])[:, :, 0].T
+        for section in range(len(A)):
+            x = ahead(x, section)
+
+        # The start that returns to itself.
+        back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
+        returned = back_a_period * monodromy(A)
+        unit = np.eye(A.shape[-1])
+        column = np.linalg.solve(unit - returned, x.T[:, :, None])
+        x = column[:, :, 0].T
+
         states = []
-        for step, push in zip(A, forcing, strict=True):
+        for section in range(len(A)):
             states.append(x)
-            x = (step @ x + push) * back
+            x = ahead(x, section)
         return np.stack(states)
 
     def products(
@@ -96,30 +123,49 @@ class Quadratic(NamedTuple):
     ) -> "Products":
         """Responses of second order to all pairs of cosines."""
         N, n, _ = self.step.shape
-        K, ny = len(f), self.show.shape[1]
+        K = len(f)
+        ny = self.show.shape[1]
         w = self.waves(f, channel)
-        squares, mean = np.zeros((2, ny, K, K)), np.zeros((ny, N, K))
-        rows = max(_NUMBERS // (2 * N * max(n, ny, 1) * K), 1)
+        squares = np.zeros((2, ny, K, K))
+        mean = np.zeros((ny, N, K))
+        numbers_of_row = 2 * N * max(n, ny, 1) * K
+        rows = max(_NUMBERS // numbers_of_row, 1)
         for begin in range(0, K, rows):
             first = np.arange(begin, min(begin + rows, K))
-            second = w[:, :, begin:]
-            forcing = _pairs(self.bend, w[:, :, first], second)
-            f_first, f_second = f[first][:, None], f[begin:]
-            sums = np.concatenate([f_first + f_second, f_first - f_second], axis=1)
-            y = self.show[:, :, :n] @ self._steady(
-                forcing.reshape(N, n, -1), sums.ravel()
-            )
-            y = y.reshape(N, ny, *sums.shape) + _pairs(
-                self.show_bend, w[:, :, first], second
-            )
-            both = y.reshape(N, ny, len(first), 2, -1)
-            mean[:, :, first] = np.moveaxis(np.real(both), 0, 1)[
-                :, :, np.arange(len(first)), 1, np.arange(len(first))
-            ]
-            size = np.moveaxis(np.mean(np.abs(both) ** 2, axis=0), 2, 0)
-            squares[:, :, first, begin:] = size
-            squares[:, :, begin:, first] = size.swapaxes(2, 3)
+            both = self._pairs_from(w, f, first)
+            # A cosine with itself has a mean, at the difference of frequencies.
+            row = np.arange(len(first))
+            outputs_first = np.moveaxis(np.real(both), 0, 1)
+            mean[:, :, first] = outputs_first[:, :, row, 1, row]
+            square = np.mean(np.abs(both) ** 2, axis=0)
+            square = np.moveaxis(square, 2, 0)
+            squares[:, :, first, begin:] = square
+            squares[:, :, begin:, first] = square.swapaxes(2, 3)
         return Products(squares[0], squares[1], mean)
+
+    def _pairs_from(
+        self,
+        w: Complex[np.ndarray, "N m K"],
+        f: Float[np.ndarray, " K"],
+        first: Int[np.ndarray, " k"],
+    ) -> Complex[np.ndarray, "N ny k 2 second"]:
+        """Outputs at the sums and at the differences of frequencies, for pairs of the `first`
+        waves with these and all that follow."""
+        N, n, _ = self.step.shape
+        C = self.show[:, :, :n]
+        ny = C.shape[1]
+        begin = first[0]
+        f_first = f[first][:, None]
+        f_second = f[begin:]
+        sums = np.concatenate([f_first + f_second, f_first - f_second], axis=1)
+        w_first = w[:, :, first]
+        w_second = w[:, :, begin:]
+
+        forcing = _pairs(self.bend, w_first, w_second)
+        y = C @ self._steady(forcing.reshape(N, n, -1), sums.ravel())
+        y = y.reshape(N, ny, *sums.shape)
+        y = y + _pairs(self.show_bend, w_first, w_second)
+        return y.reshape(N, ny, len(first), 2, -1)
 
 
 class Products(NamedTuple):
@@ -161,7 +207,9 @@ def _pairs(bend, first, second) -> Complex[np.ndarray, "N rows some both"]:
     along = np.einsum("noij,nis->nosj", bend, first, optimize=True)
     N, rows, count, m = along.shape
     along = along.reshape(N, rows * count, m)
-    both = np.concatenate([along @ second, along @ second.conj()], axis=2)
+    with_waves = along @ second
+    with_conjugates = along @ second.conj()
+    both = np.concatenate([with_waves, with_conjugates], axis=2)
     return both.reshape(N, rows, count, -1)
 
 
@@ -185,13 +233,21 @@ def second_order(
     z = s.resolve_outputs(outputs)
     z.require(*np.unique(placed.lanes.chart).tolist())
     _, columns = s.inputs_among(inputs)
-    first, second = to_host(_derivatives(from_host(placed), tuple(z.items)))
+    derivatives = _derivatives(from_host(placed), tuple(z.items))
+    first, second = to_host(derivatives)
     n = 1 + s.d
     kept = np.r_[:n, n + columns]
-    first, second = first[:, :, kept], second[:, :, kept][..., kept]
+    first = first[:, :, kept]
+    second = second[:, :, kept][..., kept]
     if not cycle.clocked:
-        first[:, 0], second[:, 0] = 0.0, 0.0
-    return Quadratic(first[:, :n], second[:, :n], first[:, n:], second[:, n:])
+        first[:, 0] = 0.0
+        second[:, 0] = 0.0
+    return Quadratic(
+        step=first[:, :n],
+        bend=second[:, :n],
+        show=first[:, n:],
+        show_bend=second[:, n:],
+    )
 
 
 @quick_jit
@@ -200,16 +256,21 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
     of outputs at this one."""
     following, _, target = placed.onwards()
     s: Structure = placed.structure()
-    z, lanes, n = s.resolve_outputs(items), placed.lanes, 1 + s.d
+    z = s.resolve_outputs(items)
+    lanes = placed.lanes
+    n = 1 + s.d
     tape = placed.tape
     assert tape is not None
 
     def work(x):
+        """(t, q) at the next section, and outputs at this one, for x = (t, q, u)."""
+        u = x[n:]
         begin = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
-        t, q = replay(s, begin, x[n:], target, tape)
-        return jnp.concatenate([t[None], q, observe(s, z, begin, x[n:])])
+        t, q = replay(s, begin, u, target, tape)
+        return jnp.concatenate([t[None], q, observe(s, z, begin, u)])
 
-    x = jnp.concatenate([lanes.t[None], lanes.q, jnp.zeros((s.nu, len(following)))])
+    u = jnp.zeros((s.nu, len(following)))
+    x = jnp.concatenate([lanes.t[None], lanes.q, u])
     m = len(x)
 
     def along(direction):
@@ -217,12 +278,16 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
         return lambda x: jax.jvp(work, (x,), (tangent,))[1]
 
     def twice(first, second):
-        return jax.jvp(
-            along(first), (x,), (jnp.broadcast_to(second[:, None], x.shape),)
-        )
+        tangent = jnp.broadcast_to(second[:, None], x.shape)
+        return jax.jvp(along(first), (x,), (tangent,))
 
+    # Second derivatives are symmetric: those of pairs with i <= j are all.
     i, j = np.triu_indices(m)
-    first, second = jax.vmap(twice)(jnp.eye(m)[i], jnp.eye(m)[j])
+    unit = jnp.eye(m)
+    first, second = jax.vmap(twice)(unit[i], unit[j])
     place = np.zeros((m, m), int)
-    place[i, j] = place[j, i] = np.arange(len(i))
-    return first[place[:, -1]].transpose(2, 1, 0), second[place].transpose(3, 2, 0, 1)
+    place[i, j] = np.arange(len(i))
+    place[j, i] = np.arange(len(i))
+    first = first[place[:, -1]]
+    second = second[place]
+    return first.transpose(2, 1, 0), second.transpose(3, 2, 0, 1)

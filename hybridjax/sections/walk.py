@@ -91,7 +91,8 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
     with outside(), on_the_cpu(), at_ease():  # (also while a program is traced)
         placed = to_host(place_on_host(cycle, family))
         lead, flow = recorded_flows(placed)
-        s, N = placed.cycle.structure, family.n_sections
+        s = placed.cycle.structure
+        N = family.n_sections
         density = _IMPLICIT_DENSITY if has_implicit(s) else _DENSITY
         begins_on_section = lead is not None and family.at_anchor
         to = np.arange(int(begins_on_section), N + 1) % N
@@ -112,7 +113,8 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
         raw = bind_at(placed.cycle.return_map, family, begin)
     late = 0.0
     if np.isfinite(raw.time[0]):
-        late = np.rint((placed.bound.time[0] - raw.time[0]) / placed.cycle.period)
+        late = placed.bound.time[0] - raw.time[0]
+        late = np.rint(late / placed.cycle.period)
     return Walk(
         lead=None if before is None else Plan.of(before),
         path=Plan.of(path),
@@ -152,7 +154,8 @@ def walked(
     (t, q) and the inputs on this one. The result of sections that leave the walk is a code."""
     map = cycle.return_map
     start = map.anchor.t[0], map.anchor.q[:, 0]
-    begin, code = start, jnp.zeros((), jnp.int32)
+    begin = start
+    code = jnp.zeros((), jnp.int32)
     if walk.lead is not None:
         assert isinstance(family.anchor, Crossing)
         at_anchor = ListLevels((family.anchor,))
@@ -167,7 +170,8 @@ def walked(
     bound = dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
     known = _known_ends(map, walk, bound)
     passage = _followed(map, walk, walk.path, bound.levels, begin, known, columns=True)
-    code = jnp.where(code == Result.OK, _code(map, walk.path, passage, begin[0]), code)
+    of_walk = _code(map, walk.path, passage, begin[0])
+    code = jnp.where(code == Result.OK, of_walk, code)
     N = family.n_sections
     lanes = Lanes(
         t=passage.pieces_t,
@@ -213,10 +217,10 @@ def _followed(
         map, begin, known, levels = moving
         maps = maps_of(map)
         travelers = Travelers(
-            lambda numbers: maps.of(numbers).structure,
-            maps.numbers,
-            False,
-            map.structure,
+            of=lambda numbers: maps.of(numbers).structure,
+            numbers=maps.numbers,
+            many=False,
+            structure=map.structure,
         )
         settings = jax.lax.stop_gradient(map.settings)
         table = path.form, path.rows, path.count if few else None

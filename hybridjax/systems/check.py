@@ -50,7 +50,9 @@ def check_system(system: HybridSystem) -> tuple[str, ...]:
     """
     _check_parameters(system)
     leaves, structure = jax.tree_util.tree_flatten(system)
-    parts = ((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x) for x in leaves)
+    parts = []
+    for x in leaves:
+        parts.append((x.shape, x.dtype) if eqx.is_array(x) else (type(x), x))
     form = hashable((structure, *parts))
     if form in _passed:
         return _passed[form]

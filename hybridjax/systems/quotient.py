@@ -450,7 +450,8 @@ class _Reduced(DerivedChart):
     def full(self, q, shift=0.0):
         """The state of the whole chart, translated by a shift."""
         kept = self.kept
-        return jnp.full(len(self.chart.states), shift).at[kept].set(q[: len(kept)])
+        state = jnp.full(len(self.chart.states), shift)
+        return state.at[kept].set(q[: len(kept)])
 
     def less(self, q):
         return jnp.asarray(q)[self.kept]

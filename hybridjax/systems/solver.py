@@ -169,7 +169,8 @@ def _radau(s: int) -> Method:
     from scipy import special
 
     # The Radau points are 1 and zeros of a Jacobi polynomial.
-    c = np.append((1 + special.roots_jacobi(s - 1, 1, 0)[0]) / 2, 1.0)
+    roots, _ = special.roots_jacobi(s - 1, 1, 0)
+    c = np.append((1 + roots) / 2, 1.0)
     # Integrals of the Lagrange polynomials from 0 to each point.
     x, weights = np.polynomial.legendre.leggauss(s)
     rows = []
@@ -181,8 +182,10 @@ def _radau(s: int) -> Method:
     gamma = float(eigenvalues[np.argmin(np.abs(eigenvalues.imag))].real)
     # The quadrature formula of order s that has the weight gamma at the start of the step.
     powers = np.vander(c, s, increasing=True).T
-    moments = 1 / np.arange(1, s + 1) - gamma * (np.arange(s) == 0)
-    error = np.concatenate([[gamma], np.linalg.solve(powers, moments) - a[-1]])
+    is_first = np.arange(s) == 0
+    moments = 1 / np.arange(1, s + 1) - gamma * is_first
+    other_weights = np.linalg.solve(powers, moments)
+    error = np.concatenate([[gamma], other_weights - a[-1]])
     full = np.pad(a, ((1, 0), (1, 0)))
     return _method(
         f"Radau({s})",

@@ -134,14 +134,17 @@ class SlidingChart(DerivedChart):
         return [along(f) for f in self.fields(t, q, u)]
 
     def field(self, t, q, u):
-        (f, g) = self.fields(t, q, u)
-        (a, b) = self.rates(t, q, u)
+        f, g = self.fields(t, q, u)
+        a, b = self.rates(t, q, u)
         return (b * f - a * g) / (b - a)
 
     def returned(self, t, q, u):
         """The effect (n, n) of a small push once the state is back on the surface, which either
         side reaches by the same direction f_a - f_b."""
-        (f, g) = self.fields(t, q, u)
-        (a, b) = self.rates(t, q, u)
-        normal = jax.grad(self.surface, 1)(jnp.asarray(t, float), jnp.asarray(q, float))
-        return jnp.eye(len(f)) - jnp.outer(f - g, normal) / (a - b)
+        f, g = self.fields(t, q, u)
+        a, b = self.rates(t, q, u)
+        t = jnp.asarray(t, float)
+        q = jnp.asarray(q, float)
+        normal = jax.grad(self.surface, 1)(t, q)
+        back = jnp.outer(f - g, normal) / (a - b)
+        return jnp.eye(len(f)) - back

@@ -246,7 +246,8 @@ class Guess(eqx.Module):
     __repr__ = fields
 
 
-DEFAULT_INPUT, SECOND_NAME = "u", "input"
+DEFAULT_INPUT = "u"
+SECOND_NAME = "input"
 """The name of the input of a system whose author named none, and its name where a state or an
 output is called so."""
 
@@ -594,7 +595,8 @@ def _parts_of_chart(name: str, chart: Chart, point: tuple) -> Iterator[Part]:
 
 
 def _parts_of_transition(x: Transition, point: tuple) -> Iterator[Part]:
-    yield Part(f"the transition '{x.name}'", f"{x.source}, {x.target}, {x.direction}")
+    kind = f"the transition '{x.name}'"
+    yield Part(kind, f"{x.source}, {x.target}, {x.direction}")
     if isinstance(x.guard, Scheduled):
         times = x.guard.period, x.guard.offset
         yield Part(f"the schedule of '{x.name}'", "", lambda: times)

@@ -91,19 +91,23 @@ def simulate_recording(
     S, n, nu = force.shape
     # (A power of two: recordings of other lengths share a compiled program.)
     cycles = 1 << (-(-(n - 1) // K) - 1).bit_length()
-    x = np.concatenate([force, np.zeros((S, cycles * K + 1 - n, nu))], axis=1)
+    rest = np.zeros((S, cycles * K + 1 - n, nu))
+    x = np.concatenate([force, rest], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
     change = np.diff(x, axis=1)[:, :, None]
     u = x[:, :-1, None] + change * middle[:, None]
     response = response_function(cycle, ClockPhase(K * steps), outputs)
-    y = np.asarray(_respond(response, jnp.asarray(u.reshape(S, -1, nu))))[:, ::steps]
+    held = jnp.asarray(u.reshape(S, -1, nu))
+    y = np.asarray(_respond(response, held))[:, ::steps]
     names = inputs + recorded.names
     units = dict(zip(names, map(unit_of, names), strict=True))
     time = np.arange(y.shape[1]) * period / K
     trials = []
     for k in range(S):
-        good = slice(0, min(n, int(np.isfinite(y[k]).all(axis=1).sum())))
-        signals = dict(zip(names, [*force[k, good].T, *y[k, good].T], strict=True))
+        finite = int(np.isfinite(y[k]).all(axis=1).sum())
+        good = slice(0, min(n, finite))
+        columns = [*force[k, good].T, *y[k, good].T]
+        signals = dict(zip(names, columns, strict=True))
         trials.append(Recording(time[good], signals, units=units, name=f"trial {k}"))
     return Recording.join(trials)
 
@@ -159,11 +163,13 @@ def add_artifacts(
     for trial in recording.trials:
         values = np.array(trial.values)
         time = trial.time
-        y = values[:, columns] + noise * rng.normal(size=(len(time), len(columns)))
+        error = rng.normal(size=(len(time), len(columns)))
+        y = values[:, columns] + noise * error
         y = np.round(y / quantum) * quantum if quantum else y
         if spikes:
             struck = rng.random(y.shape) < spikes
-            y += 20.0 * np.nanstd(y, axis=0) * rng.choice([-1, 1], y.shape) * struck
+            sign = rng.choice([-1, 1], y.shape)
+            y += 20.0 * np.nanstd(y, axis=0) * sign * struck
         y[rng.random(len(time)) < missing] = np.nan
         if gap is not None:
             y[(time >= gap[0]) & (time < gap[1])] = np.nan
@@ -214,7 +220,7 @@ def simulate_beats(
     """
     force = np.asarray(force, float)
     table = np.asarray(curve, float)
-    (S, m) = force.shape
+    S, m = force.shape
     n = len(table)
     if not n or not S:
         raise DefinitionError("`curve` and `force` need at least one value.")
@@ -235,12 +241,15 @@ def simulate_beats(
     for i in range((m - 1) * steps):
         k = i // steps
         part = (i % steps + 0.5) / steps
-        u = (1 - part) * force[:, k] + part * force[:, k + 1]
+        begin = force[:, k]
+        end = force[:, k + 1]
+        u = (1 - part) * begin + part * end
         z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
         move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):
-            events[trial].append((i + (1 - phase[trial]) / move[trial]) * h)
+            share = (1 - phase[trial]) / move[trial]
+            events[trial].append((i + share) * h)
         phase = np.where(after >= 1, after - 1, after)
     time = np.arange(m) / rate
     trials = [

@@ -97,7 +97,8 @@ def test_functions_that_are_written_anew_share_a_program(compiled):
 
 def test_a_large_job_does_not_wait_for_a_program_of_a_small_one(compiled):
     """Both have a program of their own, and lower the function once."""
-    small, large = Program(total, loops=False), Program(total, loops=True)
+    small = Program(total, loops=False)
+    large = Program(total, loops=True)
     results = [job(X, jnp.sin, 1).sum for job in (small, large, small, large)]
     assert_allclose(results, jnp.sin(X).sum() + 1)
     assert compiled == [jax_compat.quick_options(), jax_compat.loop_options()]

@@ -12,7 +12,9 @@ def step(constants, k, x, steps):
 
 
 def step_along(constants, by_constants, k, x, columns, steps):
-    one = lambda constants, x, steps: step(constants, k, x, steps)  # noqa: E731
+    def one(constants, x, steps):
+        return step(constants, k, x, steps)
+
     return pushed(one, constants, by_constants, x, columns, steps)
 
 
@@ -22,12 +24,15 @@ def with_own_derivatives(a, x):
 
 
 def with_derivatives_of_jax(a, x):
-    run = lambda k, x: step({"a": a}, k, x, 0)[0]  # noqa: E731
+    def run(k, x):
+        return step({"a": a}, k, x, 0)[0]
+
     return jax.lax.fori_loop(0, 7, run, x)
 
 
 def test_first_and_second_derivatives_are_those_of_jax():
-    a, x = jnp.asarray(1.3), jnp.array([0.2, -0.4])
+    a = jnp.asarray(1.3)
+    x = jnp.array([0.2, -0.4])
     for order in (jax.jacfwd, lambda f, n: jax.jacfwd(jax.jacfwd(f, n), n)):
         for argument in (0, 1):
             found = jax.jit(order(with_own_derivatives, argument))(a, x)
@@ -36,7 +41,8 @@ def test_first_and_second_derivatives_are_those_of_jax():
 
 
 def test_lanes_have_derivatives_of_their_own():
-    a, x = jnp.array([0.7, 1.3, 2.0]), jnp.array([0.2, -0.4])
+    a = jnp.array([0.7, 1.3, 2.0])
+    x = jnp.array([0.2, -0.4])
     slopes = jax.vmap(jax.jacfwd(with_own_derivatives), in_axes=(0, None))(a, x)
     expected = [jax.jacfwd(with_derivatives_of_jax)(each, x) for each in a]
     np.testing.assert_allclose(slopes, expected, rtol=1e-13)

@@ -10,7 +10,9 @@ from ..conftest import APEX, OUTPUTS, compiled
 
 # Sections, experiments and periods of which no other test has as many: single operations would be
 # compiled for their shapes.
-SECTIONS, EXPERIMENTS, PERIODS = 7, 3, 5
+SECTIONS = 7
+EXPERIMENTS = 3
+PERIODS = 5
 FAMILY = hj.KinematicPhase(SECTIONS, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
 # Kernels, programs (those that are kept have names of their own), and what JAX is asked about
 # itself. Then the hopper's period, which is 2 pi over a parameter.

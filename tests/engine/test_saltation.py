@@ -7,7 +7,8 @@ from hybridjax.engine.saltation import jump
 from hybridjax.systems.structure import Structure
 
 
-G, RESTITUTION = 9.81, 0.7
+G = 9.81
+RESTITUTION = 0.7
 
 
 class Flight(hj.Chart):
@@ -53,7 +54,8 @@ def jump_of(name, v):
 
 def test_a_bounce_is_that_of_the_closed_form():
     """A ball that is higher by x arrives later by -x / v, and has fallen for longer."""
-    v, e = -3.0, RESTITUTION
+    v = -3.0
+    e = RESTITUTION
     bounce = jump_of("bounce", v)
     np.testing.assert_allclose(bounce.delay_by_state, [[-1 / v, 0.0]])
     by_height = -(1 + e) * G / v

@@ -105,12 +105,16 @@ def test_derivatives_under_all_transformations(cycle):
 def test_experiments(cycle, start):
     placed = hj.sections.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
     model = hj.linearize(cycle, placed, outputs="x")
-    u = 1e-5 * np.random.default_rng(0).normal(size=(4, 16, 1))
+    rng = np.random.default_rng(0)
+    u = 1e-5 * rng.normal(size=(4, 16, 1))
     data = hj.run_experiments(
         cycle, placed, u, outputs="x", start=start, discard=0, accuracy=1e-12
     )
     assert (data.result == 0).all()
-    x0 = np.zeros(2) if start == "cycle" else model.periodic_state(u[0], 8)
+    x0 = np.zeros(2)
+    if start != "cycle":
+        x0 = model.periodic_state(u[0], 8)
     assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
-    there = hj.sections.section_map(cycle, placed, 0, 1)(placed.lanes.q[:, 0])
-    assert_allclose(there.q, placed.lanes.q[:, 1], rtol=1e-10)
+    states = placed.lanes.q
+    to_next = hj.sections.section_map(cycle, placed, 0, 1)
+    assert_allclose(to_next(states[:, 0]).q, states[:, 1], rtol=1e-10)

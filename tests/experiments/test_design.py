@@ -41,25 +41,14 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     arguments = dict(
         n_sections=N, periods=P, frequencies=(0, top / P), lines=lines, inputs=nu
     )
-    # Line j is the frequency j / P. Multiples of 1/2 are excited with two phases or not at all.
-    is_half = {j: (2 * j) % P == 0 for j in range(top + 1)}
-    excited = [j for j in range(top + 1) if lines == "two-phase" or not is_half[j]]
-    if not excited:
-        with pytest.raises(
-            hj.errors.DefinitionError, match="take more periods or a wider band"
-        ):
-            hj.multisine(**arguments, seed=seed)
-        with pytest.raises(hj.errors.DefinitionError, match="must increase in"):
-            hj.multisine(N, P, frequencies=(1.0, 0.5))
+    phases = phases_of_lines(N, P, top, lines)
+    if not phases:
+        require_refusals(N, P, arguments, seed)
         return
-    phases = {}
-    for j in excited:
-        inside = 0 < 2 * j < N * P
-        phases[j] = 2 if is_half[j] and inside else 1
     # All lines that disturb j disturb each other: so many experiments are needed at least.
     crowds = []
-    for j in excited:
-        crowds.append(sum(phases[i] for i in excited if disturb(i, j, P)))
+    for j in phases:
+        crowds.append(sum(phases[i] for i in phases if disturb(i, j, P)))
     needed = nu * max(crowds)
 
     smallest = hj.multisine(**arguments, seed=seed)
@@ -71,20 +60,54 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     largest = nu * sum(phases.values())
     number = min(needed + more, largest)
     design = hj.multisine(**arguments, seed=seed, experiments=number)
-    assert_array_equal(design.frequencies, np.array(excited) / P)
+    assert_array_equal(design.frequencies, np.array(list(phases)) / P)
     sizes = np.bincount(design.experiment, minlength=number)
     assert sizes.min() >= 1
     if nu == 1:
         assert np.ptp(sizes) <= 1
     for experiment in range(number):
-        for i, j in itertools.combinations(lines_of(design, experiment), 2):
-            assert not disturb(i, j, P), f"lines {i} and {j} of {experiment}"
-        channels = design.channel[design.experiment == experiment]
-        assert len(set(channels)) == 1
-    for j, channel in itertools.product(excited, range(nu)):
+        require_undisturbed(design, experiment, P)
+    for channel in range(nu):
+        require_phases(design, channel, phases)
+
+
+def phases_of_lines(N, P, top, lines):
+    """The number of phases with which each excited line j, the frequency j / P, is excited:
+    multiples of 1/2 with two or not at all."""
+    phases = {}
+    for j in range(top + 1):
+        is_half = (2 * j) % P == 0
+        inside = 0 < 2 * j < N * P
+        if not is_half:
+            phases[j] = 1
+        elif lines == "two-phase":
+            phases[j] = 2 if inside else 1
+    return phases
+
+
+def require_refusals(N, P, arguments, seed):
+    with pytest.raises(
+        hj.errors.DefinitionError, match="take more periods or a wider band"
+    ):
+        hj.multisine(**arguments, seed=seed)
+    with pytest.raises(hj.errors.DefinitionError, match="must increase in"):
+        hj.multisine(N, P, frequencies=(1.0, 0.5))
+
+
+def require_undisturbed(design, experiment, P):
+    """An experiment excites one input, by lines that do not disturb each other."""
+    for i, j in itertools.combinations(lines_of(design, experiment), 2):
+        assert not disturb(i, j, P), f"lines {i} and {j} of {experiment}"
+    channels = design.channel[design.experiment == experiment]
+    assert len(set(channels)) == 1
+
+
+def require_phases(design, channel, phases):
+    """A channel has each line in as many phases as it takes; two are a quarter period apart."""
+    for j, count in phases.items():
         here = design.phase[(design.line == j) & (design.channel == channel)]
-        assert len(here) == phases[j]
-        if len(here) == 2:
+        assert len(here) == count
+        if count == 2:
             cosine = np.cos(here[0] - here[1])
             assert abs(cosine) < 1e-12
 

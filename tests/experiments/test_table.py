@@ -16,7 +16,8 @@ from ..conftest import APEX
 
 
 FAMILY = hj.KinematicPhase(16, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=APEX)
-EXPERIMENTS, CYCLES = 24, 5
+EXPERIMENTS = 24
+CYCLES = 5
 
 
 @pytest.fixture(scope="module")

@@ -197,9 +197,8 @@ def ladder(rng) -> Sample:
         back[0, 0] = rng.uniform(-0.5, 0.5)
         back[1:, :] = rng.normal(0.0, 0.5, (after - 1, n))
         c = -level * rng.uniform(0.5, 1.5)
-        arrows.append(
-            arrow(rng, n, after, n=unit(n), c=c, R=back, r=rng.normal(0.0, 0.3, after))
-        )
+        offset = rng.normal(0.0, 0.3, after)
+        arrows.append(arrow(rng, n, after, n=unit(n), c=c, R=back, r=offset))
     return Sample(charts, arrows, start(rng, 1, size=0.3))
 
 
@@ -249,15 +248,18 @@ def switch(rng) -> Sample:
 def crowd(rng) -> Sample:
     """Five dimensions and four guards of all kinds, in slow motion: many crossings in one step."""
     chart = swinging(rng, 5, rate=(0.1, 0.5))
-    chart |= {"w": rng.uniform(0.05, 0.4), "S": 0.3 * chart["S"], "T": 0.3 * chart["T"]}
-    curved = 0.3 * rng.normal(size=(5, 5))
-    arrows = [
-        arrow(rng, 5, 5, m=np.zeros(2)),
-        arrow(rng, 5, 5, Q=curved + curved.T, **wave(rng, (0.0, 0.3), (1.0, 5.0))),
-        arrow(rng, 5, 5),
-        arrow(rng, 5, 5, spread=1.0, **wave(rng, (0.1, 0.5), (1.0, 5.0))),
-    ]
-    arrows[2] |= beside(rng, arrows[0], 1.0)
+    chart["w"] = rng.uniform(0.05, 0.4)
+    chart["S"] = 0.3 * chart["S"]
+    chart["T"] = 0.3 * chart["T"]
+    root = 0.3 * rng.normal(size=(5, 5))
+    straight = arrow(rng, 5, 5, m=np.zeros(2))
+    slow_wave = wave(rng, (0.0, 0.3), (1.0, 5.0))
+    curved = arrow(rng, 5, 5, Q=root + root.T, **slow_wave)
+    neighbor = arrow(rng, 5, 5)
+    large_wave = wave(rng, (0.1, 0.5), (1.0, 5.0))
+    spread = arrow(rng, 5, 5, spread=1.0, **large_wave)
+    neighbor |= beside(rng, straight, 1.0)
+    arrows = [straight, curved, neighbor, spread]
     return Sample([chart], arrows, start(rng, 5, limit=60.0))
 
 

@@ -8,6 +8,7 @@ of the values.
 
 import argparse
 import inspect
+import itertools
 import json
 import os
 import pathlib
@@ -197,16 +198,24 @@ def wrong_with(error: hj.errors.HybridJaxError, good: dict, name: str, value) ->
         return f"TEXT: {text}"
     if value is TRACED and re.search("JAX|jit", text):
         return ""
-    keys = map(str, value) if isinstance(value, dict) else ()
-    words = [name.removesuffix("s"), CALLED.get(name, name), *keys]
-    named = any(re.search(rf"\b({word})", text, re.IGNORECASE) for word in words)
-    named = named or bool(set(good) & set(re.findall(r"`(\w+)", text)))
-    named = named or any(word in repr(value) for word in re.findall(r"'(\w+)'", text))
-    return (
-        ""
-        if named or repr(value) in text or str(value) in text
-        else f"UNNAMED {name}: {text}"
-    )
+    return "" if names(text, good, name, value) else f"UNNAMED {name}: {text}"
+
+
+def names(text: str, good: dict, name: str, value) -> bool:
+    """True if a text names an argument, another one, or its value or a part of it."""
+    words = [name.removesuffix("s"), CALLED.get(name, name)]
+    if isinstance(value, dict):
+        words += map(str, value)
+    for word in words:
+        if re.search(rf"\b({word})", text, re.IGNORECASE):
+            return True
+    others = re.findall(r"`(\w+)", text)
+    if set(good) & set(others):
+        return True
+    parts = re.findall(r"'(\w+)'", text)
+    if any(part in repr(value) for part in parts):
+        return True
+    return repr(value) in text or str(value) in text
 
 
 def refused_by(kind, value) -> bool:
@@ -235,31 +244,40 @@ def main() -> None:
     turn = 0
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        for function, good in (call for part in PARTS for call in part(things)):
+        for function, good in itertools.chain(*(part(things) for part in PARTS)):
             name = name_of(function)
             wrong.setdefault(name, [])
-            kinds = kinds_of(function)
-            for argument, parameter in inspect.signature(function).parameters.items():
-                if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-                    continue
-                for value in VALUES if options.all else VALUES[turn % 16 :: 16]:
-                    kind = kinds.get(argument)
-                    alone = (
-                        value is not TRACED
-                        and kind is not None
-                        and refused_by(kind, value)
-                    )
-                    if name in SLOW and not (alone or value is TRACED):
-                        continue
-                    what = attempt(function, good, argument, value)
-                    if what and (alone or not what.startswith("UNNAMED")):
-                        shown = f"{argument}={value!r}: {what}"
-                        wrong[name].append(shown)
-                        print(name, shown, file=sys.stderr, flush=True)
+            for argument in named_arguments(function):
+                values = VALUES if options.all else VALUES[turn % 16 :: 16]
+                for shown in refusals_that_are_wrong(function, good, argument, values):
+                    wrong[name].append(shown)
+                    print(name, shown, file=sys.stderr, flush=True)
                 turn += 1
         left = sorted(path.name for path in pathlib.Path(folder).iterdir())
         os.chdir(home)
     print(json.dumps({"calls": wrong, "files": left}, indent=1))
+
+
+def named_arguments(function) -> list[str]:
+    names = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            names.append(name)
+    return names
+
+
+def refusals_that_are_wrong(function, good, argument, values):
+    """Iterate over what is wrong with the refusals of some values of an argument."""
+    kind = kinds_of(function).get(argument)
+    is_slow = name_of(function) in SLOW
+    for value in values:
+        is_traced = value is TRACED
+        alone = kind is not None and not is_traced and refused_by(kind, value)
+        if is_slow and not (alone or is_traced):
+            continue
+        what = attempt(function, good, argument, value)
+        if what and (alone or not what.startswith("UNNAMED")):
+            yield f"{argument}={value!r}: {what}"
 
 
 if __name__ == "__main__":

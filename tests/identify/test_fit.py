@@ -11,7 +11,8 @@ from hybridjax._core.findings import Finding
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 
 
-N, MULTIPLIERS = 4, (0.8, 0.5)
+N = 4
+MULTIPLIERS = (0.8, 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,8 @@ def uncertain(plant):
 
 @pytest.fixture(scope="module")
 def fits(plant):
-    htf, record = uncertain(plant), recorded(plant)
+    htf = uncertain(plant)
+    record = recorded(plant)
     return {
         "multipliers": hj.fit_multipliers(htf, 2),
         "series": hj.fit_series(record, 2),
@@ -127,7 +129,8 @@ def test_drift_is_a_finding(plant):
 
 def test_a_controller_is_a_finding(plant):
     rng = np.random.default_rng(0)
-    x, signals = np.zeros(2), []
+    x = np.zeros(2)
+    signals = []
     A, B, C = (np.asarray(m) for m in (plant.A, plant.B, plant.C))
     for k in range(N * 500):
         n = k % N

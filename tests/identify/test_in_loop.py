@@ -11,14 +11,16 @@ from hybridjax.identify.series.records import CycleGrid
 from hybridjax.identify.series.residuals import feedback_test
 
 
-N, SEEN = 4, ("u", "r", "d")
+N = 4
+SEEN = ("u", "r", "d")
 
 
 @pytest.fixture(scope="module")
 def plant():
     """Multipliers of modulus 0.8, in the loop 0.41; no feed-through."""
     rng = np.random.default_rng(3)
-    c, s = np.cos(0.225), np.sin(0.225)
+    c = np.cos(0.225)
+    s = np.sin(0.225)
     turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
@@ -33,15 +35,20 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     S, n = r.shape
     w, e, c = noise * rng.normal(size=(3, S, n))
-    x, u, y = np.zeros((S, A.shape[1])), np.zeros((S, n)), np.zeros((S, n))
+    x = np.zeros((S, A.shape[1]))
+    u = np.zeros((S, n))
+    y = np.zeros((S, n))
+    last = np.zeros(S)
     for i in range(n):
         k = i % N
         free = x @ C[k, 0] + d[:, i] + e[:, i] / 4
-        last = y[:, i - 1] if waits and i else 0 * free
         answer = 0.3 * last if waits else free
-        u[:, i] = r[:, i] + c[:, i] - GAIN[k, 0, 0] * answer
-        y[:, i] = free + through * u[:, i]
-        x = x @ A[k].T + (u[:, i] + w[:, i])[:, None] * B[k, :, 0]
+        command = r[:, i] + c[:, i]
+        u[:, i] = command - GAIN[k, 0, 0] * answer
+        last = free + through * u[:, i]
+        y[:, i] = last
+        drive = u[:, i] + w[:, i]
+        x = x @ A[k].T + drive[:, None] * B[k, :, 0]
     return u, y
 
 
@@ -78,7 +85,8 @@ def test_plant_and_controller_of_exact_data(plant):
     loop = hj.identify.estimate_loop(
         experiments(plant, 0, 2, discard=200), at_input="r", at_output="d"
     )
-    f, exact = loop.plant.frequencies, plant.feedback(GAIN)
+    f = loop.plant.frequencies
+    exact = plant.feedback(GAIN)
     assert len(f) == 12 and not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
@@ -107,7 +115,8 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     design = hj.multisine(N, 8, frequencies=(0, N / 2), amplitude=1.0).realizations(
         6, 0
     )
-    r, faint = design.signals(208)[..., 0], np.ones(8 * N)
+    r = design.signals(208)[..., 0]
+    faint = np.ones(8 * N)
     faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
     u, y = run(plant, r, 0 * r, np.random.default_rng(0))
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
@@ -124,7 +133,9 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
 
 
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
-    truth, held, regions = None, [], []
+    truth = None
+    held = []
+    regions = []
     for seed in range(20):
         data = experiments(plant, seed, 5, noise=0.5)
         loop = hj.identify.estimate_loop(data, at_input="r", at_output="d")
@@ -153,7 +164,10 @@ def test_regions_of_series_hold_in_the_loop(plant):
 def test_instruments_of_series_hold_in_the_loop(plant):
     fit = hj.fit_series(series(plant, 0), 2, references="r")
     assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
-    held, discs, off, truth = [], [], [], plant.htf(np.arange(1, 9) / 4)
+    held = []
+    discs = []
+    off = []
+    truth = plant.htf(np.arange(1, 9) / 4)
     for seed in range(30):
         fit = hj.fit_series(series(plant, seed, noise=0.7), 2, references="r")
         held.append(fit.contains(plant.multipliers)[0])
@@ -186,7 +200,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
 
 
 def test_an_order_that_is_too_low_is_noticed_in_the_loop():
-    rng, root = np.random.default_rng(1), np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
+    rng = np.random.default_rng(1)
+    root = np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(
@@ -274,10 +289,8 @@ def test_residuals_tell_of_the_loop(plant):
     assert not hj.validate(biased, late, references="r").independent
     driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
     for record, answers in (alone, True), (driven, False):
-        fit, grid = (
-            hj.fit_series(record, 2, check=False),
-            CycleGrid.from_records([record]),
-        )
+        fit = hj.fit_series(record, 2, check=False)
+        grid = CycleGrid.from_records([record])
         assert (
             feedback_test(grid, grid.y - fit.predicted(grid, True))[0] < 1e-3
         ) == answers
@@ -292,8 +305,12 @@ def test_residuals_tell_of_the_loop(plant):
 
 
 def test_what_does_not_fit_is_refused(plant):
-    data, record = experiments(plant, 0, 2), series(plant, 0)
-    refused = lambda text: pytest.raises(hj.errors.DefinitionError, match=text)  # noqa: E731
+    data = experiments(plant, 0, 2)
+    record = series(plant, 0)
+
+    def refused(text):
+        return pytest.raises(hj.errors.DefinitionError, match=text)
+
     with refused("there is no input 'q'; inputs are u, r, d"):
         hj.estimate_htf(data, references="q")
     with refused("2 inputs of the plant need as many references"):

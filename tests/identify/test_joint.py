@@ -46,7 +46,10 @@ def with_values(htf, H, variance=None):
 
 def shaken(model, rng, size=0.02):
     """Other matrices nearby, in which zeros of the padding stay zero."""
-    parts = lambda m: (m.A, m.B, m.C, m.D)  # noqa: E731
+
+    def parts(m):
+        return (m.A, m.B, m.C, m.D)
+
     return eqx.tree_at(
         parts,
         model,
@@ -89,10 +92,13 @@ def test_derivatives_are_those_of_jax(model, errors):
     )
     coordinates = local_coordinates(matrices, direct=True)
     step = rng.normal(size=coordinates.size)
-    arrays = lambda m: [  # noqa: E731
-        jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x))
-        for x in "ABCD"
-    ]
+
+    def arrays(m):
+        return [  # noqa: E731
+            jnp.asarray(getattr(m.to_ldtp(ONE, model.inputs, model.outputs), x))
+            for x in "ABCD"
+        ]
+
     here, *ends = map(
         arrays, (coordinates.model, *map(coordinates.moved, (-step, step)))
     )
@@ -164,7 +170,8 @@ def test_undetermined_responses_have_infinite_variance():
 @pytest.mark.slow
 def test_errors_are_as_small_as_the_bound(model, exact):
     """The rms error, the misfit and the coverage of 40 draws, each at the level of 0.1 %."""
-    rng, draws = np.random.default_rng(3), 40
+    rng = np.random.default_rng(3)
+    draws = 40
     bound = hj.identify.cramer_rao(model, exact, estimator="fit_ldtp")
     fits = [
         hj.fit_ldtp(noisy(exact, exact.variance, rng), initial=model)

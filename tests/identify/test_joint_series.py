@@ -34,7 +34,8 @@ def driven(model, size, sensor=0.1):
 
 
 def noisy(model, noise, cycles, seed):
-    rng, n = np.random.default_rng(seed), model.n_sections * cycles
+    rng = np.random.default_rng(seed)
+    n = model.n_sections * cycles
     before = 20 * model.n_sections
     u, w = (rng.normal(size=(n + before, len(x.inputs))) for x in (model, noise))
     y = np.asarray(model.simulate(u) + noise.simulate(w))
@@ -73,7 +74,8 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
         for t, (u, y) in enumerate(zip(one.u, one.y, strict=True)):
             cycle, n = divmod(r + t, 4)
             e = y - model.C[n] @ x - model.D[n] @ u
-            seen, S = np.isfinite(e), COVARIANCES[n]
+            seen = np.isfinite(e)
+            S = COVARIANCES[n]
             mean = S[:, seen] @ np.linalg.solve(S[np.ix_(seen, seen)], e[seen])
             np.testing.assert_allclose(
                 path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11
@@ -203,7 +205,8 @@ def test_periodic_series_and_their_htfs_agree(small):
 def test_noise_that_drives_the_system_is_found(small):
     """The spectrum of the fit is that of the truth; predictions are white, simulations are not."""
     noise = driven(small, 0.3)
-    data, other = noisy(small, noise, 600, 0), noisy(small, noise, 300, 1)
+    data = noisy(small, noise, 600, 0)
+    other = noisy(small, noise, 300, 1)
     fit = hj.fit_ldtp(data, small.dims, noise="innovations")
     f = np.linspace(0.05, 0.45, 9)
     ratio = fit.noise_spectrum(f) / noise_spectrum(noise, f)
@@ -216,7 +219,8 @@ def test_noise_that_drives_the_system_is_found(small):
 @pytest.mark.slow
 def test_errors_are_as_large_as_said(small):
     """The distances of 24 fits, in units of their covariance, and the coverage, at 0.1 %."""
-    noise, runs = driven(small, 0.3), 24
+    noise = driven(small, 0.3)
+    runs = 24
     fits = [
         hj.fit_ldtp(noisy(small, noise, 150, seed), initial=small, noise="innovations")
         for seed in range(runs)
@@ -231,7 +235,8 @@ def test_errors_are_as_large_as_said(small):
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
     assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
-    f, N = np.array([0.1, 0.3]), 4
+    f = np.array([0.1, 0.3])
+    N = 4
     white = hj.linear.LDTP(
         np.zeros((N, 1, 1)),
         np.zeros((N, 1, 2)),

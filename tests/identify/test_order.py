@@ -33,7 +33,8 @@ def test_two_multipliers_are_two(size, small, variance):
 def test_the_level_of_the_rank_test(small, variance, few, runs):
     """In 1 % of cases noise looks like one more multiplier, which fits refuse in the others; also
     with variances from few realizations, beside which noise looks larger, and has longer tails."""
-    htf, refused = small[1].select((-1, 0, 1)), 0
+    htf = small[1].select((-1, 0, 1))
+    refused = 0
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance[1:], rng)
@@ -68,7 +69,8 @@ def test_exact_htfs_have_no_more_multipliers(small):
 @pytest.mark.parametrize("size", [0.0, 0.3])
 def test_a_weak_multiplier_that_was_left_out_is_named(size):
     """A pair of modulus 0.7, and a multiplier of 0.4 that the input excites by `size` as much."""
-    real, imaginary = 0.7 * np.cos(0.9), 0.7 * np.sin(0.9)
+    real = 0.7 * np.cos(0.9)
+    imaginary = 0.7 * np.sin(0.9)
     A = np.array([[real, imaginary, 0], [-imaginary, real, 0], [0, 0, 0.4]])
     named = 0
     for seed in range(6):

@@ -23,7 +23,8 @@ def rational(f, numerator, denominator, sections):
 def test_no_start_finds_a_better_fit(exact):
     """Against scipy's solver over all coefficients, from 20 random pairs of poles."""
     fit = hj.identify.fit_rational(exact, output="vM")
-    f, h = np.asarray(exact.frequencies), np.asarray(exact[0])[:, 1, 0]
+    f = np.asarray(exact.frequencies)
+    h = np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
         e = (h - rational(f, x[2:], [1, *x[:2]], 32)) / np.linalg.norm(h)
@@ -49,7 +50,8 @@ def test_no_start_finds_a_better_fit(exact):
 
 def test_a_rational_function_is_found_exactly():
     """Three poles, two zeros; HTF, poles, zeros and gain of what was put in."""
-    f, numerator = np.linspace(0.1, 2.4, 40), np.array([2.0, -1.0, 0.3])
+    f = np.linspace(0.1, 2.4, 40)
+    numerator = np.array([2.0, -1.0, 0.3])
     poles = np.array([0.9 + 0.3j, 0.9 - 0.3j, -0.5])
     h = rational(f, numerator, np.poly(poles).real, 5)
     fit = hj.identify.fit_rational(

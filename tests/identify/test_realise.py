@@ -31,7 +31,8 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_random_systems(shape, seed):
     dims, ny, nu = shape
-    model, N = scaled(seed, dims, ny, nu), len(dims)
+    model = scaled(seed, dims, ny, nu)
+    N = len(dims)
     f = np.linspace(0.02, N / 2 - 0.05, 60)
     htf = model.htf(f)
     markov = np.asarray(model.impulse_response(40))

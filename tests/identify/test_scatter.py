@@ -9,7 +9,8 @@ from hybridjax.identify.htf_estimate import roundness
 from hybridjax.identify.weights import estimated_noise
 
 
-N, P = 4, 16
+N = 4
+P = 16
 LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 
 
@@ -60,24 +61,27 @@ def test_discs_hold_the_truth_as_often_as_they_say(
 def test_discs_whatever_the_errors_are(constant, noise, R):
     """Products of two cosines are of constant size. Of such errors without noise discs that look at
     sizes alone hold 90 % (three realizations), 92 % (four), 94 % (eight); two tell no more."""
-    rng, runs = np.random.default_rng(R), 20_000
-    error = constant * np.exp(2j * np.pi * rng.random((R, runs)))
-    error += noise * rng.normal(size=(R, runs, 2)) @ [np.sqrt(0.5), 1j * np.sqrt(0.5)]
+    rng = np.random.default_rng(R)
+    runs = 20_000
+    phases = 2 * np.pi * rng.random((R, runs))
+    parts = np.sqrt(0.5) * rng.normal(size=(R, runs, 2))
+    error = constant * np.exp(1j * phases) + noise * parts @ [1, 1j]
     shares = np.full((R, 1), 1 / R)
-    if (
-        constant == 0
-    ):  # Of experiments of different strengths; Gaussian errors know nothing of it.
+    if constant == 0:
+        # Of experiments of different strengths; Gaussian errors know nothing of it.
         shares = rng.dirichlet(np.full(R, 3.0))[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
-    variance = np.sum(shares * np.abs(error - mean) ** 2, axis=0) / (R - 1)
     residuals = np.sqrt(shares) * (error - mean)
-    square, turned = (np.abs(residuals) ** 2).sum(axis=0), (residuals**2).sum(axis=0)
-    shape = roundness(square, turned, np.full(runs, 1.0 * R))[None, :, None, None]
-    variance_dof = hj.linear.VarianceDof(np.full(runs, R - 1.0), shape)
+    square = (np.abs(residuals) ** 2).sum(axis=0)
+    turned = (residuals**2).sum(axis=0)
+    variance = square / (R - 1)
+    shape = roundness(square, turned, np.full(runs, 1.0 * R))
+    dof = np.full(runs, R - 1.0)
+    variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
     for level in (0.5, 0.8, 0.95, 0.99):
-        square = np.asarray(variance_dof.quantile(level))[0, :, 0, 0] * variance
-        inside = np.abs(mean) ** 2 <= square
+        quantile = np.asarray(variance_dof.quantile(level))[0, :, 0, 0]
+        inside = np.abs(mean) ** 2 <= quantile * variance
         if constant == 0:
             assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
         elif R > 3 and level == 0.95:
@@ -121,7 +125,8 @@ def test_sums_of_parts_are_those_of_the_whole(model):
         )
         for k in range(0, 16, 4)
     ]
-    one, many = hj.estimate_htf(data, repeats=2), hj.estimate_htf(parts, repeats=2)
+    one = hj.estimate_htf(data, repeats=2)
+    many = hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
     np.testing.assert_array_equal(many.variance_dof.dof, one.variance_dof.dof)

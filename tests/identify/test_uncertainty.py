@@ -21,7 +21,8 @@ def noisy(htf, variance, rng, correlation=0.0):
         rng.normal(size=htf.H.shape) + 1j * rng.normal(size=htf.H.shape)
         for _ in range(2)
     ]
-    own, common = parts[0], parts[1][:1, :, :1]
+    own = parts[0]
+    common = parts[1][:1, :, :1]
     error = np.sqrt(1 - correlation) * own + np.sqrt(correlation) * common
     return with_variance(
         htf, np.asarray(htf.H) + np.sqrt(variance / 2) * error, variance
@@ -58,7 +59,8 @@ def covered(hits, runs, level=0.95):
 def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, variance):
     """Errors that are common to all harmonics, too: the residuals know."""
     model, htf = small
-    true, runs = model.multipliers, 60
+    true = model.multipliers
+    runs = 60
     bound = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
@@ -77,7 +79,8 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
 
 
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
-    (model, htf), square = small, np.zeros(2)
+    (model, htf) = small
+    square = np.zeros(2)
     for seed in range(25):
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance, rng)
@@ -137,7 +140,8 @@ def pair_and_real():
 def test_first_order_covariances_and_regions(pair_and_real):
     """Against the roots of coefficients drawn at random."""
     estimate, rng = pair_and_real
-    true, c = estimate.multipliers, estimate.coefficients
+    true = estimate.multipliers
+    c = estimate.coefficients
     np.testing.assert_allclose(multipliers_of(c), true, rtol=1e-12)  # in this order
     draws = rng.multivariate_normal(c, estimate.covariance, size=2000)
     roots = np.array([np.roots([1, *draw]) for draw in draws])

@@ -15,7 +15,9 @@ from .test_uncertainty import covered
 def test_the_true_model_leaves_white_noise(small):
     """P-values are uniform, for unknown starts and missing samples, and for fits to other data,
     and correlations have variance one."""
-    p, of_fits, correlations = [], [], []
+    p = []
+    of_fits = []
+    correlations = []
     for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
@@ -66,7 +68,9 @@ def test_a_wrong_model_is_refused(small):
 
 def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
     """White noise, and a response to the inputs of the last samples that the model lacks."""
-    noticed, runs, N = 0, 25, 4
+    noticed = 0
+    runs = 25
+    N = 4
     for seed in range(runs):
         data = record(small, N * 80, seed, 0.5)
         rng = np.random.default_rng(1000 + seed)

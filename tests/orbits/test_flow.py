@@ -263,7 +263,8 @@ def test_derivatives_at_a_state_of_rest():
         return hj.flow(mathieu, hj.Guess("main", q), 7.0).state
 
     def rates(t, columns):
-        x, v = columns[:2], columns[2:]
+        x = columns[:2]
+        v = columns[2:]
         return np.concatenate([v, -(1 + 0.5 * np.cos(t)) * x])
 
     true = solve_ivp(
@@ -331,7 +332,8 @@ def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
 
     step = 1e-4
     for flows in (of_batch, of_each):
-        ahead, back = heights(9.81 + step, flows), heights(9.81 - step, flows)
+        ahead = heights(9.81 + step, flows)
+        back = heights(9.81 - step, flows)
         by_difference = (ahead - back) / (2 * step)
         for jacobian in (jax.jacrev, jax.jacfwd):
             slopes = jacobian(heights)(9.81, flows)

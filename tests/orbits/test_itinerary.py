@@ -161,7 +161,9 @@ def test_gradients_inside_of_programs_are_differences():
         monodromy = jnp.linalg.multi_dot(cycle.factors[::-1])
         return cycle.anchor.q[0, 0] + jnp.trace(monodromy)
 
-    value, at, h = jax.jit(state), np.array([2.0, 0.4, 1.3]), 1e-4
+    value = jax.jit(state)
+    at = np.array([2.0, 0.4, 1.3])
+    h = 1e-4
     gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
         difference = (value(*(at + step)) - value(*(at - step))) / (2 * h)

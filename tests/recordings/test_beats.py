@@ -70,10 +70,8 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     assert found.left_out_flat + 0.01 < found.left_out < 1
     assert "Resolution: the jitter" in repr(found)
     curve = PhaseCurve(X, CURVE, "u", time_unit="ms")
-    drawn, band = (
-        hj.plot.phase_response(curve, model=found).ax,
-        found.interval(found.phase)[0],
-    )
+    drawn = hj.plot.phase_response(curve, model=found).ax
+    band = found.interval(found.phase)[0]
     np.testing.assert_allclose(drawn.lines[1].get_ydata(), found.values / 1000)
     heights = drawn.collections[0].get_paths()[0].vertices[:, 1]
     assert heights.min() == pytest.approx(band.min() / 1000)
@@ -127,11 +125,9 @@ def rms(values):
 
 def test_slopes_are_derivatives(noisy):
     intervals = intervals_of(noisy, hj.recordings.estimate_phase(noisy, BEAT), "u")
-    table, a, rates = (
-        tabulated(4, 0.05),
-        np.array([1, -0.4, 0.2, 0.1, 0]),
-        np.full(8, 10.0),
-    )
+    table = tabulated(4, 0.05)
+    a = np.array([1, -0.4, 0.2, 0.1, 0])
+    rates = np.full(8, 10.0)
     base = forecast(intervals, table, a, rates)
     for k in range(5):
         moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates)
@@ -245,10 +241,8 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
 
 def test_what_is_refused(noisy):
     t = np.arange(0.0, 10, 0.01)
-    wave, beat = (
-        {"u": np.sin(t), "a": np.cos(6 * t), "b": np.sin(6 * t)},
-        {"beat": np.arange(9.0)},
-    )
+    wave = {"u": np.sin(t), "a": np.cos(6 * t), "b": np.sin(6 * t)}
+    beat = {"beat": np.arange(9.0)}
     angle = hj.KinematicPhase(4, position="a", velocity="b")
     for message, signals, phase in [
         ("no event 'spike'", wave, hj.AtEvent("spike")),

@@ -13,8 +13,10 @@ from hybridjax.errors import FileFormatError
 from hybridjax.recordings.formats import arrays
 
 
-SLOW, FAST = np.arange(20) / 100, np.arange(190) / 1000
-X, F = np.sin(20 * SLOW), np.cos(30 * FAST)
+SLOW = np.arange(20) / 100
+FAST = np.arange(190) / 1000
+X = np.sin(20 * SLOW)
+F = np.cos(30 * FAST)
 
 
 def samples(recording, name):
@@ -177,7 +179,8 @@ def test_feather(tmp_path):
 
 
 def test_excel(tmp_path):
-    path, book = tmp_path / "x.xlsx", pytest.importorskip("openpyxl").Workbook()
+    path = tmp_path / "x.xlsx"
+    book = pytest.importorskip("openpyxl").Workbook()
     book.active.title = "walk"
     for row in (
         ["# subject, 3"],
@@ -308,12 +311,12 @@ def write_bag(path, version):
 
     is_1 = version == "bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_1 else Stores.ROS2_HUMBLE)
-    kinds, seq = store.types, {"seq": 0} if is_1 else {}
-    time, header = kinds["builtin_interfaces/msg/Time"], kinds["std_msgs/msg/Header"]
-    point, stamped = (
-        kinds["geometry_msgs/msg/Point"],
-        kinds["geometry_msgs/msg/PointStamped"],
-    )
+    kinds = store.types
+    seq = {"seq": 0} if is_1 else {}
+    time = kinds["builtin_interfaces/msg/Time"]
+    header = kinds["std_msgs/msg/Header"]
+    point = kinds["geometry_msgs/msg/Point"]
+    stamped = kinds["geometry_msgs/msg/PointStamped"]
     layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
     image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
     messages = []
@@ -323,13 +326,12 @@ def write_bag(path, version):
         messages.append((t, "/count", kinds["std_msgs/msg/Float64"](t)))
         messages.append((t, "/image", image))
     if is_1:
-        writer, pack = rosbag1.Writer(path), store.serialize_ros1
+        writer = rosbag1.Writer(path)
+        pack = store.serialize_ros1
     else:
         plugin = rosbag2.StoragePlugin[version.upper()]
-        writer, pack = (
-            rosbag2.Writer(path, version=9, storage_plugin=plugin),
-            store.serialize_cdr,
-        )
+        writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        pack = store.serialize_cdr
     with writer:
         topics = {topic: x.__msgtype__ for _, topic, x in messages}
         connections = {
@@ -375,10 +377,8 @@ def test_bags(tmp_path, version):
 
 
 def test_libraries_that_are_not_there(tmp_path, monkeypatch):
-    tables, bags = (
-        (".feather", "pyarrow.dataset", "tables"),
-        (".mcap", "rosbags.highlevel", "ros"),
-    )
+    tables = (".feather", "pyarrow.dataset", "tables")
+    bags = (".mcap", "rosbags.highlevel", "ros")
     for suffix, library, extra in (
         (".c3d", "ezc3d", "c3d"),
         (".h5", "h5py", "mat"),
@@ -448,7 +448,8 @@ def test_a_packed_struct_is_refused_before_it_takes_memory(tmp_path, monkeypatch
 
 
 def test_one_blank_does_not_fill_a_sheet(tmp_path, monkeypatch):
-    written, line = [], arrays._line
+    written = []
+    line = arrays._line
 
     def counted(*row):
         written.append(row)

@@ -38,7 +38,9 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
 def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
     """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
     clean = add_artifacts(hopper_recording, noise=1e-4)
-    fits, data, apex = [], [], hj.Crossing("vM", "falling")
+    fits = []
+    data = []
+    apex = hj.Crossing("vM", "falling")
     dirty = add_artifacts(clean, ("u", "yM", "vM"), spikes=1e-2, seed=1)
     for recording in (clean, dirty):
         data.append(hj.recordings.sample_sections(recording, apex, **ABOUT))
@@ -68,12 +70,10 @@ def test_responses_to_pushes(hopper_cycle, angle):
         found = hj.recordings.impulse_responses(fit, data, cycles=2, width=0.08)
         sections = dataclasses.replace(sections, anchor=hj.Crossing("vM", "falling"))
         model = hj.linearize(hopper_cycle, sections, ("yM", "vM"))
-        theory, k, m, r = (
-            found.of_model(model),
-            np.arange(-N // 4, N // 4 + 1),
-            5,
-            5 * N // 4,
-        )
+        theory = found.of_model(model)
+        k = np.arange(-N // 4, N // 4 + 1)
+        m = 5
+        r = 5 * N // 4
         push = np.exp(-0.5 * (k / (N * found.width)) ** 2)
         area = push @ found.durations[(m + k) % N]
         value = push @ model.impulse_response(4 * N)[(m + r) % N, r - k, :, 0] / area

@@ -16,7 +16,9 @@ from hybridjax.recordings.inspection.differences import slow_changes
 from .mishaps import EVENT_MISHAPS, MISHAPS, mishandle, scaled, signals
 
 
-STRIDES, TRIALS, RATE = 60, 3, 64
+STRIDES = 60
+TRIALS = 3
+RATE = 64
 NAMES = {"input": "f", "outputs": ("x", "v"), "event": "top"}
 TOP = hj.Crossing("v", "falling", value=0.0)
 

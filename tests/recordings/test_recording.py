@@ -151,7 +151,8 @@ def test_vicon(tmp_path, separator):
     path = tmp_path / "walk.csv"
     path.write_text(VICON.replace(",", separator))
     found = hj.read_recording(path)
-    plate, toe = "Imported Plate - Force", "TOE"
+    plate = "Imported Plate - Force"
+    toe = "TOE"
     assert found.signals == (f"{plate}.Fx", f"{plate}.Fy", f"{toe}.X", f"{toe}.Y")
     assert found.units == ("N", "N", "mm", "mm")
     np.testing.assert_allclose(found.trials[0].time, [0, 0.001, 0.002, 0.003])

@@ -31,7 +31,8 @@ def test_a_circle(wave):
     data = sample(wave)
     circle = np.cos(np.pi / 4 * np.arange(8))
     np.testing.assert_allclose(data.cycle_outputs[:, 0], circle, atol=2e-3)
-    (record,), (times,) = data.records, data.times
+    (record,) = data.records
+    (times,) = data.times
     np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
@@ -64,8 +65,10 @@ def test_a_circle(wave):
 
 
 def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
-    (trial,), names = rhythm.trials, rhythm.signals
-    t, z = trial.time, np.exp(2j * np.pi * trial.time)
+    (trial,) = rhythm.trials
+    names = rhythm.signals
+    t = trial.time
+    z = np.exp(2j * np.pi * trial.time)
     for inputs in ((), "force"):
         with pytest.raises(
             hj.errors.DefinitionError,
@@ -98,7 +101,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
 
 
 def test_gaps_are_masked_and_cut(wave):
-    t, values = wave.trials[0].time, wave.trials[0].values.copy()
+    t = wave.trials[0].time
+    values = wave.trials[0].values.copy()
     values[(t > 4.3) & (t < 4.5), 1] = (
         np.nan
     )  # of an output, too short to lose the count
@@ -147,9 +151,12 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
 
 def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
     """Two tenths of a cycle, five times, where cycles begin: sections are left out, or right."""
-    t, values = rhythm.trials[0].time, rhythm.trials[0].values
-    names, top = rhythm.signals, hj.Crossing("v", "falling")
-    rng, hidden = np.random.default_rng(0), values.copy()
+    t = rhythm.trials[0].time
+    values = rhythm.trials[0].values
+    names = rhythm.signals
+    top = hj.Crossing("v", "falling")
+    rng = np.random.default_rng(0)
+    hidden = values.copy()
     for at in rng.choice(np.arange(10, 190), 5, replace=False):
         start = at + 0.5 - rng.uniform(0.02, 0.18)
         hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
@@ -173,7 +180,8 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
 
 
 def test_slow_drift_is_taken_out(wave):
-    t, values = wave.trials[0].time, wave.trials[0].values
+    t = wave.trials[0].time
+    values = wave.trials[0].values
     drifting = dict(
         zip("fxv", (values + 0.3 * np.cos(np.pi * t / 20)[:, None]).T, strict=True)
     )
@@ -267,32 +275,55 @@ def identify(files, out, *more):
     return main(["identify", *trials, *options, "--out", str(out), *more])
 
 
+@pytest.fixture(scope="module")
+def out(files, tmp_path_factory):
+    """The results of the command, in a folder that was not empty."""
+    folder = tmp_path_factory.mktemp("results") / "out"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(folder)
+        assert identify(files, ".") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def summary(out):
+    return json.loads((out / "summary.json").read_text())
+
+
 @pytest.mark.slow
-def test_the_command(files, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "notes.txt").write_text("mine")
-    monkeypatch.chdir(out)
-    assert identify(files, ".") == 0
-    summary = json.loads((out / "summary.json").read_text())
+def test_the_summary_of_the_command(summary):
     (found,) = np.array(summary["multipliers"]) @ [1, 1j]
     assert abs(found - MULTIPLIER) < 2e-2
     assert summary["held_out_fit_percent"][0] > 80
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") >= 7 and "<script" not in page
-    top = page[: page.index("<img")]
-    assert "± standard error" in top and f"<td>{found.real:.3f}" in top
-    assert "from force (N) to x (m), v (m/s)" in top
-    said = re.sub("</?code>", "`", top)
-    assert all(
-        f'<p class="warn">{html.escape(w)}</p>' in said for w in summary["warnings"]
-    )
-    assert all(
-        (html.escape(x) in said) == bool(n) for x, n in summary["left_out"].items()
-    )
     assert summary["sampling_rates"] == pytest.approx([64, 64])
     assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+
+
+@pytest.mark.slow
+def test_the_page_of_the_command(out, summary):
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") >= 7
+    assert "<script" not in page
     assert "p &lt; 0.001" in page or "p = " in page
+
+    above_figures = page[: page.index("<img")]
+    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    assert "± standard error" in above_figures
+    assert f"<td>{found.real:.3f}" in above_figures
+    assert "from force (N) to x (m), v (m/s)" in above_figures
+
+    text = re.sub("</?code>", "`", above_figures)
+    for warning in summary["warnings"]:
+        assert f'<p class="warn">{html.escape(warning)}</p>' in text
+    for reason, count in summary["left_out"].items():
+        is_listed = html.escape(reason) in text
+        assert is_listed == bool(count)
+
+
+@pytest.mark.slow
+def test_the_files_of_the_command(out):
     assert hj.load(out / "fit.npz").contains([MULTIPLIER], 0.999).all()
     assert hj.load(out / "htf.npz").variance is not None
     rows = (out / "sections.csv").read_text().splitlines()
@@ -300,10 +331,16 @@ def test_the_command(files, tmp_path, monkeypatch):
     assert len(rows) > 16 * 190
     assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_failure_of_the_command_leaves_nothing(files, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(hj.plot, "validation", lambda validation: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        identify(files, "../new")
-    assert [p.name for p in tmp_path.iterdir()] == ["out"] and not pyplot.get_fignums()
+        identify(files, "new")
+    assert not list(tmp_path.iterdir())
+    assert not pyplot.get_fignums()
 
 
 @pytest.mark.parametrize("name", ["summary.json", "figures/bode.png"])
@@ -320,15 +357,24 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(
 
 def test_signals_with_clocks_of_their_own(rhythm):
     """Position and velocity are never sampled together, the input more often than either."""
-    t, (force, x, v) = rhythm.trials[0].time, rhythm.trials[0].values.T
-    parts = (t, {"force": force}), (t[::2], {"x": x[::2]}), (t[1::2], {"v": v[1::2]})
-    own = hj.Recording.beside([hj.Recording(*part) for part in parts])
+    (trial,) = rhythm.trials
+    t = trial.time
+    force, x, v = trial.values.T
+    parts = [
+        hj.Recording(t, {"force": force}),
+        hj.Recording(t[::2], {"x": x[::2]}),
+        hj.Recording(t[1::2], {"v": v[1::2]}),
+    ]
+    own = hj.Recording.beside(parts)
     angle = hj.KinematicPhase(
         16, position="x", velocity="v", center=(0, 0), scale=(1, 1)
     )
-    data = [sample(r, angle, inputs="force") for r in (rhythm, own)]
-    assert data[1].missing == 0 and data[1].cycles == data[0].cycles
-    together, apart = (hj.fit_series(d, order=1).multipliers for d in data)
+    common_clock = sample(rhythm, angle, inputs="force")
+    own_clocks = sample(own, angle, inputs="force")
+    assert own_clocks.missing == 0
+    assert own_clocks.cycles == common_clock.cycles
+    together = hj.fit_series(common_clock, order=1).multipliers
+    apart = hj.fit_series(own_clocks, order=1).multipliers
     np.testing.assert_allclose(apart, together, rtol=0, atol=1e-5)
     np.testing.assert_allclose(apart, MULTIPLIER, rtol=0, atol=1e-3)
 
@@ -336,34 +382,30 @@ def test_signals_with_clocks_of_their_own(rhythm):
 @pytest.mark.slow
 def test_responses_of_a_model_are_by_the_section_of_the_push():
     """One state: a push of area 1 at section m decays by A; sections last 0.2, ..., 0.8."""
-    N, a, b, c = (
-        4,
-        0.8,
-        np.array([1.0, 2.0, 3.0, 4.0]),
-        np.array([5.0, 7.0, 11.0, 13.0]),
-    )
+    N = 4
+    a = 0.8
+    b = np.array([1.0, 2.0, 3.0, 4.0])
+    c = np.array([5.0, 7.0, 11.0, 13.0])
     columns = (x[:, None, None] for x in (b, c))
     model = hj.linear.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
-    zero, grid = np.zeros((N, 7, 1, 1)), (np.arange(N) / N, np.arange(7) / N)
+    zero = np.zeros((N, 7, 1, 1))
+    grid = (np.arange(N) / N, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
     times = np.cumsum(np.tile(np.roll(steps, 1), 60))
     found = ImpulseResponses(zero, zero, *grid, 0.0, steps, ("f",), ("x",))
-    m, r = np.arange(N)[:, None], np.arange(1, 7)
+    m = np.arange(N)[:, None]
+    r = np.arange(1, 7)
     expected = b[m] * a ** (r - 1) * c[(m + r) % N] / steps[m]
     np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
     # Their standard errors are the scatter of fits.
-    apart, rng, about = (
-        [],
-        np.random.default_rng(0),
-        dict(inputs=("f",), outputs=("x",)),
-    )
+    apart = []
+    rng = np.random.default_rng(0)
+    about = dict(inputs=("f",), outputs=("x",))
     for _ in range(60):
         u = rng.normal(size=(240, 1))
         y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
-        record, cycle = (
-            hj.experiments.SectionSeries(u, y, n_sections=N, **about),
-            np.zeros((N, 1)),
-        )
+        record = hj.experiments.SectionSeries(u, y, n_sections=N, **about)
+        cycle = np.zeros((N, 1))
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
         found = impulse_responses(
             hj.fit_series(record, 1, check=False), data, 4, width=0.0

@@ -24,13 +24,12 @@ def variable(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
 
 def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     """A linear rhythm with one multiplier, disturbed at every section, seen by three signals."""
-    rng, gains = (
-        np.random.default_rng(seed),
-        np.random.default_rng(5).normal(size=(N, 3)),
-    )
+    rng = np.random.default_rng(seed)
+    gains = np.random.default_rng(5).normal(size=(N, 3))
     trials = []
     for count in strides:
-        x, y = 0.0, []
+        x = 0.0
+        y = []
         for n in range(count * N):
             y.append(gains[n % N] * np.real(x))
             x = multiplier ** (1 / N) * x + rng.normal()
@@ -38,7 +37,8 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         slow = drift * np.sin(np.arange(len(y))[:, None] / 800)
         y += y.std(axis=0) * (noise * rng.normal(size=y.shape) + slow)
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
-        t, events = np.arange(len(y)) / N, {"e": np.arange(count)}
+        t = np.arange(len(y)) / N
+        events = {"e": np.arange(count)}
         trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
     return hj.Recording.join(trials)
 
@@ -86,22 +86,38 @@ def test_a_pair_has_one_interval_that_contains_the_estimate():
 @pytest.mark.slow
 def test_instruments_have_no_bias_by_noise():
     found = [hj.recordings.natural_multipliers(variable(0.7, seed=k)) for k in range(3)]
-    (low, high), (_, top) = found[0].interval(0.99)[0], found[0].interval(plain=True)[0]
-    assert low < 0.6 < high and top < 0.6
-    assert abs(np.mean([f.multipliers[0].real for f in found]) - 0.6) < 0.05
-    assert np.mean([f.plain[0].real for f in found]) < 0.53
+    (low, high) = found[0].interval(0.99)[0]
+    (_, top) = found[0].interval(plain=True)[0]
+    assert low < 0.6 < high
+    assert top < 0.6
+    by_instruments = [fit.multipliers[0].real for fit in found]
+    by_regression = [fit.plain[0].real for fit in found]
+    assert abs(np.mean(by_instruments) - 0.6) < 0.05
+    assert np.mean(by_regression) < 0.53
+    for fit in found:
+        require_no_finding("order", fit)
+
+
+@pytest.mark.slow
+def test_too_few_multipliers_are_a_finding():
     pair = variable(0.1, multiplier=0.3 + 0.5j)
-    single, both = (hj.recordings.natural_multipliers(pair, order) for order in (1, 2))
+    single = hj.recordings.natural_multipliers(pair, 1)
     assert "Order: 2 multipliers give 0.5" in repr(single)
+    require_no_finding("order", hj.recordings.natural_multipliers(pair, 2))
+    # (One of two intervals is enough.)
     half = hj.recordings.natural_multipliers(variable(0.1, (60, 60), 0.3 + 0.5j, 2))
-    assert not any(
-        x.cause == "order" for f in (*found, both, half) for x in f.findings
-    )  # (one of two intervals is enough)
-    drifting = [
-        hj.recordings.natural_multipliers(variable(0.1, seed=k, drift=1))
-        for k in range(3)
-    ]
-    assert all("if outputs drift" in f.findings[-1].text for f in drifting)
+    require_no_finding("order", half)
+
+
+@pytest.mark.slow
+def test_a_drift_of_outputs_is_a_finding():
+    for seed in range(3):
+        drifting = hj.recordings.natural_multipliers(variable(0.1, seed=seed, drift=1))
+        assert "if outputs drift" in drifting.findings[-1].text
+
+
+def require_no_finding(cause, fit):
+    assert cause not in [finding.cause for finding in fit.findings]
 
 
 def test_short_records_are_drawn_whole():

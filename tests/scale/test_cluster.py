@@ -19,7 +19,8 @@ import hybridjax as hj
 distributed = pytest.importorskip("distributed")
 pytest.importorskip("zarr")
 
-DRAWS, STEPS = 24, 100
+DRAWS = 24
+STEPS = 100
 
 
 class Plane(hj.Chart):

@@ -90,11 +90,9 @@ TOP = Crossing("v", "falling")
 
 def test_a_list_of_sections_is_sorted(vanderpol_cycle):
     """From the top of x on: v is lowest on the way down, x rises through 0 last."""
-    left, up, down = (
-        Crossing("v", "rising"),
-        Crossing("x", "rising"),
-        Crossing("x", "falling"),
-    )
+    left = Crossing("v", "rising")
+    up = Crossing("x", "rising")
+    down = Crossing("x", "falling")
     given = [TOP, up, left, down]
     placed = hj.sections.place_sections(vanderpol_cycle, given)
     names = [str(item) for item in placed.family.items]

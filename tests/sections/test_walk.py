@@ -63,7 +63,8 @@ def test_derivatives_of_a_traced_model_are_differences(known, no_search):
         system = eqx.tree_at(lambda h: h.k, HOPPER, k)
         return model_of(system, known, family).characteristic_polynomial()[2]
 
-    k, h = jnp.asarray(HOPPER.k, float), 1e-3
+    k = jnp.asarray(HOPPER.k, float)
+    h = 1e-3
     slope = jax.jit(jax.grad(number))(k)
     forwards = jax.jit(jax.jacfwd(number))(k)
     difference = (number(k + h) - number(k - h)) / (2 * h)

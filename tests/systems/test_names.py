@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import hybridjax as hj
 
 
-ANGULAR, PUSH = 1.3, 0.2
+ANGULAR = 1.3
+PUSH = 0.2
 
 
 class Plane(hj.Chart):

@@ -15,7 +15,9 @@ hj.enable_x64()
 @pytest.mark.slow
 def test_a_block_on_a_belt_sticks_and_slips():
     """It leaves the belt where the spring is as strong as friction; slipping by DOP853."""
-    F, belt, decay = 1.0, 0.2, 3.0
+    F = 1.0
+    belt = 0.2
+    decay = 3.0
 
     def slip(t, q):
         return [q[1], -q[0] + F / (1 + decay * (belt - q[1]))]

@@ -166,10 +166,14 @@ class _Kinds:
     def in_order(self) -> tuple[list[tuple[str, Kind | None]], tuple[str, Kind | None]]:
         """Names and kinds of those that can be given by position, and of all further ones
         (`*args`)."""
-        parameters = inspect.signature(self.function).parameters.values()
-        positional = [p.name for p in parameters if p.kind <= p.POSITIONAL_OR_KEYWORD]
-        rest = next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
-        named = [(x, self.by_name[x]) for x in positional]
+        named = []
+        rest = ""
+        for parameter in inspect.signature(self.function).parameters.values():
+            name = parameter.name
+            if parameter.kind <= parameter.POSITIONAL_OR_KEYWORD:
+                named.append((name, self.by_name[name]))
+            elif parameter.kind is parameter.VAR_POSITIONAL:
+                rest = name
         return named, (rest, self.by_name.get(rest))
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:

@@ -289,7 +289,8 @@ class Reals(Kind):
     - `form`: makes arrays of one library of all: `np.asarray`, `jnp.asarray`.
     """
 
-    single, items = "a finite number", "real numbers"
+    single = "a finite number"
+    items = "real numbers"
     types = "fiu"
     dtype: type = float
 
@@ -404,7 +405,8 @@ class Reals(Kind):
 class Complexes(Reals):
     """An array of numbers, real or complex, as `Reals` otherwise."""
 
-    single, items = "a finite number", "numbers"
+    single = "a finite number"
+    items = "numbers"
     types = "cfiu"
     dtype = complex
 
@@ -412,6 +414,7 @@ class Complexes(Reals):
 class Integers(Reals):
     """An array of whole numbers, as `Reals` otherwise."""
 
-    single, items = "an integer", "integers"
+    single = "an integer"
+    items = "integers"
     types = "iu"
     dtype = int

@@ -53,7 +53,10 @@ class Blocks:
     def slices(self, k: int) -> tuple[slice, ...]:
         """Return the part of the grid that is block k."""
         sides = zip(self.place(k), self.block, self.shape, strict=True)
-        return tuple(slice(i * b, min((i + 1) * b, n)) for i, b, n in sides)
+        slices = []
+        for i, b, n in sides:
+            slices.append(slice(i * b, min((i + 1) * b, n)))
+        return tuple(slices)
 
 
 def near_cube(shape: Sequence[int], most: int) -> tuple[int, ...]:
@@ -170,7 +173,12 @@ class ZarrStore:
                 arrays[name] = Variable(x.dtype.str, dims, x.shape[p:])
             blocks = Blocks(first.shape[:p], first.chunks[:p])
             self.layout = Layout(
-                tuple(about["dims"]), blocks, arrays, {}, (), about["description"]
+                dims=tuple(about["dims"]),
+                blocks=blocks,
+                variables=arrays,
+                constants={},
+                coordinates=(),
+                description=about["description"],
             )
             # (Zarr would read a chunk that was deleted as zeros.)
             kept = self._group[_START]

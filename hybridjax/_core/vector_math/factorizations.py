@@ -25,7 +25,8 @@ from jaxtyping import Array, Float, Int
 # Rows up to which matrices are factorized here, and up to which elimination with pivoting is
 # unrolled. Fewer: LAPACK, and loops over columns, run slower. Two more: XLA compiles for twice as
 # long, seconds, and at 16 rows LAPACK is as fast.
-MOST_ROWS, UNROLLED_PIVOTED = 12, 7
+MOST_ROWS = 12
+UNROLLED_PIVOTED = 7
 
 
 @jax.jit
@@ -48,7 +49,8 @@ def solve_positive(
             products = [(scaled[i, k], lower[j, k]) for k in range(j)]
             scaled[i, j] = _less(matrix[..., i, j], products)
         pivot = scaled[j, j]
-        singular = singular | ~(pivot > least * matrix[..., j, j])
+        is_positive = pivot > least * matrix[..., j, j]
+        singular = singular | ~is_positive
         inverse.append(1 / pivot)
         for i in range(j + 1, n):
             lower[i, j] = scaled[i, j] * inverse[j]
@@ -57,7 +59,8 @@ def solve_positive(
         rows = [right[..., i] for i in range(n)]
         rows[0] = jnp.where(singular, jnp.nan, rows[0])
         for i in range(n):
-            rows[i] = _less(rows[i], [(lower[i, k], rows[k]) for k in range(i)])
+            known = [(lower[i, k], rows[k]) for k in range(i)]
+            rows[i] = _less(rows[i], known)
         for i in reversed(range(n)):
             above = [(lower[k, i], rows[k]) for k in range(i + 1, n)]
             rows[i] = _less(rows[i] * inverse[i], above)
@@ -89,21 +92,38 @@ def solve(
 
 def _eliminated(matrix, right):
     n = matrix.shape[-1]
-    rows = [[*jnp.moveaxis(matrix[i], -1, 0), right[..., i]] for i in range(n)]
+    # Each row is a list of its coefficients and its right side.
+    rows = []
+    for i in range(n):
+        coefficients = jnp.moveaxis(matrix[i], -1, 0)
+        rows.append([*coefficients, right[..., i]])
+
     for k in range(n):
         for i in range(k + 1, n):
-            larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            pairs = list(zip(rows[k][k:], rows[i][k:], strict=True))
-            upper = [jnp.where(larger, y, x) for x, y in pairs]
-            lower = [jnp.where(larger, x, y) for x, y in pairs]
-            share = lower[0] / jnp.where(upper[0] == 0, 1.0, upper[0])
+            upper, lower = _larger_first(rows[k][k:], rows[i][k:])
+            pivot = upper[0]
+            share = lower[0] / jnp.where(pivot == 0, 1.0, pivot)
             rows[k][k:] = upper
-            rows[i][k:] = [y - share * x for x, y in zip(upper, lower, strict=True)]
+            pairs = zip(upper, lower, strict=True)
+            rows[i][k:] = [y - share * x for x, y in pairs]
+
     x: dict[int, Array] = {}
     for i in reversed(range(n)):
-        known = [(rows[i][k], x[k]) for k in x]
-        x[i] = _less(rows[i][n], known) / rows[i][i]
+        row = rows[i]
+        known = [(row[k], x[k]) for k in x]
+        x[i] = _less(row[n], known) / row[i]
     return jnp.stack([x[i] for i in range(n)], axis=-1)
+
+
+def _larger_first(
+    upper: list[Array], lower: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """Return two rows, the one with the larger first element first, for each batch element."""
+    trades = jnp.abs(lower[0]) > jnp.abs(upper[0])
+    pairs = list(zip(upper, lower, strict=True))
+    larger = [jnp.where(trades, y, x) for x, y in pairs]
+    smaller = [jnp.where(trades, x, y) for x, y in pairs]
+    return larger, smaller
 
 
 @jax.jit
@@ -125,11 +145,14 @@ def _by_columns(matrix, right):
     n = len(right)
 
     def eliminated(k, rows):
-        sizes = jnp.where(jnp.arange(n) < k, -1.0, jnp.abs(rows[:, k]))
+        is_done = jnp.arange(n) < k
+        sizes = jnp.where(is_done, -1.0, jnp.abs(rows[:, k]))
         pivot = jnp.argmax(sizes)
-        chosen = rows[pivot] / rows[pivot, k]
+        pivot_row = rows[pivot]
+        chosen = pivot_row / rows[pivot, k]
         rows = rows.at[pivot].set(rows[k])
-        rows = rows - jnp.outer(rows[:, k], chosen)
+        shares = rows[:, k]
+        rows = rows - jnp.outer(shares, chosen)
         return rows.at[k].set(chosen)
 
     rows = jnp.concatenate([matrix, right[:, None]], axis=1)
@@ -141,16 +164,19 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     """Return L in `matrix = L @ L.T`, with zeros above the diagonal; of the matrix the lower
     triangle is read. NaN if it is not positive definite."""
     n = matrix.shape[-1]
-    lower = [[jnp.zeros_like(matrix[..., 0, 0])] * n for _ in range(n)]
+    zero = jnp.zeros_like(matrix[..., 0, 0])
+    lower = [[zero] * n for _ in range(n)]
     for j in range(n):
         for i in range(j, n):
-            products = [(lower[i][k], lower[j][k]) for k in range(j)]
+            products = list(zip(lower[i][:j], lower[j][:j], strict=True))
             lower[i][j] = _less(matrix[..., i, j], products)
         pivot = lower[j][j]
-        lower[j][j] = jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))
+        root = jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))
+        lower[j][j] = root
         for i in range(j + 1, n):
-            lower[i][j] = lower[i][j] / lower[j][j]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in lower], axis=-2)
+            lower[i][j] = lower[i][j] / root
+    rows = [jnp.stack(row, axis=-1) for row in lower]
+    return jnp.stack(rows, axis=-2)
 
 
 @ft.partial(
@@ -203,27 +229,34 @@ def lu(
         other = jnp.sum(masked, axis=-2, dtype=rows.dtype, keepdims=True)
         row = jax.lax.dynamic_slice_in_dim(rows, k, 1, rows.ndim - 2)
         here = (index == k)[:, None]
-        return jnp.where(here, other, jnp.where(mask, row, rows))
+        replaced = jnp.where(mask, row, rows)
+        return jnp.where(here, other, replaced)
 
     def eliminate(k, carry):
         X, pivots, order = carry
-        candidates = jnp.where(index >= k, jnp.abs(_column(X, k)), -1.0)
+        sizes = jnp.abs(_column(X, k))
+        candidates = jnp.where(index >= k, sizes, -1.0)
         largest = jnp.argmax(candidates, axis=-1)[..., None]
         chosen = index == largest
         X = traded(X, k, chosen)
         order = traded(order[..., None], k, chosen)[..., 0]
         pivots = jnp.where(index == k, largest.astype(np.int32), pivots)
+
+        # Subtract shares of row k from the rows below, and keep these shares in its column.
         column = _column(X, k)
         pivot = _row(column[..., None], k)
+        is_later = index > k
         share = column / jnp.where(pivot == 0, 1.0, pivot)
-        share = jnp.where(index > k, share, 0.0)[..., :, None]
-        row = jnp.where(index > k, _row(X, k), 0.0)[..., None, :]
-        below = (index == k) & (index[:, None] > k)
-        X = jnp.where(below, share, X - share * row)
+        share = jnp.where(is_later, share, 0.0)[..., :, None]
+        row = jnp.where(is_later, _row(X, k), 0.0)[..., None, :]
+        below = (index == k) & is_later[:, None]
+        reduced = X - share * row
+        X = jnp.where(below, share, reduced)
         return X, pivots, order
 
     order = jnp.broadcast_to(jnp.arange(n, dtype=np.int32), matrix.shape[:-1])
-    return jax.lax.fori_loop(0, n, eliminate, (matrix, jnp.zeros_like(order), order))
+    begin = (matrix, jnp.zeros_like(order), order)
+    return jax.lax.fori_loop(0, n, eliminate, begin)
 
 
 def _less(x, products):

@@ -42,13 +42,13 @@ class _Numbers(NamedTuple):
 
 
 _N = _Numbers(
-    (
+    pi_2=(
         1.5707963267341256,
         6.077100506303966e-11,
         2.0222662487111665e-21,
         8.4784276603689e-32,
     ),
-    (
+    sin=(
         -0.1666666666666663,
         0.008333333333322103,
         -0.00019841269829577054,
@@ -56,7 +56,7 @@ _N = _Numbers(
         -2.5050747041638134e-08,
         1.5896187163960848e-10,
     ),
-    (
+    cos=(
         0.0416666666666666,
         -0.001388888888887412,
         2.4801587289479338e-05,
@@ -64,7 +64,7 @@ _N = _Numbers(
         2.0875723147665586e-09,
         -1.1359639900700292e-11,
     ),
-    (
+    arctan=(
         -0.333333333333332,
         0.1999999999995404,
         -0.14285714280244025,
@@ -77,7 +77,7 @@ _N = _Numbers(
         0.03807697614533479,
         -0.017920777271075074,
     ),
-    3.061616997868383e-17,
+    pi_4_low=3.061616997868383e-17,
 )
 _TAN_PI_8 = math.tan(math.pi / 8)
 
@@ -99,7 +99,9 @@ def _sincos(x):
     lost = (a - r) - b  # by rounding
     r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]
     # Acts from |x| ~ 1e14 on only, where x does not determine r any more.
-    r = jax.lax.clamp(jax.lax.full_like(r, -0.8), r, jax.lax.full_like(r, 0.8))
+    low = jax.lax.full_like(r, -0.8)
+    high = jax.lax.full_like(r, 0.8)
+    r = jax.lax.clamp(low, r, high)
     z = r * r
     s = r + r * z * _polynomial(n.sin, z)
     c = 1 - (0.5 * z - z * z * _polynomial(n.cos, z))
@@ -127,14 +129,17 @@ def _arctan2(y, x):
     ay = abs(y)
     low = jax.lax.min(ax, ay)
     high = jax.lax.max(ax, ay)
-    ratio = jnp.where(low == high, jnp.where(high == 0, 0.0, 1.0), low / high)
+    of_equal = jnp.where(high == 0, 0.0, 1.0)
+    ratio = jnp.where(low == high, of_equal, low / high)
     steep = ratio > _TAN_PI_8
     r = jax.lax.select(steep, (ratio - 1) / (ratio + 1), ratio)
     z = r * r
     angle = r + r * z * _polynomial(n.arctan, z)
     angle = jax.lax.select(steep, jnp.pi / 4 + (angle + n.pi_4_low), angle)
-    angle = jax.lax.select(ay > ax, jnp.pi / 2 - (angle - 2 * n.pi_4_low), angle)
-    angle = jax.lax.select(jnp.signbit(x), jnp.pi - (angle - 4 * n.pi_4_low), angle)
+    beyond_diagonal = jnp.pi / 2 - (angle - 2 * n.pi_4_low)
+    angle = jax.lax.select(ay > ax, beyond_diagonal, angle)
+    left = jnp.pi - (angle - 4 * n.pi_4_low)
+    angle = jax.lax.select(jnp.signbit(x), left, angle)
     return jax.lax.select(jnp.signbit(y), -angle, angle)
 
 

@@ -255,8 +255,11 @@ class Design(Showable, eqx.Module):
         line = self.line[k]
         channel = self.channel[k]
         length = self.n_sections * self.periods
-        spectrum = np.zeros((last - first, length // 2 + 1, len(self.inputs)), complex)
-        value = 0.5 * length * self.amplitude[k] * np.exp(1j * self.phase[k])
+        frequencies = length // 2 + 1
+        shape = (last - first, frequencies, len(self.inputs))
+        spectrum = np.zeros(shape, complex)
+        phasor = self.amplitude[k] * np.exp(1j * self.phase[k])
+        value = 0.5 * length * phasor
         value = np.where(
             is_real(line, self.periods, self.n_sections), 2 * value.real, value
         )

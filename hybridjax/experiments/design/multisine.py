@@ -125,7 +125,8 @@ def multisine(
         phase = rng.uniform(0, 2 * np.pi, len(j))
         phase = np.where(second, np.roll(phase, 1) + np.pi / 2, phase)
         phases.append(np.where(is_real(j, periods, n_sections), 0.0, phase))
-    experiment = np.concatenate([sum(shares[:i]) + x for i, x in enumerate(sets)])
+    parts = [sum(shares[:i]) + x for i, x in enumerate(sets)]
+    experiment = np.concatenate(parts)
     line = np.tile(j, nu)
     channel = np.repeat(np.arange(nu), len(j))
     phase = np.concatenate(phases)
@@ -298,7 +299,8 @@ def optimize_phases(design: Design, seed: Seed = 0) -> Design:
     where = design.experiment * nu + design.channel
     size = np.where(real, 2.0, 1.0) * 0.5 * length * np.asarray(design.amplitude)
     rng = np.random.default_rng(seed)
-    phase = np.where(free, rng.uniform(0, 2 * np.pi, len(free)), design.phase)
+    drawn = rng.uniform(0, 2 * np.pi, len(free))
+    phase = np.where(free, drawn, design.phase)
     for signal in np.unique(where):
         k = np.flatnonzero(where == signal)
         if free[k].any():
@@ -328,8 +330,10 @@ def _lower(phase, free, line, size, length: int):
         peak = np.abs(u).max()
         v = np.abs(u) / peak
         total = np.sum(v**p)
-        slope = np.fft.rfft(v ** (p - 1) * np.sign(u) / (peak * total))[line[free]]
-        turn = np.real(1j * size[free] * np.exp(1j * x) * slope.conj())
+        by_signal = v ** (p - 1) * np.sign(u) / (peak * total)
+        slope = np.fft.rfft(by_signal)[line[free]]
+        wave = 1j * size[free] * np.exp(1j * x)
+        turn = np.real(wave * slope.conj())
         return np.log(peak) + np.log(total) / p, 2 / length * turn
 
     x = phase[free]

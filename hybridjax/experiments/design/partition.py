@@ -66,10 +66,12 @@ def needs_two_phases(
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
     """Return whether normal equations can be solved, for unknowns of any magnitude."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
-    unit = np.maximum(size.max(axis=0, initial=0), np.finfo(float).tiny)
-    even = (size / unit).min(axis=1) > SINGULAR * (size / unit).max(axis=1)
+    largest = size.max(axis=0, initial=0)
+    relative = size / np.maximum(largest, np.finfo(float).tiny)
+    even = relative.min(axis=1) > SINGULAR * relative.max(axis=1)
     size = np.where(even[:, None], size, 1.0)
-    least = np.linalg.eigvalsh(gram / (size[:, :, None] * size[:, None, :]))[:, 0]
+    products = size[:, :, None] * size[:, None, :]
+    least = np.linalg.eigvalsh(gram / products)[:, 0]
     return even & (least > SINGULAR)
 
 
@@ -208,7 +210,15 @@ class _Division:
         of_second[j] = leaves
         hits = _hits(of_first, self._products), _hits(of_second, self._products)
         worse = sum(hits) - self.hits[first] - self.hits[second]
-        return _Swap(first, i, second, j, (of_first, of_second), hits, worse)
+        return _Swap(
+            first=first,
+            i=i,
+            second=second,
+            j=j,
+            classes=(of_first, of_second),
+            hits=hits,
+            worse=worse,
+        )
 
     def apply(self, swap: _Swap) -> None:
         """Exchange the lines."""
@@ -262,7 +272,9 @@ def check_sharing(
     number = experiment[order]
     of_line = classes[order]
     j = line[order]
-    clash = (number[1:] == number[:-1]) & (of_line[1:] == of_line[:-1])
+    same_number = number[1:] == number[:-1]
+    same_line = of_line[1:] == of_line[:-1]
+    clash = same_number & same_line
     if not clash.any():
         return
     k = int(np.argmax(clash))

@@ -39,7 +39,8 @@ def write_table(
     else:
         header = ("experiment", "time")
         rounding = 1e-6
-        time = np.arange(np.ceil(n / N * period * rate - rounding)) / rate
+        samples = np.ceil(n / N * period * rate - rounding)
+        time = np.arange(samples) / rate
         held = (time * N / period + 1e-9).astype(int)
         u = u[:, np.minimum(held, n - 1)]
         place = time[:, None]

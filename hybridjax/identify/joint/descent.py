@@ -28,7 +28,8 @@ Problem = FrequencyProblem | SeriesProblem
 _FIRST_DAMPING = 1e-4
 # Factors of the damping: the smallest after a step that lowers the cost (Nielsen 1999), and the
 # first after a step that fails. Closer to 1: more attempts; farther: steps too long or short.
-_LESS, _MORE = 0.1, 4.0
+_LESS = 0.1
+_MORE = 4.0
 # Largest damping: steps are then below 1e-8 of the full one. Larger: attempts below rounding;
 # smaller: descents stop in narrow valleys.
 _MOST_DAMPING = 1e8
@@ -41,7 +42,8 @@ _SETTLED_SHIFT = 1e-3
 # If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
 # rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
 # converged; smaller: minima of exact data do not.
-_STALLED_GAIN, _STALLED_STEP = 1e-10, 1e-8
+_STALLED_GAIN = 1e-10
+_STALLED_STEP = 1e-8
 
 
 class ModelPoint:

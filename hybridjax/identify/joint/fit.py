@@ -190,9 +190,13 @@ class LDTPFit(WithCost, MultiplierFit):
         in units of the noise."""
         part = SeriesPart.of(grid, self._scale)
         S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
-        path = SeriesProblem([part], S, True, True, 0).path(
-            self._coordinates.model, part
-        )
+        path = SeriesProblem(
+            parts=[part],
+            S=S,
+            by_section=True,
+            free_start=True,
+            residuals=0,
+        ).path(self._coordinates.model, part)
         sizes = np.sqrt(np.linalg.diagonal(S))[:, :, None]
         slopes = prediction.slopes_of(self._coordinates, part, path)
         for J, size in zip(slopes, sizes, strict=True):
@@ -537,7 +541,13 @@ def _series_problem(records: PreparedRecords, how: _How) -> SeriesProblem:
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
     S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
-    return SeriesProblem(parts, S, how.innovations, how.free_start, numbers)
+    return SeriesProblem(
+        parts=parts,
+        S=S,
+        by_section=how.innovations,
+        free_start=how.free_start,
+        residuals=numbers,
+    )
 
 
 def _freedom_of(

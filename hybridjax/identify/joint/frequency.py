@@ -95,7 +95,8 @@ def transfer(
     N = model.n_sections
     states = states_at(model, f)
     responses = [_outputs(model, n, states[n]) for n in range(N)]
-    waves = np.exp(-2j * np.pi / N * np.outer(harmonics, np.arange(N))) / N
+    lags = np.outer(harmonics, np.arange(N))
+    waves = np.exp(-2j * np.pi / N * lags) / N
     return np.tensordot(waves, np.stack(responses), 1).swapaxes(1, 2)
 
 
@@ -127,7 +128,8 @@ def transfer_slopes(
         rows = slice(first, first + step)
         w = weight[:, rows]
         states = states_at(model, f[rows])
-        later = states_at(dual, np.add.outer(m, f[rows]).ravel())[::-1]
+        shifted = np.add.outer(m, f[rows]).ravel()
+        later = states_at(dual, shifted)[::-1]
         slopes = np.zeros((coordinates.size, *w.shape), complex)
         for n, place in enumerate(places):
             shapes = coordinates.blocks(n)
@@ -135,7 +137,8 @@ def transfer_slopes(
                 name: slopes[place[name]].reshape(*shape, *w.shape)
                 for name, shape in shapes.items()
             }
-            waves = np.exp(-2j * np.pi / model.n_sections * n * m) / model.n_sections
+            N = model.n_sections
+            waves = np.exp(-2j * np.pi / N * n * m) / N
             after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
             _fill(blocks, coordinates, n, states[n], after, waves, w)
         yield rows, slopes
@@ -196,7 +199,8 @@ def states_at(
         return states, x
 
     _, forced = around(np.zeros((len(phi), len(f), nu), complex))
-    turn = phi * np.exp(-2j * np.pi * f)[:, None, None]
+    back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
+    turn = phi * back_a_period
     resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
     states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))
     return states

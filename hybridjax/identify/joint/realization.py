@@ -57,10 +57,12 @@ def realized_htf(
     harmonics = all_harmonics(N)
     H = np.zeros((N, F, ny, nu), complex)
     H[np.isin(harmonics, htf.harmonics)] = htf.H
-    waves = np.exp(2j * np.pi * np.outer(np.arange(N), harmonics) / N)
+    lags = np.outer(np.arange(N), harmonics)
+    waves = np.exp(2j * np.pi * lags / N)
     responses = np.tensordot(waves, H, 1)
     if htf.variance is None:
-        scale = positive(np.sqrt(np.mean(np.abs(responses) ** 2, axis=(0, 1, 3))))
+        power = np.mean(np.abs(responses) ** 2, axis=(0, 1, 3))
+        scale = positive(np.sqrt(power))
         weight = np.broadcast_to(1 / scale[:, None], (F, ny, nu))
         edge = 0.0
     else:
@@ -81,7 +83,12 @@ def realized_htf(
         K=[np.zeros((len(a), 0)) for a in A],
     )
     weights = np.broadcast_to(weight, H.shape)
-    problem = FrequencyProblem(f, harmonics, H / unit, weights)
+    problem = FrequencyProblem(
+        f=f,
+        harmonics=harmonics,
+        target=H / unit,
+        weight=weights,
+    )
     for _ in range(2):  # the second time removes rounding errors
         model = model.refined(True, problem.linearize)
     return model.to_ldtp(scale, htf.inputs, htf.outputs)
@@ -98,7 +105,8 @@ def _without_later_inputs(
     N, F, ny, nu = responses.shape
     # One weight for each column, that of its noise, keeps the rows of an input as they are.
     column = np.sqrt(np.mean(weight**2, axis=1)).T.ravel()  # (nu F)
-    powers = np.exp(2j * np.pi / N * f) ** np.arange(p + 1)[:, None]
+    delay = np.exp(2j * np.pi / N * f)
+    powers = delay ** np.arange(p + 1)[:, None]
     inputs = _real(np.kron(np.eye(nu), powers) * column)
     _, size, directions = np.linalg.svd(inputs, full_matrices=False)
     taken = directions[size > ROUNDING * size[0]]
@@ -107,7 +115,8 @@ def _without_later_inputs(
         later = [
             responses[(n + i) % N] * powers[i][:, None, None] for i in range(p + 1)
         ]
-        rows = np.stack(later).transpose(0, 2, 3, 1).reshape((p + 1) * ny, nu * F)
+        rows = np.stack(later).transpose(0, 2, 3, 1)
+        rows = rows.reshape((p + 1) * ny, nu * F)
         rows = _real(rows * column)
         for _ in range(2):  # the second time removes rounding errors
             rows = rows - (rows @ taken.T) @ taken

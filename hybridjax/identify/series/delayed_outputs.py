@@ -42,13 +42,18 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
         inputs = columns @ problem.to_lags[n]
         sampled = part.sampled[:, :, n]
         delayed = [delay_cycles(sampled, j, not problem.free) for j in delays]
-        later = np.arange(part.y.shape[1]) >= part.first[:, n, None] + problem.free
-        used = np.all(delayed, axis=0) & later[..., None]
+        cycle = np.arange(part.y.shape[1])
+        first = part.first[:, n, None] + problem.free
+        is_later = cycle >= first
+        used = np.all(delayed, axis=0) & is_later[..., None]
         no_starts = part.drift[:, :, :0]
-        return [
-            SectionRegression.make(inputs, no_starts, part.drift, used[..., alike[0]])
-            for alike in problem.alike[n]
-        ]
+        regressions = []
+        for alike in problem.alike[n]:
+            rows = used[..., alike[0]]
+            regressions.append(
+                SectionRegression.make(inputs, no_starts, part.drift, rows)
+            )
+        return regressions
 
     gram = np.zeros((ny, order + 1, order + 1))
     dof = 0
@@ -68,11 +73,13 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
         return np.zeros(order)
     roots = np.roots(null / null[0])
-    size = np.maximum(np.abs(roots) / SLOWEST, 1.0)
-    return np.pad(coefficients_of(roots / size), (0, order - len(roots)))
+    too_slow = np.maximum(np.abs(roots) / SLOWEST, 1.0)
+    c = coefficients_of(roots / too_slow)
+    return np.pad(c, (0, order - len(roots)))
 
 
 def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
     gram = delayed.gram.sum(axis=0)
-    return multipliers_of(-np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])[0])
+    c, *_ = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])
+    return multipliers_of(-c)

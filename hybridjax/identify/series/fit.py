@@ -160,7 +160,8 @@ class SeriesFit(MultiplierFit):
         earlier."""
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
-        h = np.pad(self.numerators, ((0, 0), (0, cycles * N - R), (0, 0), (0, 0)))
+        padding = cycles * N - R
+        h = np.pad(self.numerators, ((0, 0), (0, padding), (0, 0), (0, 0)))
         by_cycle = h.reshape(N, cycles, -1)
         h = divide_by_chi(self.coefficients, by_cycle).reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
@@ -180,7 +181,8 @@ class SeriesFit(MultiplierFit):
         harmonics = check_harmonics(harmonics, self.n_sections)
         N = self.n_sections
         c = self.coefficients
-        waves = np.exp(-2j * np.pi * np.outer(harmonics, np.arange(N)) / N) / N
+        lags = np.outer(harmonics, np.arange(N))
+        waves = np.exp(-2j * np.pi * lags / N) / N
 
         def sum_up(b):  # (..., N, R, ny, nu) -> (..., M, F, ny, nu)
             by_harmonic = np.einsum("mn,...nrij->...mrij", waves, b)
@@ -195,7 +197,8 @@ class SeriesFit(MultiplierFit):
         r = np.arange(self.numerators.shape[1]) - self.lead
         powers = np.exp(-2j * np.pi / N * np.outer(f, r))
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
-        by_b = (np.abs(spread / N) ** 2).sum(axis=(1, 4)) / np.abs(below) ** 2
+        power = (np.abs(spread / N) ** 2).sum(axis=(1, 4))
+        by_b = power / np.abs(below) ** 2
         variance = by_c.real + by_b * self.noise[:, None] ** 2
         variance = np.where(np.isnan(variance), np.inf, variance)
         names = self.inputs, self.outputs
@@ -358,7 +361,12 @@ def _fit_open_loop(
         problem = problem._replace(scale=problem.scale * noise)
         solution, converged = minimize(problem, solution.c)
         ratios = _noise_ratios(delayed, noise * _noise(solution))
-        return _Weighted(problem, solution, converged, ratios)
+        return _Weighted(
+            problem=problem,
+            solution=solution,
+            converged=converged,
+            ratios=ratios,
+        )
 
     best = weighted(order)
     covariance, p_steady = _uncertainty(best.problem, best.solution)
@@ -530,7 +538,8 @@ def _noise_ratios(
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
 # by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
-_WHITE_DRAWS, _FILTERED_DRAWS = 4, 16
+_WHITE_DRAWS = 4
+_FILTERED_DRAWS = 16
 # Blocks beyond the number of coefficients from which changes in time are tested. Fewer: the test
 # sees nothing.
 _FEWEST_BLOCKS = 6
@@ -715,7 +724,8 @@ def _block_sums(
     measured = fit.coefficients[..., :1]
     response = filtered_response(measured, c, regression, x[..., :1])
     slopes = regression.residual(fit.slopes[..., :1], response)
-    slopes = np.moveaxis(slopes[..., 0], 1, -1).reshape(*error.shape[:3], len(c))
+    slopes = np.moveaxis(slopes[..., 0], 1, -1)
+    slopes = slopes.reshape(*error.shape[:3], len(c))
     late = backward(slopes)
     squares = [(e**2).sum(axis=(0, 1, 2)) for e in (error, backward(error))]
     slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))

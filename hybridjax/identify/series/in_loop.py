@@ -151,10 +151,12 @@ class LoopEquations:
         columns = np.concatenate(signals, axis=2)
         no_starts = grid.drift[:, :, :0]
         rows = SectionRegression.make(columns, no_starts, grid.drift, used).remainder
-        Z, U, late = np.split(rows, np.cumsum([self.lags * nu] * 2), axis=1)
+        lags = self.lags * nu
+        Z, U, late = np.split(rows, [lags, 2 * lags], axis=1)
         # Combinations of lags, of which the reference excites those that stand out of the noise.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
-        noise = np.linalg.norm((U - Z) @ V.T, axis=0) / np.sqrt(max(used.sum(), 1))
+        unexplained = np.linalg.norm((U - Z) @ V.T, axis=0)
+        noise = unexplained / np.sqrt(max(used.sum(), 1))
         kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
         to_lags = V[kept].T / size[kept]
         instruments = Z @ to_lags
@@ -229,13 +231,15 @@ class LoopEquations:
             y = (outputs / scale[:, None]).reshape(-1, d + 1)
             W = (instruments / scale[:, None]).reshape(-1, d)
             along = W.T @ y
-            c = -np.linalg.lstsq(along[:, 1:], along[:, 0])[0]
+            c, *_ = np.linalg.lstsq(along[:, 1:], along[:, 0])
+            c = -c
             square = ((outputs @ [1.0, *c]) ** 2).sum(axis=(0, 1))
             scale = np.maximum(np.sqrt(square / dof), RANK * self.records.scale)
         along = along[:, 1:]
         # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
         part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
-        part = np.linalg.pinv(y[:, 1:].T @ y[:, 1:], RANK) @ part
+        others = y[:, 1:]
+        part = np.linalg.pinv(others.T @ others, RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
         seen = part * dof * len(scale) > _DETERMINED * (1 - part)
         return Solution(c, along, scale, int(seen.sum()))
@@ -265,7 +269,8 @@ class LoopEquations:
         score = np.sum(scores, axis=0)
         score = score[score.any(axis=1)]
         half = np.linalg.solve(along, score.T)
-        share = np.tile(np.eye(d) / len(score), (len(score), 1, 1))
+        unit = np.eye(d) / len(score)
+        share = np.tile(unit, (len(score), 1, 1))
         dof = denominator.block_freedom(score, share)
         return c, Covariance(half @ half.T, dof), scale
 

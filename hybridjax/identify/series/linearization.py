@@ -99,7 +99,8 @@ def filtered_response(
 ) -> Float[np.ndarray, "S T d m C"]:
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
-    delayed = np.zeros((*x.shape[:2], len(c), *x.shape[2:]))
+    S, T = x.shape[:2]
+    delayed = np.zeros((S, T, len(c), *x.shape[2:]))
     for j in range(len(c)):
         delayed[:, :, j] = delay_cycles(filtered, j + 1)
     return delayed
@@ -164,7 +165,7 @@ def linearize(
 
     **Arguments:** `outputs`: columns to take in place of the measured outputs.
     """
-    (N, _, ny) = problem.shape
+    N, _, ny = problem.shape
     d = len(c)
     out = Linearization(
         c=c,
@@ -191,8 +192,13 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
         rows = columns @ problem.to_lags[n]
         T = part.y.shape[1]
         starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
-        sampled = (part.sampled[:, :, n, alike[0]] for alike in problem.alike[n])
-        return [SectionRegression.make(rows, starts, part.drift, x) for x in sampled]
+        regressions = []
+        for alike in problem.alike[n]:
+            sampled = part.sampled[:, :, n, alike[0]]
+            regressions.append(
+                SectionRegression.make(rows, starts, part.drift, sampled)
+            )
+        return regressions
 
     return regress
 

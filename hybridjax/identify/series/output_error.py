@@ -74,7 +74,8 @@ class SectionRegression(NamedTuple):
         basis, size, right = np.linalg.svd(unknown, full_matrices=False)
         kept = size > RANK * size.max(axis=1, initial=0, keepdims=True)
         basis = basis * kept[:, None]
-        inverse = np.where(kept, 1 / np.where(kept, size, 1), 0)[:, None]
+        divisor = np.where(kept, size, 1)
+        inverse = np.where(kept, 1 / divisor, 0)[:, None]
         to_starts = (right.mT * inverse)[:, : starts.shape[2]]
         remainder = without(basis, rows * inputs)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
@@ -102,11 +103,13 @@ class SectionRegression(NamedTuple):
 
     def response(self, a: ByInput, x: Columns) -> Columns:
         """Return the response to the inputs and to the initial conditions that fit x best."""
-        columns = x.reshape(*x.shape[:2], -1)
+        S, T = x.shape[:2]
+        columns = x.reshape(S, T, -1)
         forced = self.inputs @ a.reshape(len(a), columns.shape[2])
         left = self.weight * (columns - forced)
-        free = self.to_starts @ (self.basis.mT @ left)
-        return (forced + self.starts @ free).reshape(x.shape)
+        starts = self.to_starts @ (self.basis.mT @ left)
+        free = self.starts @ starts
+        return (forced + free).reshape(x.shape)
 
 
 class OutputErrorProblem(NamedTuple):
@@ -147,7 +150,8 @@ class OutputErrorProblem(NamedTuple):
         def triangle(n: int):
             rows = []
             for grid in records.grids:
-                later = np.arange(grid.y.shape[1]) >= grid.first[:, n, None] + free
+                cycle = np.arange(grid.y.shape[1])
+                later = cycle >= grid.first[:, n, None] + free
                 used = grid.sampled[:, :, n].any(axis=2) & later
                 rows.append(lagged_inputs(grid.u, n, lags, records.lead)[used])
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
@@ -180,7 +184,8 @@ class OutputErrorProblem(NamedTuple):
         starts = (
             len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids
         )
-        return int(self.records.sampled[n, i]) - self.lags * self.shape[1] - sum(starts)
+        samples = int(self.records.sampled[n, i])
+        return samples - self.lags * self.shape[1] - sum(starts)
 
     def parts(self) -> list[CycleGrid]:
         """Return all grids, with the outputs in units of `scale`."""

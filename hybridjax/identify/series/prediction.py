@@ -52,13 +52,16 @@ class SeriesPart(NamedTuple):
         basis, size, _ = np.linalg.svd(waves, full_matrices=False)
         largest = size.max(axis=-1, keepdims=True, initial=0)
         kept = size > RANK * np.maximum(largest, RANK)
+        basis = basis * kept[..., None, :]
+        u = np.moveaxis(grid.u, 2, 0)
+        y = np.moveaxis(grid.y / scale, 2, 0)
         return cls(
-            u=np.ascontiguousarray(np.moveaxis(grid.u, 2, 0)),
-            y=np.ascontiguousarray(np.moveaxis(grid.y / scale, 2, 0)),
+            u=np.ascontiguousarray(u),
+            y=np.ascontiguousarray(y),
             sampled=sampled,
             lost=inside & ~sampled,
             first=np.argmax(grid.inside[:, 0], axis=1),
-            drift=np.moveaxis(basis * kept[..., None, :], 2, 3),
+            drift=np.moveaxis(basis, 2, 3),
         )
 
     @property
@@ -115,7 +118,8 @@ class SeriesProblem(NamedTuple):
                 except np.linalg.LinAlgError:
                     return np.inf
                 pairs = zip(path.whiten, path.error, strict=True)
-                cost += sum(float((np.matvec(w, e) ** 2).sum()) for w, e in pairs)
+                for w, e in pairs:
+                    cost += float((np.matvec(w, e) ** 2).sum())
         return cost
 
     def reweighted(self, model: PeriodicModel) -> "SeriesProblem":
@@ -123,16 +127,19 @@ class SeriesProblem(NamedTuple):
         square = np.zeros(self.S.shape)
         count = np.zeros(self.S.shape)
         for part in self.parts:
-            for n, error in enumerate(self.path(model, part).error):
+            path = self.path(model, part)
+            for n, error in enumerate(path.error):
                 sampled = part.sampled[n].astype(float)
                 square[n] += np.einsum("rti,rtj->ij", error, error)
                 count[n] += np.einsum("rti,rtj->ij", sampled, sampled)
         if not self.by_section:
             square[:] = square.sum(axis=0)
             count[:] = count.sum(axis=0)
-        values, vectors = np.linalg.eigh(square / np.maximum(count, 1))
-        floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * values[:, -1:])
-        variances = np.maximum(values, floor)[:, None]
+        covariance = square / np.maximum(count, 1)
+        variances, vectors = np.linalg.eigh(covariance)
+        largest = variances[:, -1:]
+        floor = np.maximum(SMALLEST_ERROR**2, SMALLEST_ERROR * largest)
+        variances = np.maximum(variances, floor)[:, None]
         return self._replace(S=vectors * variances @ vectors.mT)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
@@ -144,9 +151,10 @@ class SeriesProblem(NamedTuple):
             R, _ = part.shape
             along = np.zeros((R, path.start_gram.shape[1], P))
             for n, slopes in enumerate(slopes_of(coordinates, part, path)):
-                J = path.whiten[n] @ part.without_drift(n, slopes)
+                whiten = path.whiten[n]
+                J = whiten @ part.without_drift(n, slopes)
                 flat = J.reshape(-1, P)
-                white = np.matvec(path.whiten[n], path.error[n])
+                white = np.matvec(whiten, path.error[n])
                 gram += flat.T @ flat
                 gradient += white.ravel() @ flat
                 along += path.starts[n].mT @ J.reshape(R, -1, P)
@@ -159,50 +167,78 @@ class SeriesProblem(NamedTuple):
         """Return states and errors for the initial states that fit best."""
         R, T = part.shape
         N = len(self.S)
-        pairs = [self._weights(part, n) for n in range(N)]
-        given = [mean for mean, _ in pairs]
-        whiten = [root for _, root in pairs]
-        gain = [_gain(K, mean) for K, mean in zip(model.K, given, strict=True)]
-        F = [A - G @ C for A, C, G in zip(model.A, model.C, gain, strict=True)]
-        y = [part.y[n] - part.u[n] @ model.D[n].T for n in range(N)]
-        starts = max(model.dims[n] for n in part.first) if self.free_start else 0
+        given = []
+        whiten = []
+        gain = []
+        F = []
+        y = []
+        for n in range(N):
+            mean, root = self._weights(part, n)
+            G = _gain(model.K[n], mean)
+            given.append(mean)
+            whiten.append(root)
+            gain.append(G)
+            F.append(model.A[n] - G @ model.C[n])
+            at_once = part.u[n] @ model.D[n].T
+            y.append(part.y[n] - at_once)
+        starts = 0
+        if self.free_start:
+            starts = max(model.dims[n] for n in part.first)
 
         def enter(n: int, x: Columns) -> None:
             begins = part.first == n
             if starts and begins.any():
-                x[begins, 0, :, 1 : 1 + x.shape[2]] = np.eye(x.shape[2])
+                d = x.shape[2]
+                x[begins, 0, :, 1 : 1 + d] = np.eye(d)
 
         def drive(n: int, later: Columns) -> None:
             later[..., 0] += part.u[n] @ model.B[n].T
-            later[..., 0] += np.matvec(gain[n], y[n] * part.sampled[n])
+            sampled = y[n] * part.sampled[n]
+            later[..., 0] += np.matvec(gain[n], sampled)
 
         # The first column is driven, the others start from each coordinate of the initial state.
         filled = [1 + starts] * N
+        shape = (R, T, 1 + starts)
         states = []
         errors = []
         responses = []
         gram = np.zeros((R, starts, starts))
         along = np.zeros((R, starts, 1))
-        for n, x in enumerate(recursion(F, (R, T, 1 + starts), enter, drive, filled)):
+        for n, x in enumerate(recursion(F, shape, enter, drive, filled)):
             error = model.C[n] @ x
             error[..., 0] = y[n] - error[..., 0]
             error = part.without_drift(n, error)
             white = whiten[n] @ error
             samples = white.shape[1] * white.shape[2]
+            driven = white[..., :1].reshape(R, samples, 1)
             rows = white[..., 1:].reshape(R, samples, starts)
             gram += rows.mT @ rows
-            along += rows.mT @ white[..., :1].reshape(R, samples, 1)
+            along += rows.mT @ driven
             states.append(x)
             errors.append(error)
             responses.append(rows)
+
         x0 = _solve_starts(gram, along)[:, None]
-        states = [x[..., 0] + (x[..., 1:] @ x0)[..., 0] for x in states]
-        errors = [e[..., 0] - (e[..., 1:] @ x0)[..., 0] for e in errors]
-        entering = [
-            np.matvec(given[n], (y[n] - x @ model.C[n].T) * part.sampled[n])
-            for n, x in enumerate(states)
-        ]
-        return Path(F, gain, whiten, states, entering, errors, responses, gram)
+
+        def from_starts(columns: Columns) -> np.ndarray:
+            return (columns[..., 1:] @ x0)[..., 0]
+
+        states = [x[..., 0] + from_starts(x) for x in states]
+        errors = [e[..., 0] - from_starts(e) for e in errors]
+        entering = []
+        for n, x in enumerate(states):
+            innovation = y[n] - x @ model.C[n].T
+            entering.append(np.matvec(given[n], innovation * part.sampled[n]))
+        return Path(
+            F=F,
+            gain=gain,
+            whiten=whiten,
+            x=states,
+            entering=entering,
+            error=errors,
+            starts=responses,
+            start_gram=gram,
+        )
 
     def _weights(self, part: SeriesPart, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrix of the mean of all errors, given the sampled ones, and the matrix that
@@ -213,9 +249,11 @@ class SeriesProblem(NamedTuple):
         if not lost.any():
             return identity[None, None], _whitening(S)[None, None]
         kept = 1.0 - lost
-        among_kept = S * kept[..., None, :]
-        both = kept[..., :, None] * among_kept + identity * lost[..., None]
-        return among_kept @ np.linalg.inv(both), _whitening(both)
+        with_kept = S * kept[..., None, :]
+        among_kept = kept[..., :, None] * with_kept
+        among_lost = identity * lost[..., None]
+        both = among_kept + among_lost
+        return with_kept @ np.linalg.inv(both), _whitening(both)
 
 
 def _whitening(covariance: np.ndarray) -> np.ndarray:
@@ -255,13 +293,15 @@ def recursion(
     for n, step in enumerate(F):
         enter(n, x)
         later = np.zeros((R, T, step.shape[-2], columns))
-        later[..., : filled[n]] = step @ x[..., : filled[n]]
+        columns_so_far = slice(filled[n])
+        later[..., columns_so_far] = step @ x[..., columns_so_far]
         drive(n, later)
         x = later
         phi = step @ phi
     starts = np.zeros_like(x)
     for k in range(T - 1):
-        starts[:, k + 1] = phi[:, min(k, phi.shape[1] - 1)] @ starts[:, k] + x[:, k]
+        period = phi[:, min(k, phi.shape[1] - 1)]
+        starts[:, k + 1] = period @ starts[:, k] + x[:, k]
     x = starts
     for n, step in enumerate(F):
         enter(n, x)
@@ -300,7 +340,8 @@ def slopes_of(
     for n, states in enumerate(recursion(path.F, shape, enter, drive, ends)):
         place = places[n]
         slopes = model.C[n] @ states
-        slopes[..., place["Y"]] += _outer(coordinates.to_C[n][None, None], path.x[n])
+        to_C = coordinates.to_C[n][None, None]
+        slopes[..., place["Y"]] += _outer(to_C, path.x[n])
         if coordinates.direct:
             unit = np.eye(len(model.C[n]))[None, None]
             slopes[..., place["D"]] += _outer(unit, part.u[n])
@@ -312,7 +353,8 @@ def _outer(
 ) -> np.ndarray:
     """Return (R, T, a, q b), the outer products of rows of the left matrix and right vectors."""
     product = left[..., None] * right[:, :, None, None, :]
-    return product.reshape(*product.shape[:3], -1)
+    R, T, a, _, _ = product.shape
+    return product.reshape(R, T, a, -1)
 
 
 def _solve_starts(
@@ -358,10 +400,16 @@ def noise_spectrum(
         )
     k = np.arange(N)
     matrices = map(np.asarray, noise.matrices[:4])
-    H = harmonic_transfer(*matrices, np.add.outer(k, f).ravel())
+    shifted = np.add.outer(k, f).ravel()
+    H = harmonic_transfer(*matrices, shifted)
+    power = (np.abs(H) ** 2).sum(axis=3)
     # (harmonic k, inputs at f + j, frequency, output)
-    power = (np.abs(H) ** 2).sum(axis=3).reshape(N, N, len(f), len(noise.outputs))
-    return np.stack([power[k, (m - k) % N].sum(axis=0) for m in harmonics])
+    power = power.reshape(N, N, len(f), len(noise.outputs))
+    spectra = []
+    for m in harmonics:
+        of_inputs = power[k, (m - k) % N]
+        spectra.append(of_inputs.sum(axis=0))
+    return np.stack(spectra)
 
 
 def noise_model(
@@ -378,9 +426,12 @@ def noise_model(
     names = tuple(f"noise of {name}" for name in outputs)
     unit = scale[:, None]
     D = [unit * root for root in roots]
-    if not model.K[0].shape[1]:
+    has_states = model.K[0].shape[1] > 0
+    if not has_states:
         N, ny, _ = S.shape
-        A, B, C = np.zeros((N, 1, 1)), np.zeros((N, 1, ny)), np.zeros((N, ny, 1))
+        A = np.zeros((N, 1, 1))
+        B = np.zeros((N, 1, ny))
+        C = np.zeros((N, ny, 1))
         return LDTP(A, B, C, D, None, names, outputs)
     B = [K @ root for K, root in zip(model.K, roots, strict=True)]
     C = [unit * C for C in model.C]
@@ -403,13 +454,19 @@ class Predictor(NamedTuple):
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
         part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
-        problem = SeriesProblem([part], self.S, True, free_start, 0)
+        problem = SeriesProblem(
+            parts=[part],
+            S=self.S,
+            by_section=True,
+            free_start=free_start,
+            residuals=0,
+        )
         path = problem.path(self.model, part)
         out = np.zeros(grid.y.shape)
-        for n, (x, C, D) in enumerate(
-            zip(path.x, self.model.C, self.model.D, strict=True)
-        ):
-            simulated = x @ C.T + part.u[n] @ D.T
+        for n, x in enumerate(path.x):
+            by_state = x @ self.model.C[n].T
+            by_input = part.u[n] @ self.model.D[n].T
+            simulated = by_state + by_input
             predicted = part.y[n] - path.error[n]
             out[:, :, n] = np.where(part.sampled[n], predicted, simulated)
         return out

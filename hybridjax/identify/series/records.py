@@ -105,7 +105,8 @@ def drift_waves(record: SectionSeries) -> Float[np.ndarray, "T K"]:
     if record.drift is None:
         return np.zeros((T, 0))
     waves = np.arange(int(2 * T / record.drift) + 1)
-    return np.cos(np.pi / T * (np.arange(T)[:, None] + 0.5) * waves)
+    middle = np.arange(T)[:, None] + 0.5
+    return np.cos(np.pi / T * middle * waves)
 
 
 class PreparedRecords:
@@ -143,7 +144,8 @@ class PreparedRecords:
         varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
         _require_signals(self.outputs, varies, "constant")
         require_deviations(self.records)
-        self.scale = np.sqrt(np.nansum(y**2, axis=0) / self.sampled.sum(axis=0))
+        power = np.nansum(y**2, axis=0) / self.sampled.sum(axis=0)
+        self.scale = np.sqrt(power)
 
     @property
     def about(self) -> dict[str, Any]:

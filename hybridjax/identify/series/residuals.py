@@ -35,7 +35,8 @@ _COLORED = 0.01
 # Shifts by whole cycles from which the dependence of residuals on inputs of other cycles follows,
 # and the deviates by which that on their own must exceed it. More shifts: time. Larger deviates:
 # too few dimensions are called noise. Smaller: noise is called too few dimensions.
-_SHIFTS, _ALONE = 8, 4.0
+_SHIFTS = 8
+_ALONE = 4.0
 # Advice where inputs answer residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"
@@ -84,12 +85,15 @@ def whiteness_test(
     tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
         product = np.full(scaled.shape, np.nan)
-        product[:, k + 1 :] = scaled[:, k + 1 :] * scaled[:, : -k - 1]
+        now = scaled[:, k + 1 :]
+        before = scaled[:, : -k - 1]
+        product[:, k + 1 :] = now * before
         by_section = product.reshape(error.shape)
         samples = np.isfinite(by_section).sum(axis=(0, 1))
         total = np.nansum(by_section, axis=(0, 1))
         tested[:, k] = samples >= FEWEST_SAMPLES
-        z[:, k] = tested[:, k] * total / np.sqrt(np.maximum(samples, 1))
+        deviation = np.sqrt(np.maximum(samples, 1))
+        z[:, k] = tested[:, k] * total / deviation
     # The mean over the sections of each lag, and the deviations from it: independent.
     sections = tested.sum(axis=0)
     by_lag = z.sum(axis=0) ** 2 / np.maximum(sections, 1)
@@ -176,7 +180,8 @@ def _regressed(
     spread /= 1 + (root**2).sum() / samples
     correlation = inputs.T @ residual / np.sqrt(spread)
     left, values, _ = np.linalg.svd(inputs, full_matrices=False)
-    left = left[:, values > RANK * values[0]][:, : samples // 2]
+    kept = values > RANK * values[0]
+    left = left[:, kept][:, : samples // 2]
     explained = ((left.T @ residual) ** 2).sum()
     by_fit = ((left.T @ root) ** 2).sum()
     unexplained = (residual**2).sum() - explained
@@ -184,7 +189,12 @@ def _regressed(
     left_by_fit = (root**2).sum() - by_fit
     ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
     p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
-    return _Regressed(correlation, float(stats.norm.isf(p)), degrees, float(by_fit))
+    return _Regressed(
+        correlation=correlation,
+        deviate=float(stats.norm.isf(p)),
+        degrees=degrees,
+        by_fit=float(by_fit),
+    )
 
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
@@ -212,7 +222,8 @@ def about_misfit(
     inputs = outside.u
     if not direct:
         earlier = np.zeros((S, T * N, inputs.shape[3]))
-        earlier[:, 1:] = inputs.reshape(S, T * N, -1)[:, :-1]
+        in_order = inputs.reshape(S, T * N, -1)
+        earlier[:, 1:] = in_order[:, :-1]
         inputs = earlier.reshape(inputs.shape)
     _, p, _ = independence_test(inputs, late, N, ANSWER)
     tested = ~is_exact(grid, error)
@@ -284,12 +295,15 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     S, T, N, nu = grid.u.shape
     lags = 2
     earlier = np.zeros((S, T * N, error.shape[3]))
-    earlier[:, 1:] = np.nan_to_num(error).reshape(S, T * N, -1)[:, :-1]
+    in_order = np.nan_to_num(error).reshape(S, T * N, -1)
+    earlier[:, 1:] = in_order[:, :-1]
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
-        whole = grid.inside[:, :, n] & (grid.age[:, :, n] > lags + 1)
+        is_late = grid.age[:, :, n] > lags + 1
+        whole = grid.inside[:, :, n] & is_late
         past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
         u = grid.u[:, :, n][whole]
-        new[:, :, n][whole] = u - past @ np.linalg.lstsq(past, u)[0]
+        by_past, *_ = np.linalg.lstsq(past, u)
+        new[:, :, n][whole] = u - past @ by_past
     _, p, _ = independence_test(earlier.reshape(error.shape), new, lags, ANSWER)
     return p

@@ -79,7 +79,8 @@ def subspace_model(
             raise DefinitionError(
                 f"the data show {len(size)} dimensions of section {n}, not {d}: lower `dims`."
             )
-        scale = np.maximum(size[:d], _SHRINKAGE * size[0]) / np.sqrt(len(section.y))
+        size = np.maximum(size[:d], _SHRINKAGE * size[0])
+        scale = size / np.sqrt(len(section.y))
         to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
 
@@ -122,7 +123,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
-    answer = bool(special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2) <= ANSWER)
+    p = special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2)
+    answer = bool(p <= ANSWER)
     if left <= _SHRINKAGE * whole:
         return answer or None
     if answer:
@@ -158,8 +160,12 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
             out[:, :, n] = regression.reduced(z).reshape(z.shape)
         return out
 
-    y = left(grid.y, np.asarray(grid.sampled.all(axis=3)))
-    return grid._replace(u=left(grid.u, grid.inside), y=y, drift=no_columns)
+    all_sampled = np.asarray(grid.sampled.all(axis=3))
+    return grid._replace(
+        u=left(grid.u, grid.inside),
+        y=left(grid.y, all_sampled),
+        drift=no_columns,
+    )
 
 
 def _sections(
@@ -182,22 +188,27 @@ class _Section:
         self.record, cycle = np.nonzero(sampled[:, :, section])
         self.time = cycle * z.shape[2] + section
         self._z = z.reshape(len(z), -1, z.shape[3])
-        self.u, self.y = np.split(self._z[self.record, self.time], [-ny], axis=1)
+        signals = self._z[self.record, self.time]
+        self.u, self.y = np.split(signals, [-ny], axis=1)
 
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
         record."""
         back = self.time[:, None] + later - 1 - np.arange(length)
+        is_inside = back >= 0
         rows = self._z[self.record[:, None], np.maximum(back, 0)]
-        return np.where((back >= 0)[..., None], rows, 0.0).reshape(len(back), -1)
+        rows = np.where(is_inside[..., None], rows, 0.0)
+        return rows.reshape(len(back), -1)
 
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
-    size = np.sqrt(np.square(rows).sum(axis=0))
-    rows = rows / positive(size)
-    x = np.linalg.solve(rows.T @ rows + _SHRINKAGE * np.eye(len(size)), rows.T @ target)
-    return x / positive(size)[:, None]
+    size = positive(np.sqrt(np.square(rows).sum(axis=0)))
+    rows = rows / size
+    gram = rows.T @ rows
+    shrunk = gram + _SHRINKAGE * np.eye(len(size))
+    x = np.linalg.solve(shrunk, rows.T @ target)
+    return x / size[:, None]
 
 
 def _from_states(

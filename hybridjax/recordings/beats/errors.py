@@ -107,7 +107,13 @@ def whitening(
     by_drift = weight * ahead.slopes[:, -1]
     nothing = np.zeros(L)
     if not wander.size:
-        return Whitening(weight, nothing, nothing, nothing, np.ones(L))
+        return Whitening(
+            weight=weight,
+            by_drift=nothing,
+            kept=nothing,
+            learned=nothing,
+            scale=np.ones(L),
+        )
     left = _left(intervals, wander.memory)
     kept = np.zeros(L)
     learned = np.zeros(L)
@@ -121,8 +127,15 @@ def whitening(
         kept[k] = a * (1 - gain * g)
         learned[k] = a * gain
         scale[k] = square**0.5
-        variance = a * a * variance * (1 - gain * g) + (1 - a * a) * stationary
-    return Whitening(weight, by_drift, kept, learned, scale)
+        update = a * a * variance * (1 - gain * g)
+        variance = update + (1 - a * a) * stationary
+    return Whitening(
+        weight=weight,
+        by_drift=by_drift,
+        kept=kept,
+        learned=learned,
+        scale=scale,
+    )
 
 
 def _left(intervals: Intervals, memory: float) -> Lanes:
@@ -131,7 +144,8 @@ def _left(intervals: Intervals, memory: float) -> Lanes:
     if not memory:
         return left
     middle = intervals.start + intervals.duration / 2
-    left[:-1] = np.exp(-np.abs(np.diff(middle)) / memory)
+    step = np.abs(np.diff(middle))
+    left[:-1] = np.exp(-step / memory)
     left[:-1][np.diff(intervals.trial) != 0] = 0.0
     return left
 

@@ -276,7 +276,9 @@ def projected(intervals: Intervals, fit: CurveFit, white: Whitening) -> Projecte
     intervals), without what the rates of the trials explain."""
     columns = np.column_stack([fit.residual, fit.forecast.slopes])
     columns = white(columns)
-    rest, along, _ = without_rates(intervals, columns[:, -1], columns[:, :-1])
+    by_rate = columns[:, -1]
+    others = columns[:, :-1]
+    rest, along, _ = without_rates(intervals, by_rate, others)
     return Projected(rest[:, 0], rest[:, 1:], along)
 
 
@@ -304,7 +306,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     score = across.T @ errors.residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
     share = curvature[1:, 0] / max(curvature[0, 0], _TINY)
-    inner = curvature[1:, 1:] - np.outer(share, curvature[0, 1:])
+    by_first = np.outer(share, curvature[0, 1:])
+    inner = curvature[1:, 1:] - by_first
     pull = score[1:] - share * score[0]
     gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
     unit = max(noise, _TINY)
@@ -315,7 +318,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     def improbable(log_size: float) -> float:
         """Return minus twice the logarithm of the likelihood of tau^2."""
         size = np.exp(log_size)
-        return float((np.log1p(size * gain) - size * power / (1 + size * gain)).sum())
+        information = 1 + size * gain
+        return float((np.log1p(size * gain) - size * power / information).sum())
 
     def unlikely(log_size: float) -> float:
         """Return minus twice the logarithm of the posterior density of the logarithm of tau."""
@@ -464,11 +468,6 @@ class Carried(NamedTuple):
     part: float
     error: float
     """Standard error; infinite if no two intervals follow each other."""
-
-    @property
-    def significance(self) -> float:
-        """Number of standard errors."""
-        return abs(self.part) / self.error
 
 
 def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:

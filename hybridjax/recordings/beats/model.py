@@ -115,8 +115,11 @@ def _of_trial(
     number: int,
 ) -> Intervals | None:
     """Return the intervals of a trial during which its input x was sampled, if there are any."""
-    start = np.concatenate([np.zeros(0), *(w.time[:-1] for w in stretches)])
-    duration = np.concatenate([np.zeros(0), *(np.diff(w.time) for w in stretches)])
+    nothing = np.zeros(0)
+    starts = [w.time[:-1] for w in stretches]
+    durations = [np.diff(w.time) for w in stretches]
+    start = np.concatenate([nothing, *starts])
+    duration = np.concatenate([nothing, *durations])
     holes = gaps(time, bridgeable(time))
     # An interval may begin or end just where the input does.
     margin = 1e-9 * duration
@@ -131,13 +134,20 @@ def _of_trial(
     # The phase advances evenly under the mean input.
     inputs = np.interp(start + half_steps, time, x - x.mean())
     trial = np.full(len(start), number)
-    return Intervals(start, duration, trial, np.full(len(start), step), inputs)
+    return Intervals(
+        start=start,
+        duration=duration,
+        trial=trial,
+        step=np.full(len(start), step),
+        inputs=inputs,
+    )
 
 
 def basis(phase: Lanes, waves: int, jitter: float = 0.0) -> Table:
     """Return 1 and half waves cos(pi k phase), as they act on a phase with this jitter."""
     angle = np.pi * np.arange(waves + 1)
-    left_by_jitter = np.exp(-((jitter * angle) ** 2) / 2 * phase[:, None])
+    variance = (jitter * angle) ** 2 / 2
+    left_by_jitter = np.exp(-variance * phase[:, None])
     return np.cos(angle * phase[:, None]) * left_by_jitter
 
 
@@ -287,7 +297,8 @@ class _PhaseModel:
         k2 = advance(now.phase + k1 / 2, middle)
         k3 = advance(now.phase + k2 / 2, middle)
         k4 = advance(now.phase + k3, end)
-        return now.phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6, k1, k4
+        phase = now.phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        return phase, k1, k4
 
     def _derivatives(
         self,
@@ -311,7 +322,16 @@ class _PhaseModel:
         drift *= gain[:, None]
         drift += (half * (1 - part))[:, None] * now.force
         drift += (half * part)[:, None] * force
-        return _Running(now.rows, now.step, now.rate, phase, u, drift, force, growth)
+        return _Running(
+            rows=now.rows,
+            step=now.step,
+            rate=now.rate,
+            phase=phase,
+            u=u,
+            drift=drift,
+            force=force,
+            growth=growth,
+        )
 
 
 def _end(
@@ -329,7 +349,8 @@ def _end(
     rise = after - before
     cubic = first + last - 2 * rise
     quadratic = 3 * rise - 2 * first - last
-    part = np.clip((1 - before) / np.where(rise > 0, rise, 1.0), 0.0, 1.0)
+    divisor = np.where(rise > 0, rise, 1.0)
+    part = np.clip((1 - before) / divisor, 0.0, 1.0)
     rate = rise
     for _ in range(4):  # Newton's iterations: to rounding
         value = before + part * (first + part * (quadratic + part * cubic))

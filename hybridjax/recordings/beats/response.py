@@ -379,4 +379,6 @@ def _memory(intervals: Intervals, fit: CurveFit) -> float:
     if after.sum() < 3:
         return 0.0
     errors = whitened(intervals, fit)(fit.residual[:, None])[:, 0]
-    return float(np.corrcoef(errors[1:][after], errors[:-1][after])[0, 1])
+    now = errors[1:][after]
+    before = errors[:-1][after]
+    return float(np.corrcoef(now, before)[0, 1])

@@ -18,8 +18,11 @@ from ...errors import FileFormatError, HybridJaxError
 
 
 _HEADER = 128
-_MATRIX, _COMPRESSED = 14, 15
-_CELL, _STRUCT, _OBJECT = 1, 2, 3
+_MATRIX = 14
+_COMPRESSED = 15
+_CELL = 1
+_STRUCT = 2
+_OBJECT = 3
 # Classes of arrays: text, double, single, and whole numbers of 8 to 64 bits.
 _TEXT_AND_NUMBERS = (4, *range(6, 16))
 # Bytes that count for an empty member. Smaller: small files of millions of empty members take

@@ -218,12 +218,7 @@ def read_table(
         findings.append(assumed("decimal commas were read as such."))
         _require_no_points(path, lines, start)
         lines = [x.replace(",", ".") for x in lines]
-    values = np.zeros((0, 0))
-    with suppress(ValueError), warnings.catch_warnings():  # a number in every field
-        warnings.simplefilter("ignore")  # about an empty table
-        values = np.loadtxt(
-            lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"'
-        )
+    values = _numbers_alone(lines, sep)
     if values.shape[1] != len(headers):
         values, texts = _by_line(path, headers, lines, start, sep, wanted)
         if texts and wanted.signals is None:
@@ -239,6 +234,16 @@ def read_table(
     columns = dict(zip(headers, values.T, strict=True))
     columns.pop("", None)
     return Columns(columns, tuple(findings))
+
+
+def _numbers_alone(lines: Sequence[str], sep: str) -> Float[np.ndarray, "n k"]:
+    """Read lines that have a number in every field; an empty array for other lines."""
+    with suppress(ValueError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about an empty table
+        return np.loadtxt(
+            lines, delimiter=sep or None, ndmin=2, comments=None, quotechar='"'
+        )
+    return np.zeros((0, 0))
 
 
 def _require_no_points(path: Path, lines: Sequence[str], start: int) -> None:

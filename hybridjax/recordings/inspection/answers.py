@@ -191,7 +191,8 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     edges = np.linspace(0, cycles, number + 1).astype(int)
     for a, b in pairwise(edges):
         rows = np.arange(a + 1, b - ahead)
-        inputs = np.stack([u[rows + c] for c in range(-1, ahead + 1)], axis=1)
+        lags = range(-1, ahead + 1)
+        inputs = np.stack([u[rows + c] for c in lags], axis=1)
         known = np.isfinite(inputs).all(axis=(1, 2, 3))
         known &= np.isfinite(y[rows - 1]).all(axis=1)
         known &= np.isfinite(y[rows]).all(axis=1)
@@ -235,14 +236,16 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     left = 0.0
     for record in data.records:
         y = record.y[whole_cycles(record)] / size
-        y = y.reshape(-1, N * len(size))[:, : len(slope)]
+        y = y.reshape(-1, N * len(size))
+        y = y[:, : len(slope)]
         y = y[np.isfinite(y).all(axis=1)]
         late = y @ slope / max(slope @ slope, tiny)
         times.append(late)
         whole += (y**2).sum()
         left += ((y - late[:, None] * slope) ** 2).sum()
     late = np.concatenate(times)
-    follows = abs(late[1:] @ late[:-1]) / max(late @ late, tiny)
+    products = abs(late[1:] @ late[:-1])
+    follows = products / max(late @ late, tiny)
     # (Times beyond a cycle are those of outputs that do not change along it.)
     if left < (1 - _SHIFTED) * whole and follows < 0.5 and late.std() < 1:
         yield Finding(

@@ -127,7 +127,9 @@ def _is_unit(ratio: float, is_output: bool) -> bool:
 def _levels(x: Series) -> Float[np.ndarray, "3"]:
     """Return the quantiles 10, 50 and 90 % of a signal; NaN if it has no sample."""
     x = x[np.isfinite(x)]
-    return np.quantile(x, [0.1, 0.5, 0.9]) if len(x) else np.full(3, np.nan)
+    if len(x):
+        return np.quantile(x, [0.1, 0.5, 0.9])
+    return np.full(3, np.nan)
 
 
 def clocks(recording: Recording) -> Iterator[Finding]:

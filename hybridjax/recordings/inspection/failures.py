@@ -82,7 +82,8 @@ def frozen(x: Series, period: float, is_input: bool) -> Rows:
 
 def _runs(x: Series) -> tuple[Int[np.ndarray, " r"], Int[np.ndarray, " r"]]:
     """Return first samples and lengths of the runs of equal values; each NaN is its own run."""
-    first = np.flatnonzero(np.concatenate([[True], x[1:] != x[:-1]]))
+    changes = x[1:] != x[:-1]
+    first = np.flatnonzero(np.concatenate([[True], changes]))
     return first, np.diff(np.append(first, len(x)))
 
 

@@ -202,7 +202,9 @@ def _samples_per_cycle(values: Float[np.ndarray, "n k"]) -> float:
             continue
         low, high = np.quantile(x, [0.1, 0.9])
         margin = 0.25 * (high - low)
-        side = np.sign((x > high - margin) * 1 - (x < low + margin) * 1)
+        is_high = x > high - margin
+        is_low = x < low + margin
+        side = np.sign(is_high * 1 - is_low * 1)
         at = np.flatnonzero(side)
         upward = at[1:][np.diff(side[at]) > 0]
         if len(upward) > 2:

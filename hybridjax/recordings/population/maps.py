@@ -39,7 +39,8 @@ _ALL = 12
 _MANY = 30
 # Levels of the test for skewed values, for means and for groups. Larger: wider bands where normal
 # values seem skewed by chance. Smaller: bands of skewed values of few subjects are too narrow.
-_SKEWED_MEAN, _SKEWED_GROUPS = 0.2, 0.05
+_SKEWED_MEAN = 0.2
+_SKEWED_GROUPS = 0.05
 # Rotations in the test for skewed values. Fewer: its level is coarse. More: time.
 _ROTATIONS = 200
 
@@ -74,7 +75,8 @@ class MapResult(Showable):
         places = np.nonzero(self.significant)
         for (name, x), place in zip(self.axes.items(), places, strict=True):
             if len(place):
-                spans.append(f"{name} {x[place].min():.3g} to {x[place].max():.3g}")
+                values = x[place]
+                spans.append(f"{name} {values.min():.3g} to {values.max():.3g}")
         where = ", ".join(spans) or "none"
         largest = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
         half_width = f"{np.median(self.reach):.3g} {self.unit}".rstrip()
@@ -228,7 +230,8 @@ class PopulationMaps:
         **Arguments:** `parts`: maps of the subjects of each group. `largest`: in ascending order.
         """
         flat = [y.reshape(len(y), -1) for y in parts]
-        value, error, t = moments(flat, [np.ones((1, len(y))) for y in flat])
+        each_once = [np.ones((1, len(y))) for y in flat]
+        value, error, t = moments(flat, each_once)
         # Up to rounding.
         below = np.searchsorted(largest, np.abs(t) * (1 - 1e-9))
         above = np.maximum(len(largest) - below, 1)
@@ -333,8 +336,10 @@ def _are_skewed(parts: list[Maps], level: float, rng: np.random.Generator) -> bo
         n = len(part)
         values = np.concatenate([part.real, part.imag], axis=1)
         # Deviations from a mean have n - 1 dimensions.
-        contrasts = np.linalg.qr(np.eye(n) - 1 / n)[0][:, : n - 1]
-        rotation, _ = np.linalg.qr(rng.normal(size=(_ROTATIONS, n - 1, n - 1)))
+        basis, _ = np.linalg.qr(np.eye(n) - 1 / n)
+        contrasts = basis[:, : n - 1]
+        drawn = rng.normal(size=(_ROTATIONS, n - 1, n - 1))
+        rotation, _ = np.linalg.qr(drawn)
         found += _skewness(values[None])[0]
         rotated += [_skewness(contrasts @ q @ (contrasts.T @ values)) for q in rotation]
     return bool((1 + (rotated >= found).sum()) <= level * (1 + _ROTATIONS))
@@ -344,7 +349,8 @@ def _skewness(deviation: Float[np.ndarray, "... n V"]) -> Float[np.ndarray, "...
     """Return the sum over the grid of squared skewness, times the number of subjects."""
     second = np.mean(deviation**2, axis=-2)
     third = np.mean(deviation**3, axis=-2)
-    square = third**2 / np.maximum(second, np.finfo(float).tiny ** 0.25) ** 3
+    least = np.finfo(float).tiny ** 0.25
+    square = third**2 / np.maximum(second, least) ** 3
     return deviation.shape[-2] * square.sum(axis=-1)
 
 

@@ -30,7 +30,8 @@ Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
 # Fewest subjects whose distribution is tested, and the level. Fewer subjects: the test sees
 # nothing. Larger level: normal subjects are doubted. Smaller: outliers pass.
-_FEWEST_TESTED, _NORMAL = 5, 0.02
+_FEWEST_TESTED = 5
+_NORMAL = 0.02
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
 
 
@@ -169,7 +170,8 @@ class Population(Showable):
             x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
             fit = meta(y, v, x)
             spread = (np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x))
-            residual = (y - x @ fit.coefficients) / np.sqrt(v + fit.between[0, 0])
+            deviation = np.sqrt(v + fit.between[0, 0])
+            residual = (y - x @ fit.coefficients) / deviation
             findings += _about_distribution(quantity, cell, residual)
             names = ["mean", *slopes]
             if cell != "all":
@@ -208,7 +210,8 @@ class Population(Showable):
         data, cell, w, pairs = self._contrast(quantity, a, b, covariates)
         subject, _ = data["subject"].factorize()
         slopes = data.filter(like=_SLOPE)
-        x = np.column_stack([np.eye(len(w))[cell], slopes - slopes.mean()])
+        of_cell = np.eye(len(w))[cell]
+        x = np.column_stack([of_cell, slopes - slopes.mean()])
         fit = mixed(data["y"].to_numpy(), data["v"].to_numpy(), x, subject, cell)
         weights = np.eye(x.shape[1])[len(w) - 1 :]
         weights[0, : len(w)] = w
@@ -217,7 +220,8 @@ class Population(Showable):
         if len(y) > 2:
             bounds = spread_interval(y, v, np.ones((len(y), 1)))
             spread = (np.sqrt(w @ fit.between @ w), *bounds)
-            residual = (y - y.mean()) / np.sqrt(v + w @ fit.between @ w)
+            deviation = np.sqrt(v + w @ fit.between @ w)
+            residual = (y - y.mean()) / deviation
             warn_of(_about_distribution(quantity, f"{a} - {b}", residual))
         n = subject.max() + 1
         names = [f"{a} - {b}", *slopes]
@@ -247,7 +251,8 @@ class Population(Showable):
             between = fit.between[0, 0]
             share = between / (between + v)
             of_mean = (1 - share) ** 2 * fit.covariance[0, 0]
-            of_spread = 2 * v**2 / (v + between) ** 3 * fit.uncertainty[0, 0]
+            by_between = 2 * v**2 / (v + between) ** 3
+            of_spread = by_between * fit.uncertainty[0, 0]
             error = np.sqrt(share * v + of_mean + of_spread)
             value = mean + share * (y - mean)
             reach = stats.t.ppf(0.975, fit.most) * error
@@ -423,7 +428,9 @@ class Population(Showable):
             frame = frame[rows]
         frame = frame[np.isfinite(frame["y"])]
         by = frame.groupby(["subject", *factors_of(frame), "cell"], sort=False)
-        data = by[["w", "wy"]].sum().join(by[list(slopes)].mean()).reset_index()
+        sums = by[["w", "wy"]].sum()
+        means = by[list(slopes)].mean()
+        data = sums.join(means).reset_index()
         return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
     def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
@@ -441,8 +448,13 @@ class Population(Showable):
         require(dict(list(data.groupby("cell")["subject"])), 2)
         cell, names = data["cell"].factorize()
         is_a = data.drop_duplicates("cell")[factor].to_numpy() == a
-        w = np.where(is_a, 1 / max(is_a.sum(), 1), -1 / max((~is_a).sum(), 1))
-        weighted = data.assign(y=data["y"] * w[cell], v=data["v"] * w[cell] ** 2)
+        weight_of_a = 1 / max(is_a.sum(), 1)
+        weight_of_b = -1 / max((~is_a).sum(), 1)
+        w = np.where(is_a, weight_of_a, weight_of_b)
+        weighted = data.assign(
+            y=data["y"] * w[cell],
+            v=data["v"] * w[cell] ** 2,
+        )
         of_subjects = weighted.groupby("subject")
         whole = of_subjects.size() == len(names)
         return data, cell, w, of_subjects[["y", "v"]].sum()[whole]

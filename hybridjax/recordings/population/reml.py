@@ -70,7 +70,9 @@ def mixed(
     cell = np.eye(cells.max() + 1)[cells]
     # The elements of a lower triangular factor of Psi that are not zero.
     row, column = np.nonzero(np.tril(cell.T @ same @ cell))
-    scale = max(float(np.std(y)), float(np.sqrt(v.mean())), 1e-300)
+    spread = float(np.std(y))
+    error = float(np.sqrt(v.mean()))
+    scale = max(spread, error, 1e-300)
     square = scale**2
     y = y / scale
     v = v / square
@@ -143,7 +145,8 @@ def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     """Return the fit of single estimates of subjects, with the covariance of Hartung and Knapp
     (2001; Knapp and Hartung 2003), scaled by the weighted residuals, but not below one: estimates
     that scatter less than their errors would have none."""
-    fit = mixed(y, v, x, np.arange(len(y)), np.zeros(len(y), int))
+    each = np.arange(len(y))
+    fit = mixed(y, v, x, each, np.zeros(len(y), int))
     square = weighted_squares(y, v + fit.between[0, 0], x) / fit.most
     covariance = fit.plain * max(square, 1.0)
     return fit._replace(covariance=covariance, slopes=np.zeros_like(fit.slopes))
