@@ -206,7 +206,7 @@ def continuation(
     print(branch.values, branch.stable)
     ```
 
-    **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `hj.convert.to_pandas`.
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `branch.to_pandas()`.
     """
     values = _check(cycle, range)
     cycle = _at_event(cycle)

@@ -421,17 +421,15 @@ def write_numbers(folder, result, formats):
 def test_figures():
     table = {"subject": np.tile(np.arange(N), 2), "condition": np.repeat(["a", "b"], N)}
     people = Population(table, {"q": RNG.normal(size=2 * N)}, {"q": np.ones(2 * N)})
-    labels = [x.get_text() for x in hj.plot.forest(people, "q").ax.get_yticklabels()]
+    labels = [x.get_text() for x in people.plot("q").ax.get_yticklabels()]
     assert labels.count("3") == 2 and {"mean, a", "mean, b"} < set(labels)
     lines = hj.plot.paired(people, "q", "a", "b").ax.get_lines()
     assert sum(len(line.get_xdata()) == 2 for line in lines) >= N
     y = RNG.normal(size=(12, 6, 8))
     y[:6, 2:4, 2:5] += 4.0
     test = maps_of(y, 12, group=np.repeat(["a", "b"], 6)).difference("a", "b")
-    assert (
-        len(hj.plot.subject_maps(test).ax.collections) == 2
-    )  # the map and its outline
+    assert len(test.plot().ax.collections) == 2  # the map and its outline
     curve = PopulationMaps(
         {"subject": np.arange(12)}, y[:, 0], {"lag": AXES["lag"]}
     ).mean()
-    assert len(hj.plot.subject_maps(curve).ax.get_lines()) == 12 + 3
+    assert len(curve.plot().ax.get_lines()) == 12 + 3
