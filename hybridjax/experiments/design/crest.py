@@ -8,6 +8,7 @@ from jaxtyping import Float
 from ...errors import DefinitionError
 from .partition import is_real
 
+
 # Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
 # (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
 _POWERS = (4, 8, 16, 32, 64, 128)

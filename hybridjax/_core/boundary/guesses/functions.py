@@ -82,7 +82,7 @@ NAMES = {
             "phase phase_angle instantaneous_phase"
         ),
         "`cycle.sensitivity(parameter)` has derivatives of a cycle, and `jax.grad` those of any "
-        "number": "sensitivity sensitivities gradient parameter_sensitivity",
+        "number": "sensitivity sensitivities parameter_sensitivity",
         "use `result.write_report(folder)`": "report write_report make_report",
         "`hj.optimal_design(model)` and `hj.multisine(n_sections)` make designs": (
             "design design_experiment experiment_design optimal_input doe"
