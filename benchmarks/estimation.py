@@ -120,7 +120,7 @@ def interpolated(data, degree: int):
 
 
 def crest() -> None:
-    random, low = hj.multisine(), hj.experiments.optimize_phases(hj.multisine())
+    random, low = hj.multisine(), hj.multisine().optimize_phases()
     for name, design in (("random", random), ("optimized", low)):
         factors = design.crest_factors()
         print(f"estimation.crest.{name}.mean {factors.mean():.2f}")

@@ -23,9 +23,8 @@ import traceback
 
 import one_thread
 from cases import NAMES, Options
-from tables import fill
-
 from report import Report, hardware, software, today
+from tables import fill
 
 
 HERE = pathlib.Path(__file__).parent

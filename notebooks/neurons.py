@@ -65,7 +65,7 @@ print(phase)
 # as missed spikes; therefore the limits are gaps in the distribution of intervals.
 
 # %%
-figure = hj.plot.phase(phase)
+figure = phase.plot()
 
 # %% [markdown]
 # ## The curve

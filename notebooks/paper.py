@@ -197,7 +197,7 @@ data = {
 }
 for d in data.values():
     print(d)
-figure = hj.plot.experiment(data["kinematic"], 0)
+figure = data["kinematic"].plot(0)
 
 # %% [markdown]
 # ## Harmonic transfer functions

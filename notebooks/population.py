@@ -65,7 +65,7 @@ for k in range(12):
 
 # %%
 people = hj.recordings.Population.from_fits(fits, table)
-hj.plot.forest(people, "modulus")
+people.plot("modulus")
 people.mean("modulus").T
 
 # %%
@@ -88,7 +88,7 @@ values = np.stack([response.values[:, :, 0, 0] for response in responses])  # of
 axes = {"phase": responses[0].phase, "lag (cycles)": responses[0].lag}
 maps = hj.recordings.PopulationMaps(table, values, axes, unit="m/(N s)")
 difference = maps.difference("old", "young")
-hj.plot.subject_maps(difference)
+difference.plot()
 difference
 
 # %% [markdown]
@@ -98,7 +98,7 @@ difference
 curves = hj.recordings.PopulationMaps(
     table, values[:, 0], {"lag (cycles)": axes["lag (cycles)"]}, unit=maps.unit
 )
-hj.plot.subject_maps(curves.mean("young"))
+curves.mean("young").plot()
 print(difference.methods)
 
 # %% [markdown]

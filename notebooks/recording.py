@@ -99,10 +99,10 @@ print("held by the 95 % regions:", surer.contains(cycle.multipliers))
 # spectrum of the force.
 
 # %%
-figure = hj.plot.phase(phase)
+figure = phase.plot()
 
 # %%
-figure = hj.plot.section_data(data)
+figure = data.plot()
 
 # %% [markdown]
 # ## How many multipliers, and is the model good?
@@ -118,7 +118,7 @@ held_out = hj.recordings.hold_out(data, order=2)
 held_out.validation
 
 # %%
-figure = hj.plot.validation(held_out.validation)
+figure = held_out.validation.plot()
 
 # %% [markdown]
 # ## Limits of the data
@@ -155,7 +155,7 @@ f = np.arange(1, 161) / 20
 figure = hj.plot.bode(fit.htf(f), exact.htf(f))
 
 # %%
-figure = hj.plot.impulse_responses(hj.recordings.impulse_responses(fit, data))
+figure = hj.recordings.impulse_responses(fit, data).plot()
 
 # %% [markdown]
 # ## The next experiment

@@ -80,7 +80,7 @@ looked = hj.recordings.check_recording(
     recording, inputs="voltage", outputs=("hip", "stance"), phase=phase, data=strides
 )
 print(looked.findings[-1])
-figure = hj.plot.section_data(strides)
+figure = strides.plot()
 
 # %% [markdown]
 # ## There are too few strides for a fit

@@ -50,7 +50,7 @@ clean = hj.run_experiments(
     cycle, phase, design, outputs
 )  # the first 20 strides are discarded
 data = hj.experiments.add_noise(clean, snr=20)  # one part in ten of noise
-hj.plot.experiment(data)
+data.plot()
 print(data.summary())
 
 # %% [markdown]
@@ -146,7 +146,7 @@ report = hj.validate(series.model, test)
 report
 
 # %%
-hj.plot.validation(report)
+report.plot()
 
 # %% [markdown]
 # The model explains nearly all of that. Yet its residuals are correlated over fractions of a

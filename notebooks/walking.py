@@ -58,7 +58,7 @@ print(phase)
 strides
 
 # %%
-figure = hj.plot.phase(phase)
+figure = phase.plot()
 
 # %% [markdown]
 # ## Multipliers

@@ -173,7 +173,7 @@ def test_section_data(wave):
     with pytest.raises(hj.errors.DefinitionError, match="that `to_xarray` made of a"):
         convert.from_xarray(dataset)
 
-    frame = convert.to_pandas(data)
+    frame = data.to_pandas()
     assert_array_equal(frame["time"], data.times[0])
     first = frame["section"][0]
     expected = (first + np.arange(8)) % 8
@@ -182,7 +182,7 @@ def test_section_data(wave):
 
 def test_a_table_of_a_recording_is_read_back():
     pytest.importorskip("pandas")
-    frame = convert.to_pandas(recording())
+    frame = recording().to_pandas()
     first = frame[frame["trial"] == 0].drop(columns="trial")
     again = hj.Recording.from_frame(first, units={"a": "N"})
     assert_array_equal(again.trials[0].values, recording().trials[0].values)
@@ -191,7 +191,7 @@ def test_a_table_of_a_recording_is_read_back():
 def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
-    table = convert.to_pandas(H)
+    table = H.to_pandas()
     row = table.loc[-1, H.frequencies[1].item(), "y", "w"]
     value = complex(H[-1][1, 0, 1])
     assert tuple(row) == (value.real, value.imag, np.abs(value))
@@ -204,7 +204,7 @@ def test_tables_of_fits(model):
     u = rng.normal(size=(60 * N, 2))
     record = hj.experiments.SectionSeries(u, model.simulate(u), n_sections=N)
     fit = hj.fit_series(record, order=1)
-    table = convert.to_pandas(fit)
+    table = fit.to_pandas()
     multipliers = table["real"] + 1j * table["imaginary"]
     assert_array_equal(multipliers, fit.multipliers)
     errors = np.hypot(table["real_error"], table["imaginary_error"])
@@ -213,7 +213,7 @@ def test_tables_of_fits(model):
 
     htf = model.htf(np.linspace(0.01, 0.4, 20))
     rational = hj.identify.fit_rational(htf, input="u")
-    table = convert.to_pandas(rational)
+    table = rational.to_pandas()
     poles = table["pole_real"] + 1j * table["pole_imaginary"]
     assert_array_equal(poles, rational.poles[0])
 

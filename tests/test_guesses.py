@@ -55,6 +55,7 @@ def names():
         ),
         rat=hj.identify.fit_rational(est),
         traj=hj.simulate(hopper, "flight", (2.0, 0.0, 1.0, 0.0), 1.0),
+        result=hj.identify_recording(made, APEX, "u", OUTPUTS, n_sections=8, order=2),
     )
     return known
 
@@ -101,6 +102,22 @@ phys.compare(cycle)
 phys.contains(hopper)
 phys.identifiability.plot()
 rat.modulus
+hj.linearize(cycle, [apex]).multipliers
+hj.run_experiments(cycle, sections, hj.optimal_design(model, noise=1e-4), discard=0)
+hj.fit_multipliers(est, hj.select_order(est))
+hj.fit_series(result, 2)
+hj.select_order(result)
+hj.validate(result, result.data)
+hj.validate(result, data)
+fit.compare(result).p_value
+hj.plot.multipliers(result)
+hj.plot.multipliers(cycle, fit)
+hj.plot.multipliers(cycle, result)
+hj.plot.bode(model)
+hj.plot.htf([model, model])
+hj.experiments.add_noise(data, 1e-5)
+cycle.simultaneous_events()
+repr(hj.explore(hopper, "k"))
 """
 
 LEAD = """
@@ -243,6 +260,41 @@ hj.plot.bode(est, Hz=True)                              -> `unit='Hz'`
 hj.plot.bode(est, unit="Hz")                            -> needs the `period`
 hj.plot.poincare_map(cycle)                             -> hj.plot.return_map(cycle)
 hj.validate(fit, data, held_out=0.2)                    -> hj.recordings.hold_out
+hj.poles(cycle)                                         -> `cycle.multipliers`
+hj.monodromy(cycle)                                     -> hj.linearize(cycle, sections)
+hj.sensitivity(cycle, "k")                              -> cycle.sensitivity(
+hj.phase(rec)                                           -> hj.recordings.estimate_phase
+hj.phase_response(cycle)                                -> `cycle.responses()`
+hj.isochrons(cycle)                                     -> cycle.asymptotic_phase
+hj.basin_of_attraction(cycle)                           -> hj.simulate
+hj.spike_triggered_average(rec)                         -> hj.recordings.phase_response
+hj.read_raw_c3d("walk.c3d")                             -> hj.read_recording
+hj.gait_stability(rec)                                  -> hj.identify_recording
+hj.design(cycle)                                        -> hj.optimal_design
+hj.required_duration(result)                            -> plan.cycles_for
+hj.report(result)                                       -> result.write_report
+result.predict(rec)                                     -> hj.validate(result, data)
+result.confidence_interval()                            -> `fit.interval`
+result.interval()                                       -> `fit.interval`
+result.standard_errors                                  -> `fit.standard_errors`
+fit.multipliers_ci                                      -> `interval`
+fit.std                                                 -> `standard_errors`
+cycle.evaluate(0.3)                                     -> cycle.trajectory()
+cycle.responses("u")                                    -> responses().curve(
+cycle.fluctuations(white=0.01)                          -> white={'yM': 0.01}
+hj.simulate(cycle, n_cycles=5)                          -> cycle.trajectory(periods)
+hj.plot.htf(result)                                     -> result.fit.htf(frequencies)
+hj.plot.multipliers([cycle, fit])                       -> hj.plot.multipliers(true, {'fit': fit})
+hj.plot.validation(hj.validate(fit, data))              -> validation.plot()
+hj.plot.save("cycle.png", cycle.plot())                 -> plot.save(path)
+hj.multisine(model)                                     -> model.n_sections
+hj.run_experiments(model, design)                       -> simulate_experiments(model, design)
+hj.fit_multipliers(est, order=[1, 2])                   -> hj.select_order(htf)
+hj.optimal_design(model, limit=0.01)                    -> limit={'u': 0.01}
+hj.identify_recording([rec, rec], apex, "u", "yM")      -> hj.Recording.join
+hj.identify_subjects([rec], apex, inputs="u")           -> functools.partial(
+hj.recordings.Population([fit, fit])                    -> Population.from_fits
+hj.fit_model(hopper, result, "k")                       -> ObservedSeries(result.data
 setattr(hopper, "k", 9.0)                               -> system.replace(k=9.0)
 setattr(hopper, "stiffness", 9.0)                       -> use `k`
 setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)
@@ -659,6 +711,15 @@ def test_identify_model_finds_the_exact_multipliers(names):
     assert result.comparison.max_error < 1e-3
     assert_allclose(result.model.multipliers, names["cycle"].multipliers, atol=1e-10)
     assert "ModelIdentification(VerticalHopper; 32/32 ok)" in repr(result)
+
+
+def test_a_result_of_several_steps_compares_as_its_fit(names):
+    """Not as a truth without errors."""
+    fit = names["fit"]
+    result = names["result"]
+    assert fit.compare(result).p_value == fit.compare(result.fit).p_value
+    assert fit.compare(result).p_value > fit.compare(result.multipliers).p_value
+    assert "other fit" in repr(fit.compare(result))
 
 
 def test_every_result_prints_itself():

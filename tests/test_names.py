@@ -162,7 +162,7 @@ def test_level_is_a_coverage_and_alpha_a_significance():
     [
         (lambda: hj.Settings, "hj.Settings is hj.orbits.Settings"),
         (lambda: hj.SeriesFit, "hj.SeriesFit is hj.identify.SeriesFit"),
-        (lambda: hj.coincidences, "hj.coincidences is hj.orbits.simultaneous_events"),
+        (lambda: hj.coincidences, "hj.coincidences is cycle.simultaneous_events()"),
         (lambda: hj.orbits.continuation, "hj.orbits.continuation is hj.continuation"),
         (lambda: hj.sections.linearize, "hj.sections.linearize is hj.linearize"),
         (lambda: hj.errors.simulate, "hj.errors.simulate is hj.simulate"),
@@ -170,6 +170,10 @@ def test_level_is_a_coverage_and_alpha_a_significance():
             lambda: hj.experiments.run_experiments,
             "hj.experiments.run_experiments is hj.run_experiments",
         ),
+        (lambda: hj.plot.validation, "hj.plot.validation is validation.plot()"),
+        (lambda: hj.plot.section_data, "hj.plot.section_data is data.plot()"),
+        (lambda: hj.section_data, "hj.section_data is hj.recordings.sample_sections"),
+        (lambda: hj.convert.to_pandas, "hj.convert.to_pandas is result.to_pandas()"),
         (lambda: hj.multisine(4, periods=4).f, "`f` of Design is `frequency`"),
         (
             lambda: hj.Crossing("x", "falling").function,

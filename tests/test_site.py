@@ -54,6 +54,19 @@ GIVEN = UNCHECKED["made by this package"] | {
 }
 
 
+# Constants, types for annotations and `except`, and codes.
+NOT_CALLED = {"COLORS", "PAGE", "Parameter", "Fit", "Result"} | {
+    "DefinitionError",
+    "HybridJaxError",
+}
+
+
+def test_users_call_or_construct_150_names_at_most():
+    others = GIVEN | NOT_CALLED
+    called = [name for name in public_names() if name.split(".")[-1] not in others]
+    assert len(called) <= 150
+
+
 def test_every_public_name_that_a_user_writes_is_in_an_example():
     """Slow tests run the how-to pages and the README; notebooks run when they are built."""
     pages = [ROOT / "README.md", *(ROOT / "docs/how-to").glob("*.md")]

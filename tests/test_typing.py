@@ -97,7 +97,6 @@ ALLOWED = {
     "HybridSystem.replace",
     "sweep.maps",
     "save.thing",
-    "to_pandas.thing",
     "Recording.__init__.time",
     "Recording.from_frame.frame",
     "from_xarray.dataset",

@@ -18,7 +18,8 @@ from .exceptions import UnknownAttribute
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
-# Names that became others before version 0.2, and those now.
+# Names that became others before version 0.2, and those now. (A namespace stands before names
+# that are others elsewhere.)
 _NAMES = {
     "Advice": "hj.recordings.Diagnosis",
     "FrequencyResponse": "hj.designs.ResponseGoal",
@@ -35,21 +36,33 @@ _NAMES = {
     "advise": "hj.recordings.diagnose",
     "bodes": "hj.plot.bode",
     "choose_order": "hj.select_order",
-    "coincidences": "hj.orbits.simultaneous_events",
+    "coincidences": "cycle.simultaneous_events()",
     "draws": "hj.designs.draw_models",
+    "forest": "population.plot(quantity)",
     "harmonics": "hj.plot.htf",
     "inspect": "hj.recordings.check_recording",
     "ldtp_bound": "hj.identify.cramer_rao(model, htf, estimator='fit_ldtp')",
     "loop": "hj.identify.estimate_loop",
     "magnitude": "hj.plot.htf",
     "multiplier_bound": "hj.identify.cramer_rao",
+    "optimize_phases": "design.optimize_phases()",
+    "plot.experiment": "data.plot(index)",
+    "plot.impulse_responses": "responses.plot()",
+    "plot.phase": "phase.plot()",
+    "plot.save": "plot.save(path), a method of every figure",
+    "plot.section_data": "data.plot()",
+    "plot.sweep": "maps[quantity].plot(), of what `hj.sweep` returns",
+    "plot.validation": "validation.plot()",
     "random_force": "hj.experiments.random_input",
     "section_data": "hj.recordings.sample_sections",
     "settle": "hj.plants.find_cycle",
+    "simultaneous_events": "cycle.simultaneous_events()",
     "sliding": "hj.systems.filippov",
     "spoil": "hj.testing.add_artifacts",
     "stream_experiments": "hj.run_experiments(..., chunk=, store=)",
     "strides": "hj.plot.standard_errors",
+    "subject_maps": "maps.plot(), of the mean or difference of maps",
+    "to_pandas": "result.to_pandas()",
     "write_design": "design.write(path)",
     "write_report": "result.write_report(folder)",
 }
@@ -145,16 +158,19 @@ def about_name(package: str, name: str, names: list[str]) -> str:
     """Return one line that leads from a name that a namespace does not have to the one that is
     meant."""
     asked = package.replace("hybridjax", "hj", 1) + f".{name}"
-    if name in _NAMES:
-        return f"{asked} is {_NAMES[name]}"
+    namespace = asked.removeprefix("hj.").rpartition(".")[0]
+    now = _NAMES.get(f"{namespace}.{name}", _NAMES.get(name))
+    if now is not None:
+        return f"{asked} is {now}"
     place = place_of(name)
     if place is not None:
         other = _leads().other_than(package, name)
         if other is not None:
-            return f"there is no {asked}: {other}; another function is {place}"
+            rest = "" if place in other else f"; another function is {place}"
+            return f"there is no {asked}: {other}{rest}"
         return f"{asked} is {place}"
-    namespace = package.replace("hybridjax", "hj", 1)
-    known = {own: f"{namespace}.{own}" for own in names} | places()
+    own_place = package.replace("hybridjax", "hj", 1)
+    known = {own: f"{own_place}.{own}" for own in names} | places()
     return f"there is no {asked}: {_leads().about_name(package, name, known)}"
 
 

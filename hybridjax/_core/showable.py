@@ -14,6 +14,9 @@ from .findings import Finding
 class Showable:
     """A result that can be drawn and put in a table, and that lists the reasons to doubt it.
 
+    A result of several steps may name fields in `_stands_for`: functions that take such an object
+    take the result, too, and use the field.
+
     **Fields:** `findings`, reasons to doubt the result; empty where there are none, or where the
     step that made it does not look for any.
     """
@@ -52,10 +55,35 @@ class Showable:
         return first.draw(self, *args, **options)
 
     def to_pandas(self) -> Any:
-        """Return a `pandas.DataFrame`, as `hj.convert.to_pandas` does.
+        """Return a table of the result.
 
-        **Raises:** `DefinitionError` where pandas is not installed, and for a result that is no
-        table.
+        - Fits: a row for each multiplier, with the 95 % interval of its modulus. Fits of
+          parameters: a row for each parameter. A `RationalFit` gives a row for each output and
+          pole.
+        - `LimitCycle`, `LimitCycles`, `Branch`: a row for each cycle, with its parameters;
+          `multipliers.0.real`, ...
+        - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
+        - `LDTP`: a row for each multiplier.
+        - `Recording`, `SectionData`: a row for each sample, with time and trial;
+          `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise,
+          with the number of the experiment, the cycle and the section.
+        - `Design`: a row for each cosine. `Trajectory`, `Flow`: a row for each end of a step.
+        - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they
+          print.
+        - `PhaseCurve`, `ImpulseResponses`: a row for each value. `Sensitivity`: a row for each
+          event. `Identifiability`: a row for each parameter. `PlantCycle`: a row for each section.
+          `Population`: its `table`.
+        - Other results that have findings: a row for each.
+
+        Complex numbers get columns for their real and imaginary part, which R and CSV files can
+        hold; H and multipliers their modulus, too. `standard_error` is the root of the expected
+        squared distance from the true value; `real_error` and `imaginary_error` are those of the
+        parts.
+
+        **Returns:** a `pandas.DataFrame`.
+
+        **Raises:** `DefinitionError` where pandas, or xarray, is not installed, and for a result
+        that is no table.
 
         **Example:**
 
@@ -64,7 +92,9 @@ class Showable:
         print(data.to_pandas().head())
         ```
         """
-        return importlib.import_module("hybridjax.convert").to_pandas(self)
+        # (By name: results know nothing of tables, which import all of them.)
+        tables = importlib.import_module("hybridjax.convert.tables")
+        return tables.to_pandas(self)
 
 
 bind_methods(Showable)

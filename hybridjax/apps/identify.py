@@ -286,16 +286,16 @@ def _figures(result: Identification, htf: HTF) -> Iterable[tuple[str, look.Plot]
         "multipliers",
         plot.multipliers(result.fit, {"plain regression": result.diagnosis.plain}),
     )
-    yield "validation", plot.validation(result.held_out.validation)
-    yield "impulse_responses", plot.impulse_responses(result.responses)
+    yield "validation", result.held_out.validation.plot()
+    yield "impulse_responses", result.responses.plot()
     for i, suffix in enumerate(_suffixes(htf.inputs)):
         yield f"bode{suffix}", plot.bode(htf, input=i)
         yield (
             f"harmonics{suffix}",
             plot.htf({"": htf}, harmonics=shown, input=i, decades=3),
         )
-    yield "phase", plot.phase(result.phase)
-    yield "sections", plot.section_data(result.data)
+    yield "phase", result.phase.plot()
+    yield "sections", result.data.plot()
     if result.curve is not None:
         yield "curve", plot.phase_response(result.curve)
 
@@ -309,8 +309,8 @@ def _natural_figures(
         "multipliers",
         plot.multipliers(fit.multipliers, {"plain regression": fit.plain}),
     )
-    yield "phase", plot.phase(result.phase)
-    yield "sections", plot.section_data(result.data)
+    yield "phase", result.phase.plot()
+    yield "sections", result.data.plot()
 
 
 def _natural_page(result: NaturalIdentification, images: dict[str, str]) -> str:

@@ -79,7 +79,7 @@ def reproduce(
     They appear when all of them are ready, and replace those of an earlier run. Other files in the
     folder stay as they are.
 
-    **Arguments:** `formats`: of the figures, as in `hj.plot.save`.
+    **Arguments:** `formats`: of the figures, as in `plot.save`.
 
     **Returns:** what `summary.json` holds.
 

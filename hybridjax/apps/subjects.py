@@ -14,7 +14,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, cast
 
-from .. import __version__, plot
+from .. import __version__
 from .._core import html
 from .._core.arguments import package
 from .._core.boundary.checked import checked
@@ -97,7 +97,7 @@ class SubjectStudy(Showable):
 
     @checked
     def plot(self, quantity: str = "modulus", *, ax: AxesLike | None = None) -> Plot:
-        """Draw a quantity of all subjects, as `hj.plot.forest` does."""
+        """Draw a quantity of all subjects, as `Population.plot` does."""
         return forest(self.population, quantity, ax=ax)
 
     def to_pandas(self) -> Any:
@@ -225,7 +225,7 @@ def identify_subjects(
 
     ```python
     import functools
-    hj.convert.to_pandas(recording).to_csv("S1.csv")
+    recording.to_pandas().to_csv("S1.csv")
     with open("subjects.csv", "w") as table:
         print("file,subject", file=table)
         print("S1.csv,S1", file=table)
@@ -235,7 +235,7 @@ def identify_subjects(
     ```
 
     **Before:** `hj.identify_recording` of one subject. **After:** `study.population.difference`,
-    `hj.plot.forest`.
+    `study.plot(quantity)`.
     """
     rows = _rows(Path(table))
     root = Path(folder)
@@ -362,7 +362,7 @@ def _write(
     with results_folder(study.folder, "population", _FILES) as new:
         for quantity, caption in _FOREST.items():
             with contextlib.suppress(DefinitionError):  # for too few subjects
-                figure = plot.forest(population, quantity)
+                figure = population.plot(quantity)
                 name = f"forest_{quantity}"
                 save_and_close(new / name, figure, with_png(formats))
                 parts.append(

@@ -5,5 +5,4 @@ from .lti import (
     to_lti as to_lti,
     to_scipy as to_scipy,
 )
-from .tables import to_pandas as to_pandas
 from .xarray_datasets import from_xarray as from_xarray, to_xarray as to_xarray

@@ -1,13 +1,12 @@
 """Results as `pandas.DataFrame`."""
 
 import functools
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from .._core.arguments import package
-from .._core.boundary.checked import checked
-from .._core.boundary.values import Plain, with_article
+from .._core.boundary.values import with_article
 from .._core.showable import Showable
 from ..designs.optimize import OptimalDesign
 from ..engine.trajectory import Trajectory
@@ -40,52 +39,8 @@ from ..recordings.recording import Recording
 from .xarray_datasets import to_xarray
 
 
-def _is_result(thing: Any) -> bool:
-    return isinstance(thing, Showable)
-
-
-@checked
-def to_pandas(thing: Annotated[Any, Plain("a result", _is_result)]) -> Any:
-    """Return a `pandas.DataFrame` of a result; `result.to_pandas()` does the same.
-
-    - Fits: a row for each multiplier, with the 95 % interval of its modulus. Fits of parameters: a
-      row for each parameter. A `RationalFit` gives a row for each output and pole.
-    - `LimitCycle`, `LimitCycles`, `Branch`: a row for each cycle, with its parameters;
-      `multipliers.0.real`, ...
-    - `HTF`: a row for each harmonic, frequency, output and input, which are the index.
-    - `LDTP`: a row for each multiplier.
-    - `Recording`, `SectionData`: a row for each sample, with time and trial;
-      `Recording.from_frame` reads one trial of it. `ExperimentData`, `SectionSeries`: likewise,
-      with the number of the experiment, the cycle and the section.
-    - `Design`: a row for each cosine. `Trajectory`, `Flow`: a row for each end of a step.
-    - `OrderSelection`, `Validation`, `OptimalDesign` and comparisons: the table that they print.
-    - `PhaseCurve`, `ImpulseResponses`: a row for each value. `Sensitivity`: a row for each event.
-      `Identifiability`: a row for each parameter. `PlantCycle`: a row for each section.
-      `Population`: its `table`.
-    - Other results that have findings: a row for each.
-
-    Complex numbers get columns for their real and imaginary part, which R and CSV files can hold; H
-    and multipliers their modulus, too. `standard_error` is the root of the expected squared
-    distance from the true value; `real_error` and `imaginary_error` are those of the parts.
-
-    **Arguments:**
-
-    - `thing`: an object of one of these types.
-
-    **Returns:** a `pandas.DataFrame`.
-
-    **Raises:** `DefinitionError` where pandas, or xarray, is not installed, and for a result that
-    is no table.
-
-    **Example:**
-
-    ```python
-    hj.convert.to_pandas(htf).to_csv("htf.csv")
-    print(hj.convert.to_pandas(fit))
-    ```
-
-    **Before:** a recording, limit cycles, HTFs or a fit.
-    """
+def to_pandas(thing: Showable) -> Any:
+    """`result.to_pandas()`: a `pandas.DataFrame` of a result."""
     return package("pandas").DataFrame(_columns(thing))
 
 

@@ -21,7 +21,6 @@ from .._core.boundary.kinds import Count
 from .._core.boundary.values import Number
 from ..errors import DefinitionError
 from ..experiments.design.design import Design
-from ..experiments.design.multisine import optimize_phases
 from ..orbits.cycle import LimitCycle
 from ..sections.families import FamilyLike, as_family
 from ..sections.second_order import Quadratic, second_order
@@ -280,7 +279,7 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
             amplitude=design.amplitude[lines],
             phase=design.phase[lines],
         )
-        phase[lines] = optimize_phases(single, seed).phase
+        phase[lines] = single.optimize_phases(seed).phase
     design = dataclasses.replace(design, phase=phase)
     highest = np.abs(design.signals()).max(axis=1)
     factor = np.ones_like(highest)

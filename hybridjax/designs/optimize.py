@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -76,7 +76,11 @@ class OptimalDesign(Showable, eqx.Module):
       peaks and distortions.
     - `rms`, `usual_rms`: predicted rms values of all signals, by name; of `distortion of y` where
       it is limited, expected for random phases (with a limited peak, for the optimized phases).
+
+    Functions that take a design take it, too.
     """
+
+    _stands_for: ClassVar = ("design",)
 
     design: Design
     usual: Design

@@ -2,7 +2,6 @@ from .data import ExperimentData as ExperimentData, Simulated as Simulated
 from .design.design import Design as Design
 from .design.filtered_noise import random_input as random_input
 from .design.multisine import (
-    optimize_phases as optimize_phases,
     paper_design as paper_design,
 )
 from .motion import perturbed_trajectory as perturbed_trajectory

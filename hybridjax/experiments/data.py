@@ -253,6 +253,31 @@ class ExperimentData(Showable, eqx.Module):
         causes = () if self.simulated is None else self.simulated.causes
         return summary(self.result, self.failed_at, self.n_sections, limit, causes)
 
+    def plot(self, index: Index = 0, *, ax: object = None) -> Any:
+        """Draw inputs and deviations of the outputs of one experiment against time.
+
+        One row per signal. Cycles before the window that estimates use are shaded. A failed
+        experiment ends at a mark, and the title gives the reason.
+
+        **Arguments:**
+
+        - `index`: number of the experiment; negative numbers count from the last. Default: 0.
+        - `ax`: one Axes per signal, inputs first. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 1). Time is in cycles, signals are in
+        their units.
+
+        **Raises:** `DefinitionError` for an experiment that does not exist, or if `ax` does not
+        hold one Axes per signal.
+
+        **Example:**
+
+        ```python
+        data.plot(-1).save("last.png")
+        ```
+        """
+        return super().plot(index, ax=ax)
+
     def __repr__(self) -> str:
         S, n, _ = self.u.shape
         state = self.summary()

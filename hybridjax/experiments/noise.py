@@ -161,8 +161,8 @@ _simulate = eqx.filter_jit(lambda ldtp, u, x0: jax.vmap(ldtp.simulate)(u, x0))
 @checked
 def add_noise(
     data: ExperimentData,
-    *,
     std: Annotated[Numbers, Reals(sign="nonnegative")] | None = None,
+    *,
     snr: float | None = None,
     memory: NonNegative = 0.0,
     seed: Seed = 0,

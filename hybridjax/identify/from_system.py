@@ -1,7 +1,7 @@
 """All steps from a system to estimated multipliers, in one call."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import equinox as eqx
 import numpy as np
@@ -52,7 +52,7 @@ class ModelIdentification(WithMultipliers, eqx.Module):
 
     **Fields:** `cycle`; `model`, the exact linearization; `design`, `data` of its experiments,
     `htf`, estimated from them, and `fit`, whose multipliers `comparison` compares with the exact
-    ones.
+    ones. Functions that take a fit, data or an HTF take it, too.
     """
 
     cycle: LimitCycle
@@ -61,6 +61,8 @@ class ModelIdentification(WithMultipliers, eqx.Module):
     data: ExperimentData
     htf: HTF
     fit: StructuredFit
+
+    _stands_for: ClassVar = ("fit", "data", "htf")
 
     @property
     def multipliers(self) -> Complex[np.ndarray, " d"]:

@@ -308,6 +308,10 @@ class OrderSelection(Showable, eqx.Module):
     def order(self) -> int:
         return self.by_rank if self.variances else self.by_mdl
 
+    def __index__(self) -> int:
+        """The order: functions take a selection as the number."""
+        return self.order
+
     def __repr__(self) -> str:
         rows = ["order  left/noise  deviations (1 %)  chi-square/dof          MDL"]
         for k, d in enumerate(self.orders):

@@ -6,7 +6,7 @@ see whether `whitened` takes the errors of the fit into account.
 """
 
 import itertools
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -15,7 +15,7 @@ from scipy import stats
 
 from .._core.arguments import require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import Probability, SignalNames
+from .._core.boundary.kinds import PeriodCount, Probability, SignalNames
 from .._core.findings import Finding, print_findings
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.showable import Showable
@@ -70,7 +70,7 @@ _SAMPLES_PER_LAG = 4
 class Validation(Showable, eqx.Module):
     r"""The part of data that a model explains, and tests of the residuals.
 
-    Printing it gives a report; `hj.plot.validation` draws it.
+    Printing it gives a report; `validation.plot()` draws it.
 
     **Fields:**
 
@@ -117,6 +117,34 @@ class Validation(Showable, eqx.Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     findings: tuple[Finding, ...] = eqx.field(static=True, default=())
+
+    @checked
+    def plot(self, *, cycles: PeriodCount = 4, ax: object = None) -> Any:
+        """Draw measured and simulated outputs, and correlations of the residuals; one row per
+        output.
+
+        Left: the last cycles of the longest record. Middle: correlations of the residuals with
+        earlier ones, right: with earlier inputs. Bars are means of the correlations over all
+        sections, in units of their standard deviation. If there is no correlation, 1 % of the bars
+        lie outside of the shaded band.
+
+        **Arguments:**
+
+        - `cycles`: number of cycles to show. Default: 4.
+        - `ax`: three Axes per output. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (ny, 3). Time is in cycles, lags are in sections,
+        and outputs in their units.
+
+        **Raises:** `DefinitionError` if `ax` does not hold three Axes per output.
+
+        **Example:**
+
+        ```python
+        hj.validate(model, data).plot(cycles=4)
+        ```
+        """
+        return super().plot(cycles=cycles, ax=ax)
 
     @property
     def white(self) -> bool:
@@ -236,7 +264,7 @@ def validate(
     print(validation)
     ```
 
-    **Before:** `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. **After:** `hj.plot.validation`.
+    **Before:** `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. **After:** `validation.plot()`.
     """
     free_start = start == "free"
     records = uninterrupted_records(data)

@@ -156,7 +156,7 @@ class TrottingQuadruped(TwoLeggedBar):
     as those of `TwoLeggedBar`; nothing is lost at touchdown (rho = 1), but legs damp. While both
     feet of a pair stand, a reflex adds `thrust` to the force of the legs. Without it, the order in
     which the feet land has no effect of first order, and the cycle has multipliers; with it, each
-    order has a derivative of its own (`hj.orbits.simultaneous_events`), and `find_limit_cycle`
+    order has a derivative of its own (`cycle.simultaneous_events()`), and `find_limit_cycle`
     raises an error that reports this.
 
     The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow

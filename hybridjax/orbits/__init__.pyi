@@ -7,7 +7,6 @@ from .branches import (
 )
 from .coincidence import (
     SimultaneousEvents as SimultaneousEvents,
-    simultaneous_events as simultaneous_events,
 )
 from .cycle import LimitCycle as LimitCycle
 from .flow import Flow as Flow

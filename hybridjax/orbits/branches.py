@@ -105,7 +105,12 @@ class Branch(Showable, eqx.Module):
         return len(self.values)
 
     def __getitem__(self, k: SupportsIndex) -> LimitCycle:
-        return self.cycles[k]
+        return self._each[k]
+
+    @remembered
+    def _each(self) -> tuple[LimitCycle, ...]:
+        """The cycles, the same objects at each call: they remember what was computed of them."""
+        return tuple(self.cycles[k] for k in range(len(self)))
 
     @remembered
     def multipliers(self) -> Complex[np.ndarray, "K r"]:
@@ -121,7 +126,10 @@ class Branch(Showable, eqx.Module):
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
         """True for each stable cycle. At a marked point itself rounding decides."""
-        return np.array([self[k].stable for k in range(len(self))])
+        if self.cycles.conserved:
+            return np.array([cycle.stable for cycle in self._each])
+        # (All at once: rounding of the product touches small multipliers only.)
+        return (np.abs(self.cycles.multipliers) < 1).all(axis=1)
 
     def largest(self, output: str) -> Float[np.ndarray, " K"]:
         """The largest value of a state or output on each cycle, as accurate as a plot needs.
@@ -211,7 +219,7 @@ def continuation(
     print(branch.values, branch.stable)
     ```
 
-    **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `hj.convert.to_pandas`.
+    **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `branch.to_pandas()`.
     """
     values = _check(cycle, range)
     cycle = _at_event(cycle)

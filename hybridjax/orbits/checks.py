@@ -411,7 +411,7 @@ def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
     return (
         f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
         "they come in one order or the other, and no linearization holds for both: "
-        "`hj.orbits.simultaneous_events` of the cycle, which `throw=False` returns, has the "
+        "`simultaneous_events()` of the cycle, which `throw=False` returns, has the "
         "derivatives of each. Let them happen at different times, or write them as one event."
     )
 

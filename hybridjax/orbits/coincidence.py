@@ -9,13 +9,12 @@ for events that are independent of each other, it is differentiable.
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._core.boundary.checked import checked
 from .._core.compilation import host_first
 from .._core.executor import to_host
 from .._core.results import Result
@@ -29,7 +28,6 @@ from ..errors import ComputationError
 from ..systems.structure import Structure
 from ..systems.transition import TOGETHER, Scheduled
 from .crossing import AtEvent
-from .cycle import LimitCycle
 from .return_map import ReturnMap
 from .rivals import is_due
 
@@ -63,35 +61,12 @@ class _Order(NamedTuple):
     derivative: Float[np.ndarray, "m n"]
 
 
-@checked
-def simultaneous_events(cycle: LimitCycle) -> list[SimultaneousEvents]:
-    """Find groups of events that coincide on a limit cycle, with derivatives for each order.
-
-    The orders of a group commute if all lead to the same state with the same derivative. Then
-    `find_limit_cycle`, sweeps and `continuation` treat the cycle as any other; otherwise its result
-    is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it with `throw=False`). A group contains at
-    least one event that is not scheduled.
-
-    **Arguments:**
-
-    - `cycle`: result of `hj.find_limit_cycle`, with `throw=False` if its orders do not commute.
-
-    **Returns:** a list of `SimultaneousEvents`, with the `time`, the `orders` of the events, and a
-    derivative of the map over the group for each; empty if no events coincide.
-
-    **Example:**
-
-    ```python
-    groups = hj.orbits.simultaneous_events(cycle)
-    print([group.orders for group in groups])  # [], since no events of this cycle coincide
-    ```
-
-    **Before:** `hj.find_limit_cycle`.
-    """
+def simultaneous_events(cycle: Any) -> list[SimultaneousEvents]:
+    """Return `LimitCycle.simultaneous_events`."""
     return [group for group in _groups(cycle) if group is not None]
 
 
-def _groups(cycle: LimitCycle) -> list[SimultaneousEvents | None]:
+def _groups(cycle: Any) -> list[SimultaneousEvents | None]:
     """The groups of events that happen at the same time; `None` for one whose order is the same for
     all neighbors of the cycle."""
     cycle = to_host(cycle)
@@ -209,7 +184,7 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     return bool((np.abs(change) <= ROUNDING * size).all())
 
 
-def commutes(cycle: LimitCycle) -> bool:
+def commutes(cycle: Any) -> bool:
     """True if the orders of all events that coincide on a cycle commute, or are the same for all
     of its neighbors; False if no events do."""
     groups = _groups(cycle)

@@ -48,6 +48,7 @@ from ..linear.htf import HTF
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem, OutputNames, arrays_of
+from .coincidence import SimultaneousEvents, simultaneous_events
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
@@ -382,6 +383,25 @@ class LimitCycle(WithMultipliers, eqx.Module):
         cycles that are not isolated.
         """
         return sensitivity(self._checked(), parameter)
+
+    def simultaneous_events(self) -> list[SimultaneousEvents]:
+        """Return groups of events that coincide on the cycle, with derivatives for each order.
+
+        If the orders of a group commute, `find_limit_cycle`, sweeps and `continuation` treat the
+        cycle as ok; otherwise its result is `Result.SIMULTANEOUS` (`find_limit_cycle` returns it
+        with `throw=False`). A group contains at least one event that is not scheduled.
+
+        **Returns:** a list of `SimultaneousEvents`, with the `time`, the `orders` of the events,
+        and a derivative of the map over the group for each; empty if no events coincide.
+
+        **Example:**
+
+        ```python
+        groups = cycle.simultaneous_events()
+        print([group.orders for group in groups])  # [], since no events of this cycle coincide
+        ```
+        """
+        return simultaneous_events(self)
 
     def fluctuations(
         self, white: Given = None, guards: Given = None, resets: GivenResets = None

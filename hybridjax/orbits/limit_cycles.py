@@ -220,7 +220,7 @@ def find_limit_cycles(
     print(cycles.period, cycles.multipliers)
     ```
 
-    **Before:** `hj.find_limit_cycle`. **After:** `hj.convert.to_pandas`.
+    **Before:** `hj.find_limit_cycle`. **After:** `cycles.to_pandas()`.
     """
     execution = Execution() if execution is None else execution
     systems = _stacked(systems)

@@ -33,28 +33,8 @@ from .look import (
 )
 
 
-@checked
 def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
-    """Draw the periods of the cycles in order, and their distribution.
-
-    **Arguments:**
-
-    - `phase`: result of `hj.recordings.estimate_phase`.
-    - `ax`: two Axes. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (1, 2): the periods in seconds against the number of the
-    cycle, and their histogram.
-
-    **Raises:** `DefinitionError` if `ax` does not hold two Axes.
-
-    **Example:**
-
-    ```python
-    hj.plot.phase(result.phase)
-    ```
-
-    **Before:** `hj.recordings.estimate_phase`. **After:** `hj.plot.save`.
-    """
+    """`phase.plot()`: the periods of the cycles in order, and their distribution."""
     with panels(ax, 1, 2, width=PAGE, height=2.2, width_ratios=(3, 1)) as axes:
         left, right = axes[0]
         first = 0
@@ -75,32 +55,8 @@ def phase(phase: Phase, *, ax: AxesLike | None = None) -> Plot:
     return Plot(axes)
 
 
-@checked
 def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
-    """Draw for each signal the average cycle, the deviations from it, and the spectra of inputs.
-
-    Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
-    deviation. Right: for an input, its power against frequency; for an output, its deviations in
-    successive cycles, at the section where they are largest.
-
-    **Arguments:**
-
-    - `data`: result of `hj.recordings.sample_sections`.
-    - `ax`: three Axes per signal, inputs first. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 3). Phases are in cycles, frequencies in
-    cycles per period, and signals in their units.
-
-    **Raises:** `DefinitionError` if `ax` does not hold three Axes per signal.
-
-    **Example:**
-
-    ```python
-    hj.plot.section_data(result.data)
-    ```
-
-    **Before:** `hj.recordings.sample_sections`. **After:** `hj.fit_series`.
-    """
+    """`data.plot()` of a recording: for each signal the cycle, deviations, and spectra."""
     N = data.n_sections
     nu = len(data.inputs)
     names = data.inputs + data.outputs
@@ -145,7 +101,6 @@ def _powers_of_ten(ax: Axes) -> None:
     ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3), useMathText=True)
 
 
-@checked
 def impulse_responses(
     responses: ImpulseResponses,
     *,
@@ -153,32 +108,7 @@ def impulse_responses(
     input: str | int = 0,
     ax: AxesLike | None = None,
 ) -> Plot:
-    """Draw the responses of a rhythm to a push against the phase of the push and the time since.
-
-    Left: all phases, in colors. Right: curves at the phases marked left, with bands of 95 %.
-    Dashed: the responses of a model with the same sections.
-
-    **Arguments:**
-
-    - `responses`: result of `hj.recordings.impulse_responses`.
-    - `model`: an `LDTP` with the same sections, inputs and outputs. Default: None.
-    - `input`: name or index of the input that pushes. Default: 0.
-    - `ax`: two Axes per output. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (ny, 2). Time and phase are in cycles, responses in
-    units of the output per unit of the input times second.
-
-    **Raises:** `DefinitionError` for an input that does not exist, a model with other sections or
-    names, or if `ax` does not hold two Axes per output.
-
-    **Example:**
-
-    ```python
-    hj.plot.impulse_responses(result.responses)
-    ```
-
-    **Before:** `hj.recordings.impulse_responses`. **After:** `hj.plot.save`.
-    """
+    """`responses.plot()`: all phases in colors, and curves at some of them with bands."""
     ny = len(responses.outputs)
     N = len(responses.phase)
     pushing = channel_index("input", input, responses.inputs)
@@ -248,7 +178,7 @@ def phase_response(
     hj.plot.phase_response(oscillator.responses().curve())
     ```
 
-    **Before:** `hj.recordings.phase_response` or `cycle.responses`. **After:** `hj.plot.save`.
+    **Before:** `hj.recordings.phase_response` or `cycle.responses`. **After:** `plot.save(path)`.
     """
     curves = [curve] if model is None else [curve, model]
     units = [unit_of(x.input) for x in curves]
@@ -276,35 +206,10 @@ def phase_response(
     return Plot(axes)
 
 
-@checked
 def experiment(
     data: ExperimentData, index: int = 0, *, ax: AxesLike | None = None
 ) -> Plot:
-    """Draw inputs and deviations of the outputs of one experiment against time.
-
-    One row per signal. Cycles before the window that estimates use are shaded. A failed experiment
-    ends at a mark, and the title gives the reason.
-
-    **Arguments:**
-
-    - `data`: result of `hj.run_experiments`.
-    - `index`: number of the experiment; negative numbers count from the last. Default: 0.
-    - `ax`: one Axes per signal, inputs first. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 1). Time is in cycles, signals are in their
-    units.
-
-    **Raises:** `DefinitionError` for an experiment that does not exist, or if `ax` does not hold
-    one Axes per signal.
-
-    **Example:**
-
-    ```python
-    hj.plot.experiment(data, 0)
-    ```
-
-    **Before:** `hj.run_experiments`. **After:** `hj.estimate_htf`.
-    """
+    """`data.plot(index)`: inputs, and deviations of the outputs, of one experiment."""
     S, n, _ = data.u.shape
     require_index("experiment", index, S)
     index = index % S
@@ -338,36 +243,10 @@ def experiment(
     return Plot(axes)
 
 
-@checked
 def validation(
     validation: Validation, *, cycles: PeriodCount = 4, ax: AxesLike | None = None
 ) -> Plot:
-    """Draw measured and simulated outputs, and correlations of the residuals; one row per output.
-
-    Left: the last cycles of the longest record. Middle: correlations of the residuals with earlier
-    ones, right: with earlier inputs. Bars are means of the correlations over all sections, in units
-    of their standard deviation. If there is no correlation, 1 % of the bars lie outside of the
-    shaded band.
-
-    **Arguments:**
-
-    - `validation`: result of `hj.validate`.
-    - `cycles`: number of cycles to show. Default: 4.
-    - `ax`: three Axes per output. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (ny, 3). Time is in cycles, lags are in sections, and
-    outputs in their units.
-
-    **Raises:** `DefinitionError` if `ax` does not hold three Axes per output.
-
-    **Example:**
-
-    ```python
-    hj.plot.validation(hj.validate(model, data), cycles=4)
-    ```
-
-    **Before:** `hj.validate`. **After:** `hj.plot.save`.
-    """
+    """`validation.plot()`: measured and simulated outputs, and correlations of residuals."""
     from scipy import special  # (a fifth of a second)
 
     N = validation.n_sections

@@ -189,6 +189,10 @@ class Explorer:
         self.figure.canvas.flush_events()
         self.move({name: value})
 
+    def __repr__(self) -> str:
+        lines = [f"Explorer({_written(self.values)})", self.message, repr(self.cycle)]
+        return "\n".join(filter(None, lines))
+
     def show(self) -> None:
         """Open a window with the sliders (in scripts)."""
         window = pyplot.figure(figsize=(5, 0.5 * len(self._sliders) + 0.3))

@@ -23,13 +23,17 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 Fit = RationalFit | StructuredFit
 Transfer = HTF | LDTP
-"""HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them."""
+"""HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them, or over
+all frequencies."""
 Families = Mapping[str, Transfer | Sequence[Transfer]]
 """HTFs by name, such as that of a family of sections."""
 Fits = Fit | Sequence[Fit]
 Unit = Literal["cycles/period", "Hz", "rad/s"]
 """Units of frequencies."""
 FREQUENCY = "input frequency $f$ (cycles/period)"
+# Frequencies at which models without an HTF beside them are drawn, up to half of their sections in
+# a period. Fewer: peaks have corners. More: time.
+_FREQUENCIES = 501
 _OUTPUTS = [
     COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")
 ]
@@ -51,10 +55,10 @@ def htf(
 ) -> Plot:
     """Draw |H_m| against the input frequency, on a logarithmic scale.
 
-    One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`) at the
-    frequencies of the first HTF, are drawn as broad pale lines under the estimates, in any order of
-    the arguments. HTFs with a variance have a band that holds the true value at each frequency with
-    a probability of 95 %.
+    One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`), are drawn
+    as broad pale lines under the estimates, in any order of the arguments: models at the
+    frequencies of the first HTF, and models alone over all. HTFs with a variance have a band that
+    holds the true value at each frequency with a probability of 95 %.
 
     **Arguments:**
 
@@ -71,8 +75,8 @@ def htf(
     **Returns:** `hj.plot.Plot` with `axes` (1, 1), or (outputs, names) of a dict. Frequencies are
     in cycles per period, magnitudes in units of the output per unit of the input.
 
-    **Raises:** `DefinitionError` for an output, input or harmonic that does not exist, for models
-    without an HTF, or if `ax` does not hold one Axes per panel.
+    **Raises:** `DefinitionError` for an output, input or harmonic that does not exist, or if `ax`
+    does not hold one Axes per panel.
 
     **Example:**
 
@@ -154,10 +158,10 @@ def bode(
     **Arguments:**
 
     - `htfs`: one HTF or several, also in a list; or a dict of them by name (the paper's Fig. 4),
-      for a column for each name. Exact HTFs, and those of models (`LDTP`) at the frequencies of the
-      first HTF, are drawn as broad pale lines under the estimates. HTFs with a variance have bands
-      that contain the true values with a probability of 95 %. Their phase is not drawn where the
-      band of the magnitude contains zero.
+      for a column for each name. Exact HTFs, and those of models (`LDTP`), are drawn as broad pale
+      lines under the estimates: models at the frequencies of the first HTF, and models alone over
+      all. HTFs with a variance have bands that contain the true values with a probability of 95 %.
+      Their phase is not drawn where the band of the magnitude contains zero.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
       that it has; by name beside a dict of HTFs. Default: none.
     - `harmonic`: the m of H_m. Default: 0.
@@ -178,8 +182,8 @@ def bode(
     these), phases in degrees.
 
     **Raises:** `DefinitionError` for a name or harmonic that does not exist, for fits that have
-    none of the inputs, for models without an HTF, for a unit of time without a period, if no
-    frequency is positive on a logarithmic axis, or if `ax` does not hold one Axes per panel.
+    none of the inputs, for a unit of time without a period, if no frequency is positive on a
+    logarithmic axis, or if `ax` does not hold one Axes per panel.
 
     **Example:**
 
@@ -472,11 +476,11 @@ def _grid(
 
 
 def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
+    if not htfs:
+        raise DefinitionError("`htfs` holds nothing to draw.")
     grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
-        raise DefinitionError(
-            "`htfs` holds no HTF to draw: of a model alone, draw `model.htf(frequencies)`."
-        )
+        grids = [np.linspace(0, htfs[0].n_sections / 2, _FREQUENCIES)]
     drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
     return sorted(drawn, key=lambda htf: htf.source != "exact")
 

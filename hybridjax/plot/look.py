@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 
-from .._core.boundary.checked import checked, checked_methods
+from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import FilePath
 from .._core.signal import unit_of, with_unit
 from .._core.writing import Format, replacing
@@ -85,7 +85,7 @@ def style() -> contextlib.AbstractContextManager:
         panel.plot(*cycle.trajectory()("yM", "vM")[1:])
     ```
 
-    **Before:** any result. **After:** `hj.plot.save`.
+    **Before:** any result. **After:** `figure.savefig`.
     """
     _load_backend()
     return matplotlib.rc_context(_STYLE | _FONTS_IN_FILES)
@@ -131,12 +131,18 @@ class Plot:
         **Returns:** the paths.
 
         **Raises:** `DefinitionError` if they cannot be written, and for a suffix of another format.
+
+        **Example:**
+
+        ```python
+        hj.plot.cycle(cycle, "yM", "vM").save("orbit", formats=("png", "svg"))
+        ```
         """
         if formats is None:
             suffix = Path(path).suffix[1:]
             known = suffix in get_args(Format)
             formats = [cast(Format, suffix if known else "png")]
-        return save(path, self, formats)
+        return _write(path, self, formats)
 
     def show(self) -> None:
         """Open a window with the figure, or show it in a notebook."""
@@ -238,36 +244,8 @@ def letters(axes: Any) -> None:
         ax.yaxis.set_offset_position("right")  # (a power of ten would cover the letter)
 
 
-@checked
-def save(
-    path: FilePath, plot: Plot | Figure | Axes, formats: Sequence[Format] = ("png",)
-) -> tuple[Path, ...]:
-    """Write a figure, in one file for each format.
-
-    **Arguments:**
-
-    - `path`: path without suffix; a suffix of a format is dropped.
-    - `plot`: result of a function of `hj.plot`, or any figure or Axes of matplotlib.
-    - `formats`: "png" (150 dots per inch), "pdf" and "svg", one or several. Default: ("png",).
-
-    **Returns:** the paths, a tuple with one `pathlib.Path` for each format.
-
-    **Raises:** `DefinitionError` if the files cannot be written, and for a suffix of another
-    format.
-
-    **Example:**
-
-    ```python
-    hj.plot.save("orbit", hj.plot.cycle(cycle, "yM", "vM"), formats=("png", "svg"))
-    ```
-
-    **Before:** any function of `hj.plot`. **After:** none; the files are complete.
-    """
-    if isinstance(plot, Axes):
-        figure = cast(Figure, plot.get_figure(root=True))
-    else:
-        figure = plot
-    figure = figure.figure if isinstance(figure, Plot) else figure
+def _write(path: FilePath, plot: Plot, formats: Sequence[Format]) -> tuple[Path, ...]:
+    """Write a figure, in one file for each format. A suffix of a format is dropped."""
     path = Path(path)
     if path.suffix[1:] in get_args(Format):
         path = path.with_suffix("")
@@ -283,7 +261,7 @@ def save(
     with matplotlib.rc_context(_FONTS_IN_FILES):
         for target, format in zip(paths, formats, strict=True):
             with replacing(target) as new:
-                figure.savefig(new, format=format, dpi=_STYLE["figure.dpi"])
+                plot.figure.savefig(new, format=format, dpi=_STYLE["figure.dpi"])
     return paths
 
 
@@ -291,6 +269,6 @@ def save_and_close(
     path: FilePath, plot: Plot, formats: Sequence[Format]
 ) -> tuple[Path, ...]:
     """Write a figure that is not shown, and free its memory."""
-    paths = save(path, plot, formats)
+    paths = _write(path, plot, formats)
     pyplot.close(plot.figure)
     return paths

@@ -1,14 +1,11 @@
 """Limit cycles over parameters: branches, and maps of sweeps."""
 
 import itertools
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from .._core.arguments import require_among
 from .._core.boundary.checked import checked
-from .._core.boundary.values import show
 from .._core.signal import Signal
 from ..errors import DefinitionError
 from ..orbits.branches import KINDS, Branch
@@ -52,7 +49,7 @@ def branch(
     hj.plot.branch(branch, output="yM")
     ```
 
-    **Before:** `hj.continuation`. **After:** `hj.plot.save`.
+    **Before:** `hj.continuation`. **After:** `plot.save(path)`.
     """
     names = {b.parameter for b in branches}
     if len(names) != 1:
@@ -112,44 +109,11 @@ def _parts(branch: Branch) -> list[tuple[slice, bool]]:
     return parts
 
 
-@checked
-def sweep(
-    maps: Any, name: str = "spectral_radius", *, ax: AxesLike | None = None
-) -> Plot:
-    """Draw a quantity of a sweep: a curve over one parameter, or a map over two.
-
-    **Arguments:**
-
-    - `maps`: the dataset that `hj.sweep` returns.
-    - `name`: the quantity. Default: "spectral_radius".
-    - `ax`: one Axes. Default: a new figure of one column's width.
-
-    **Returns:** `hj.plot.Plot` with `axes` (1, 1).
-
-    **Raises:** `DefinitionError` if the dataset has no such quantity over one or two parameters, or
-    if `ax` is not one Axes.
-
-    **Example:**
-
-    ```python
-    maps = hj.sweep(hopper, {"k": np.linspace(9, 11, 5)})
-    hj.plot.sweep(maps, "spectral_radius")
-    ```
-
-    **Before:** `hj.sweep`. **After:** `hj.plot.save`.
-    """
-    if not isinstance(getattr(maps, "data_vars", None), Mapping):
-        raise DefinitionError(
-            f"`maps` must be the dataset that `hj.sweep` returns, not {show(maps)}."
-        )
-    drawable = [
-        str(key) for key, values in maps.data_vars.items() if 1 <= values.ndim <= 2
-    ]
-    require_among("map", [name], drawable, "over one or two parameters ")
-    with panels(ax) as axes:
+def sweep(maps: Any, name: str) -> Plot:
+    """Draw a quantity of the dataset of a sweep: a curve over one parameter, or a map over two."""
+    with panels(None) as axes:
         quantity = maps[name]
-        quantity.plot(
-            ax=axes[0, 0], **({"x": quantity.dims[0]} if quantity.ndim == 2 else {})
-        )
+        first = {"x": quantity.dims[0]} if quantity.ndim == 2 else {}
+        quantity.plot(ax=axes[0, 0], **first)
         axes[0, 0].set_title("")
     return Plot(axes)

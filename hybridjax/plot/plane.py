@@ -21,12 +21,13 @@ from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, legend, letters, 
 
 
 _MARKERS = "osD^vP*X"
+Estimate = RationalFit | MultiplierFit | Multipliers
 
 
 @checked
 def multipliers(
     true: LimitCycle | LDTP | MultiplierFit | Multipliers,
-    estimates: Mapping[str, RationalFit | MultiplierFit | Multipliers] | None = None,
+    estimates: Mapping[str, Estimate] | RationalFit | MultiplierFit | None = None,
     *,
     zoom: bool = True,
     ax: AxesLike | None = None,
@@ -42,7 +43,8 @@ def multipliers(
     - `true`: multipliers (d,), or a `LimitCycle` or `LDTP` that has them; or the estimate with
         which others are compared, such as a `SeriesFit`.
     - `estimates`: by label, a `RationalFit` (one marker per output), a `StructuredFit`,
-        `SeriesFit` or the result of `hj.identify.cramer_rao`, or multipliers (d,). Default: none.
+        `SeriesFit` or the result of `hj.identify.cramer_rao`, or multipliers (d,); or one fit
+        without a label. Default: none.
     - `zoom`: whether to draw the inset. Default: True.
     - `ax`: one Axes. Default: a new figure.
 
@@ -56,9 +58,11 @@ def multipliers(
     hj.plot.multipliers(cycle, {"structured fit": fit})
     ```
 
-    **Before:** `hj.fit_multipliers`. **After:** `hj.plot.save`.
+    **Before:** `hj.fit_multipliers`. **After:** `plot.save(path)`.
     """
     reference = "estimate" if isinstance(true, MultiplierFit) else "exact"
+    if isinstance(estimates, RationalFit | MultiplierFit):
+        estimates = {"fit": estimates}
     borders = _borders({reference: true, **(estimates or {})})
     true = _values(true)
     if true.size == 0:
@@ -143,7 +147,7 @@ def poles_zeros(fits: Mapping[str, RationalFit], *, ax: AxesLike | None = None) 
     hj.plot.poles_zeros({"clock": hj.identify.fit_rational(htf)})
     ```
 
-    **Before:** `hj.identify.fit_rational`. **After:** `hj.plot.save`.
+    **Before:** `hj.identify.fit_rational`. **After:** `plot.save(path)`.
     """
     if not fits or len({(fit.outputs, fit.n_sections) for fit in fits.values()}) != 1:
         raise DefinitionError(

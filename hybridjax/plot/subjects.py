@@ -10,37 +10,10 @@ from ..recordings.population.population import Population
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, colored, panels
 
 
-@checked
 def forest(
     population: Population, quantity: str, *, ax: AxesLike | None = None
 ) -> Plot:
-    """Draw the estimate of each subject, and the mean of each group and condition.
-
-    Estimates are squares with their 95 % intervals, predictions open circles, and means diamonds,
-    as wide as their 95 % intervals.
-
-    **Arguments:**
-
-    - `population`: a `hj.recordings.Population`, also that of `hj.identify_subjects`.
-    - `quantity`: name of the quantity, such as "modulus".
-    - `ax`: one Axes. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (1, 1), the quantity in its unit.
-
-    **Raises:** `DefinitionError` for a quantity that does not exist, too few subjects for a mean,
-    or if `ax` is not one Axes.
-
-    **Example:**
-
-    ```python
-    gain = np.array([0.61, 0.58, 0.66, 0.63])
-    table = {"subject": ["S1", "S2", "S3", "S4"]}
-    people = hj.recordings.Population(table, {"gain": gain}, {"gain": 0.02 + 0 * gain})
-    hj.plot.forest(people, "gain")
-    ```
-
-    **Before:** `hj.identify_subjects`. **After:** `hj.plot.paired`.
-    """
+    """`people.plot(quantity)`: the estimate of each subject, and the means."""
     means = population.mean(quantity)
     subjects = population.predictions(quantity)
     names = []
@@ -109,7 +82,7 @@ def paired(
     hj.plot.paired(people, "gain", "fast", "slow")
     ```
 
-    **Before:** `hj.identify_subjects`. **After:** `hj.plot.save`.
+    **Before:** `hj.identify_subjects`. **After:** `plot.save(path)`.
     """
     (test,) = population.difference(quantity, a, b).itertuples()
     subjects = population.predictions(quantity)
@@ -145,34 +118,8 @@ def paired(
     return Plot(axes)
 
 
-@checked
 def subject_maps(result: MapResult, *, ax: AxesLike | None = None) -> Plot:
-    """Draw a mean or a difference over subjects.
-
-    A curve: each subject as a thin line, the mean, its band, and the significant points (bar). A
-    map: its values, with outlined significant points. Of complex values, the magnitude is drawn.
-
-    **Arguments:**
-
-    - `result`: result of `mean` or `difference` of a `hj.recordings.PopulationMaps`.
-    - `ax`: one Axes. Default: a new figure.
-
-    **Returns:** `hj.plot.Plot` with `axes` (1, 1), the values in `result.unit`.
-
-    **Raises:** `DefinitionError` for maps with more than two axes, or if `ax` is not one Axes.
-
-    **Example:**
-
-    ```python
-    phase = np.arange(8) / 8
-    curves = np.sin(2 * np.pi * phase) + 0.1 * np.random.default_rng(0).normal(size=(5, 8))
-    table = {"subject": ["S1", "S2", "S3", "S4", "S5"]}
-    maps = hj.recordings.PopulationMaps(table, curves, {"phase": phase}, "mm/N")
-    hj.plot.subject_maps(maps.mean())
-    ```
-
-    **Before:** `hj.recordings.PopulationMaps`. **After:** `hj.plot.save`.
-    """
+    """`maps.mean().plot()`: a mean or a difference over subjects, as a curve or a map."""
     is_complex = np.iscomplexobj(result.values)
     size = np.abs if is_complex else np.asarray
     values = size(result.values)

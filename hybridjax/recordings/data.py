@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -89,6 +90,30 @@ class SectionData(Showable, eqx.Module):
         nu = len(self.inputs)
         size = np.sqrt(np.nanmean(self._deviations() ** 2, axis=0))
         return size[:nu], size[nu:]
+
+    @checked
+    def plot(self, *, ax: object = None) -> Any:
+        """Draw for each signal the average cycle, the deviations from it, and the spectra of
+        inputs.
+
+        Left: the average cycle. Middle: deviations against phase, gray, with twice their standard
+        deviation. Right: for an input, its power against frequency; for an output, its deviations
+        in successive cycles, at the section where they are largest.
+
+        **Arguments:** `ax`: three Axes per signal, inputs first. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (nu + ny, 3). Phases are in cycles, frequencies in
+        cycles per period, and signals in their units.
+
+        **Raises:** `DefinitionError` if `ax` does not hold three Axes per signal.
+
+        **Example:**
+
+        ```python
+        result.data.plot()
+        ```
+        """
+        return super().plot(ax=ax)
 
     @checked
     def of_inputs(self, names: Sequence[str]) -> "SectionData":

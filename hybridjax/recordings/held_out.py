@@ -52,6 +52,10 @@ class HeldOutOrders(NamedTuple):
     errors: Float[np.ndarray, " k"]
     order: int
 
+    def __index__(self) -> int:
+        """The order: functions take a selection as the number."""
+        return self.order
+
     def __repr__(self) -> str:
         rows = ["order  error of held-out cycles (relative)"]
         rows += [

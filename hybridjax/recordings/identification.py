@@ -10,7 +10,7 @@ import itertools
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import numpy as np
@@ -70,7 +70,11 @@ class Identification(WithMultipliers, eqx.Module):
     of that check; `phase`; `data`, at the sections; `fit`, to all of it; `held_out`, a fit to the
     first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
     curve of events alone under one input (else None); `diagnosis`.
+
+    Functions that take a fit or data take it, too.
     """
+
+    _stands_for: ClassVar = ("fit", "data")
 
     recording: Recording
     findings: tuple[Finding, ...] = eqx.field()
@@ -91,7 +95,7 @@ class Identification(WithMultipliers, eqx.Module):
           `cycle.csv`: the average cycle.
         - `htf.npz`, `fit.npz`: transfer functions and fit, for `hj.load`. `summary.json`: the
           numbers.
-        - `figures/`: in each of the `formats` of `hj.plot.save`, and as PNG for the page.
+        - `figures/`: in each of `formats`, as `plot.save` takes them, and as PNG for the page.
 
         Other files in the folder stay as they are. Results of an earlier report are replaced; a
         hidden list in the folder holds their names.
@@ -128,7 +132,11 @@ class NaturalIdentification(WithMultipliers, eqx.Module):
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `phase`; `data`,
     at the sections; `fit`, the `NaturalMultipliers`; `findings` of all steps.
+
+    Functions that take such data take it, too.
     """
+
+    _stands_for: ClassVar = ("fit", "data")
 
     recording: Recording
     phase: Phase

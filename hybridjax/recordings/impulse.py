@@ -1,6 +1,6 @@
 """Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import equinox as eqx
 import numpy as np
@@ -60,6 +60,40 @@ class ImpulseResponses(Showable, eqx.Module):
     n_sections = property(lambda self: len(self.phase))
 
     @checked
+    def plot(
+        self,
+        *,
+        model: LDTP | None = None,
+        input: str | int = 0,
+        ax: object = None,
+    ) -> Any:
+        """Draw the responses of a rhythm to a push against the phase of the push and the time
+        since.
+
+        Left: all phases, in colors. Right: curves at the phases marked left, with bands of 95 %.
+        Dashed: the responses of a model with the same sections.
+
+        **Arguments:**
+
+        - `model`: an `LDTP` with the same sections, inputs and outputs. Default: None.
+        - `input`: name or index of the input that pushes. Default: 0.
+        - `ax`: two Axes per output. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (ny, 2). Time and phase are in cycles, responses in
+        units of the output per unit of the input times second.
+
+        **Raises:** `DefinitionError` for an input that does not exist, a model with other sections
+        or names, or if `ax` does not hold two Axes per output.
+
+        **Example:**
+
+        ```python
+        result.responses.plot(input="u")
+        ```
+        """
+        return super().plot(model=model, input=input, ax=ax)
+
+    @checked
     def of_model(self, model: LDTP) -> Responses:
         """Return the responses of a model to pushes that are held from each section to the next.
 
@@ -116,7 +150,7 @@ def impulse_responses(
     print(responses.values.shape)
     ```
 
-    **Before:** `hj.fit_series`. **After:** `hj.plot.impulse_responses`,
+    **Before:** `hj.fit_series`. **After:** `responses.plot()`,
     `hj.recordings.PopulationMaps`.
     """
     require_same("fit and data", fit, data)

@@ -1,5 +1,7 @@
 """The phase of a recording."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -7,6 +9,7 @@ from scipy import signal
 from scipy.interpolate import PchipInterpolator
 
 from .._core.arguments import require_equal
+from .._core.boundary.checked import checked
 from .._core.memo import remembered
 from .._core.showable import Showable
 from .._core.text import folded, how_many
@@ -93,6 +96,25 @@ class Phase(Showable, eqx.Module):
     @property
     def period(self) -> float:
         return float(np.median(np.concatenate(self.periods)))
+
+    @checked
+    def plot(self, *, ax: object = None) -> Any:
+        """Draw the periods of the cycles in order, and their distribution.
+
+        **Arguments:** `ax`: two Axes. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (1, 2): the periods in seconds against the number
+        of the cycle, and their histogram.
+
+        **Raises:** `DefinitionError` if `ax` does not hold two Axes.
+
+        **Example:**
+
+        ```python
+        result.phase.plot()
+        ```
+        """
+        return super().plot(ax=ax)
 
     def by_trial(self, recording: Recording) -> list[tuple[Trial, tuple[Winding, ...]]]:
         """Return each trial with its stretches.

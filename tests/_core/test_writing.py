@@ -4,7 +4,6 @@ import json
 import os
 
 import pytest
-from matplotlib.figure import Figure
 
 import hybridjax as hj
 from hybridjax._core.writing import results_folder
@@ -159,7 +158,7 @@ DESIGN = hj.multisine(n_sections=4, periods=4, frequencies=(0.25, 0.5))
 WRITERS = {
     "save": (lambda path: hj.save(path, DESIGN), "x.npz"),
     "Design.write": (lambda path: DESIGN.write(path), "x.csv"),
-    "plot.save": (lambda path: hj.plot.save(path, Figure()), "x.png"),
+    "plot.save": (lambda path: DESIGN.plot().save(path), "x.png"),
 }
 
 

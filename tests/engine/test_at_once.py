@@ -118,7 +118,7 @@ def test_full_duty_is_refused_by_name_from_any_guess(
 def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
     cycle = hj.find_limit_cycle(Converter(1.05), hj.Guess("on", (0.3, 0.2), time=0.9))
     failed = hj.find_limit_cycle(Converter(1.0), cycle, throw=False)
-    (group,) = hj.orbits.simultaneous_events(failed)
+    (group,) = failed.simultaneous_events()
     assert set(group.orders) == {("tick on",), ("trip", "tick")}
     duties = np.array([0.95, *BESIDE_FULL, 1.1])
     batch = hj.orbits.find_limit_cycles([Converter(float(x)) for x in duties], cycle)
@@ -236,7 +236,7 @@ def test_a_spike_that_pushes_another_neuron_over_its_threshold(push):
     period = np.log((1.5 - push) / 0.5)
     assert_allclose(cycle.period, period, rtol=1e-10)
     assert len(cycle.multipliers) == 0  # every neighbor is set back to the same state
-    assert hj.orbits.simultaneous_events(cycle) == []
+    assert cycle.simultaneous_events() == []
 
 
 class Kicked(hj.HybridSystem):

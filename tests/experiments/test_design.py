@@ -265,7 +265,7 @@ def test_several_inputs(division):
 
 def test_crest_factors():
     random = hj.multisine(periods=32, frequencies=(0, 3.0), seed=1)
-    low = hj.experiments.optimize_phases(random, seed=1)
+    low = random.optimize_phases(seed=1)
     assert_array_equal(low.line, random.line)
     assert_array_equal(low.amplitude, random.amplitude)
     assert random.crest_factors().mean() > 2.9
@@ -274,7 +274,7 @@ def test_crest_factors():
     with pytest.raises(
         hj.errors.DefinitionError, match="no phase of this design is free"
     ):
-        hj.experiments.optimize_phases(orthogonal)
+        orthogonal.optimize_phases()
 
 
 def test_phases_that_are_not_random_have_no_variance_of_distortion(hopper):
@@ -282,7 +282,7 @@ def test_phases_that_are_not_random_have_no_variance_of_distortion(hopper):
     lines = []
     phases = []
     for seed in (1, 5):
-        low = hj.experiments.optimize_phases(random, seed=seed)
+        low = random.optimize_phases(seed=seed)
         for experiment in range(6):
             lines.append(np.array(lines_of(low, experiment)) / 32)
             phases.append(low.phase[low.experiment == experiment])

@@ -159,7 +159,7 @@ def designs(t):
     yield hj.experiments.Design, good
     yield t.design.scaled, dict(rms=1.0)
     yield t.design.realizations, dict(count=2)
-    yield hj.experiments.optimize_phases, dict(design=t.design)
+    yield t.design.optimize_phases, dict(seed=0)
 
 
 def experiments(t):
@@ -317,9 +317,9 @@ def subjects(t):
     yield population.power, dict(quantity="m", difference=0.1, subjects=(4,), draws=2)
     yield maps.mean, dict(label="old")
     yield maps.difference, two
-    yield hj.plot.forest, dict(population=population, quantity="m")
+    yield population.plot, dict(quantity="m")
     yield hj.plot.paired, dict(population=population, quantity="m") | two
-    yield hj.plot.subject_maps, dict(result=maps.mean())
+    yield maps.mean().plot, dict(ax=None)
     study = dict(table="nope.csv", folder="missing/x", identify=hj.identify_recording)
     yield hj.identify_subjects, study
 
@@ -363,7 +363,6 @@ def conversions(t):
     lifted = hj.convert.to_harmonic_state_space(t.cycle)
     yield lifted.transfer, dict(frequencies=[0.1], period=1.0)
     yield hj.convert.to_xarray, dict(thing=t.model)
-    yield hj.convert.to_pandas, dict(thing=t.fit)
     yield hj.convert.from_xarray, dict(dataset=hj.convert.to_xarray(t.model))
 
 
@@ -381,14 +380,13 @@ def plots(t):
     yield hj.experiments.perturbed_trajectory, dict(placed=t.placed, inputs=t.data.u[0])
     yield plot.return_map, dict(cycle=t.cycle)
     yield positional(plot.branch), dict(values=t.branch)
-    yield plot.experiment, dict(data=t.data)
+    yield t.data.plot, dict(index=0)
     yield plot.multipliers, dict(true=np.array([0.5]))
     yield plot.poles_zeros, dict(fits={"a": t.rational})
-    yield plot.impulse_responses, dict(responses=t.found.responses)
-    yield plot.phase, dict(phase=t.phase)
-    yield plot.section_data, dict(data=t.section_data)
-    yield plot.validation, dict(validation=t.validation)
-    yield plot.save, dict(path="missing/figure", plot=t.plot)
+    yield t.found.responses.plot, dict(model=None, input=0)
+    yield t.phase.plot, dict(ax=None)
+    yield t.section_data.plot, dict(ax=None)
+    yield t.validation.plot, dict(cycles=4)
     yield t.plot.save, dict(path="missing/figure")
 
 
@@ -399,7 +397,7 @@ def rhythms(t):
         return q[0]
 
     yield hj.systems.filippov, dict(charts=charts, surface=surface)
-    yield hj.orbits.simultaneous_events, dict(cycle=t.cycle)
+    yield t.cycle.simultaneous_events, {}
     about = dict(recording=t.recording, sections=BEAT, input="f")
     yield hj.recordings.phase_response, about
     yield hj.plot.phase_response, dict(curve=t.beats)

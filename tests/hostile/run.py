@@ -93,7 +93,7 @@ SLOW = {
     "identifiability",
     "identify_recording",
     "linearize",
-    "optimize_phases",
+    "Design.optimize_phases",
     "place_sections",
     "response_function",
     "return_map",

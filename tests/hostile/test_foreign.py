@@ -56,14 +56,6 @@ def test_drawings(call):
     refused("Drawing: ", call)
 
 
-@pytest.mark.parametrize("maps", [0, None, "map.zarr", {}, [1]])
-def test_figures_of_sweeps(maps):
-    refused(
-        "`maps` must be the dataset that `hj.sweep` returns",
-        lambda: hj.plot.sweep(maps),
-    )
-
-
 @pytest.mark.parametrize("amplitude", [{}, [], "x", lambda f: {}, lambda f: f[:2]])
 def test_amplitudes(amplitude):
     refused("`amplitude` must", lambda: hj.multisine(4, 8, amplitude=amplitude))
@@ -104,7 +96,7 @@ def test_names_that_no_file_can_have(tmp_path):
         lambda: hj.read_recording(f"{name}.csv"),
         lambda: hj.load(f"{name}.npz"),
         lambda: hj.save(f"{name}.npz", htf),
-        lambda: hj.plot.save(name, hj.plot.bode(htf)),
+        lambda: hj.plot.bode(htf).save(name),
     ):
         refused("cannot (read|write) .*: File name too long", call)
 

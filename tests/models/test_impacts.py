@@ -51,9 +51,7 @@ def test_events_that_coincide_neither_graze_nor_accumulate():
 def test_each_order_of_the_feet_has_its_derivative():
     cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped(thrust=1.0), throw=False)
     assert cycle.result == hj.errors.Result.SIMULTANEOUS
-    let_go, land = sorted(
-        hj.orbits.simultaneous_events(cycle), key=lambda both: both.time
-    )
+    let_go, land = sorted(cycle.simultaneous_events(), key=lambda both: both.time)
     assert_allclose(let_go.time, 0.48890534976601)
     assert_allclose(land.time, 0.79608769379953)
     for both, size in ((let_go, LET_GO), (land, LAND)):

@@ -108,7 +108,7 @@ def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
     cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
     assert cycle.result == hj.errors.Result.SIMULTANEOUS
-    (found,) = hj.orbits.simultaneous_events(cycle)
+    (found,) = cycle.simultaneous_events()
     assert found.time % 1.0 == pytest.approx(0.5)
     assert not found.commute
     exact = {

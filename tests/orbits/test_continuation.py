@@ -107,7 +107,7 @@ def test_a_branch_becomes_a_dataset_and_a_table(by_amplitude):
     dataset = hj.convert.to_xarray(branch)
     assert_array_equal(dataset["A"], branch.values)
     assert_array_equal(dataset["multipliers"], branch.multipliers)
-    table = hj.convert.to_pandas(branch)
+    table = branch.to_pandas()
     rows_of_points = table[table["kind"] != ""].index
     assert list(rows_of_points) == [point.index for point in branch.points]
 

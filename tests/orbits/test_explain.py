@@ -86,7 +86,7 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
         no_turn = (None, 0, None)
         monkeypatch.setattr(newton, "_by_rough_turns", lambda map, x: (x, *no_turn))
     cycle = hj.find_limit_cycle(Balls(), BALLS)
-    (both,) = hj.orbits.simultaneous_events(cycle)
+    (both,) = cycle.simultaneous_events()
     assert both.commute
     assert set(both.orders) == {
         ("impact0", "impact1"),
@@ -107,7 +107,7 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
         hj.find_limit_cycle(system, begin)
     cycle = hj.find_limit_cycle(system, begin, throw=False)
     assert cycle.result == hj.errors.Result.SIMULTANEOUS
-    (both,) = hj.orbits.simultaneous_events(cycle)
+    (both,) = cycle.simultaneous_events()
     assert not both.commute
 
     # The balls from half a tenth of a second before the impacts to as long after them.

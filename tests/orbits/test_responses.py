@@ -417,7 +417,7 @@ def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_pa
     (low, high) = measured.interval(curve.phase)
     values = curve.values
     assert np.mean(((low <= values) & (values <= high))[np.isfinite(values)]) > 0.9
-    hj.plot.save(tmp_path / "both", hj.plot.phase_response(measured, model=curve))
+    hj.plot.phase_response(measured, model=curve).save(tmp_path / "both")
 
 
 def _shifted(cycle, name, step):

@@ -31,7 +31,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
 def test_a_cycle_that_was_not_found_is_refused():
     far = hj.Guess("flight", (1e3, 30.0, 1.0, 5.0))
     failed = hj.find_limit_cycle(hj.models.VerticalHopper(), far, throw=False)
-    for function in (hj.plot.cycle, hj.orbits.simultaneous_events):
+    for function in (hj.plot.cycle, hj.orbits.LimitCycle.simultaneous_events):
         with pytest.raises(
             hj.errors.DefinitionError, match="the search for this cycle failed"
         ):

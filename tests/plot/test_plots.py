@@ -277,7 +277,7 @@ def test_poles_and_zeros(rational):
 def test_experiment(hopper):
     design = hj.multisine(periods=4, frequencies=(0, 2.0))
     data = hj.experiments.simulate_experiments(hopper, design, discard=2)
-    figure = hj.plot.experiment(data, -1).figure
+    figure = data.plot(-1).figure
     assert [ax.get_ylabel() for ax in figure.axes] == [
         "u",
         r"$\delta$ yM",
@@ -288,24 +288,22 @@ def test_experiment(hopper):
     assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.errors.DefinitionError, match="no experiment 99"):
-        hj.plot.experiment(data, 99)
+        data.plot(99)
 
 
 def test_saved_in_several_formats(tmp_path):
     plot = hj.plot.multipliers([0.5])
-    png, pdf, svg = hj.plot.save(
-        tmp_path / "multipliers.png", plot, ("png", "pdf", "svg")
-    )
+    png, pdf, svg = plot.save(tmp_path / "multipliers.png", ("png", "pdf", "svg"))
     assert png.read_bytes()[:4] == b"\x89PNG"
     assert pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
     expected = [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
     assert [p.name for p in (png, pdf, svg)] == expected
-    assert hj.plot.save(str(tmp_path / "v1.0"), plot.figure) == (tmp_path / "v1.0.png",)
+    assert plot.save(str(tmp_path / "v1.0")) == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.errors.DefinitionError, match="x.bmp': formats are png"):
-        hj.plot.save(tmp_path / "x.bmp", plot)
+        plot.save(tmp_path / "x.bmp")
 
 
 def test_a_crowd_of_multipliers_has_no_inset():
@@ -346,7 +344,7 @@ def found(hopper):
 
 
 def test_validation_draws_signals_and_correlations(found):
-    figure = hj.plot.validation(found, cycles=2).figure
+    figure = found.plot(cycles=2).figure
     upper, lower = np.reshape(figure.axes, (2, 3))
     simulated, measured = lower[0].get_lines()
     assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
@@ -366,7 +364,7 @@ def test_no_texts_overlap_at_the_width_of_a_column(found):
     """None is cut."""
     with hj.plot.style():
         figure, axes = pyplot.subplots(2, 3, figsize=(3.5, 3.0), layout="constrained")
-        hj.plot.validation(found, ax=axes)
+        found.plot(ax=axes)
         figure.canvas.draw()
     boxes = {}
     for text in figure.findobj(Text):

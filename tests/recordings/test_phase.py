@@ -137,7 +137,7 @@ def test_what_is_no_phase(wave):
 def test_events_without_jitter():
     t = 0.3 + np.arange(60)
     recording = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
-    hj.plot.phase(hj.recordings.estimate_phase(recording, hj.AtEvent("e")))
+    hj.recordings.estimate_phase(recording, hj.AtEvent("e")).plot()
 
 
 def test_events_that_all_come_twice():

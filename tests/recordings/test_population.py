@@ -446,7 +446,7 @@ def test_figures():
     table = {"subject": subject, "condition": condition}
     values = RNG.normal(size=2 * N)
     people = Population(table, {"q": values}, {"q": np.ones(2 * N)})
-    forest = hj.plot.forest(people, "q").ax
+    forest = people.plot("q").ax
     labels = [x.get_text() for x in forest.get_yticklabels()]
     assert labels.count("3") == 2
     assert {"mean, a", "mean, b"} < set(labels)
@@ -460,9 +460,9 @@ def test_figures_of_maps():
     y[:6, 2:4, 2:5] += 4.0
     group = np.repeat(["a", "b"], 6)
     difference = maps_of(y, 12, group=group).difference("a", "b")
-    ax = hj.plot.subject_maps(difference).ax
+    ax = difference.plot().ax
     assert len(ax.collections) == 2, "the map and its outline"
     table = {"subject": np.arange(12)}
     curves = PopulationMaps(table, y[:, 0], {"lag": AXES["lag"]})
-    ax = hj.plot.subject_maps(curves.mean()).ax
+    ax = curves.mean().plot().ax
     assert len(ax.get_lines()) == 12 + 3

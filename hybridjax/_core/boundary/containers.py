@@ -39,8 +39,9 @@ class Instance(Kind):
         self.allowed = with_article(cls.__name__)
 
     def take(self, value):
-        if isinstance(value, self.cls):
-            return current(value)
+        for thing in (value, *_parts(value)):
+            if isinstance(thing, self.cls):
+                return current(thing)
         raise self.refused(value)
 
 
@@ -54,10 +55,23 @@ class Having(Kind):
         self.names = sorted(x for x in names if x[0] != "_")
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
+    def take(self, value):
+        # (The parts first: they have more, such as errors beside multipliers.)
+        for thing in (*_parts(value), value):
+            if self.fits(thing):
+                return thing
+        raise self.refused(value)
+
     def fits(self, value):
         missing = object()
         found = [inspect.getattr_static(value, x, missing) for x in self.names]
         return all(x is not missing for x in found)
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    """Iterate over the parts that functions take in place of a result of several steps."""
+    for name in getattr(type(value), "_stands_for", ()):
+        yield getattr(value, name)
 
 
 class Items(Kind):

@@ -144,6 +144,7 @@ def _leads_of_attribute(
     owners = [base.__name__ for base in cls.__mro__]
     yield words.lead_of(ATTRIBUTES, owners, name)
     yield _use(_synonym(name, attributes))
+    yield _use(_error_bars(name, attributes))
     yield _use(_attribute_of_part(cls, name))
     yield words.lead_of_library(owners, name)
     yield _use(_spelled_alike(name, attributes, _SLIP))
@@ -155,6 +156,13 @@ def _leads_of_attribute(
     function = place_of(name)
     if function is not None and not is_namespace(name):
         yield f"`{function}` is a function that may take it"
+
+
+def _error_bars(name: str, attributes: Collection[str]) -> str | None:
+    """Return the attribute that has what a name such as `multipliers_ci` ends with."""
+    _, separator, last = name.rpartition("_")
+    is_error = last in ("ci", "se", "sd", "std", "err", "error", "errors", "interval")
+    return _synonym(last, attributes) if separator and is_error else None
 
 
 def _use(name: str | None) -> str | None:
@@ -191,8 +199,10 @@ def _attribute_of_part(cls: type, name: str) -> str | None:
     if not dataclasses.is_dataclass(cls):
         return None
     for field in dataclasses.fields(cls):
-        if isinstance(field.type, type) and name in attributes_of(field.type):
-            return f"{field.name}.{name}"
+        known = attributes_of(field.type) if isinstance(field.type, type) else []
+        for word in (name, *words.synonyms(name)):
+            if word in known:
+                return f"{field.name}.{word}"
     return None
 
 

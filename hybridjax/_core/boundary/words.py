@@ -9,6 +9,10 @@ from .guesses.sentences import LIBRARIES
 from .guesses.synonyms import ALIKE, WORDS
 
 
+# Words of two letters that stand for one thing in names such as `multipliers_ci`.
+_SHORT = {"ci", "se", "sd"}
+
+
 def lead_of_library(owners: Iterable[str], name: str) -> str | None:
     """Return the sentence of the first library that has a name. (Libraries that are installed are
     imported for that: an error has time.)"""
@@ -47,9 +51,10 @@ def synonyms(name: str) -> tuple[str, ...]:
 
 def parts(name: str) -> Iterator[str]:
     """Iterate over the words in a name, the last one first. (Letters stand for too much.)"""
-    found = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
+    found = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+(?:\d+[a-z]+)*", name)
     for part in reversed(found):
-        if len(part) > 2 and len(found) > 1:
+        is_word = len(part) > 2 or part in _SHORT
+        if is_word and len(found) > 1:
             yield part.lower()
 
 

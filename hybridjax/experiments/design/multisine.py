@@ -1,6 +1,5 @@
-"""Multisines over a band, the paper's design; phases for a low crest factor."""
+"""Multisines over a band, and the paper's design."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
@@ -31,13 +30,6 @@ Band = tuple[NonNegative, NonNegative]
 Lines = Literal["all", "odd", "two-phase"]
 Division = Literal["random", "sum-free", "disjoint", "orthogonal"]
 
-# Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
-# (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
-_POWERS = (4, 8, 16, 32, 64, 128)
-# Steps of the minimization at each power. Fewer: higher crest factors. Twice as many: hardly lower
-# ones, in twice the time.
-_STEPS = 100
-
 
 @checked
 def multisine(
@@ -57,7 +49,7 @@ def multisine(
     The frequencies are divided at random among the experiments, under the rules of Sec. V-B
     (see `Design.check`), in sets whose sizes differ by at most one. For N = 32, P = 64 and
     frequencies up to 10 the 620 frequencies need 20 experiments, the exact minimum; the paper takes
-    80. `hj.experiments.optimize_phases` gives the signals low crest factors.
+    80. `design.optimize_phases()` gives the signals low crest factors.
 
     **Arguments:**
 
@@ -101,7 +93,7 @@ def multisine(
     ```
 
     **After:** `hj.run_experiments`, `hj.experiments.simulate_experiments`,
-    `hj.experiments.optimize_phases`, `hj.optimal_design`.
+    `design.optimize_phases()`, `hj.optimal_design`.
     """
     names = input_names(inputs)
     check_window(n_sections, periods)
@@ -256,91 +248,3 @@ def paper_design(
         division=division,
         experiments=experiments,
     )
-
-
-@checked
-def optimize_phases(design: Design, seed: Seed = 0) -> Design:
-    r"""Return the design with phases that give each signal a low crest factor max |u| / rms(u).
-
-    The peak is approached by norms $\sum |u|^p$ of growing p, minimized over the phases (Guillaume,
-    Schoukens, Pintelon and Kollar, IEEE Trans. Instrum. Meas. 40, 1991). For 31 lines this cuts the
-    crest factor from 3.6 (random phases) to 2.15, so that the same peak carries 2.8 times the
-    power. These phases are not random, so that the sample variance over realizations does not
-    contain the distortion. Phases of lines that are measured in several experiments together
-    (multiples of 1/2, orthogonal experiments) are kept.
-
-    **Arguments:** `design`: a `Design`. `seed`: seed of the random phases at the start of the
-    minimization. Default: 0.
-
-    **Returns:** a `Design` with the frequencies and amplitudes of the one that was given.
-
-    **Raises:** `DefinitionError` if there is no phase to choose.
-
-    **Example:**
-
-    ```python
-    flat = hj.experiments.optimize_phases(design)
-    print(design.crest_factors(), flat.crest_factors())
-    ```
-
-    **Before:** `hj.multisine` or `hj.optimal_design`. **After:** `hj.run_experiments`.
-    """
-    nu = len(design.inputs)
-    length = design.n_sections * design.periods
-    _, pair, count = np.unique(
-        design.line * nu + design.channel, return_inverse=True, return_counts=True
-    )
-    real = is_real(design.line, design.periods, design.n_sections)
-    free = (count[pair] == 1) & ~real
-    if not free.any():
-        raise DefinitionError(
-            "no phase of this design is free: each is shared or has a fixed sign."
-        )
-    where = design.experiment * nu + design.channel
-    size = np.where(real, 2.0, 1.0) * 0.5 * length * np.asarray(design.amplitude)
-    rng = np.random.default_rng(seed)
-    drawn = rng.uniform(0, 2 * np.pi, len(free))
-    phase = np.where(free, drawn, design.phase)
-    for signal in np.unique(where):
-        k = np.flatnonzero(where == signal)
-        if free[k].any():
-            phase[k[free[k]]] = _lower(
-                phase[k], free[k], design.line[k], size[k], length
-            )
-    return dataclasses.replace(design, phase=phase % (2 * np.pi))
-
-
-def _lower(phase, free, line, size, length: int):
-    """Return the free phases of one signal that minimize its peak."""
-    from scipy.optimize import minimize  # (a third of a second, needed by few designs)
-
-    spectrum = np.zeros(length // 2 + 1, complex)
-    best = phase[free]
-    least = np.inf
-
-    def signal(x):
-        value = size * np.exp(1j * np.where(free, 0.0, phase))
-        value[free] = size[free] * np.exp(1j * x)
-        spectrum[line] = value
-        return np.fft.irfft(spectrum, length)
-
-    def norm(x, p):
-        """Return the logarithm of the p-norm and its derivatives."""
-        u = signal(x)
-        peak = np.abs(u).max()
-        v = np.abs(u) / peak
-        total = np.sum(v**p)
-        by_signal = v ** (p - 1) * np.sign(u) / (peak * total)
-        slope = np.fft.rfft(by_signal)[line[free]]
-        wave = 1j * size[free] * np.exp(1j * x)
-        turn = np.real(wave * slope.conj())
-        return np.log(peak) + np.log(total) / p, 2 / length * turn
-
-    x = phase[free]
-    for p in _POWERS:
-        x = minimize(norm, x, p, "L-BFGS-B", jac=True, options={"maxiter": _STEPS}).x
-        peak = np.abs(signal(x)).max()
-        if peak < least:
-            best = x
-            least = peak
-    return best

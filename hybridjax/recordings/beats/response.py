@@ -245,7 +245,6 @@ class PhaseResponse(PhaseCurve):
 def phase_response(
     recording: Recording,
     sections: Phase | AtEvent | Crossing,
-    *,
     input: str,
 ) -> PhaseResponse:
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.

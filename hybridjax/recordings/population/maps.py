@@ -17,7 +17,7 @@ family-wise error at each point (Nichols and Holmes, Human Brain Mapping 15, 200
 import dataclasses
 import itertools
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Inexact
@@ -70,6 +70,32 @@ class MapResult(Showable):
     unit: str
     methods: str
 
+    @checked
+    def plot(self, *, ax: object = None) -> Any:
+        """Draw the mean or difference over subjects.
+
+        A curve: each subject as a thin line, the mean, its band, and the significant points (bar).
+        A map: its values, with outlined significant points. Of complex values, the magnitude is
+        drawn.
+
+        **Arguments:** `ax`: one Axes. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (1, 1), the values in `unit`.
+
+        **Raises:** `DefinitionError` for maps with more than two axes, or if `ax` is not one Axes.
+
+        **Example:**
+
+        ```python
+        phase = np.arange(8) / 8
+        curves = np.sin(2 * np.pi * phase) + 0.1 * np.random.default_rng(0).normal(size=(5, 8))
+        table = {"subject": ["S1", "S2", "S3", "S4", "S5"]}
+        maps = hj.recordings.PopulationMaps(table, curves, {"phase": phase}, "mm/N")
+        maps.mean().plot()
+        ```
+        """
+        return super().plot(ax=ax)
+
     def __repr__(self) -> str:
         spans = []
         places = np.nonzero(self.significant)
@@ -113,7 +139,7 @@ class PopulationMaps:
     ```
 
     **Before:** `hj.recordings.impulse_responses`, `hj.recordings.phase_response`. **After:**
-    `hj.plot.subject_maps`.
+    `maps.mean().plot()`.
     """
 
     def __init__(

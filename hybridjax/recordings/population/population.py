@@ -71,7 +71,7 @@ class Population(Showable):
     ```
 
     **Before:** `hj.identify_subjects`, or estimates with standard errors. **After:**
-    `hj.plot.forest`, `hj.plot.paired`.
+    `people.plot(quantity)`, `hj.plot.paired`.
     """
 
     def __init__(
@@ -148,6 +148,33 @@ class Population(Showable):
         counted = "; ".join(f"{cell}: {count} subjects" for cell, count in counts)
         names = ", ".join(self.values)
         return folded(f"Population({names}; {counted}; {len(self.table)} estimates)")
+
+    def plot(self, quantity: str, *, ax: object = None) -> Any:
+        """Draw the estimate of each subject, and the mean of each group and condition.
+
+        Estimates are squares with their 95 % intervals, predictions open circles, and means
+        diamonds, as wide as their 95 % intervals.
+
+        **Arguments:**
+
+        - `quantity`: name of the quantity, such as "modulus".
+        - `ax`: one Axes. Default: a new figure.
+
+        **Returns:** `hj.plot.Plot` with `axes` (1, 1), the quantity in its unit.
+
+        **Raises:** `DefinitionError` for a quantity that does not exist, too few subjects for a
+        mean, or if `ax` is not one Axes.
+
+        **Example:**
+
+        ```python
+        gain = np.array([0.61, 0.58, 0.66, 0.63])
+        table = {"subject": ["S1", "S2", "S3", "S4"]}
+        people = hj.recordings.Population(table, {"gain": gain}, {"gain": 0.02 + 0 * gain})
+        people.plot("gain")
+        ```
+        """
+        return super().plot(quantity, ax=ax)
 
     def mean(self, quantity: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean over subjects, and the spread between them, in each group and condition.

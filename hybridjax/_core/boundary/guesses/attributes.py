@@ -197,7 +197,10 @@ ATTRIBUTES = {
         "`cycle.trajectory()` follows the cycle, and `hj.simulate(system, chart, state, "
         "duration)` another state": "simulate",
         "`cycle.trajectory()` has times `t` and states `after`; `cycle.trajectory()('name')` one "
-        "signal": "t time x y ys states q orbit solution points values sol",
+        "signal": (
+            "t time x y ys states q orbit solution points values sol evaluate at sample "
+            "interpolate state_at eval"
+        ),
         "`cycle.responses()` has the responses to brief pushes, and "
         "`cycle.sensitivity(parameter)` those to lasting changes": (
             "step impulse_response perturb push"
@@ -310,6 +313,11 @@ ATTRIBUTES = {
             "validation score r2 rsquared rmse goodness cross_validation"
         ),
         "`result.fit` is the fit": "model params coef",
+        "`hj.validate(result, data)` compares it with data, and `result.fit.htf(frequencies)` is "
+        "its response": "predict simulate residuals",
+        "`hj.save(path, result.fit)` writes the fit, and `result.write_report(folder)` all": (
+            "save export to_file dump"
+        ),
     },
     "Validation": {
         "`validation.fit` is the share of each output that the model explains, in %": (

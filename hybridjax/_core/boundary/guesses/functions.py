@@ -35,7 +35,9 @@ NAMES = {
             "integrator"
         ),
         "use `model.simulate(u)`": "dlsim forced_response lsim forced",
-        "use `cycle.multipliers`": "eigenvalues eig eigvals",
+        "use `cycle.multipliers`, or those of a model or a fit": (
+            "eigenvalues eig eigvals pole"
+        ),
         "use `hj.enable_x64()`": "enable_double float64 set_precision config double",
         "use `hj.Crossing('y', 'falling')` of a signal 'y', or `recording.mark(name, crossing)`": (
             "find_events poincare_section event find_peaks heel_strike detect_events "
@@ -48,11 +50,12 @@ NAMES = {
         "use `hj.find_limit_cycle(system).multipliers`": (
             "floquet floquet_multipliers multipliers characteristic_multipliers"
         ),
-        "use `model.htf(frequencies)`": (
+        "use `model.htf(frequencies)`, of `model = hj.linearize(cycle, sections)`, or of a fit": (
             "freqresp frequency_response tf transfer_function htf transfer"
         ),
         "use `hj.identify_recording(recording, ...)`": (
-            "identify_subject identify_trial identify_gait analyze analyse analysis"
+            "identify_subject identify_trial identify_gait analyze analyse analysis gait "
+            "gait_stability"
         ),
         "use `model.impulse_response(n_lags)`": "impulse_response impulse",
         "use `model.simulate(u, x0)`": "initial_response",
@@ -61,14 +64,33 @@ NAMES = {
             "load_dataset load_recording read_c3d read_csv read_mat read_raw read mot sto trc c3d "
             "csv edf bdf open import load_data parquet excel loadmat file io load"
         ),
-        "use `hj.linearize(cycle, sections)`": "monodromy linearization jacobian",
+        "use `hj.linearize(cycle, sections)`, and its `monodromy()`": (
+            "monodromy linearization jacobian"
+        ),
         "use `hj.experiments.add_noise(data, std=...)`": (
             "noise measurement_noise awgn"
         ),
         "use `hj.sections.section_map(cycle, sections, i, j)`; `hj.plot.return_map(cycle)` draws "
         "one": "poincare_map poincare stroboscopic cobweb",
-        "use `model.multipliers`": "pole",
-        "use `cycle.responses()`": "prc phase_response_curve isochron ipr adjoint",
+        "`cycle.responses()` has that of a model, and `hj.recordings.phase_response(recording, "
+        "sections, input)` estimates one": (
+            "prc phase_response phase_response_curve ipr adjoint sta spike_triggered "
+            "spike_triggered_average phase_resetting phase_resetting_curve"
+        ),
+        "use `cycle.asymptotic_phase(chart, state)`": "isochron asymptotic_phase",
+        "use `hj.recordings.estimate_phase(recording, sections)`": (
+            "phase phase_angle instantaneous_phase"
+        ),
+        "`cycle.sensitivity(parameter)` has derivatives of a cycle, and `jax.grad` those of any "
+        "number": "sensitivity sensitivities parameter_sensitivity",
+        "use `result.write_report(folder)`": "report write_report make_report",
+        "`hj.optimal_design(model)` and `hj.multisine(n_sections)` make designs": (
+            "design design_experiment experiment_design optimal_input doe"
+        ),
+        "`hj.simulate(system, chart, state, duration)` shows where a state goes, and "
+        "`hj.flow(system, start, duration)` where many go": (
+            "basin basin_of_attraction attractor viability"
+        ),
         "`hj.multisine(n_sections)` makes a periodic input, "
         "`hj.experiments.random_input(duration, rate, bandwidth)` a random one, and "
         "`hj.run_experiments` also takes an array": (
@@ -99,7 +121,7 @@ NAMES = {
             "damp damping margin gramian gram ctrb obsv controllability observability balred "
             "balanced balanced_reduction minreal hinf h2 hinfsyn lqr dlqr lqe kalman place acker "
             "pid dcgain c2d d2c zpk ss2tf tf2ss tf2zpk rlocus root_locus nichols hsvd "
-            "nichols_plot locus sisotool sensitivity interconnect series parallel append "
+            "nichols_plot locus sisotool interconnect series parallel append "
             "reachable care dare lyap dlyap norm lead_lag gain_margin disk_margins h2syn"
         ),
         "use `model.feedback(controller)`, of a model or an HTF": (
@@ -185,7 +207,8 @@ NAMES = {
         ),
         "`result.diagnosis.expected` and `plan.cycles_for(standard_error)` predict the number of "
         "cycles": (
-            "learning_curve power_analysis sample_size power n_strides how_many"
+            "learning_curve power_analysis sample_size power n_strides how_many duration "
+            "required_duration how_long trial_length"
         ),
         "use `cycle.plot(x, y)`": (
             "phase_portrait phase_plane portrait phaseplot streamplot"
@@ -236,7 +259,7 @@ NAMES = {
         "use `cycle.plot()` or `trajectory.plot()`": (
             "trajectory states simulation solution"
         ),
-        "use `hj.plot.validation(validation)`": "residuals prediction fit qq",
+        "use `validation.plot()`": "residuals prediction fit qq",
         "use `hj.plot.spectrum(plan, model)`, or `design.plot()`": (
             "psd spectra periodogram design"
         ),
@@ -254,8 +277,8 @@ NAMES = {
 those of a namespace."""
 
 IN_NAMESPACES = {
-    "convert": "`to_pandas`, `to_xarray`, `to_scipy` and `to_control` convert, and `result.H` and "
-    "other fields are arrays",
+    "convert": "`to_xarray`, `to_scipy`, `to_control` and `result.to_pandas()` convert, and "
+    "`result.H` and other fields are arrays",
     "hybridjax": "`dir(hj)` lists its names, and those of the page of each namespace, such as "
     "`hj.recordings`, are one level below",
     "models": "`dir(hj.models)` lists its names; `hj.HybridSystem.from_functions(states, field, "

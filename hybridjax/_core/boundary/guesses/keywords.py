@@ -72,6 +72,7 @@ KEYWORDS = {
         "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=20_000)`": "settings",
     },
     "simulate": {
+        "`cycle.trajectory(periods)` follows a cycle": "n_cycles cycles periods",
         "events are transitions of the system, as in `hj.HybridSystem.from_functions(states, "
         "field, events)`": "events",
         "parameters belong to the system: `system.replace(k=9.0)` changes them": (
@@ -98,7 +99,7 @@ KEYWORDS = {
         "`design.realizations(4)` repeats a design with new phases": "realizations",
         "`design.realizations(4)` repeats a design with new phases; `experiments` is their number "
         "for one set of frequencies": "experiments",
-        "`hj.experiments.optimize_phases(design)` makes the peaks small": (
+        "`design.optimize_phases()` makes the peaks small": (
             "phases crest crest_factor schroeder"
         ),
         "samples lie on sections: frequencies are in cycles per period, and `design.write(path, "
@@ -176,6 +177,12 @@ KEYWORDS = {
             "dsmax dsmin ds0 min_step"
         ),
         "the branch goes to both ends of the range": "direction backward forward bothside",
+    },
+    "identify_subjects": {
+        "`identify=functools.partial(hj.identify_recording, sections=..., inputs=..., "
+        "outputs=...)` identifies each recording": (
+            "inputs outputs sections order n_sections"
+        ),
     },
     "sweep": {
         "pass the values by name: `hj.sweep(system, {'k': values})`": (

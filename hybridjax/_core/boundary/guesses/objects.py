@@ -52,8 +52,7 @@ STEPS = {
     (
         "HTF",
         "Identification",
-    ): "`result.fit` is a fit, and `hj.fit_series(result.data, order)` makes another",
-    ("HasRecords", "Identification"): "pass its `data`",
+    ): "`result.fit.htf(frequencies)` is that of the fit",
     (
         "ExperimentData",
         "SectionData",
@@ -116,6 +115,20 @@ STEPS = {
 stands for those derived from it."""
 
 OBJECTS = {
+    "fit_multipliers.list": "`hj.select_order(htf)` compares orders",
+    "fit_multipliers.tuple": "`hj.select_order(htf)` compares orders",
+    "fit_series.list": "`hj.select_order(data)` compares orders",
+    "multisine.LDTP": "pass `model.n_sections`",
+    "run_experiments.LDTP": "`hj.experiments.simulate_experiments(model, design)` runs experiments "
+    "on a model",
+    "optimal_design.float": "name the signal: `limit={'u': 0.01}` is its largest rms",
+    "identify_recording.list": "`hj.Recording.join(recordings)` makes trials of one recording; of "
+    "several subjects, `hj.identify_subjects(table, folder)`",
+    "Population.list": "`hj.recordings.Population.from_fits(fits, labels)` takes fits",
+    "responses.str": "`cycle.responses().curve('u')` is that to one input",
+    "fluctuations.float": "name the signal: `white={'y': 0.01}`",
+    "fit_model.Identification": "`hj.fitting.ObservedSeries(result.data, sections)` makes one",
+    "fit_model.SectionData": "`hj.fitting.ObservedSeries(data, sections)` makes one",
     "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
@@ -132,6 +145,7 @@ OBJECTS = {
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
     "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
     "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
+    "multipliers.list": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "save.HybridSystem": "a system is code: keep the script that makes it",
     "save.Recording": "`recording.to_pandas().to_csv(path)` writes it",

@@ -117,7 +117,7 @@ ALIKE = {
         "eigvals eig pole floquet_multipliers multiplier floquet roots lambdas "
         "characteristic_multipliers poles_ exponents"
     ),
-    "errors": "se bse std_err sd uncertainty uncertainties sigma yerr error_bars std_error",
+    "errors": "se bse std std_err sd uncertainty uncertainties sigma yerr error_bars std_error",
     "estimates": "results",
     "event": "poincare surface trigger crossing poincare_section",
     "file": "fname filepath path file_name name_of_file outfile out folder",
