@@ -269,9 +269,11 @@ def errors(
     def divide(x):
         return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
 
-    ratio = jnp.where(rough == 0, 1.0, jnp.maximum(divide(rough), 1 - divide(plain)))
+    larger = jnp.maximum(divide(rough), 1 - divide(plain))
+    ratio = jnp.where(rough == 0, 1.0, larger)
     powers = round(method.order - method.order / method.gain)
-    local = jnp.abs(estimate) * jnp.minimum(ratio, 1.0) ** powers + left
+    share = jnp.minimum(ratio, 1.0) ** powers
+    local = jnp.abs(estimate) * share + left
     estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
     return estimate, local
 
@@ -308,8 +310,10 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         now = jnp.max(jnp.abs(change), axis=0)
         size = jnp.abs(q) + jnp.max(jnp.abs(w), axis=0)
         # A component goes on while it moves by more than rounding errors, and converges.
-        going = (now > small * size) & ((now < 0.5 * last) | (i < 2))
-        return w, now, going.any(), i + 1
+        moves = now > small * size
+        converges = (now < 0.5 * last) | (i < 2)
+        going = (moves & converges).any()
+        return w, now, going, i + 1
 
     w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
     begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
@@ -356,27 +360,36 @@ class StageEquations(NamedTuple):
         """Those at increments w of a step from (t, q) over h."""
         A = np.array(method.a)
         times = t + np.array(method.c)[:, None] * h
-        J = jax.vmap(ft.partial(_jacobian, field))(times, q + _contract(A, w))
-        stages = range(len(A))
-        # Blocks that are not zero, those before stage k eliminated.
-        rest = {(i, j): -A[i, j] * h * J[i] for i, j in np.argwhere(A).tolist()}
-        for k in stages:
-            rest[k, k] = jnp.eye(len(q))[..., None] + rest.get((k, k), 0.0)
+        states = q + _contract(A, w)
+        J = jax.vmap(ft.partial(_jacobian, field))(times, states)
+        eye = jnp.eye(len(q))[..., None]
+        blocks = {}
+        for i, j in np.argwhere(A).tolist():
+            blocks[i, j] = -A[i, j] * h * J[i]
+        for k in range(len(A)):
+            blocks[k, k] = eye + blocks.get((k, k), 0.0)
+        return cls.factored(blocks, len(A))
+
+    @classmethod
+    def factored(
+        cls, blocks: dict[tuple[int, int], Array], stages: int
+    ) -> "StageEquations":
+        """Those with these blocks by Gaussian elimination; blocks that are left out are zero."""
+        rest = dict(blocks)
         inverses = []
         lower: dict[tuple[int, int], Array] = {}
-        for k in stages:
+        for k in range(stages):
             inverses.append(inverse(rest[k, k]))
-            later = stages[k + 1 :]
-            for i in later:
-                if (i, k) not in rest:
-                    continue
+            later = range(k + 1, stages)
+            below = [i for i in later if (i, k) in rest]
+            beside = [j for j in later if (k, j) in rest]
+            for i in below:
                 lower[i, k] = _product(rest[i, k], inverses[k])
-                for j in later:
-                    if (k, j) in rest:
-                        taken = _product(lower[i, k], rest[k, j])
-                        rest[i, j] = rest.get((i, j), 0.0) - taken
+                for j in beside:
+                    taken = _product(lower[i, k], rest[k, j])
+                    rest[i, j] = rest.get((i, j), 0.0) - taken
         upper = {(k, j): block for (k, j), block in rest.items() if j > k}
-        return cls(tuple(inverses), lower, upper)
+        return cls(inverses=tuple(inverses), lower=lower, upper=upper)
 
     def solve(self, right: Float[Array, "s n L"]) -> Float[Array, "s n L"]:
         """The solution of the linear equations with this right side."""
@@ -422,13 +435,16 @@ def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
     rows = np.arange(n)[:, None]
 
     def eliminate(k, X):
-        candidates = jnp.where(rows >= k, jnp.abs(X[:, k]), -1.0)
-        is_pivot = (rows == jnp.argmax(candidates, axis=0))[:, None]
+        size = jnp.abs(X[:, k])
+        candidates = jnp.where(rows >= k, size, -1.0)
+        place = jnp.argmax(candidates, axis=0)
+        is_pivot = (rows == place)[:, None]
         pivot = jnp.sum(jnp.where(is_pivot, X, 0.0), axis=0)
         X = jnp.where(is_pivot, X[k], X)
         pivot = pivot / pivot[k]
-        X = X - X[:, k][:, None] * pivot
-        return jnp.where((rows == k)[:, None], pivot, X)
+        column = X[:, k][:, None]
+        is_row = (rows == k)[:, None]
+        return jnp.where(is_row, pivot, X - column * pivot)
 
     eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
     X = jnp.concatenate([matrix, eye], axis=1)

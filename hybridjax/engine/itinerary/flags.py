@@ -150,18 +150,21 @@ def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
       than recorded. (A fall is no event where its predicate does not hold.)
     - The one at whose zero the leg ends must have been positive, and must fall.
     """
-    known = row.signs != 0
-    known = known & (jnp.arange(len(row.signs)) != row.target)
+    places = jnp.arange(len(row.signs))
+    known = (row.signs != 0) & (places != row.target)
     begins = jnp.isinf(before.value)
+    within = known & ~begins
+    signs = jnp.sign(now.value)
     # (Comparisons with NaN are false.)
+    as_recorded = signs * row.signs > 0
     compared = known & ((row.signs > 0) | row.at_once)
-    other = begins & compared & ~(jnp.sign(now.value) * row.signs > 0)
-    unknown = known & ~jnp.isfinite(now.value) & ~begins
-    returns = known & ~begins & dips(before, now, jnp.sign(now.value))
-    positive = (before.value > 0) & ~begins
-    falls = known & positive & ~(now.value > 0)
+    other = begins & compared & ~as_recorded
+    unknown = within & ~jnp.isfinite(now.value)
+    returns = within & dips(before, now, signs)
+    falls = within & (before.value > 0) & ~(now.value > 0)
     enabled = before.enabled | now.enabled | now.enabled_at_zero
-    left = (other | unknown | returns | (falls & enabled)).any()
+    happens = falls & enabled
+    left = (other | unknown | returns | happens).any()
     return left | _misses(row, before, now)
 
 
@@ -170,16 +173,21 @@ def _misses(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     correction has its sign in the row before.)"""
     if not now.value.size:
         return jnp.asarray(False)
-    was_positive = (before.value[row.target] > 0) | (row.signs[row.target] <= 0)
+    ends_at_zero = row.target >= 0
+    value = before.value[row.target]
+    sign = row.signs[row.target]
+    was_positive = (value > 0) | (sign <= 0)
     falls = now.rate[row.target] < 0
-    return (row.target >= 0) & ~(was_positive & falls)
+    return ends_at_zero & ~(was_positive & falls)
 
 
 def has_rival(row: Row, begin, now: Watched) -> Bool[Array, ""]:
     """Test whether another function falls to zero where an event happens, so that it may come first
     (see `Tape.rival`)."""
-    other = (row.signs > 0) & (jnp.arange(len(row.signs)) != row.target)
-    close = TOGETHER * (now.t - begin) * jnp.abs(now.rate)
+    places = jnp.arange(len(row.signs))
+    other = (row.signs > 0) & (places != row.target)
+    duration = now.t - begin
+    close = TOGETHER * duration * jnp.abs(now.rate)
     falls = (now.rate < 0) & (now.value <= close)
     return (other & falls & now.enabled).any()
 
@@ -213,11 +221,13 @@ def entered(
     others = values(b, q)
     terms = jnp.abs(jax.jacfwd(values, 1)(b, q)) @ jnp.abs(q)
     noise = ROUNDING * (terms + jnp.abs(others))
-    equal = jnp.abs(others[:, None] - own) <= noise[:, None]
+    apart = jnp.abs(others[:, None] - own)
+    equal = apart <= noise[:, None]
+    still_to_fall = pending[: len(own)]
     known = equal.any(axis=1)
-    armed = (equal & pending[: len(own)]).any(axis=1)
+    armed = (equal & still_to_fall).any(axis=1)
     more = (0, width - len(others))
-    return Entry(jnp.pad(known, more), jnp.pad(armed, more))
+    return Entry(known=jnp.pad(known, more), armed=jnp.pad(armed, more))
 
 
 def leveled(row: Row, flags: Flags) -> Flags:
@@ -237,14 +247,20 @@ def dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:
     """Test whether functions with these signs at two times have had the other one in between:
     whether the cubic polynomials with their values and rates have."""
     h = now.t - before.t
-    first, last = signs * before.value, signs * now.value
+    first = signs * before.value
+    last = signs * now.value
+    slope0 = h * signs * before.rate
+    slope1 = h * signs * now.rate
+    # The polynomial first + slope0 x + second x^2 + third x^3 of the part x of the time.
     rise = last - first
-    slope0, slope1 = h * signs * before.rate, h * signs * now.rate
     third = slope0 + slope1 - 2 * rise
     second = 3 * rise - 2 * slope0 - slope1
-    # The minimum is at the larger root of the derivative if the polynomial is of order 3.
-    root = jnp.sqrt(jnp.maximum(second**2 - 3 * third * slope0, 0.0))
+    # Its minimum is at the larger root of its derivative.
+    discriminant = second**2 - 3 * third * slope0
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
     place = -slope0 / (second + root)
-    lowest = first + place * (slope0 + place * (second + place * third))
     within = (place > 0) & (place < 1)
-    return jax.lax.stop_gradient((first > 0) & (last > 0) & within & (lowest < 0))
+    bend = second + place * third
+    lowest = first + place * (slope0 + place * bend)
+    positive = (first > 0) & (last > 0)
+    return jax.lax.stop_gradient(positive & within & (lowest < 0))
