@@ -11,6 +11,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
     python benchmarks/strangers.py weak     # fit_series of a pair beside a weak multiplier
     python benchmarks/strangers.py study    # studies whose data support a lower order
+    python benchmarks/strangers.py natural  # multipliers of rhythms that nobody perturbs
     python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
     python benchmarks/strangers.py pushes   # experiments on them, with four sizes of inputs
 
@@ -410,6 +411,50 @@ def weak(draws: int) -> None:
         )
 
 
+def natural(draws: int) -> None:
+    """Print how often intervals of natural multipliers hold the largest modulus, and in how many of
+    the misses nothing is said."""
+    print("multipliers, cycles      held     n  share  p of 95 %  quiet  bias")
+    for multipliers in truth.NATURAL:
+        for cycles in (60, 100, 300):
+            held = 0
+            quiet = 0
+            errors = []
+            for seed in range(draws):
+                y, true = truth.unperturbed_rhythm(multipliers, cycles, seed)
+                found = _natural(y, 1 if np.isreal(multipliers[0]) else 2)
+                modulus = float(np.abs(true[0]))
+                low, high = found.interval()[0]
+                holds = bool(low <= modulus <= high)
+                held += holds
+                quiet += not holds and not found.findings
+                errors.append(abs(found.multipliers[0]) - modulus)
+            p = stats.binomtest(held, draws, 0.95).pvalue
+            name = f"{np.abs(multipliers[0]):.2f}, {np.angle(multipliers[0]):.1f} rad, {cycles}"
+            print(
+                f"{name:22} {held:6} {draws:5} {held / draws:6.3f} {p:10.2g} {quiet:6} "
+                f"{np.mean(errors):6.3f}",
+                flush=True,
+            )
+
+
+def _natural(y: np.ndarray, order: int) -> hj.recordings.NaturalMultipliers:
+    """Return the natural multipliers of eight samples a cycle."""
+    signals = {f"y{i}": column for i, column in enumerate(y.T)}
+    recording = hj.Recording(
+        np.arange(len(y)) / 8, signals, events={"e": np.arange(len(y) // 8)}
+    )
+    data = hj.recordings.sample_sections(
+        recording,
+        hj.AtEvent("e"),
+        inputs=(),
+        outputs=recording.signals,
+        n_sections=8,
+        bandwidth=np.inf,
+    )
+    return hj.recordings.natural_multipliers(data, order)
+
+
 def loops(draws: int) -> None:
     """Print errors of `fit_series(references=)` relative to those of `fit_ldtp`, and refusals."""
     print(
@@ -476,6 +521,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "loops": (loops, 10),
     "phase": (phase, 30),
     "phase-long": (long_phase, 10),
+    "natural": (natural, 400),
     "plants": (strangers_plants.plants, 40),
     "pushes": (strangers_plants.pushes, 12),
 }

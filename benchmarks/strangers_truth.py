@@ -269,3 +269,31 @@ def weak_series(
     u = rng.normal(size=(3, 450, 1))
     y = loop.response(u)
     return loop, u, y + 0.1 * y.std(axis=(0, 1)) * rng.normal(size=y.shape)
+
+
+# Multipliers of rhythms that nobody perturbs (of a pair the upper one).
+NATURAL: list[list[complex]] = [
+    [0.2],
+    [0.5],
+    [0.7],
+    [0.9],
+    [0.95],
+    [-0.7],
+    [0.3 * np.exp(1j)],
+    [0.6 * np.exp(1j)],
+    [0.9 * np.exp(1j)],
+]
+
+
+def unperturbed_rhythm(
+    multipliers: list[complex], cycles: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return three outputs at eight sections a cycle of a random loop that noise drives at each
+    section, with noise of a fifth of their standard deviations, and the true multipliers."""
+    rng = np.random.default_rng((seed, cycles, 13))
+    loop = loop_with(multipliers, 8, 3, rng)
+    settle = 40
+    n = (cycles + settle) * 8
+    y = loop.response(np.zeros((1, n, 1)), rng.normal(size=(1, n, len(loop.A[0]))))
+    y = y[0, settle * 8 :]
+    return y + 0.2 * y.std(axis=0) * rng.normal(size=y.shape), loop.multipliers

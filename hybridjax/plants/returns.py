@@ -53,11 +53,10 @@ _COLUMNS = 4
 # as long, leave the linear range. Smaller: contacts of simulators with fixed time steps begin at
 # the same step for all of them, so that their noise hides.
 _LARGEST_STEP = 0.01
-# Steps of time by which the grid of a simulator is moved, one for each pair: multiples of the
-# golden ratio fill the unit interval evenly, also after a multiplication by any integer.
-_GOLDEN = (np.sqrt(5.0) - 1) / 2
 # Phases of the grid at which its noise is measured. Fewer: stairs between them hide. More: time.
 _GRIDS = 8
+# Phases of the grid with which the plant is tried. One of them: steps that divide it hide.
+_TRIED = (0.381966, 0.618034)
 # Part of the range by which a return may differ if the grid is moved. Larger: controllers that
 # count time steps are disturbed. Smaller: errors of integration count as a disturbance.
 _GRID_ERROR = 0.03
@@ -82,6 +81,10 @@ _RESIDUAL = 1e-5
 # Modulus of multipliers that are no doubt if they hide. Smaller: plants that forget everything in
 # one cycle are doubted. Larger: what matters hides.
 _SMALL = 0.05
+# Range of a coordinate below which it is rounding, in units of the largest number of the state.
+# Larger: motions in small units are taken as rest. Smaller: differences of rounding errors count as
+# slopes.
+_REST = 1e-13
 _DRAWS = 1000
 
 
@@ -208,15 +211,17 @@ class ReturnMap:
         rows = np.array([x.state for x in points], float)[:, self.columns]
         size = np.ptp(rows, axis=0)
         largest = np.abs(rows).max(axis=0)
-        # (A coordinate that does not move has the size of its value.)
-        rest = np.where(self.x, np.abs(self.x), 1.0)
-        self.size = np.where(size > 1e-9 * largest, size, rest)
+        rounding = _REST * largest.max(initial=0)
+        # (A coordinate that does not move has the size of its value, one at zero the size 1.)
+        rest = np.where(largest > rounding, largest, 1.0)
+        moves = size > np.maximum(1e-9 * largest, rounding)
+        self.size = np.where(moves, size, rest)
 
     def grid_may_move(self) -> bool:
         """Return whether the plant may begin with a shorter time step. (A controller that counts
         time steps is disturbed by it.)"""
         plain = self(self.x)
-        moved = [self(self.x, first=part) for part in (_GOLDEN, 1 - _GOLDEN)]
+        moved = [self(self.x, first=part) for part in _TRIED]
         change = np.abs(np.array(moved) - plain)
         return bool((change <= _GRID_ERROR * self.size).all())
 
@@ -233,8 +238,7 @@ class ReturnMap:
         move = 2 * _LARGEST_STEP * self.size * signs
         states = []
         signals = []
-        for pair in range(1, _GRIDS + 1):
-            first = pair * _GOLDEN % 1.0
+        for first in _grid_phases(rng, _GRIDS):
             above = self(self.x + move, first=first)
             signals_above = self.signals
             below = self(self.x - move, first=first)
@@ -324,16 +328,15 @@ class ReturnMap:
         at the ends of time steps, the differences then scatter as over many steps of the grid.
         """
         d = len(self.x)
-        repeats = max(1, _COLUMNS // d)
-        slopes = np.empty((repeats, len(_STEPS), d, d))
-        pair = 0
+        steps = np.tile(_STEPS, max(1, _COLUMNS // d))
+        slopes = np.empty((len(steps), d, d))
+        rng = np.random.default_rng(2)
         for k in counted(range(d), "coordinates", d):
-            for r in range(repeats):
-                for j, step in enumerate(_STEPS):
-                    pair += 1
-                    first = pair * _GOLDEN % 1.0 if self.moves_grid else 0.0
-                    slopes[r, j, :, k] = self._slope(k, step, first)
-        slopes = slopes.reshape(-1, d, d)
+            firsts = np.zeros(len(steps))
+            if self.moves_grid:
+                firsts = _grid_phases(rng, len(steps))
+            for j, (step, first) in enumerate(zip(steps, firsts, strict=True)):
+                slopes[j, :, k] = self._slope(k, step, first)
         return slopes * self.size / self.size[:, None]
 
     def _slope(self, k: int, step: float, first: float) -> Float[np.ndarray, " d"]:
@@ -379,6 +382,16 @@ class ReturnMap:
             f"{abs(residual[k]):.1g} of its range, and noise is {noise[k]:.1g}. Give `find_cycle` "
             "more `cycles`, or a `guess` nearer to the cycle."
         )
+
+
+def _grid_phases(rng: np.random.Generator, count: int) -> Float[np.ndarray, " count"]:
+    """Return phases of the grid of time: one in each of so many equal parts of a step, in random
+    order.
+
+    A plant may divide its steps. Phases in a regular order could then be nearly equal, or follow
+    the sizes of the steps, and their scatter would be far too small.
+    """
+    return (rng.permutation(count) + rng.uniform(size=count)) / count
 
 
 def measured_returns(map: ReturnMap) -> Returns:

@@ -39,13 +39,22 @@ from .inspection.differences import alternating_cycles
 
 # Draws of the bootstrap. More: time. Fewer: the ends of intervals scatter.
 _DRAWS = 1000
-# Fewest cycles of a block (else the third root of their number), and of blocks in a record, below
-# which whole records are drawn. More: few blocks. Fewer: memory of disturbances is cut.
+# Cycles of a block, in units of the third root of their number. More: few blocks. Fewer: errors
+# of successive cycles, which all sections have in common, are cut apart, and intervals too narrow.
+_BLOCK = 2.0
+# Fewest cycles of a block, and of blocks in a record, below which whole records are drawn. More:
+# few blocks. Fewer: memory of disturbances is cut.
 _SHORTEST_BLOCK = 4
 # Number of sections of a state, of sections between a state and its instruments, and of
 # combinations of the instruments per dimension of the state. More: weak instruments, and a first
 # stage that follows noise. Fewer: smoothing correlates their noise, and directions are missed.
 _EACH = 2
+# Modulus of multipliers of draws, at most, for which a bias is computed. Larger: it is infinite.
+# Smaller: slow multipliers keep a part of it.
+_STABLE = 0.99
+# Least variance of a combination of states, relative to the largest. Larger: small ones count as
+# larger. Smaller: noise of covariances is amplified.
+_LEAST_VARIANCE = 1e-3
 
 Draws = Complex[np.ndarray, "B d"]
 MultiplierCount = Annotated[int, Whole(1, 12)]
@@ -160,8 +169,10 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         order of moduli; `plain`: those of least squares. A complex pair has one modulus, and one
         interval.
 
-        They are percentiles of the bootstrap, widened by the ratio of Student's distribution for so
-        many blocks to the normal one (Hesterberg, *Am. Stat.* 69, 2015), and contain the estimate.
+        They are the estimate plus and minus the standard error of the bootstrap, times the quantile
+        of Student's distribution for so many blocks. (Percentiles of the bootstrap lie on the wrong
+        side: estimates of slow multipliers scatter towards zero, so that the truth lies above.) A
+        real multiplier whose interval contains 0 has moduli from 0 on.
 
         **Example:**
 
@@ -175,11 +186,13 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
         values = self.plain if plain else self.multipliers
         draws = self.plain_draws if plain else self.draws
-        moduli = _moduli(values, draws)
-        low, high = np.quantile(moduli, stats.norm.cdf([-reach, reach]), axis=0)
-        # (The correction of the bias may bring the estimate to the edge of its draws.)
-        modulus = np.abs(values)
-        return np.stack([np.minimum(low, modulus), np.maximum(high, modulus)], axis=1)
+        is_real = values.imag == 0
+        center = np.where(is_real, values.real, np.abs(values))
+        drawn = np.where(is_real, draws.real, _moduli(values, draws))
+        half = reach * drawn.std(axis=0)
+        ends = np.abs(np.stack([center - half, center + half], axis=1))
+        low = np.where(half < np.abs(center), ends.min(axis=1), 0.0)
+        return np.stack([low, ends.max(axis=1)], axis=1)
 
     def __repr__(self) -> str:
         lines = [
@@ -209,6 +222,8 @@ def _beside(values: Complex[np.ndarray, " d"], draws: Draws) -> Draws:
     """Return draws in the order in which the sum of their distances from the values is smallest."""
     from scipy.optimize import linear_sum_assignment  # (a third of a second)
 
+    if len(values) == 1:
+        return draws
     ordered = np.empty_like(draws)
     for row, drawn in enumerate(draws):
         _, columns = linear_sum_assignment(np.abs(values[:, None] - drawn))
@@ -245,7 +260,8 @@ def natural_multipliers(
     the same multipliers: the coefficients of their characteristic polynomials are averaged.
 
     The mean of each record is estimated, which biases the multipliers if there are few cycles. This
-    bias is corrected to first order in the inverse number of cycles (Pope 1990). Measurement noise
+    bias is corrected to first order in the inverse number of cycles (Nicholls and Pope 1988).
+    Measurement noise
     biases a plain regression towards zero (Dingwell and Cusumano 2000 show why to be careful with
     so few cycles and so much noise). Here the states at earlier sections of the same cycle serve as
     instruments: noise that is not correlated over three sections or more has no effect on them.
@@ -307,7 +323,7 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     moments = _moments(data, order)
     K = len(moments.records)
     _, counts = np.unique(moments.records, return_counts=True)
-    block = max(_SHORTEST_BLOCK, round(K ** (1 / 3)))
+    block = max(_SHORTEST_BLOCK, round(_BLOCK * K ** (1 / 3)))
     if np.median(counts) < _SHORTEST_BLOCK * block and len(counts) >= _SHORTEST_BLOCK:
         block = int(counts.max())
     rng = np.random.default_rng(seed)
@@ -319,7 +335,8 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     )
     first_stage = np.linalg.pinv(square, hermitian=True) @ cross.mT
     by_instruments = ahead @ first_stage @ np.linalg.pinv(cross @ first_stage)
-    multipliers = _corrected(_multipliers(by_instruments), K / len(counts))
+    # (With the noise of the states: without it, weak instruments give variances near zero.)
+    multipliers = _multipliers(_corrected(by_instruments, state / K, K / len(counts)))
     plain = _multipliers(forward @ np.linalg.inv(state))
     explained = cross[0] @ np.linalg.solve(square[0], cross[0].mT)
     whole = np.trace(state[0], axis1=1, axis2=2)
@@ -456,24 +473,56 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
         times_value = np.pad(polynomial, ((0, 0), (0, 0), (1, 0)))
         polynomial = times_z - values[..., k, None] * times_value
     mean = np.real(polynomial).mean(axis=1)
-    return _largest_first(np.array([np.roots(x) for x in mean], complex))
+    # (Roots are eigenvalues of companion matrices, of all draws at once.)
+    companion = np.zeros((len(mean), *values.shape[2:], *values.shape[2:]))
+    companion[:, 0] = -mean[:, 1:]
+    companion[:, 1:, :-1] = np.eye(values.shape[2] - 1)
+    return _largest_first(np.linalg.eigvals(companion).astype(complex))
 
 
 def _largest_first(z: Draws) -> Draws:
     return np.take_along_axis(z, np.argsort(-np.abs(z), axis=1, kind="stable"), axis=1)
 
 
-def _corrected(z: Draws, length: float) -> Draws:
-    """Remove the bias of first order that the unknown mean of each record, and regression on the
-    past, make in records of so many cycles (Pope 1990, for disturbances along the eigenvectors; for
-    one multiplier Kendall's (1 + 3 z) / length)."""
-    own = z[:, :, None]
-    other = z[:, None, :]
-    product = own * other
-    modulus = np.clip(np.abs(product), 0, 0.99)
-    stable = modulus * np.exp(1j * np.angle(product))
-    by_regression = (other * (1 - own**2) / (1 - stable)).sum(axis=2)
-    return _largest_first(z + (1 + 2 * z + by_regression) / length)
+def _corrected(
+    maps: Float[np.ndarray, "B N d d"],
+    covariance: Float[np.ndarray, "B N d d"],
+    length: float,
+) -> Float[np.ndarray, "B N d d"]:
+    r"""Return maps without the bias of first order that the unknown mean of each record, and
+    regression on the past, make in records of so many cycles (Nicholls and Pope 1988):
+
+    $$-G \left[(I - J^T)^{-1} + J^T (I - J^T J^T)^{-1}
+    + \sum_i \lambda_i (I - \lambda_i J^T)^{-1}\right] \Sigma^{-1}$$
+
+    over the length, with $G = \Sigma - J \Sigma J^T$ the covariance of the disturbances. For one
+    multiplier this is Kendall's (1 + 3 z) / length.
+    """
+    eye = np.eye(maps.shape[-1])
+    state = _positive(covariance)
+    disturbances = _positive(state - maps @ state @ maps.mT)
+    values = np.linalg.eigvals(maps)
+    # (Of unstable draws, the bias at the edge of stability.)
+    largest = np.abs(values).max(axis=-1)
+    inside = np.minimum(1.0, _STABLE / np.maximum(largest, _STABLE))
+    values = values * inside[..., None]
+    back = maps.mT * inside[..., None, None]
+    sums = np.linalg.inv(eye - back) + back @ np.linalg.inv(eye - back @ back)
+    for k in range(values.shape[-1]):
+        value = values[..., k, None, None]
+        sums = sums + (value * np.linalg.inv(eye - value * back)).real
+    change = disturbances @ sums @ np.linalg.inv(state) / length
+    # (Of d equal multipliers it is 3 + d at most; maps far from normal would be moved without end.)
+    largest = (3 + maps.shape[-1]) / length
+    size = np.linalg.norm(change, 2, axis=(-2, -1))[..., None, None]
+    return maps + change * np.minimum(1.0, largest / np.maximum(size, largest))
+
+
+def _positive(covariance: Float[np.ndarray, "B N d d"]) -> Float[np.ndarray, "B N d d"]:
+    """Return the nearest covariances of full rank: estimates may have negative variances."""
+    values, axes = np.linalg.eigh((covariance + covariance.mT) / 2)
+    least = _LEAST_VARIANCE * np.abs(values[..., -1:])
+    return (axes * np.maximum(values, least)[..., None, :]) @ axes.mT
 
 
 def _resampled(

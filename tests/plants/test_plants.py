@@ -204,6 +204,67 @@ def test_errors_contain_the_stairs_of_time_steps():
     assert sum(flat) < 10
 
 
+class FineStairs(Stairs):
+    """The same, whose simulator divides each of its steps into five."""
+
+    def step(self, u, duration):
+        fine = self.dt / 5
+        count = int(duration / fine + 1e-9)
+        for _ in range(count):
+            super().step(u, fine)
+        return super().step(u, duration - count * fine)
+
+
+def test_errors_contain_stairs_of_steps_that_a_plant_divides():
+    """Phases of the grid that follow the sizes of the steps would look like curvature: the errors
+    are then a third of the true ones."""
+    rng = np.random.default_rng(1)
+    ratios = []
+    for _ in range(16):
+        a = rng.uniform(0.2, 0.5)
+        b = rng.uniform(0.3, 0.5)
+        c = rng.uniform(0.25, 0.4)
+        d = rng.uniform(0.3, 0.5)
+        plant = FineStairs(a, b, c, d, float(1 / rng.integers(20, 60)))
+        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        returns = cycle.perturbed_returns("v")
+        off = returns.multipliers[0] - (a + b * d)
+        ratios.append(abs(off) / returns.standard_errors[0])
+    # (The rms of 16 numbers of Student's distribution with 21 degrees of freedom.)
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+class Rounded(Circle):
+    """A circle with another coordinate that is at rest, but for rounding errors."""
+
+    states = ("x", "y", "side")
+
+    def reset(self, seed):
+        self.side = 0.0
+        return super().reset(seed)
+
+    def get_state(self):
+        return (*self.q, self.side)
+
+    def set_state(self, q):
+        self.side = float(q[2]) if len(q) > 2 else self.side
+        return super().set_state(q[:2]) | {"side": self.side}
+
+    def step(self, u, duration):
+        rounding = 4e-16 * math.sin(1e4 * self.q[0])
+        self.side = (1.0 + self.side * math.exp(-0.1 * duration) + rounding) - 1.0
+        return super().step(u, duration)
+
+
+def test_a_coordinate_of_rounding_errors_is_at_rest():
+    """Its range is no size: it is neither off the cycle, nor noise."""
+    cycle = hj.plants.find_cycle(Rounded(), ANGLE, "x", cycles=40)
+    returns = cycle.perturbed_returns()
+    slow = math.exp(-0.2 * math.pi)
+    assert_allclose(returns.multipliers, [slow, MULTIPLIER], rtol=0, atol=1e-6)
+    assert not returns.findings
+
+
 @pytest.mark.parametrize(("size", "cause"), [(1e-6, "stairs"), (0.1, None)])
 def test_inputs_that_stay_on_one_stair_are_named(size, cause):
     plant = Stairs(0.4, 0.4, 0.3, 0.4, 0.005)

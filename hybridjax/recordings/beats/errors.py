@@ -115,27 +115,30 @@ def whitening(
             scale=np.ones(L),
         )
     left = _left(intervals, wander.memory)
-    kept = np.zeros(L)
-    learned = np.zeros(L)
-    scale = np.ones(L)
-    stationary = wander.size**2
-    variance = stationary
-    # (Lists: items of arrays take three times as long.)
-    for k, (g, a) in enumerate(zip(by_drift.tolist(), left.tolist(), strict=True)):
-        square = 1.0 + g * g * variance
-        gain = variance * g / square
-        kept[k] = a * (1 - gain * g)
-        learned[k] = a * gain
-        scale[k] = square**0.5
-        update = a * a * variance * (1 - gain * g)
-        variance = update + (1 - a * a) * stationary
+    filters = _filters(by_drift, left[:, None], np.array([wander.size**2]))
+    kept, learned, scale = (x[:, 0] for x in filters)
     return Whitening(
-        weight=weight,
-        by_drift=by_drift,
-        kept=kept,
-        learned=learned,
-        scale=scale,
+        weight=weight, by_drift=by_drift, kept=kept, learned=learned, scale=scale
     )
+
+
+def _filters(
+    by_drift: Lanes,
+    left: Float[np.ndarray, "L W"],
+    stationary: Float[np.ndarray, " W"],
+) -> tuple[
+    Float[np.ndarray, "L W"], Float[np.ndarray, "L W"], Float[np.ndarray, "L W"]
+]:
+    """Return `kept`, `learned` and `scale` of Kalman filters for W wandering rates at once, which
+    have the variances `stationary`, and of which `left` remains in the next interval."""
+    drift = by_drift[:, None]
+    variance = np.empty_like(left)
+    now = stationary
+    for k, (g, a) in enumerate(zip(by_drift.tolist(), left * left, strict=True)):
+        variance[k] = now
+        now = a * (now / (1.0 + g * g * now)) + (1.0 - a) * stationary
+    square = 1.0 + drift**2 * variance
+    return left / square, left * variance * drift / square, np.sqrt(square)
 
 
 def _left(intervals: Intervals, memory: float) -> Lanes:
@@ -169,26 +172,34 @@ def estimate_wander(
     if int(used.sum()) - trials - columns.shape[1] < _FEWEST_LEFT:
         return Wander.none()
 
-    def improbable(wander: Wander) -> float:
-        white = whitening(intervals, ahead, rates, used, wander)
-        by_rate = white(ahead.slopes[:, -1:])[:, 0]
-        y = white(residual[:, None])
-        return _improbable(intervals, white, by_rate, y, white(columns))
+    plain = whitening(intervals, ahead, rates, used, Wander.none())
+    by_drift = plain.weight * ahead.slopes[:, -1]
+    deviations = np.column_stack([ahead.slopes[:, -1], residual, columns])
+
+    def improbable(wanders: list[Wander]) -> list[tuple[float, Wander]]:
+        left = np.stack([_left(intervals, x.memory) for x in wanders], axis=1)
+        stationary = np.array([x.size**2 for x in wanders])
+        filters = _filters(by_drift, left, stationary)
+        rows = []
+        for wander, *numbers in zip(wanders, *(x.T for x in filters), strict=True):
+            white = Whitening(plain.weight, by_drift, *numbers)
+            errors = white(deviations)
+            rows.append((_improbable(intervals, white, errors), wander))
+        return rows
 
     # Rates that every interval has anew make some intervals noisier than others: without them, a
     # wandering rate would explain that, too.
     changes = (_CHANGES / period).tolist()
     anew = [Wander.none()] + [Wander(change, 0.0) for change in changes]
-    independent = min((improbable(x), x) for x in anew)
+    independent = min(improbable(anew))
     wandering = []
     for memory in (_MEMORIES * period).tolist():
         if memory > 4 * longest:
             break
         forgotten = 1 - np.exp(-2 * period / memory)
         for change in changes:
-            wander = Wander(float(change / np.sqrt(forgotten)), memory)
-            wandering.append((improbable(wander), wander))
-    correlated = min(wandering, default=independent)
+            wandering.append(Wander(float(change / np.sqrt(forgotten)), memory))
+    correlated = min(improbable(wandering)) if wandering else independent
     if independent[0] - correlated[0] < _LEAST_GAIN:
         return independent[1]
     return correlated[1]
@@ -216,17 +227,14 @@ def without_rates(
     return WithoutRates(columns - explained, along, power)
 
 
-def _improbable(
-    intervals: Intervals,
-    white: Whitening,
-    by_rate: Lanes,
-    residual: Float[np.ndarray, "L 1"],
-    columns: Columns,
-) -> float:
+def _improbable(intervals: Intervals, white: Whitening, errors: Columns) -> float:
     """Return minus twice the logarithm of the restricted likelihood of independent errors, with the
-    variance at which it is largest."""
-    both = np.concatenate([residual, columns], axis=1)
-    rest, _, power = without_rates(intervals, by_rate, both)
+    variance at which it is largest.
+
+    **Arguments:** `errors`: derivatives by the rates, residuals, and derivatives by what was
+    fitted.
+    """
+    rest, _, power = without_rates(intervals, errors[:, 0], errors[:, 1:])
     y = rest[:, 0]
     x = rest[:, 1:]
     curvatures, axes = np.linalg.eigh(x.T @ x)

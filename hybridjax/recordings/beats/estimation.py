@@ -40,6 +40,9 @@ _ROUNDS = 8
 # depend on the start. Smaller: more iterations for digits that noise hides.
 _SETTLED = 1e-6
 _SAME = 0.01
+# The same of the cost while jitter and smoothness still change. Larger: more updates of them.
+# Smaller: digits that the next update changes.
+_NEARLY_SETTLED = 1e-3
 # Blocks from which standard errors are computed: one per trial if there are so many, else parts of
 # trials with at least so many intervals. More, shorter: blocks are not independent. Fewer, longer:
 # standard errors scatter.
@@ -146,14 +149,14 @@ def fit_curve(
         fit = _look(intervals, table, fit)
         if waves:
             fit = fit._replace(smoothness=_smoothness(intervals, fit))
-        fit = _minimize(intervals, table, fit)
+        fit = _minimize(intervals, table, fit, _NEARLY_SETTLED)
         fit = fit._replace(used=fit.counted())
         fit = fit._replace(wander=_wander(intervals, fit))
         missed = whitened(intervals, fit).missed(fit.residual)
         fit = fit._replace(jitter=float(missed[fit.used].std()))
         if _is_settled(before, fit):
             break
-    return fit
+    return _minimize(intervals, table, fit, _SETTLED)
 
 
 def _start(intervals: Intervals, waves: int, start: CurveFit | None) -> CurveFit:
@@ -218,9 +221,11 @@ def _look(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
     return fit._replace(residual=residual, forecast=ahead, converged=True)
 
 
-def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
+def _minimize(
+    intervals: Intervals, table: Table, fit: CurveFit, settled: float
+) -> CurveFit:
     """Minimize the penalized sum of squares over curve and rates: Gauss-Newton steps, which are
-    halved until the sum decreases.
+    halved until the sum decreases, up to a step that gains less than the fraction `settled`.
 
     Rates are eliminated from each step. (In scipy's `least_squares`, those of hundreds of trials
     would be most of the unknowns.)
@@ -249,7 +254,7 @@ def _minimize(intervals: Intervals, table: Table, fit: CurveFit) -> CurveFit:
         gain = 1 - after / cost
         fit = trial
         cost = after
-        if gain < _SETTLED:
+        if gain < settled:
             return fit
     return fit._replace(converged=False)
 
