@@ -170,7 +170,7 @@ class OptimalDesign(Showable, eqx.Module):
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum):\n  "
             f"no design within the limits {'(of distortion: an upper bound) ' * bounded}"
-            f"needs less than {1 / self.certificate:.1%} of these cycles"
+            f"needs less than {100 / self.certificate:.1f} % of these cycles"
         )
         below = "\n".join(["", self.advice, certificate, repr(self.design)]).replace(
             "\n", "\n  "

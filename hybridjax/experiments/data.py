@@ -253,7 +253,7 @@ class ExperimentData(Showable, eqx.Module):
         causes = () if self.simulated is None else self.simulated.causes
         return summary(self.result, self.failed_at, self.n_sections, limit, causes)
 
-    def plot(self, index: Index = 0, *, ax: object = None) -> Any:
+    def plot(self, index: int = 0, *, ax: object = None) -> Any:
         """Draw inputs and deviations of the outputs of one experiment against time.
 
         One row per signal. Cycles before the window that estimates use are shaded. A failed

@@ -15,6 +15,7 @@ from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.showable import WithMultipliers
+from .._core.text import how_many
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
@@ -113,7 +114,10 @@ class RationalFit(WithMultipliers, eqx.Module):
     def __repr__(self) -> str:
         poles = self.denominator.shape[1] - 1
         zeros = self.numerator.shape[1] - 1
-        rows = [f"RationalFit(H_0 from {self.input}, {poles} poles, {zeros} zeros)"]
+        sizes = (
+            f"{how_many(poles, 'pole', 'poles')}, {how_many(zeros, 'zero', 'zeros')}"
+        )
+        rows = [f"RationalFit(H_0 from {self.input}, {sizes})"]
         fits = zip(
             self.outputs, self.multipliers, self.residual, self.result, strict=True
         )

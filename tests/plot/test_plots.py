@@ -50,8 +50,12 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
         from_htf = draw(estimate, exact).ax.lines
         for line, expected in zip(from_model, from_htf, strict=True):
             assert_allclose(line.get_xydata(), expected.get_xydata(), rtol=1e-9)
-    with pytest.raises(hj.errors.DefinitionError, match="model alone"):
-        hj.plot.bode(hopper)
+    # Alone, up to half of its sections in a period.
+    drawn, *_ = hj.plot.bode(hopper).ax.lines
+    f, size = drawn.get_xydata().T
+    assert f[0] == 0
+    assert f[-1] == 16
+    assert_allclose(size, abs(hopper.htf(f, harmonics=0).H[0, :, 0, 0]), rtol=1e-9)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
