@@ -170,7 +170,6 @@ def rearm(
     lanes: Lanes,
     watched: Watch,
     fired: Index,
-    together: Mask,
     span: Times,
     u: Inputs,
     residue: Times,
@@ -180,8 +179,8 @@ def rearm(
 
     A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
     until it has left zero, if it rises, or if it was crossed before (see `Entry`). Otherwise the
-    reset has put it there, and it is due at once if it falls, as it is if it was at its zero in
-    the old chart, together with the guard that fired.
+    reset has put it there, or it has come to zero together with the guard that fired, and it is due
+    at once if it falls.
 
     A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
     that the reset has led across it, or if it falls, and the old chart does not have it.
@@ -194,11 +193,9 @@ def rearm(
     zero = xp.maximum(zero, xp.where(other, 0.0, 4 * residue))
     falls = rate < 0
     late = overdue(watched, lanes.t, span) & (value < -zero)
-    at_zero = xp.abs(value) <= zero
-    due = together & other & at_zero & falls
     put = other & falls & (value <= zero) & ~late & (entry.armed | ~entry.known)
     late = late & (entry.armed | (falls & ~entry.known))
-    armed = ((value > zero) | due | put | late) & belongs(s, lanes.chart)[:-1]
+    armed = ((value > zero) | put | late) & belongs(s, lanes.chart)[:-1]
     armed = with_schedules(s, armed, lanes.armed & ~_over(s, lanes.t, fired))
     return lanes._replace(armed=xp.where(fired >= 0, armed, lanes.armed))
 
@@ -337,12 +334,18 @@ def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask, span: Times
+    pace: Float[Array, "4 L"],
+    moved: Times,
+    event: Mask,
+    slow: Mask,
+    span: Times,
+    transitions: int,
 ) -> tuple[Float[Array, "4 L"], Mask]:
     """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
     shrink with a sum that converges.
 
-    `slow` marks events whose guard is crossed at a vanishing speed.
+    `slow` marks events whose guard is crossed at a vanishing speed. So many different `transitions`
+    may coincide without accumulating.
     """
     xp = namespace(pace)
     since, gap, streak, total = pace
@@ -356,7 +359,8 @@ def keep_pace(
     total = xp.where(event, xp.where(shrinks, total + since, 0.0), total)
     series = since * ratio / xp.where(shrinks, 1 - ratio, 1.0)
     to_come = xp.where(shrinks, series, xp.inf)
-    zeno = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
+    enough = _ZENO_STREAK + xp.where(since == 0, transitions, 0)
+    zeno = (streak >= enough) & (to_come <= _ZENO_REST * total)
     zeno = event & (zeno | (slow & (streak >= _ZENO_SLOW)))
     gap = xp.where(event, since, gap)
     since = xp.where(event, 0.0, since)

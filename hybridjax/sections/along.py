@@ -136,7 +136,7 @@ def _ends_at_targets(
     none = np.zeros(len(at), np.int32)
     u = np.zeros((s.nu, 1))
     entry = Entry(ends.armed, ends.armed)
-    return rearm(s, armed, watched, fired, none > 0, period, u, none, entry)
+    return rearm(s, armed, watched, fired, period, u, none, entry)
 
 
 def _places_on(
