@@ -182,7 +182,6 @@ def rearm(
     lanes: Lanes,
     watched: Watch,
     fired: Index,
-    together: Mask,
     span: Times,
     u: Inputs,
     residue: Times,
@@ -192,8 +191,8 @@ def rearm(
 
     A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
     until it has left zero, if it rises, or if it was crossed before (see `Entry`). Otherwise the
-    reset has put it there, and it is due at once if it falls, as it is if it was at its zero in
-    the old chart, together with the guard that fired.
+    reset has put it there, or it has come to zero together with the guard that fired, and it is due
+    at once if it falls.
 
     A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
     that the reset has led across it, or if it falls, and the old chart does not have it.
@@ -207,12 +206,10 @@ def rearm(
     falls = rate < 0
     is_new = ~entry.known
     late = overdue(watched, lanes.t, span) & (value < -zero)
-    at_zero = xp.abs(value) <= zero
-    due = together & other & at_zero & falls
     was_not_crossed = entry.armed | is_new
     put = other & falls & (value <= zero) & ~late & was_not_crossed
     late = late & (entry.armed | (falls & is_new))
-    armed = (value > zero) | due | put | late
+    armed = (value > zero) | put | late
     armed = armed & belongs(s, lanes.chart)[:-1]
     still_waiting = lanes.armed & ~_over(s, lanes.t, fired)
     armed = with_schedules(s, armed, still_waiting)
@@ -364,12 +361,18 @@ def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
 
 
 def keep_pace(
-    pace: Float[Array, "4 L"], moved: Times, event: Mask, slow: Mask, span: Times
+    pace: Float[Array, "4 L"],
+    moved: Times,
+    event: Mask,
+    slow: Mask,
+    span: Times,
+    transitions: int,
 ) -> tuple[Float[Array, "4 L"], Mask]:
     """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
     shrink with a sum that converges.
 
-    `slow` marks events whose guard is crossed at a vanishing speed.
+    `slow` marks events whose guard is crossed at a vanishing speed. So many different `transitions`
+    may coincide without accumulating.
     """
     xp = namespace(pace)
     since, gap, streak, total = pace
@@ -387,7 +390,8 @@ def keep_pace(
     # The sum of the intervals to come, as a geometric series.
     series = since * ratio / xp.where(shrinks, 1 - ratio, 1.0)
     to_come = xp.where(shrinks, series, xp.inf)
-    converges = (streak >= _ZENO_STREAK) & (to_come <= _ZENO_REST * total)
+    enough = _ZENO_STREAK + xp.where(since == 0, transitions, 0)
+    converges = (streak >= enough) & (to_come <= _ZENO_REST * total)
     stops = slow & (streak >= _ZENO_SLOW)
     zeno = event & (converges | stops)
     gap = xp.where(event, since, gap)

@@ -36,6 +36,9 @@ from .rivals import is_due
 # events in two orders, functions at two times, the period and the durations between sections.
 # Smaller: errors of the flow count as differences. Larger: small differences pass.
 SAME = 1e-6
+# Events at one time of which all orders are compared. More: seven events have 5040 orders, which
+# take ten seconds, and each further one takes ten times as long. Fewer: more groups are refused.
+_MOST_ORDERED = 6
 
 
 class SimultaneousEvents(NamedTuple):
@@ -51,7 +54,8 @@ class SimultaneousEvents(NamedTuple):
     cycle that reach the events in this order."""
     commute: bool
     """Whether all orders lead through as many events to the same state, with the same
-    derivative."""
+    derivative. Orders of more than six events are not compared: `orders` then has the one of the
+    cycle, `derivatives` none, and `commute` is False."""
 
 
 class _Order(NamedTuple):
@@ -109,9 +113,17 @@ def groups_on(
         in_order = all(_follows_at_once(path, k, period) for k in before_last)
         if in_order and not missed:
             groups.append(None)
+        elif len({*events, *missed}) > _MOST_ORDERED:
+            groups.append(_not_compared(path, group))
         else:
             groups.append(_coincidence(path, group[0], period, scale))
     return groups
+
+
+def _not_compared(path: Trajectory, group: list[int]) -> SimultaneousEvents:
+    """A group with too many orders to compare them."""
+    names = tuple(path.structure.transitions[g].name for g in path.event[group])
+    return SimultaneousEvents(float(path.t[group[0]]), (names,), (), False)
 
 
 def _coincidence(

@@ -737,7 +737,7 @@ def _require_ends(found: Flow) -> None:
         )
     if codes[k] == Result.SIMULTANEOUS:
         raise ComputationError(
-            f"{message}, and its derivatives depend on the order. `throw=False` returns the "
+            f"{message}, and its derivatives may depend on the order. `throw=False` returns the "
             "events."
         )
     begin = found.request.lanes.t[0]

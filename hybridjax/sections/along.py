@@ -174,7 +174,6 @@ def _ends_at_targets(
         armed,
         watched,
         fired,
-        together=np.zeros(len(at), bool),
         span=period,
         u=np.zeros((s.nu, 1)),
         residue=np.zeros(len(at), np.int32),

@@ -574,6 +574,45 @@ def test_events_that_coincide():
     assert apart.result == Result.OK
 
 
+def counters(n):
+    """n counters, all of which add the clock's time at the same time."""
+
+    def count(k):
+        return (
+            f"count {k}",
+            lambda t, q, u, p: p.at - q[-1],
+            lambda t, q, u, p: q.at[k].add(q[-1]),
+        )
+
+    return hj.HybridSystem.from_functions(
+        (*(f"x{k}" for k in range(n)), "clock"),
+        lambda t, q, u, p: jnp.zeros(n + 1).at[-1].set(1.0),
+        [count(k) for k in range(n)],
+        {"at": 0.5},
+    )
+
+
+@pytest.mark.parametrize("n", [3, 5])
+def test_each_of_several_events_that_coincide_happens_once(n):
+    """None is due again after the others, also where a flow ends right after them."""
+    start = hj.Guess("main", jnp.zeros(n + 1))
+    for end in (dict(until=1.0), dict(events=n, within=1.0)):
+        found = hj.flow(counters(n), start, **end)
+        assert found.event_index[: n + 1].tolist() == [*range(n), -1]
+        assert_allclose(found.state[:n], 0.5, rtol=1e-12)
+    program = jax.jit(lambda x: hj.flow(counters(n), hj.Guess("main", x), 1.0))
+    found = program(start.state)
+    assert found.event_index[: n + 1].tolist() == [*range(n), -1]
+    assert found.result == Result.SIMULTANEOUS
+
+
+def test_many_events_that_coincide_are_not_called_zeno():
+    """Their orders are too many to compare."""
+    start = hj.Guess("main", jnp.zeros(14))
+    with pytest.raises(ComputationError, match="coincide.* depend on the order"):
+        hj.flow(counters(13), start, 1.0)
+
+
 def test_events_at_the_start_and_at_the_end():
     """Findings say that rounding decides whether they happen, and that they do not."""
     for end in (FIRST, FIRST * (1 - 1e-15), FIRST * (1 + 1e-15)):

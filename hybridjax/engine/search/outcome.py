@@ -186,9 +186,8 @@ def _after(
     slow = verdict.lands & (new.slow | (on & (speed < SLOW * state.approach.rate)))
     slow = slow | _is_shallow(state, aim, new, verdict, t, task)
     passed = xp.where(accepted, step_length(aim, new), 0.0)
-    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span)
-    falls = (xp.abs(end.value) <= zero) & (end.rate < 0)
-    together = (ready & falls)[:-1].any(axis=0)
+    count = len(task.s.transitions)
+    pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span, count)
     t = xp.where(accepted, t, lanes.t)
     waiting = await_schedules(task.s, lanes.armed, lanes.t, t) & ~due[:-1]
     after = Lanes(
@@ -200,7 +199,7 @@ def _after(
         pace,
     )
     watched = _merge(accepted, end, state.watched)
-    end = _reset(after, watched, ready[-1], fired, together, task)
+    end = _reset(after, watched, ready[-1], fired, task)
     return *end, zeno, slow
 
 
@@ -234,7 +233,6 @@ def _reset(
     watched: Watch,
     aimed: Mask,
     fired: Index,
-    together: Mask,
     task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
     """Lanes after the resets of their events, the watched functions there, and whether the target's
@@ -249,7 +247,7 @@ def _reset(
         after = watch(s, new.t, chart, q, task.u, task.target, fires)
         residue = xp.abs(of_row(watched.value, fired))
         entry = _entry(lanes, watched, new, task)
-        new = rearm(s, new, after, fired, together, task.span, task.u, residue, entry)
+        new = rearm(s, new, after, fired, task.span, task.u, residue, entry)
         counts = xp.where(fires, level_counts(after, task.span), aimed)
         return new, _merge(fires, after, watched), counts
 
