@@ -73,14 +73,17 @@ def take_step(
     if weights is None:
         middle = halfway_cubic(q, end, K[0], f1, h)
     else:
-        middle = q + h * combined(weights.state, K), combined(weights.rate, K)
+        until = h * combined(weights.state, K)
+        middle = q + until, combined(weights.rate, K)
     return Step(end, K[0], f1, error, error, *middle)
 
 
 def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
     def stage(K, xs):
         row, c, k = xs
-        return K.at[k].set(field(t + c * h, q + h * jnp.tensordot(row, K, 1))), None
+        y = q + h * jnp.tensordot(row, K, 1)
+        rate = field(t + c * h, y)
+        return K.at[k].set(rate), None
 
     stages = len(method.c)
     begin = jnp.zeros((stages, *q.shape), q.dtype)
@@ -110,7 +113,8 @@ def looped_step(
         rate = apart(field(t + c[k] * h, y))
         return jax.lax.dynamic_update_index_in_dim(K, rate, k, 0)
 
-    K = jax.lax.fori_loop(0, stages, stage, jnp.zeros((stages, *q.shape), q.dtype))
+    nothing = jnp.zeros((stages, *q.shape), q.dtype)
+    K = jax.lax.fori_loop(0, stages, stage, nothing)
     rate = weighted(jnp.asarray(method.b), K)
     error_rate = weighted(jnp.asarray(method.error), K)
     return q + h * rate, h * error_rate
@@ -119,7 +123,8 @@ def looped_step(
 def _unrolled_stages(method, field, t, q, h) -> list[States]:
     K: list[jax.Array] = []
     for row, c in zip(method.a, method.c, strict=True):
-        K.append(field(t + c * h, q + h * _combine(row, K)))
+        y = q + h * _combine(row, K)
+        K.append(field(t + c * h, y))
     return K
 
 
@@ -149,7 +154,10 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
     shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
 
     def change(shift):
-        return xp.abs(field(t * (1 + shift[0]), q * (1 + shift[1:, None])) - f)
+        of_time = 1 + shift[0]
+        of_states = 1 + shift[1:, None]
+        shifted = field(t * of_time, q * of_states)
+        return xp.abs(shifted - f)
 
     changes = for_each_row(change, shifts)
     return xp.max(xp.where(xp.isfinite(changes), changes, 0.0), axis=0)
@@ -166,13 +174,16 @@ def short_step(
     from the midpoint rule vanishes where h is four times the decay time of a mode, that from the
     other nowhere.)
     """
+    xp = namespace(q)
     half = 0.5 * h
-    k2 = field(t + half, q + half * f)
-    k3 = field(t + half, q + half * k2)
+    middle = t + half
+    k2 = field(middle, q + half * f)
+    k3 = field(middle, q + half * k2)
     k4 = field(t + h, q + h * k3)
     slope = (f + 2 * k2 + 2 * k3 + k4) / 6
-    xp = namespace(q)
-    return q + h * slope, h * xp.maximum(xp.abs(slope - k2), xp.abs(slope - k3))
+    by_k2 = xp.abs(slope - k2)
+    by_k3 = xp.abs(slope - k3)
+    return q + h * slope, h * xp.maximum(by_k2, by_k3)
 
 
 # Relative change at which increments are settled: a few rounding errors. Larger: steps have errors
@@ -274,8 +285,9 @@ def errors(
     powers = round(method.order - method.order / method.gain)
     share = jnp.minimum(ratio, 1.0) ** powers
     local = jnp.abs(estimate) * share + left
-    estimate = jnp.where(estimate < 0, estimate - left, estimate + left)
-    return estimate, local
+    lower = estimate - left
+    higher = estimate + left
+    return jnp.where(estimate < 0, lower, higher), local
 
 
 def increments(method, field, t, q, h, small: float = _SETTLED):
@@ -315,8 +327,10 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         going = (moves & converges).any()
         return w, now, going, i + 1
 
-    w = jnp.zeros((len(c), *q.shape), q.dtype).at[0].set(h * field(t, q))
-    begin = w, jnp.full(q.shape, jnp.inf, q.dtype), jnp.array(True), 0
+    nothing = jnp.zeros((len(c), *q.shape), q.dtype)
+    w = nothing.at[0].set(h * field(t, q))
+    unknown = jnp.full(q.shape, jnp.inf, q.dtype)
+    begin = w, unknown, jnp.array(True), 0
 
     # A step that needs more iterations is rejected for its error.
     def unsettled(carry):
@@ -330,7 +344,8 @@ def _with_derivatives(method, field, still, start, w):
     """The increments w, as functions of the field and of the `start` (t, q, h) of the step."""
     t, q, h = start
     A = np.array(method.a)
-    times = t + np.array(method.c)[:, None] * h
+    c = np.array(method.c)[:, None]
+    times = t + c * h
     fixed = [jax.lax.stop_gradient(x) for x in start]
     equations = StageEquations.at(method, still, *fixed, w)
     for _ in range(2):
@@ -359,7 +374,8 @@ class StageEquations(NamedTuple):
     ) -> "StageEquations":
         """Those at increments w of a step from (t, q) over h."""
         A = np.array(method.a)
-        times = t + np.array(method.c)[:, None] * h
+        c = np.array(method.c)[:, None]
+        times = t + c * h
         states = q + _contract(A, w)
         J = jax.vmap(ft.partial(_jacobian, field))(times, states)
         eye = jnp.eye(len(q))[..., None]
