@@ -43,7 +43,7 @@ def test_events_that_coincide_neither_graze_nor_accumulate():
     pace = np.array([[0.0], [np.inf], [0.0], [0.0]])
     event = np.ones(1, bool)
     for moved in [1.0, 0.0] * 9:
-        pace, zeno = keep_pace(pace, np.array([moved]), event, ~event, 2.0)
+        pace, zeno = keep_pace(pace, np.array([moved]), event, ~event, 2.0, 2)
         assert not zeno
 
 
