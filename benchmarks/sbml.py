@@ -4,8 +4,9 @@
     python benchmarks/sbml.py FOLDER --cases 00026 00041
     python benchmarks/sbml.py FOLDER --gradients 20  and gradients of 20 of the right ones
 
-FOLDER has one folder for each case (`00026` with `00026-sbml-l3v1.xml`): it is `cases/semantic` of
-https://github.com/sbmlteam/sbml-test-suite (LGPL 2.1), from which nothing is kept here:
+FOLDER has one folder for each case (`00026` with `00026-sbml-l3v1.xml`, `-model.m`, `-settings.txt`
+and `-results.csv`): it is `cases/semantic` of https://github.com/sbmlteam/sbml-test-suite (LGPL
+2.1), from which nothing is kept here:
 
     S. M. Keating, L. P. Smith, B. Shapiro, M. Hucka, F. T. Bergmann, B. Olivier and A. Finney,
     The SBML Test Suite, semantic test cases, https://sbml.org/software/sbml-test-suite.

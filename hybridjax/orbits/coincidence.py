@@ -279,7 +279,7 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
         if _scheduled_at(s, g, t, due) and s.clocks[g] not in happened
     ]
     is_last = True
-    for g in [*scheduled, *s.guards(a)]:
+    for g in [*scheduled, *_guards_due(s, a, time, q, u, due)]:
         if g in before.events:
             continue
         if not kernels.enabled(s, s.member(g), time, q.T, u).all():
@@ -288,8 +288,6 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
         saltation = event.saltation[0]
         if g in scheduled:
             saltation = event.by_state[0]
-        elif not falls_within(event.level[0], event.rate[0], due):
-            continue
         b = s.chart_index(s.transitions[g].target)
         events = (*before.events, g)
         order = _Order(
@@ -302,6 +300,26 @@ def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Ord
         yield from _orders(s, t, order, due)
     if is_last and before.events:
         yield before
+
+
+def _guards_due(
+    s: Structure,
+    a: int,
+    time: Float[np.ndarray, "1"],
+    q: Float[np.ndarray, "1 n"],
+    u: Float[np.ndarray, "nu 1"],
+    due: float,
+) -> list[int]:
+    """The guards of chart a that are at zero, up to their change in a time `due`, and fall."""
+    guards = s.guards(a)
+    if not guards:
+        return []
+    first = np.zeros(1, np.int32)
+    watched = kernels.watched(s, a, None, time, q.T, u, first)[:, :, 0]
+    field = kernels.field(s, a, time, q.T, u)[:, 0, 0]
+    level, by_t = watched[:, 0], watched[:, 1]
+    rate = by_t + watched[:, 2 : 2 + len(field)] @ field
+    return [guards[k] for k in np.flatnonzero(falls_within(level, rate, due))]
 
 
 def check_begin(map: ReturnMap) -> None:
