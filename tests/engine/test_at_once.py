@@ -423,6 +423,7 @@ def beating():
     return hj.find_limit_cycle(Beat(), guess, section=hj.AtEvent("kick"))
 
 
+@pytest.mark.slow
 def test_an_event_at_once_that_begins_beside_the_known_cycle_is_not_missed():
     """Turns begin right after the kick: they would not have the event that it brings about."""
     cycle = beating()
@@ -444,6 +445,7 @@ def test_an_event_at_once_that_begins_beside_the_known_cycle_is_not_missed():
 
 
 @pytest.mark.parametrize("with_another_section", [False, True])
+@pytest.mark.slow
 def test_experiments_do_not_miss_an_event_at_once_on_a_section(with_another_section):
     """A push of 0.1 leaves x below 1.2 after the next kick, and one of 0.3 does not."""
     cycle = beating()

@@ -203,6 +203,7 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
 
 
 @pytest.mark.parametrize("begin", [0.0, 10.0])
+@pytest.mark.slow
 def test_an_event_just_before_a_blow_up_is_found(begin):
     """x' = x^2 from 1 is 1 / (1 - t): it reaches 1e11 in 1 - 1e-11, and infinity in 1."""
 

@@ -103,6 +103,7 @@ class Chattering(hj.HybridSystem):
         return [hj.Transition("spike", "membrane", "membrane", peak, reset=after)]
 
 
+@pytest.mark.slow
 def test_a_burst_that_meets_the_plane_through_its_guess_twice_is_found():
     cycle = hj.find_limit_cycle(Chattering(), hj.Guess("membrane", (-55.0, 0.0)))
     path = hj.simulate(Chattering(), "membrane", (-55.0, 0.0), 600.0)

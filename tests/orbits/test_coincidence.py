@@ -220,6 +220,7 @@ def results_of_all_searches(system, guess, value):
     return {name: int(result) for name, result in results.items()}
 
 
+@pytest.mark.slow
 def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
     """x would be full 1e-10 before the tick: beside the cycle, the clock may empty it instead."""
     guess = hj.Guess("up", (0.4,), time=0.5)

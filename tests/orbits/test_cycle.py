@@ -140,6 +140,7 @@ def test_a_default_section_that_is_missed_is_replaced():
     )
 
 
+@pytest.mark.slow
 def test_a_default_section_is_not_replaced_by_one_at_an_event():
     """A Schmitt trigger with the levels 1 and -1, supplied by 2 and -2: its period is 2 ln 3."""
     charts = {

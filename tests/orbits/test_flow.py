@@ -274,6 +274,7 @@ def test_derivatives_at_a_state_of_rest():
     assert_allclose(own, true.y[:, -1].reshape(2, 2), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_where_states_are_small_for_a_moment():
     """The foot of the hopper rests on the ground, and leaves it slowly."""
     hopper = hj.models.VerticalHopper()
@@ -288,6 +289,7 @@ def test_derivatives_where_states_are_small_for_a_moment():
     assert_allclose(slope, difference, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_many_flows_one_of_which_fails():
     """A ball that comes to rest before the end has NaN, and the others are untouched."""
     states = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
@@ -310,6 +312,7 @@ def test_many_flows_one_of_which_fails():
     assert_allclose(slopes[0], by_one, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
     """They share the parameters. What uses the flow that failed has no derivative."""
     starts = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
@@ -410,6 +413,7 @@ def test_a_guard_that_is_touched():
     assert_allclose(jax.grad(end)(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
     """The last part is filled up; reverse mode of a program searches the parts again."""
     monkeypatch.setattr("hybridjax.orbits.flow._RECORD", 4e5)

@@ -423,6 +423,7 @@ def test_a_drive_without_the_period_of_the_clock_is_refused_at_every_door(compil
     assert result(0.01) == hj.errors.Result.NOT_VERIFIED
 
 
+@pytest.mark.slow
 def test_a_lane_without_a_cycle_has_no_derivative(free):
     """In reverse mode. The others keep theirs: that of x(0) in closed form."""
 
@@ -517,6 +518,7 @@ class Window(hj.HybridSystem):
         return 1.0
 
 
+@pytest.mark.slow
 def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     """Not at the ends of a step, but at the zero of the guard within."""
     cycle = hj.find_limit_cycle(Window(), hj.Guess("follows", (0.5,)))

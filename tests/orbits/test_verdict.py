@@ -150,6 +150,7 @@ def ghost_beside(cycle):
     return dataclasses.replace(cycle, anchor=anchor)
 
 
+@pytest.mark.slow
 def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
     cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
     ghost = ghost_beside(cycle)
