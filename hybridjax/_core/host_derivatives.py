@@ -15,7 +15,7 @@ from . import jax_compat
 from .compilation import at_ease, uncollected, whole
 from .exceptions import DefinitionError
 from .executor import from_host, is_hidden, is_inside_program, on_the_cpu, to_host
-from .lanes import JACOBIAN_COLUMNS
+from .lanes import JACOBIAN_COLUMNS, value_and_columns
 
 
 class NotOnHostError(Exception):
@@ -106,29 +106,25 @@ def along_program(function: Callable) -> Callable:
     return along
 
 
-def _with_columns(
-    function: Callable, *arguments_and_directions: Any
-) -> tuple[Any, Any]:
+def _with_columns(function: Callable, *arguments_and_directions: Any) -> tuple:
     """The value of `function(*arguments)`, and its derivatives in P directions."""
     *arguments, directions = arguments_and_directions
-    is_still = jax.tree_util.tree_map(
-        lambda by, _: by is not None, directions, tuple(arguments), is_leaf=_is_none
+
+    def of(arguments):
+        return function(*arguments)
+
+    def is_none(x):
+        return x is None
+
+    def has_direction(by, _):
+        return by is not None
+
+    everything = tuple(arguments)
+    moves = jax.tree_util.tree_map(
+        has_direction, directions, everything, is_leaf=is_none
     )
-    moving, still = eqx.partition(tuple(arguments), is_still)
-
-    def of(moving):
-        value = function(*eqx.combine(moving, still))
-        return eqx.partition(value, eqx.is_inexact_array)
-
-    def push(direction):
-        return jax.jvp(of, (moving,), (direction,), has_aux=True)
-
-    smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(directions)
-    return eqx.combine(smooth, rest), columns
-
-
-def _is_none(x: Any) -> bool:
-    return x is None
+    moving, still = eqx.partition(everything, moves)
+    return value_and_columns(of, moving, still, directions)
 
 
 def _compiled_derivatives(compiled: Callable, arguments: tuple, tangents: tuple):

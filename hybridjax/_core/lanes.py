@@ -236,6 +236,23 @@ def _moving(primal: Any, tangent: Any) -> tuple[Any, Any, Any]:
     return *eqx.partition(primal, has), eqx.filter(tangent, has)
 
 
+def value_and_columns(
+    function: Callable, moving: Any, still: Any, directions: Any
+) -> tuple[Any, Any]:
+    """The value of a function of a tree, of which the part `moving` has derivatives, and those of
+    its numbers in P directions: trees of the form of `moving` with arrays (P, ...)."""
+
+    def of(moving):
+        value = function(eqx.combine(moving, still))
+        return eqx.partition(value, eqx.is_inexact_array)
+
+    def push(direction):
+        return jax.jvp(of, (moving,), (direction,), has_aux=True)
+
+    smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(directions)
+    return eqx.combine(smooth, rest), columns
+
+
 def by_jacobian(function: Callable) -> Callable:
     """A function of a tree with few numbers, whose derivatives by these are computed forwards, all
     at once; so are derivatives of derivatives.
@@ -254,17 +271,8 @@ def by_jacobian(function: Callable) -> Callable:
 
         def with_columns(moving):
             numbers, back = ravel_pytree(moving)
-
-            def of(moving):
-                value = function(eqx.combine(moving, still))
-                return eqx.partition(value, eqx.is_inexact_array)
-
-            def push(direction):
-                return jax.jvp(of, (moving,), (back(direction),), has_aux=True)
-
             units = jnp.eye(len(numbers), dtype=numbers.dtype)
-            smooth, columns, rest = jax.vmap(push, out_axes=(None, 0, None))(units)
-            return eqx.combine(smooth, rest), columns
+            return value_and_columns(function, moving, still, jax.vmap(back)(units))
 
         value, columns = by_jacobian(with_columns)(moving)
 

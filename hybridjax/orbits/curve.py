@@ -42,7 +42,7 @@ _SHRUNK = 1e-3
 
 # Bytes of recorded steps that the points of a branch keep. More: long branches of large systems
 # fill the memory. Less: more of their trajectories are integrated again for figures.
-_MEMORY = 2**28
+_MOST_BYTES = 2**28
 
 
 @dataclasses.dataclass
@@ -135,7 +135,7 @@ class Curve:
         self.sequence = _rotated(cycle.event_sequence)
         self.value = float(parameter_of(cycle.system, parameter))
         self.least_range = SAME
-        self.memory = 0
+        self.kept_bytes = 0
         if not self.sequence:
             first_ranges = self._ranges(to_host(cycle.pieces))
             self.least_range = max(SAME, _SHRUNK * float(np.max(first_ranges)))
@@ -205,8 +205,8 @@ class Curve:
         if self.map.base is not None or not len(events):
             return None
         k = far_from_events(pieces.t, events, float(point.turn.period))
-        begin = pieces.t[k : k + 1] / point.turn.period
-        phase = begin * float(self.map.expected)
+        part = pieces.t[k : k + 1] / point.turn.period
+        phase = part * float(self.map.expected)
         anchor = point.anchor._replace(t=phase, chart=pieces.chart[[k]])
         if k == 0:
             return None
@@ -307,8 +307,9 @@ class Curve:
     def _kept(self, turn: Turn) -> Turn:
         """A turn with its recorded steps; of long branches with what tells its events."""
         assert turn.tapes is not None
-        self.memory += sum(x.nbytes for x in jax.tree_util.tree_leaves(turn.tapes))
-        if self.memory <= _MEMORY:
+        leaves = jax.tree_util.tree_leaves(turn.tapes)
+        self.kept_bytes += sum(x.nbytes for x in leaves)
+        if self.kept_bytes <= _MOST_BYTES:
             return turn
         tapes = turn.tapes._replace(h=None, before=None, after=None, chart=None)
         return turn._replace(tapes=tapes)

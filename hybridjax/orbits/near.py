@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._core.compilation import at_ease, identity, quick_jit, whole
+from .._core.compilation import at_ease, identity, whole
 from .._core.executor import (
     from_host,
     is_traced,
@@ -95,22 +95,6 @@ def known_beside(cycle: LimitCycle) -> LimitCycle | None:
     return _beside.get(cycle, None)
 
 
-def derived_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle | None:
-    """The same outside of programs, once so many derivatives were asked for that it pays to compile
-    them. None if the search is to find the cycle: before that, where the cycle leaves the route,
-    and for derivatives by many numbers."""
-    key = "derivatives", route.first.form, identity((map.structure,))
-    _calls[key] += 1
-    traced = [x.size for x in leaves_of(map) if is_tracer(x)]
-    if _calls[key] <= _DERIVATIVES_WORTH_COMPILING or sum(traced) > JACOBIAN_COLUMNS:
-        return None
-    try:
-        found, result = _outside(map, with_numbers(route))
-    except _RouteLeftError:
-        return None
-    return _beside_known(known, route, map, found, result)
-
-
 def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
     """The cycle of a return map whose system is traced inside of a program, with derivatives, on
     the route of a known cycle.
@@ -128,6 +112,22 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
     return _beside_known(known, route, map, found, _result(route, map, found))
 
 
+def derived_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle | None:
+    """The same outside of programs, once so many derivatives were asked for that it pays to compile
+    them. None if the search is to find the cycle: before that, where the cycle leaves the route,
+    for derivatives by many numbers, and where JAX hides values, as below `vmap`."""
+    key = "derivatives", route.first.form, identity((map.structure,))
+    _calls[key] += 1
+    traced = [x.size for x in leaves_of(map) if is_tracer(x)]
+    if _calls[key] <= _DERIVATIVES_WORTH_COMPILING or sum(traced) > JACOBIAN_COLUMNS:
+        return None
+    try:
+        found, result = _outside(map, with_numbers(route))
+    except _SearchError:
+        return None
+    return _beside_known(known, route, map, found, result)
+
+
 def _beside_known(
     known: LimitCycle, route: Route, map: ReturnMap, found: Corrected, result: Any
 ) -> LimitCycle:
@@ -136,8 +136,8 @@ def _beside_known(
     return cycle
 
 
-class _RouteLeftError(Exception):
-    """A cycle leaves the route of the known one."""
+class _SearchError(Exception):
+    """The search is to find a cycle."""
 
 
 def _on_route(map: ReturnMap, route: Route) -> tuple[Corrected, Int[Array, ""]]:
@@ -149,16 +149,21 @@ def _on_route(map: ReturnMap, route: Route) -> tuple[Corrected, Int[Array, ""]]:
 def _on_route_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     """`_on_route` and its derivatives.
 
-    **Raises:** `_RouteLeftError`.
+    **Raises:** `_SearchError` for a cycle that leaves the route.
     """
     cycle, columns = along_program(_on_route)(arguments, directions)
     _, result = cycle
     if result != Result.OK:
-        raise _RouteLeftError
+        raise _SearchError
     return cycle, columns
 
 
-_outside = by_columns(quick_jit(_on_route), _on_route_along)
+def _hidden(*_: Any) -> Any:
+    """**Raises:** `_SearchError`: a code that is hidden could not send a cycle to the search."""
+    raise _SearchError
+
+
+_outside = by_columns(_hidden, _on_route_along)
 
 
 def with_numbers(route: Route) -> Route:

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Numbers, SignalNames
 from .._core.boundary.values import Reals
-from .._core.compilation import host_first, quick_jit
+from .._core.compilation import host_first
 from .._core.executor import (
     Array,
     is_inside_program,
@@ -198,10 +198,19 @@ def _on_walk_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
     return found, columns
 
 
-_of_walk = by_columns(quick_jit(_on_walk), _on_walk_along, of_flow)
+def _searched(
+    cycle: LimitCycle,
+    family: AbstractSections,
+    outputs: tuple[str | Output, ...],
+    _: Walk,
+):
+    """`_on_walk` by a search, where a code that is hidden could not lead to one."""
+    matrices = _matrices(cycle, family, outputs, None)
+    return *matrices, jnp.zeros(family.n_sections, jnp.int32)
 
 
 _of_family = by_columns(_matrices, _matrices_along, of_flow)
+_of_walk = by_columns(_searched, _on_walk_along, of_flow)
 
 
 @host_first
