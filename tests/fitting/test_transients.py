@@ -93,7 +93,7 @@ def test_prints_have_the_digits_that_errors_leave():
     data = observed(1.0, seed=0)
     assert " known=" not in repr(data)  # (It would list the place of each sample.)
     table = repr(hj.fit_model(ball(), data, ("e", "drag")))
-    assert re.search(r"e  +0\.\d{5} +± 0\.00\d\d\n", table)
+    assert re.search(r"e  +0\.\d{4} +± 0\.00\d\d\n", table)
 
 
 @pytest.mark.slow
