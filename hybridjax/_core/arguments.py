@@ -121,9 +121,13 @@ def require_among(
     """
     for name in names:
         if name not in among:
+            from .boundary.leads import meant_name  # (it imports this module)
+
             known = ", ".join(among) or "none"
+            meant = meant_name(name, among)
+            lead = "" if meant is None else f": use '{meant}'"
             raise DefinitionError(
-                f"{where}there is no {kind} '{name}'; {kind}s are {known}."
+                f"{where}there is no {kind} '{name}'; {kind}s are {known}{lead}."
             )
 
 

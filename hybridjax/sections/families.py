@@ -393,13 +393,15 @@ class SectionList(AbstractSections):
 
 
 FamilyLike: TypeAlias = (
-    AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+    AbstractSections | Crossing | AtEvent | SectionCount | Sequence[Crossing | AtEvent]
 )
-"""A family, a single section, or a list of sections."""
+"""A family, a single section, the number of sections of a clock, or a list of sections."""
 
 
 def as_family(sections: FamilyLike) -> AbstractSections:
-    """A family from a family, a single section, or a list of sections."""
+    """A family from a family, a single section, a number of them, or a list of sections."""
+    if isinstance(sections, int):
+        return ClockPhase(sections)
     if isinstance(sections, Crossing | AtEvent):
         return SectionList([sections])
     return sections if isinstance(sections, AbstractSections) else SectionList(sections)

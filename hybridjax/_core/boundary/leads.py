@@ -15,7 +15,7 @@ from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
 from .guesses.keywords import KEYWORDS, NEEDS
 from .guesses.objects import MAKERS, OBJECTS, STEPS
-from .values import Kind, show, with_article
+from .values import Kind, Number, show, with_article
 
 
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
@@ -185,13 +185,21 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
     )
 
 
+def meant_name(name: str, among: Collection[str]) -> str | None:
+    """Return the name of a user's that another one is a slip of; None if there is none."""
+    return words.same_word(name, among) or _spelled_alike(name, among, _SLIP)
+
+
 def _documented(cls: type, name: str) -> str | None:
-    """Return the parameter of a system whose description has this word."""
-    if dataclasses.is_dataclass(cls):
-        for field in dataclasses.fields(cls):
-            if name in field.metadata.get("doc", "").split():
-                return field.name
-    return None
+    """Return the parameter of a system whose description has this word, or one like it."""
+    if not dataclasses.is_dataclass(cls):
+        return None
+    parameters: dict[str, str] = {}
+    for field in dataclasses.fields(cls):
+        for word in field.metadata.get("doc", "").split():
+            parameters.setdefault(word, field.name)
+    word = name if name in parameters else _spelled_alike(name, parameters, _SLIP)
+    return None if word is None else parameters[word]
 
 
 def _attribute_of_part(cls: type, name: str) -> str | None:
@@ -338,16 +346,26 @@ def about_object(
     """Return the call that makes what a function needs instead of a value, or the part of it that
     is needed, as the rest of a sentence; "" if none is known.
 
-    **Arguments:** `given`: all arguments, whose names the call has.
+    **Arguments:** `function`: its name, of a method with its class. `given`: all arguments, whose
+    names the call has.
     """
     return _in_names_of(given, _about_object(function, kind, value))
 
 
+def about_percent(kind: Kind | None, value: Any) -> str:
+    """Return the number that a percentage means, as the rest of a sentence; "" for others."""
+    if not isinstance(kind, Number) or not isinstance(value, int | float):
+        return ""
+    is_share = max(kind.low, kind.above) == 0 and min(kind.high, kind.below) == 1
+    return f": {value:g} % is {value / 100:g}" if is_share and 1 < value <= 100 else ""
+
+
 def _about_object(function: str, kind: Kind | None, value: Any) -> str:
-    for base in type(value).__mro__:
-        lead = OBJECTS.get(f"{function}.{base.__name__}")
-        if lead is not None:
-            return f": {lead}"
+    for name in (function, function.rpartition(".")[2]):
+        for base in type(value).__mro__:
+            lead = OBJECTS.get(f"{name}.{base.__name__}")
+            if lead is not None:
+                return f": {lead}"
     wanted = list(classes_in(kind))
     if _is_class_of(value, wanted):
         return f": make one, as `{value.__name__}()`"
