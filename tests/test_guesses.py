@@ -565,6 +565,24 @@ def test_a_chart_without_states_is_refused():
         Flight()
 
 
+@pytest.mark.parametrize("given", [3, "position", ("y", 2), None])
+def test_states_that_are_no_names_are_refused(given):
+    class Flight(hj.Chart):
+        states = given
+
+        def field(self, t, q, u):
+            return q
+
+    with pytest.raises(hj.errors.DefinitionError, match="`states` of Flight must be"):
+        Flight()
+
+
+def test_a_state_of_a_flow_by_name_leads_on(names):
+    flow = hj.flow(names["hopper"], hj.Guess("flight", (2.0, 1.0, 0.0, 0.0)), 0.1)
+    with pytest.raises(AttributeError, match="`state` has the states at the end"):
+        flow.yM  # noqa: B018
+
+
 def test_a_system_without_inputs_is_not_linearized():
     silent = hj.HybridSystem.from_functions(
         ("x",), lambda t, q, u, p: (jnp.cos(t) - q[0],), period=2 * np.pi, inputs=()

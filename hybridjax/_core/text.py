@@ -19,6 +19,9 @@ _WIDTH = 100
 # Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
 # module no longer stand on one line.
 _FEW = 4
+# Decimals up to which a standard error has no power of ten. More: zeros to count. Fewer: errors of
+# usual fits look unlike their values.
+_PLAIN_DECIMALS = 6
 # Digits of a number without a standard error, or with a tiny one. More: digits that differ between
 # machines. Fewer: fits of data without noise look less accurate than they are.
 _MOST_DIGITS = 9
@@ -106,7 +109,9 @@ def rounded(x: Any, error: Any) -> str:
 
 def standard_error(error: Any) -> str:
     """A standard error with two digits."""
-    return _to_places(float(error), 1 - _exponent(error)) if error > 0 else "0"
+    if not error > 0:
+        return "0"
+    return _to_places(float(error), 1 - _exponent(error), most=_PLAIN_DECIMALS)
 
 
 def _exponent(x: Any) -> int:
@@ -114,11 +119,11 @@ def _exponent(x: Any) -> int:
     return int(f"{x:.1e}".partition("e")[2])
 
 
-def _to_places(x: float, places: int, sign: str = "-") -> str:
+def _to_places(x: float, places: int, sign: str = "-", most: int = _MOST_DIGITS) -> str:
     """A number with these decimals; of less than one, digits are left out at its end. Powers of ten
     stand where zeros would be many."""
     x = round(x, places) + 0.0  # (no -0)
-    if places > _MOST_DIGITS or places < -2:
+    if places > most or places < -2:
         digits = max(_exponent(abs(x)) + places, 0) if x else 0
         return f"{x:{sign}.{digits}e}"
     return f"{x:{sign}.{max(places, 0)}f}"

@@ -123,6 +123,8 @@ class _Anchored(AbstractSections):
         return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
 
     def describe(self, i: int) -> str:
+        if i == 0:
+            return "section 0"
         return f"section {i} ({self.label} phase {i}/{self.n_sections} after section 0)"
 
 
@@ -163,6 +165,8 @@ class ClockPhase(_Anchored):
         return BoundSections.at_times(first + steps)
 
     def describe(self, i: int) -> str:
+        if i == 0:
+            return "section 0"
         return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
 
 

@@ -125,6 +125,10 @@ def _about_part(thing: Any, name: str) -> str:
         return f": `cycle.trajectory()('{name}')` has times and values of a signal"
     if callable(thing):
         return f": `trajectory('{name}')` has times and values of a signal"
+    if not hasattr(type(thing), "__getitem__"):
+        return (
+            ": `state` has the states at the end, in the order of its chart's `states`"
+        )
     return f": `['{name}']` has the values of a signal"
 
 
