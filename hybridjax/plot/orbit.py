@@ -207,9 +207,12 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not any(name in there for there in texts.values()):
             texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
-    drawn = [*ax.transData.transform(np.transpose(orbit(*names)[1:]))]
+    lines = [np.transpose(orbit(*names)[1:])]
+    lines += [x.get_xydata() for x in ax.get_lines() if x.get_linestyle() == "-"]
+    drawn = [*ax.transData.transform(np.vstack(lines))]
     boxes: list[Bbox] = []
-    for point, there in texts.items():
+    # (Long names first: short ones find a place beside them.)
+    for point, there in sorted(texts.items(), key=lambda x: -max(map(len, x[1]))):
         boxes.append(_text(ax, "\n".join(there), point, center, drawn, boxes))
 
 

@@ -25,7 +25,7 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     assert v < -1, "both events lie above"
     written = [text.get_text() for text in texts]
     numbers = ["0", "4", "8", "12", "16", "20", "24", "28"]
-    assert written == ["liftoff", "touchdown", *numbers]
+    assert written == ["touchdown", "liftoff", *numbers]
 
 
 def test_names_of_events_keep_apart(hopper_cycle):
