@@ -254,6 +254,9 @@ def test_p_values_have_few_digits():
         (1e-9, 1.3e-11, "1.000e-09 ± 1.3e-11"),
         (-0.0001, 0.012, "-0.00010 ± 0.012"),
         (0.5, 12.0, "0.50 ± 12"),
+        (0.5, np.inf, "0.5 ± inf"),
+        (0.5, np.nan, "0.5 ± nan"),
+        (0.123456, 4.1e-7, "0.12345600 ± 4.1e-07"),
     ],
 )
 def test_values_have_the_digits_that_their_errors_leave(value, error, text):

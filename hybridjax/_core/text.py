@@ -109,8 +109,8 @@ def rounded(x: Any, error: Any) -> str:
 
 def standard_error(error: Any) -> str:
     """A standard error with two digits."""
-    if not error > 0:
-        return "0"
+    if error == 0 or not np.isfinite(error):
+        return f"{error:g}"
     return _to_places(float(error), 1 - _exponent(error), most=_PLAIN_DECIMALS)
 
 
