@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .exceptions import ComputationError, DefinitionError
+from .spelling import slip_of
 
 
 if TYPE_CHECKING:
@@ -121,10 +122,8 @@ def require_among(
     """
     for name in names:
         if name not in among:
-            from .boundary.leads import meant_name  # (it imports this module)
-
             known = ", ".join(among) or "none"
-            meant = meant_name(name, among)
+            meant = slip_of(name, among)
             lead = "" if meant is None else f": use '{meant}'"
             raise DefinitionError(
                 f"{where}there is no {kind} '{name}'; {kind}s are {known}{lead}."

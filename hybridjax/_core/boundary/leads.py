@@ -5,11 +5,11 @@ Users guess with the words of other libraries, and give an object of an earlier 
 """
 
 import dataclasses
-import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..public import about_word, is_namespace, place_of
+from ..spelling import spelled_alike
 from . import words
 from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
@@ -23,10 +23,7 @@ from .values import Kind, Number, show, with_article
 _LISTED = 24
 
 
-# Likeness of two spellings, from 0 to 1, at which one is taken for a slip in the other, and at
-# which it is the last guess. Lower: names of other things are suggested. Higher: slips lead
-# nowhere.
-_SLIP = 0.85
+# Likeness of two spellings at which one is the last guess for the other; see `SLIP`.
 _ALIKE = 0.7
 
 
@@ -64,11 +61,11 @@ def _leads_of_name(
     yield words.lead_of(NAMES, [own], name)
     yield place(words.same_word(name, places))
     yield words.lead_of(NAMES, [""], name)
-    yield place(_spelled_alike(name, places, _SLIP))
+    yield place(spelled_alike(name, places))
     yield words.lead_of_library([""], name)
     for part in words.parts(name):
         yield words.lead_of(NAMES, [own, ""], part)
-    yield place(_spelled_alike(name, places, _ALIKE))
+    yield place(spelled_alike(name, places, _ALIKE))
     for part in words.parts(name):
         yield place(words.with_part(part, places))
 
@@ -151,12 +148,12 @@ def _leads_of_attribute(
     yield _use(_error_bars(name, attributes))
     yield _use(_attribute_of_part(cls, name))
     yield words.lead_of_library(owners, name)
-    yield _use(_spelled_alike(name, attributes, _SLIP))
+    yield _use(spelled_alike(name, attributes))
     yield _use(_documented(cls, name))
     for part in words.parts(name):
         yield words.lead_of(ATTRIBUTES, owners, part)
         yield _use(words.with_part(part, attributes))
-    yield _use(_spelled_alike(name, attributes, _ALIKE))
+    yield _use(spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
     if function is not None and not is_namespace(name):
         yield f"`{function}` is a function that may take it"
@@ -177,9 +174,9 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
     """Return the sentence about a parameter that a class has not."""
     alike = (
         _synonym(name, known),
-        _spelled_alike(name, known, _SLIP),
+        spelled_alike(name, known),
         _documented(cls, name),
-        _spelled_alike(name, known, _ALIKE),
+        spelled_alike(name, known, _ALIKE),
     )
     meant = next((x for x in alike if x is not None), None)
     lead = "" if meant is None else f": use `{meant}`"
@@ -187,11 +184,6 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
         f"{cls.__name__}: there is no parameter '{name}'; parameters are "
         f"{', '.join(known) or 'none'}{lead}."
     )
-
-
-def meant_name(name: str, among: Collection[str]) -> str | None:
-    """Return the name of a user's that another one is a slip of; None if there is none."""
-    return words.same_word(name, among) or _spelled_alike(name, among, _SLIP)
 
 
 def _documented(cls: type, name: str) -> str | None:
@@ -202,7 +194,7 @@ def _documented(cls: type, name: str) -> str | None:
     for field in dataclasses.fields(cls):
         for word in field.metadata.get("doc", "").split():
             parameters.setdefault(word, field.name)
-    word = name if name in parameters else _spelled_alike(name, parameters, _SLIP)
+    word = name if name in parameters else spelled_alike(name, parameters)
     return None if word is None else parameters[word]
 
 
@@ -320,15 +312,15 @@ def _leads_of_argument(
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
     yield words.lead_of(KEYWORDS, owners, name)
-    yield _use(_spelled_alike(name, parameters, _SLIP))
+    yield _use(spelled_alike(name, parameters))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
         yield words.lead_of(KEYWORDS, owners, part)
-    yield _use(_spelled_alike(name, parameters, _ALIKE))
+    yield _use(spelled_alike(name, parameters, _ALIKE))
 
 
 def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
-    return name if name in parameters else _spelled_alike(name, parameters, _SLIP)
+    return name if name in parameters else spelled_alike(name, parameters)
 
 
 def _synonym(name: str, among: Collection[str]) -> str | None:
@@ -337,11 +329,6 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
         if word in among:
             return word
     return words.same_word(name, among)
-
-
-def _spelled_alike(name: str, among: Collection[str], likeness: float) -> str | None:
-    alike = difflib.get_close_matches(name, among, n=1, cutoff=likeness)
-    return alike[0] if alike else None
 
 
 def about_object(
