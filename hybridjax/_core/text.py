@@ -95,7 +95,9 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
 
 def rounded(x: Any, error: Any) -> str:
     """A number, real or complex, up to the second digit of its standard error: at least two digits,
-    at most nine; nine without an error."""
+    at most nine; nine without an error, three if it is infinite."""
+    if np.isinf(error):
+        return number(x, 3)
     z = complex(x)
     size = max(abs(z.real), abs(z.imag))
     if not (np.isfinite(size) and np.isfinite(error) and error > 0):

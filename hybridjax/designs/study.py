@@ -357,10 +357,8 @@ class SequentialDesign(Showable, eqx.Module):
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         usual_name = plan.usual_name.capitalize()
-        comparison = (
-            f"{usual_name} would need about {equal:.3g} cycles for the same standard "
-            "errors."
-        )
+        cycles = float(f"{equal:.3g}")
+        comparison = f"{usual_name} would need about {cycles:.0f} cycles for the same standard errors."
         if self.done:
             return comparison
         design = plan.design
