@@ -358,7 +358,8 @@ class SequentialDesign(Showable, eqx.Module):
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         usual_name = plan.usual_name.capitalize()
         cycles = float(f"{equal:.3g}")
-        comparison = f"{usual_name} would need about {cycles:.0f} cycles for the same standard errors."
+        need = f"would need about {cycles:.0f} cycles for the same standard errors"
+        comparison = f"{usual_name} {need}."
         if self.done:
             return comparison
         design = plan.design
