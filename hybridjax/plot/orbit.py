@@ -208,7 +208,8 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
             texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
     lines = [np.transpose(orbit(*names)[1:])]
-    lines += [x.get_xydata() for x in ax.get_lines() if x.get_linestyle() == "-"]
+    solid = [x for x in ax.get_lines() if x.get_linestyle() == "-"]
+    lines += [np.asarray(x.get_xydata()) for x in solid]
     drawn = [*ax.transData.transform(np.vstack(lines))]
     boxes: list[Bbox] = []
     # (Long names first: short ones find a place beside them.)
