@@ -19,5 +19,6 @@ def spelled_alike(
 
 def slip_of(name: str, among: Collection[str]) -> str | None:
     """Return the name that another one is a slip of, in case or letters; None if none is."""
-    in_lower_case = {other.lower(): other for other in among}
+    # (The first of several counts.)
+    in_lower_case = {other.lower(): other for other in reversed(list(among))}
     return in_lower_case.get(name.lower()) or spelled_alike(name, among)
