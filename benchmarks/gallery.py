@@ -217,7 +217,7 @@ def table(rows: dict[str, dict]) -> str:
 
 
 def _text(z: complex) -> str:
-    return f"{z.real:.8g} ± {z.imag:.8g}i" if z.imag else f"{z.real:.8g}"
+    return f"{z.real:.8g} ± {z.imag:.8g}j" if z.imag else f"{z.real:.8g}"
 
 
 def main():

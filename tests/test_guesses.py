@@ -103,6 +103,9 @@ phys.contains(hopper)
 phys.identifiability.plot()
 rat.modulus
 hj.linearize(cycle, [apex]).multipliers
+hj.linearize(cycle, 32).multipliers
+hj.run_experiments(cycle, 8, design)
+hj.sections.place_sections(cycle, 8)
 hj.run_experiments(cycle, sections, hj.optimal_design(model, noise=1e-4), discard=0)
 hj.fit_multipliers(est, hj.select_order(est))
 hj.fit_series(result, 2)
@@ -133,7 +136,19 @@ hj.find_limit_cycle(hopper, k=9.0)                      -> system.replace(k=
 hj.simulate(hopper, t_span=(0, 2))                      -> `duration`
 hj.simulate(hopper, hopper.guess(), 1.0, t_eval=[0.1])  -> trajectory.at
 hj.linearize(hopper, sections)                          -> hj.find_limit_cycle(system)
-hj.linearize(cycle, 32)                                 -> hj.ClockPhase
+hj.linearize(cycle, 32.5)                               -> hj.ClockPhase
+hj.continuation(cycle, "stiffness", (8, 12))            -> use `k`
+hj.sweep(hopper, {"stifness": [8.0]})                   -> use `k`
+hj.linearize(cycle, sections, outputs=("YM",))          -> use 'yM'
+rec["yn"]                                               -> signals are u, yM, vM
+rec["Vm"]                                               -> use 'vM'
+cycle.trajectory("yM")                                  -> cycle.trajectory()('yM')
+fit.contains(0.5, level=5)                              -> 5 % is 0.05
+fit.interval(95)                                        -> 95 % is 0.95
+hj.continuation(cycle, "k", (9, 11), step=5)            -> 5 % is 0.05
+hj.identify_recording(rec, apex, "u", "yM", random_state=0) -> nothing to seed
+fit.bootstrap(1000)                                     -> fit.interval(level)
+hj.continuation(cycle, "k", (9.9, 10.1), step=1.0)["k"] -> branch.values
 hj.ClockPhase(n=8)                                      -> `n_sections`
 hj.multisine(8, input="u")                              -> `inputs`
 hj.run_experiments(cycle, design, sections)             -> wrong order
@@ -548,6 +563,24 @@ def test_a_chart_without_states_is_refused():
 
     with pytest.raises(hj.errors.DefinitionError, match="class Flight.*states = "):
         Flight()
+
+
+@pytest.mark.parametrize("given", [3, "position", ("y", 2), None])
+def test_states_that_are_no_names_are_refused(given):
+    class Flight(hj.Chart):
+        states = given
+
+        def field(self, t, q, u):
+            return q
+
+    with pytest.raises(hj.errors.DefinitionError, match="`states` of Flight must be"):
+        Flight()
+
+
+def test_a_state_of_a_flow_by_name_leads_on(names):
+    flow = hj.flow(names["hopper"], hj.Guess("flight", (2.0, 1.0, 0.0, 0.0)), 0.1)
+    with pytest.raises(AttributeError, match="`state` has the states at the end"):
+        flow.yM  # noqa: B018
 
 
 def test_a_system_without_inputs_is_not_linearized():

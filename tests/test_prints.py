@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import hybridjax as hj
 from hybridjax._core.html import Curve, picture
 from hybridjax._core.public import place_of
-from hybridjax._core.text import p_value
+from hybridjax._core.text import p_value, rounded, standard_error
 from hybridjax.experiments.data import Simulated
 from hybridjax.orbits.branches import Branch, BranchEnd, BranchPoint
 from hybridjax.systems.system import own_fields
@@ -178,7 +178,7 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     for thing, texts, pictures in (
         (
             hopper_cycle,
-            ["-0.248983 + 0.699333i", "1 s", "liftoff, touchdown", "yM (m)"],
+            ["-0.248983+0.699333j", "1 s", "liftoff, touchdown", "yM (m)"],
             2,
         ),
         (placed_kinematic, ["27 in flight, 5 in stance", "2 to 4"], 1),
@@ -207,7 +207,7 @@ def test_fits_show_standard_errors():
     )
     fit = hj.fit_series(record, order=2)
     page = shown(fit)
-    errors = [x for x in page.texts if re.fullmatch(r"\d\.\de-\d\d", x)]
+    errors = [x for x in page.texts if re.fullmatch(r"0\.0+\d\d", x)]
     assert_allclose([float(x) for x in errors], fit.standard_errors, rtol=0.05)
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
@@ -242,6 +242,29 @@ def test_p_values_have_few_digits():
         0.997: "p > 0.99",
     }
     assert {p: p_value(p) for p in given} == given
+
+
+@pytest.mark.parametrize(
+    "value, error, text",
+    [
+        (9.99, 0.0012, "9.9900 ± 0.0012"),
+        (-0.2489207 + 0.6992677j, 6.9e-5, "-0.248921+0.699268j ± 0.000069"),
+        (0.742, 0.0996, "0.74 ± 0.10"),
+        (12345.0, 230.0, "12340 ± 230"),
+        (1e-9, 1.3e-11, "1.000e-09 ± 1.3e-11"),
+        (-0.0001, 0.012, "-0.00010 ± 0.012"),
+        (0.5, 12.0, "0.50 ± 12"),
+        (18.6540553, np.inf, "18.7 ± inf"),
+        (0.5, np.nan, "0.5 ± nan"),
+        (0.123456, 4.1e-7, "0.12345600 ± 4.1e-07"),
+    ],
+)
+def test_values_have_the_digits_that_their_errors_leave(value, error, text):
+    assert f"{rounded(value, error)} ± {standard_error(error)}" == text
+
+
+def test_values_without_errors_have_nine_digits():
+    assert rounded(1 / 3, np.nan) == rounded(1 / 3, 0.0) == "0.333333333"
 
 
 def test_prints_are_true():

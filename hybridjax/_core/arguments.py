@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .exceptions import ComputationError, DefinitionError
+from .spelling import slip_of
 
 
 if TYPE_CHECKING:
@@ -122,8 +123,10 @@ def require_among(
     for name in names:
         if name not in among:
             known = ", ".join(among) or "none"
+            meant = slip_of(name, among)
+            lead = "" if meant is None else f": use '{meant}'"
             raise DefinitionError(
-                f"{where}there is no {kind} '{name}'; {kind}s are {known}."
+                f"{where}there is no {kind} '{name}'; {kind}s are {known}{lead}."
             )
 
 

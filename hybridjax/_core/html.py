@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from .text import number, rounded, standard_error
+
 
 # Rows of a table, and points of a curve, that are shown. More make notebooks large: 12 rows fill
 # half a screen, and a curve of 300 pixels with 120 points looks smooth.
@@ -80,23 +82,14 @@ def _row(cell: str, texts: Sequence[str], head: str | None = None) -> str:
     return f"<tr>{''.join(cells)}</tr>"
 
 
-def complex_number(z: complex, digits: int = 6) -> str:
-    """A number such as `-0.248983 + 0.699333i`."""
-    real = f"{z.real:.{digits}g}"
-    if not z.imag:
-        return real
-    sign = "-" if z.imag < 0 else "+"
-    return f"{real} {sign} {abs(z.imag):.{digits}g}i"
-
-
 def multiplier_table(
     values: Complex[np.ndarray, " d"], errors: Float[np.ndarray, " d"] | None = None
 ) -> str:
     """The multipliers, their standard errors if they are given, and their moduli."""
-    digits = 6 if errors is None else 8
-    columns = {"multiplier": [complex_number(z, digits) for z in values]}
+    columns = {"multiplier": [number(z) for z in values]}
     if errors is not None:
-        known = [f"{x:.1e}" if np.isfinite(x) else "unknown" for x in errors]
+        columns["multiplier"] = [*map(rounded, values, errors)]
+        known = [standard_error(x) if np.isfinite(x) else "unknown" for x in errors]
         columns["± standard error"] = known
     columns["modulus"] = [f"{abs(z):.6g}" for z in values]
     return table(tuple(columns), zip(*columns.values(), strict=True))

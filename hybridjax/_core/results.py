@@ -22,7 +22,10 @@ class Result(enum.IntEnum):
     OK = 0, "ok"
     SECTION_MISSED = 1, "the section was not crossed within the time allowed"
     EVENT_ORDER = 3, "events came in another order or number than on the limit cycle"
-    GRAZING = 4, "a guard or section was touched tangentially (grazing)"
+    GRAZING = (
+        4,
+        "a guard or section was touched tangentially (grazing), or the state rests on it",
+    )
     ZENO = (
         5,
         "events accumulate in finite time (Zeno): what comes to rest or slides there needs a chart "

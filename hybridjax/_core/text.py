@@ -19,6 +19,12 @@ _WIDTH = 100
 # Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
 # module no longer stand on one line.
 _FEW = 4
+# Decimals up to which a standard error has no power of ten. More: zeros to count. Fewer: errors of
+# usual fits look unlike their values.
+_PLAIN_DECIMALS = 6
+# Digits of a number without a standard error, or with a tiny one. More: digits that differ between
+# machines. Fewer: fits of data without noise look less accurate than they are.
+_MOST_DIGITS = 9
 
 
 def p_value(p: float) -> str:
@@ -85,6 +91,44 @@ def number(x: Any, digits: int = 6, unit: str = "") -> str:
     if z.imag:
         text += f"{z.imag:+.{digits}g}j"
     return f"{text} {unit}".rstrip()
+
+
+def rounded(x: Any, error: Any) -> str:
+    """A number, real or complex, up to the second digit of its standard error: at least two digits,
+    at most nine; nine without an error, three if it is infinite."""
+    if np.isinf(error):
+        return number(x, 3)
+    z = complex(x)
+    size = max(abs(z.real), abs(z.imag))
+    if not (np.isfinite(size) and np.isfinite(error) and error > 0):
+        return number(x, _MOST_DIGITS)
+    places = 1 - _exponent(error)
+    if size > 0:
+        places = min(max(places, 1 - _exponent(size)), 8 - _exponent(size))
+    real = _to_places(z.real, places)
+    return f"{real}{_to_places(z.imag, places, '+')}j" if z.imag else real
+
+
+def standard_error(error: Any) -> str:
+    """A standard error with two digits."""
+    if error == 0 or not np.isfinite(error):
+        return f"{error:g}"
+    return _to_places(float(error), 1 - _exponent(error), most=_PLAIN_DECIMALS)
+
+
+def _exponent(x: Any) -> int:
+    """The power of ten of the first digit, of two."""
+    return int(f"{x:.1e}".partition("e")[2])
+
+
+def _to_places(x: float, places: int, sign: str = "-", most: int = _MOST_DIGITS) -> str:
+    """A number with these decimals; of less than one, digits are left out at its end. Powers of ten
+    stand where zeros would be many."""
+    x = round(x, places) + 0.0  # (no -0)
+    if places > most or places < -2:
+        digits = max(_exponent(abs(x)) + places, 0) if x else 0
+        return f"{x:{sign}.{digits}e}"
+    return f"{x:{sign}.{max(places, 0)}f}"
 
 
 def how_many(count: int, one: str, several: str) -> str:

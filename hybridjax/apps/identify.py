@@ -25,7 +25,7 @@ from .._core.boundary.kinds import FilePath
 from .._core.findings import Finding
 from .._core.results import Result
 from .._core.signal import with_unit
-from .._core.text import listed
+from .._core.text import listed, rounded, standard_error
 from .._core.writing import Format, results_folder
 from ..io import save
 from ..linear.htf import HTF
@@ -391,9 +391,12 @@ def _page(result: Identification, images: dict[str, str]) -> str:
             "Standard errors to be expected from more strides",
             "",
             html.table(
-                ("strides", *map(html.complex_number, result.fit.multipliers)),
+                (
+                    "strides",
+                    *map(rounded, result.fit.multipliers, result.fit.standard_errors),
+                ),
                 [
-                    (str(n), *(f"{e:.1e}" for e in x))
+                    (str(n), *(standard_error(e) for e in x))
                     for n, x in expected
                     if np.isfinite(x).all()
                 ],

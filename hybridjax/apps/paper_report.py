@@ -139,7 +139,7 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
     text += ": with the paper's parameters the real part is negative, the printed sign was lost"
     printed = 0.25 + np.array([0.7j, -0.7j])
     note(
-        "the multipliers are 0.25 +- 0.70i",
+        "the multipliers are 0.25 +- 0.70j",
         np.all(np.abs(exact - printed) < 1e-2),
         text,
     )

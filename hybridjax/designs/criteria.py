@@ -129,7 +129,7 @@ def wanted_parts(
         name = f"{z.real:.4g}"
         rows = [gradient.real]
         if z.imag != 0:
-            name += f"{z.imag:+.4g}i"
+            name += f"{z.imag:+.4g}j"
             rows.append(gradient.imag)
         if goal.part == "modulus":
             rows = [(z.conj() * gradient).real / abs(z)]

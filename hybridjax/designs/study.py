@@ -15,7 +15,7 @@ from .._core.executor import is_traced
 from .._core.html import card, multiplier_table, table, text
 from .._core.progress import working
 from .._core.showable import Showable
-from .._core.text import folded
+from .._core.text import folded, how_many
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.design.design import Design
@@ -262,9 +262,10 @@ class SequentialDesign(Showable, eqx.Module):
         errors = _standard_errors(fewer.fit, self.goal)
         if not fewer.objection and self._suffices(fewer.fit, errors):
             raise DefinitionError(
-                f"the data support {supported} multipliers, not {self.order}, and determine these "
-                f"to a standard error of {errors.max():.2g}: add the blocks to a study with order="
-                f"{supported}, or with a smaller `standard_error`."
+                f"the data support {how_many(supported, 'multiplier', 'multipliers')}, not "
+                f"{self.order}, and determine these to a standard error of "
+                f"{errors.max():.2g}: add the blocks to a study with order={supported}, or "
+                "with a smaller `standard_error`."
             )
 
     def _next(
@@ -356,14 +357,15 @@ class SequentialDesign(Showable, eqx.Module):
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         usual_name = plan.usual_name.capitalize()
-        comparison = (
-            f"{usual_name} would need about {equal:.3g} cycles for the same standard "
-            "errors."
-        )
+        cycles = float(f"{equal:.3g}")
+        need = f"would need about {cycles:.0f} cycles for the same standard errors"
+        comparison = f"{usual_name} {need}."
         if self.done:
             return comparison
         design = plan.design
-        return f"{comparison}\nnext: {design.experiments} experiments of {design.periods} periods"
+        experiments = how_many(design.experiments, "experiment", "experiments")
+        periods = how_many(design.periods, "period", "periods")
+        return f"{comparison}\nnext: {experiments} of {periods}"
 
 
 def _standard_errors(

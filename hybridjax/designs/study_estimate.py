@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from .._core.executor import from_host, to_host
+from .._core.text import how_many
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.record import require_deviations
@@ -191,8 +192,8 @@ def _objection(fit: MultiplierFit, most: int, order: int) -> str:
         )
     if most < order:
         return (
-            f"the data support {most} multipliers, not {order} (if that remains so, lower `order` "
-            "in a new study)"
+            f"the data support {how_many(most, 'multiplier', 'multipliers')}, not {order} "
+            "(if that remains so, lower `order` in a new study)"
         )
     if (np.abs(fit.multipliers) >= 1).any():
         return (

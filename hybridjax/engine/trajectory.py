@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
@@ -43,6 +43,9 @@ from .watch import slopes
 # Values and rates of a guard are zero below this part of their terms. Smaller: rounding hides a
 # reset that ends on a guard. Larger: one that ends close to it is reported.
 _SAME = 1e-9
+# The part of a state's size by which it moves in a moment, in which a guard at rest begins to fall.
+# Smaller: rounding hides it. Larger: a guard that falls later is reported.
+_MOMENT = 1e-6
 
 
 class Event(NamedTuple):
@@ -422,8 +425,8 @@ def constant_input(system: HybridSystem, input: Any) -> Any:
 
 
 def begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
-    """Doubts about a start at which guards are beyond zero, or at zero and fall."""
-    for g, value, is_due in guards_reached(s, begin, u):
+    """Doubts about a start at which guards are beyond zero, or at zero and fall, or begin to."""
+    for g, value, is_due in guards_reached(s, begin, u, at_rest=True):
         transition = s.transitions[g]
         name = transition.name
         if is_due:
@@ -443,10 +446,16 @@ def begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding
 
 
 def guards_reached(
-    s: Structure, lane: Lanes, u: np.ndarray, instant: float = 0.0
+    s: Structure,
+    lane: Lanes,
+    u: np.ndarray,
+    instant: float = 0.0,
+    *,
+    at_rest: bool = False,
 ) -> Iterator[tuple[int, float, bool]]:
     """The transitions of a lane whose guards are beyond zero, or fall to zero within an `instant`:
-    they have, or get at once, the sign that they have after their event.
+    they have, or get at once, the sign that they have after their event. With `at_rest`, also those
+    at zero that begin to fall, as the height of a ball that is at rest on the ground.
 
     **Returns:** for each its index, the value of its guard, and whether it is at zero.
     """
@@ -456,12 +465,10 @@ def guards_reached(
     if not guards:
         return
     q = lane.q[:n]
-    first = np.zeros(1, np.int32)
-    rows = kernels.watched(s, a, None, lane.t, q, u, first)[..., 0]
     point = np.append(lane.t, q)
-    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
-    flow = np.append(1.0, rate)
-    for g, row in zip(guards, rows, strict=True):
+    rows, flow = _along(s, a, point, u)
+    begins = _begin_to_fall(s, a, point, flow, u) if at_rest else np.zeros(len(rows))
+    for g, row, begin in zip(guards, rows, begins, strict=True):
         if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
             continue
         slope = row[1 : 2 + n]
@@ -472,6 +479,34 @@ def guards_reached(
             yield g, float(row[0]), False
         elif falls and row[0] <= noise - instant * rate:
             yield g, float(row[0]), True
+        elif begin and row[0] <= noise:
+            yield g, float(row[0]), True
+
+
+def _along(
+    s: Structure, a: int, point: Float[np.ndarray, " n1"], u: np.ndarray
+) -> tuple[Float[np.ndarray, "g n2"], Float[np.ndarray, " n1"]]:
+    """The guards of chart a at a time and state, with their slopes, and the flow of both."""
+    t = point[:1]
+    q = point[1:, None]
+    first = np.zeros(1, np.int32)
+    rows = kernels.watched(s, a, None, t, q, u, first)[..., 0]
+    return rows, np.append(1.0, kernels.field(s, a, t, q, u)[:, 0, 0])
+
+
+def _begin_to_fall(
+    s: Structure,
+    a: int,
+    point: Float[np.ndarray, " n1"],
+    flow: Float[np.ndarray, " n1"],
+    u: np.ndarray,
+) -> Bool[np.ndarray, " g"]:
+    """Whether each guard of chart a falls a moment later."""
+    speed = np.abs(flow[1:]).max()
+    moment = _MOMENT * (1 + np.abs(point[1:]).max()) / speed if speed else 0.0
+    rows, flow = _along(s, a, point + moment * flow, u)
+    slopes = rows[:, 1 : 1 + len(point)]
+    return slopes @ flow < -_SAME * np.abs(slopes * flow).sum(axis=1)
 
 
 def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:

@@ -19,7 +19,7 @@ from .._core.boundary.values import Integers, Reals
 from .._core.findings import Finding, print_findings
 from .._core.results import Result
 from .._core.showable import Showable
-from .._core.text import fields, folded, listed
+from .._core.text import fields, folded, how_many, listed
 from ..errors import DefinitionError
 from .record import SectionSeries
 
@@ -284,8 +284,9 @@ class ExperimentData(Showable, eqx.Module):
         if self.label:
             state = f"{self.label}, {state}"
         text = folded(
-            f"ExperimentData({state}; {n // self.n_sections} cycles of "
-            f"{self.n_sections} sections each, window P = {self.periods} periods; "
+            f"ExperimentData({state}; {how_many(n // self.n_sections, 'cycle', 'cycles')} of "
+            f"{how_many(self.n_sections, 'section', 'sections')} each, "
+            f"window P = {how_many(self.periods, 'period', 'periods')}; "
             f"{listed(self.inputs)} -> {listed(self.outputs)})"
         )
         return "\n".join(filter(None, [text, print_findings(self.findings, "  ")]))

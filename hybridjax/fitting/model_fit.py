@@ -16,7 +16,7 @@ from .._core.findings import Finding
 from .._core.html import table, text
 from .._core.results import Result
 from .._core.showable import Showable
-from .._core.text import p_value
+from .._core.text import p_value, rounded, standard_error
 from ..errors import DefinitionError
 from ..identify.fit import Fit, WithCost, not_converged
 from ..linear.ldtp import LDTP
@@ -30,9 +30,6 @@ from .problem import DELAYS, FitProblem, of_system
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
 # Larger: badly identified combinations count as unidentifiable. Smaller: rounding identifies them.
 _RANK = 1e-9
-# Digits of a value that is printed without a standard error. More: digits that differ between
-# machines. Fewer: fits of data without noise look less exact than they are.
-_MOST_DIGITS = 9
 # Entries of a direction this close to zero, or to ratios of integers with denominators up to the
 # largest one, are replaced by these (they have no unit); a basis is solved for entries whose
 # smallest singular value is above it. Larger: exponents that are none are printed as integers.
@@ -341,8 +338,12 @@ class ParameterFit(WithCost, Fit):
         for name, value, error, unit in zip(
             self.names, self.values, self.standard_errors, self.units, strict=True
         ):
-            shown = "not identified alone" if np.isinf(error) else f"± {error:.2g}"
-            yield name, f"{value:.{_digits(value, error)}g}", shown, unit
+            shown = (
+                "not identified alone"
+                if np.isinf(error)
+                else f"± {standard_error(error)}"
+            )
+            yield name, rounded(value, error), shown, unit
 
     def _table(self) -> Iterator[str]:
         """Yield the lines of a summary with the values."""
@@ -350,15 +351,6 @@ class ParameterFit(WithCost, Fit):
         for name, value, error, unit in self.rows():
             shown = f"{error} {unit}" if "±" in error else error
             yield f"{name:{width}}  {value:<14} {shown}".rstrip()
-
-
-def _digits(value: float, error: float) -> int:
-    """Digits of a value that its standard error leaves, and at least three: the error has two. Nine
-    without an error."""
-    size = abs(value) / error if error > 0 else np.inf
-    if size == 0 or not np.isfinite(error) or not np.isfinite(size):
-        return _MOST_DIGITS
-    return int(np.clip(np.ceil(np.log10(size)) + 2, 3, _MOST_DIGITS))
 
 
 class ParameterEstimate(ParameterFit):

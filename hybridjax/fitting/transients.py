@@ -74,7 +74,7 @@ class ObservedTrajectory(AbstractObservation):
         start: Guess,
         times: Annotated[Numbers, Reals("K")] | None = None,
         outputs: OptionalNames = (),
-        values: Annotated[Numbers, Reals("K outputs", missing=True)] | None = None,
+        values: Annotated[Numbers, Reals(missing=True)] | None = None,
         *,
         std: Deviations | None = None,
         events: Mapping[str, Annotated[Numbers, Reals()]] | None = None,
@@ -87,7 +87,7 @@ class ObservedTrajectory(AbstractObservation):
 
         - `start`: chart, state and time at which the flow begins.
         - `times` (K,), `outputs`, `values` (K, ny): samples; NaN where they are missing. Those of
-          one output are a column, too: `heights[:, None]`.
+          one output may have the shape (K,).
         - `std`: their standard deviation, one number or one for each output.
         - `events`: times of the first events of each name, in order: `{"bounce": (0.45, 1.08)}`.
           `events_std`: their standard deviation, one number.
@@ -281,6 +281,8 @@ def _samples(
         return np.zeros(0), np.zeros((0, 0))
     own_times = np.asarray(times, float)
     samples = np.asarray(values, float)
+    if samples.ndim == 1 and len(outputs) == 1:
+        samples = samples[:, None]
     axes = {"times": len(own_times), "outputs": len(outputs)}
     require_axes("`values`", samples, axes)
     if samples.size and np.isnan(samples).all():

@@ -17,7 +17,7 @@ from .._core.findings import Finding
 from .._core.html import multiplier_table, text, unit_circle
 from .._core.results import Result
 from .._core.showable import Showable
-from .._core.text import folded, p_value
+from .._core.text import folded, p_value, rounded, standard_error
 from ..errors import DefinitionError
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
@@ -109,7 +109,7 @@ class MultiplierComparison(Showable, eqx.Module):
 
 
 def _show(value: complex) -> str:
-    imaginary = f" {value.imag:+.9f}i" if value.imag else 14 * " "
+    imaginary = f" {value.imag:+.9f}j" if value.imag else 14 * " "
     return f"{value.real:+.9f}{imaginary}"
 
 
@@ -394,7 +394,7 @@ def shown_multipliers(fit: MultiplierFit) -> str:
         reason = Result(fit.result).message
         return f"no multipliers: {reason} (`multipliers` holds its last step)"
     shown = (
-        f"{_short(z)} ± {error:.1e}"
+        f"{rounded(z, error)} ± {standard_error(error)}"
         for z, error in zip(fit.multipliers, fit.standard_errors, strict=True)
     )
     return f"multipliers (± standard error) {', '.join(shown)}"
@@ -409,11 +409,6 @@ def _tail(distance: float, equations: int, dof: float) -> float:
     left = max(dof - equations + 1, 1.0)
     ratio = distance * left / (equations * dof)
     return float(special.fdtrc(equations, left, ratio))
-
-
-def _short(value: complex) -> str:
-    imaginary = f"{value.imag:+.7f}i" if value.imag else ""
-    return f"{value.real:+.7f}{imaginary}"
 
 
 class FitWithoutModel(MultiplierFit):

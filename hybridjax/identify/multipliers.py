@@ -20,6 +20,7 @@ from .._core.execution import one_blas_thread
 from .._core.findings import Finding, refuse, warn_of
 from .._core.results import Result
 from .._core.showable import Showable
+from .._core.text import how_many
 from ..errors import DefinitionError
 from ..linear.frequency_response import Harmonics
 from ..linear.htf import HTF
@@ -93,10 +94,11 @@ class StructuredFit(WithCost, FitWithoutModel):
 
     def _about(self) -> str:
         pairs = zip(self.outputs, self.residual, strict=True)
+        harmonics = how_many(len(self.harmonics), "harmonic", "harmonics")
         misfit = ", ".join(f"{name} {x:.1e}" for name, x in pairs)
         return (
             f"residual {misfit}; chi-square per degree of freedom {self.chi2_per_dof:.3g}; "
-            f"{len(self.harmonics)} harmonics, degree {self.numerators.shape[1] - 1}"
+            f"{harmonics}, degree {self.numerators.shape[1] - 1}"
         )
 
 
@@ -454,7 +456,8 @@ def unsupported(
     remedy = f"lower `order` to {most}" if most else "excite more"
     anyway = ", or pass check=False" if refused else ""
     text = (
-        f"the data support {most} multipliers, not {order}: the weakest is {weakest:.3g} times "
-        f"the noise, and may be noise alone; {remedy}, or measure longer{anyway}."
+        f"the data support {how_many(most, 'multiplier', 'multipliers')}, not {order}: the "
+        f"weakest is {weakest:.3g} times the noise, and may be noise alone; {remedy}, or "
+        f"measure longer{anyway}."
     )
     return [Finding("order", text, "refused" if refused else "warned")]

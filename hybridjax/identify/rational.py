@@ -15,7 +15,7 @@ from .._core.html import card, text, unit_circle
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.showable import WithMultipliers
-from .._core.text import how_many
+from .._core.text import how_many, number
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
 from .descent import least_squares
@@ -122,7 +122,7 @@ class RationalFit(WithMultipliers, eqx.Module):
             self.outputs, self.multipliers, self.residual, self.result, strict=True
         )
         for name, multipliers, residual, code in fits:
-            shown = ", ".join(f"{x.real:+.5f}{x.imag:+.5f}i" for x in multipliers)
+            shown = ", ".join(number(x, 5) for x in multipliers)
             if code != Result.OK:
                 shown = f"none: {Result(int(code)).message}"
             rows.append(f"  {name}: multipliers {shown}; residual {residual:.2e}")

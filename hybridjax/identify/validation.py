@@ -181,7 +181,7 @@ class Validation(Showable, eqx.Module):
         verdict = {True: "not rejected", False: "rejected"}
         rows.append(
             f"residuals: whiteness {verdict[self.white]}, independence of the input "
-            f"{verdict[self.independent]} (level {self.alpha:g})"
+            f"{verdict[self.independent]} (alpha {self.alpha:g})"
         )
         if self.left_out:
             rows.append(f"records too short to compare, left out: {self.left_out}")

@@ -19,7 +19,7 @@ from .._core.html import COLORS, Curve, card, picture
 from .._core.precision import require_x64
 from .._core.showable import Showable
 from .._core.signal import ratio, with_unit
-from .._core.text import folded, listed
+from .._core.text import folded, how_many, listed
 from ..errors import DefinitionError
 from . import algebra
 from .algebra import SAME_FREQUENCY
@@ -195,7 +195,7 @@ class HTF(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         count = self.frequencies.shape[-1]
-        counted = "1 frequency" if count == 1 else f"{count} frequencies"
+        counted = how_many(count, "frequency", "frequencies")
         span = ""
         if count and not is_traced(self.frequencies):
             f = np.asarray(self.frequencies)
@@ -207,11 +207,12 @@ class HTF(Showable, eqx.Module):
         shown = ", ".join(map(str, self.harmonics))
         if len(self.harmonics) == high - low + 1 > 3:
             shown = f"{low} to {high}"
+        noun = "harmonic" if len(self.harmonics) == 1 else "harmonics"
         sections = "continuous time"
         if self.n_sections:
-            sections = f"{self.n_sections} sections"
+            sections = how_many(self.n_sections, "section", "sections")
         return folded(
-            f"HTF({self.source}; harmonics {shown}; {counted}{span} cycles/period; "
+            f"HTF({self.source}; {noun} {shown}; {counted}{span} cycles/period; "
             f"{sections}: {listed(self.inputs)} -> {listed(self.outputs)})"
         )
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Complex, Float
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Numbers, Share
 from .._core.boundary.values import Reals
-from .._core.html import COLORS, Curve as Line, card, complex_number, picture, table
+from .._core.html import COLORS, Curve as Line, card, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
 from .._core.progress import say, working
@@ -162,8 +162,7 @@ class Branch(Showable, eqx.Module):
         begin, end = self.ends
         rows = [("from", begin.value, begin.message)]
         rows += [
-            (p.kind, p.value, ", ".join(map(complex_number, p.critical)))
-            for p in self.points
+            (p.kind, p.value, ", ".join(map(number, p.critical))) for p in self.points
         ]
         rows += [("to", end.value, end.message)]
         rows = [(name, f"{value:.9g}", text) for name, value, text in rows]

@@ -36,7 +36,7 @@ from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.showable import WithMultipliers
 from .._core.signal import unit_of, with_unit
-from .._core.text import number
+from .._core.text import how_many, number
 from ..engine.lanes import Lanes, Tape
 from ..engine.replay import linear_moves, recorded_moves
 from ..engine.settings import Settings
@@ -488,12 +488,13 @@ class LimitCycle(WithMultipliers, eqx.Module):
         residual = float(self.residual)
         is_rounding = residual < _ROUNDING
         closes = f"below {_ROUNDING:g}" if is_rounding else f"{residual:.2g}"
+        steps = how_many(int(self.iterations), "Newton step", "Newton steps")
         lines = {
             "period": number(self.period, 12, time_unit),
             f"at t = {begin}": self._state_text(),
             "events": ", ".join(events) or "none",
             **multipliers,
-            "residual": f"{closes} after {int(self.iterations)} Newton steps",
+            "residual": f"{closes} after {steps}",
             **self._checks(),
         }
         stiff = stiff_charts(self.structure, to_host(self.pieces), float(self.period))

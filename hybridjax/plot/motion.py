@@ -384,7 +384,7 @@ def _sheet() -> tuple[Figure, Any]:
         width_ratios=(1.15, 1),
         height_ratios=(1.4, 1),
         wspace=0.3,
-        hspace=0.3,
+        hspace=0.4,
     )
     return figure, grid
 

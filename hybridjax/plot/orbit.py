@@ -1,5 +1,6 @@
 """A limit cycle in phase space (paper Fig. 1)."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
 
 from .._core.boundary.checked import checked
 from ..engine import kernels
@@ -24,10 +26,14 @@ CHARTS = [
 """Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
-# What a corner of a name outside of the axes counts, in points of the orbit that it covers.
-# Smaller: names lie on ticks where the orbit is dense.
+# What a corner of a name outside of the axes, or another name that it covers, counts, in points of
+# the orbit that it covers. Smaller: names lie on ticks where the orbit is dense.
 _OUTSIDE = 10_000
+# Free pixels around a name. More: no place is free in a small picture. Fewer: names touch.
+_APART = 4
+# Where a name is tried: turned from the way to the center, and at distances in points.
 _TURNS = np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
+_DISTANCES = 9, 18
 _NUMBER: dict[str, Any] = {
     "fontsize": "x-small",
     "color": "0.35",
@@ -201,14 +207,22 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not any(name in there for there in texts.values()):
             texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
-    drawn = [*ax.transData.transform(np.transpose(orbit(*names)[1:]))]
-    for point, there in texts.items():
-        _text(ax, "\n".join(there), point, center, drawn)
+    lines = [np.transpose(orbit(*names)[1:])]
+    solid = [x for x in ax.get_lines() if x.get_linestyle() == "-"]
+    lines += [np.asarray(x.get_xydata()) for x in solid]
+    drawn = [*ax.transData.transform(np.vstack(lines))]
+    boxes: list[Bbox] = []
+    # (Long names first: short ones find a place beside them.)
+    for point, there in sorted(texts.items(), key=lambda x: -max(map(len, x[1]))):
+        boxes.append(_text(ax, "\n".join(there), point, center, drawn, boxes))
 
 
-def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
-    """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn,
-    to which its own are added."""
+def _text(ax: Axes, text: str, point, center, drawn: list, others: list[Bbox]) -> Bbox:
+    """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn
+    and no other text.
+
+    **Returns:** its box.
+    """
     note: Any = ax.annotate(
         text,
         point,
@@ -220,20 +234,21 @@ def _text(ax: Axes, text: str, point, center, drawn: list) -> None:
     to, at = ax.transData.transform([center, point])
     inwards = np.arctan2(*(to - at)[::-1])
 
-    def covered(turn: float) -> int:
+    def covered(place: tuple[float, float]) -> int:
+        distance, turn = place
         x = np.cos(inwards + turn)
         y = np.sin(inwards + turn)
-        note.set_position((9 * x, 9 * y))
+        note.set_position((distance * x, distance * y))
         note.set_ha(_side(x, "right", "left"))
         note.set_va(_side(y, "top", "bottom"))
         box = note.get_window_extent()
         outside = 4 - ax.bbox.count_contains(box.corners())
-        return _OUTSIDE * outside + box.padded(4).count_contains(drawn)
+        around = box.padded(_APART)
+        bad = outside + around.count_overlaps(others)
+        return _OUTSIDE * bad + around.count_contains(drawn)
 
-    covered(min(_TURNS, key=covered))
-    box = note.get_window_extent()
-    for x in np.linspace(box.x0, box.x1, 20):
-        drawn += [(x, box.y0), (x, box.y1)]
+    covered(min(itertools.product(_DISTANCES, _TURNS), key=covered))
+    return note.get_window_extent()
 
 
 def _side(x: float, below: Any, above: Any) -> Any:

@@ -181,7 +181,8 @@ class SectionData(Showable, eqx.Module):
         ):
             sizes.append(f"{name} {x:.3g} {unit}".rstrip())
         summary = (
-            f"SectionData({self.cycles:.5g} cycles of {self.n_sections} sections in "
+            f"SectionData({self.cycles:.5g} cycles of "
+            f"{how_many(self.n_sections, 'section', 'sections')} in "
             f"{how_many(len(self.records), 'record', 'records')}"
         )
         if self.missing:

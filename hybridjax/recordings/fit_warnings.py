@@ -17,7 +17,7 @@ from .._core.boundary.checked import checked
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.results import Result
 from .._core.showable import Showable
-from .._core.text import listed, p_value
+from .._core.text import listed, p_value, rounded, standard_error
 from ..identify.series.delayed_outputs import late_outputs, ordinary_least_squares
 from ..identify.series.fit import SeriesFit
 from ..identify.series.output_error import OutputErrorProblem
@@ -371,9 +371,10 @@ def about_phase_response(curve: Any) -> Iterator[Finding]:
     if 2 * stats.t.sf(abs(carried), curve.dof) < _LEVEL:
         yield Finding(
             "memory",
-            f"a push changes the next interval, too: by {curve.carried:.2f} ± "
-            f"{curve.carried_error:.2g} (standard error) times the change of its own. The curve "
-            "shows the change of its own interval; the shift that stays is another. "
+            "a push changes the next interval, too: by "
+            f"{rounded(curve.carried, curve.carried_error)} ± "
+            f"{standard_error(curve.carried_error)} (standard error) times the change of its own. "
+            "The curve shows the change of its own interval; the shift that stays is another. "
             "`hj.identify_recording` with `outputs=()` fits durations with their memory.",
         )
     elif abs(curve.memory) > _MEMORY:

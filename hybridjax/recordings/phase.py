@@ -176,7 +176,7 @@ class Phase(Showable, eqx.Module):
         if self.backwards:
             text += f"; {100 * self.backwards:.2g} % of samples ran backwards"
         if self.dropped:
-            text += f"; {self.dropped} doubled events left out"
+            text += f"; {how_many(self.dropped, 'doubled event', 'doubled events')} left out"
         if self.missed:
-            text += f"; {self.missed} cycles with missed events left out"
+            text += f"; {how_many(self.missed, 'cycle', 'cycles')} with missed events left out"
         return folded(text + ")")

@@ -45,6 +45,9 @@ class Trial(eqx.Module):
     events: dict[str, Float[np.ndarray, " _"]]
     name: str = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        return f"Trial({_summary(self).strip()})"
+
 
 @checked
 class Recording(Showable, eqx.Module):
@@ -334,9 +337,11 @@ def _summary(trial: Trial) -> str:
     """Return length, rate, gaps and events of a trial on one line, or folded."""
     step = np.diff(trial.time)
     usual = float(np.median(step))
+    longest = f"{step.max():.4g} s"
+    uneven = "" if longest == f"{usual:.4g} s" else f", longest {longest}"
     parts = [
         f"  {trial.name}: {len(trial.time)} samples in {np.ptp(trial.time):.4g} s, every "
-        f"{usual:.4g} s ({1 / usual:.4g} Hz, longest {step.max():.4g} s)"
+        f"{usual:.4g} s ({1 / usual:.4g} Hz{uneven})"
     ]
     missing = int(np.isnan(trial.values).any(axis=1).sum())
     if missing:

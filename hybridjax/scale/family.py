@@ -27,7 +27,7 @@ from ..systems.system import (
     require_positive,
     unit_of_parameter,
 )
-from ..systems.varied import with_parameters
+from ..systems.varied import parameter_of, with_parameters
 
 
 Axes = Mapping[str, Vector]
@@ -141,7 +141,10 @@ class Family:
         self.model = model
         self.names = tuple(names)
         allowed, required = _parameters(model)
-        if allowed is not None:
+        if isinstance(model, HybridSystem):
+            for name in self.names:
+                parameter_of(model, name)
+        elif allowed is not None:
             require_among("parameter", self.names, allowed, "`model`: ")
         for name in required:
             if name not in self.names:

@@ -123,6 +123,8 @@ class _Anchored(AbstractSections):
         return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
 
     def describe(self, i: int) -> str:
+        if i == 0:
+            return "section 0"
         return f"section {i} ({self.label} phase {i}/{self.n_sections} after section 0)"
 
 
@@ -163,6 +165,8 @@ class ClockPhase(_Anchored):
         return BoundSections.at_times(first + steps)
 
     def describe(self, i: int) -> str:
+        if i == 0:
+            return "section 0"
         return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
 
 
@@ -393,13 +397,15 @@ class SectionList(AbstractSections):
 
 
 FamilyLike: TypeAlias = (
-    AbstractSections | Crossing | AtEvent | Sequence[Crossing | AtEvent]
+    AbstractSections | Crossing | AtEvent | SectionCount | Sequence[Crossing | AtEvent]
 )
-"""A family, a single section, or a list of sections."""
+"""A family, a single section, the number of sections of a clock, or a list of sections."""
 
 
 def as_family(sections: FamilyLike) -> AbstractSections:
-    """A family from a family, a single section, or a list of sections."""
+    """A family from a family, a single section, a number of them, or a list of sections."""
+    if isinstance(sections, int):
+        return ClockPhase(sections)
     if isinstance(sections, Crossing | AtEvent):
         return SectionList([sections])
     return sections if isinstance(sections, AbstractSections) else SectionList(sections)

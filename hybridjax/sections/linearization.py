@@ -65,7 +65,7 @@ def linearize(
     **Arguments:**
 
     - `cycle`: result of `hj.find_limit_cycle`.
-    - `sections`: a family or `PlacedSections`.
+    - `sections`: a family, the number of sections of a clock, or `PlacedSections`.
     - `outputs`: names or `Output`s. Default: all states that every chart defines.
     - `inputs`: names. Default: all.
     - `delay`: pair of delays, of the inputs and of the outputs, in the unit of time, for

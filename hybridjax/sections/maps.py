@@ -17,7 +17,7 @@ from .._core.executor import is_traced, namespace, put
 from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.showable import Showable
-from .._core.text import folded
+from .._core.text import folded, how_many
 from ..engine.lanes import nan_where
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
@@ -64,10 +64,9 @@ class SectionMap(Showable, eqx.Module):
 
     def __repr__(self):
         system = type(self.placed.cycle.system).__name__
+        states = how_many(self.dims[0], "state", "states")
         ends = " to ".join(map(self.placed.family.describe, (self.i, self.j)))
-        return folded(
-            f"SectionMap({system}: from {ends}; {self.dims[0]} states to {self.dims[1]})"
-        )
+        return folded(f"SectionMap({system}: from {ends}; {states} to {self.dims[1]})")
 
     @property
     def fixed_point(self) -> Float[Array, " n"]:

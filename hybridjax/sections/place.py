@@ -39,11 +39,12 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
     **Arguments:**
 
     - `cycle`: result of `hj.find_limit_cycle`.
-    - `sections`: a family (`ClockPhase`, `ArcLength`, `KinematicPhase`, `SectionList`), or a list
-      of `Crossing` and `AtEvent`, which is sorted: section 0 is the first one, and the others
-      follow in the order in which the cycle meets them (`placed.family.items`). Under
-      transformations of JAX a list must be in order. The flow from each section to the next may
-      take as many steps as the cycle's `settings` allow, and at least 1024.
+    - `sections`: a family (`ClockPhase`, `ArcLength`, `KinematicPhase`, `SectionList`), the number
+      of sections of a clock, or a list of `Crossing` and `AtEvent`, which is sorted: section 0 is
+      the first one, and the others follow in the order in which the cycle meets them
+      (`placed.family.items`). Under transformations of JAX a list must be in order. The flow from
+      each section to the next may take as many steps as the cycle's `settings` allow, and at least
+      1024.
 
     **Returns:** `PlacedSections`, which every function takes in place of a family: `lanes`, the N
     states on the cycle, and `duration` (N,), the times from section to section.

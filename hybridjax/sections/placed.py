@@ -23,7 +23,7 @@ from .._core.meaning import require_as_made
 from .._core.precision import require_x64
 from .._core.results import Result
 from .._core.showable import Showable
-from .._core.text import folded, number
+from .._core.text import folded, how_many, number
 from ..engine import kernels
 from ..engine.events import due_at_once
 from ..engine.lanes import Lanes, Tape, for_each_chart, needed, only
@@ -80,7 +80,8 @@ class PlacedSections(Showable, eqx.Module):
     def __repr__(self):
         system = type(self.cycle.system).__name__
         family = type(self.family).__name__
-        head = f"PlacedSections({self.n_sections} sections of a {family} on a cycle of {system}"
+        count = how_many(self.n_sections, "section", "sections")
+        head = f"PlacedSections({count} of a {family} on a cycle of {system}"
         if is_traced(self):
             return f"{head}, traced)"
         sections, dimension, start, _ = self._facts().values()

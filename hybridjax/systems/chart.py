@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import inspect
 import operator
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -9,6 +10,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from .._core.boundary.values import show
 from .._core.signal import signals
 from .._core.text import listed
 from ..errors import DefinitionError
@@ -59,6 +61,8 @@ class Chart(eqx.Module):
         fields = {field.name for field in dataclasses.fields(cls)}
         is_named = hasattr(cls, "states") or "states" in fields
         if is_named and not cls.__abstractmethods__:
+            if "states" not in fields:
+                _require_names(cls)
             return super().__new__(cls)
         name = "YourChart" if cls is Chart else cls.__name__
         raise DefinitionError(
@@ -84,6 +88,20 @@ class Chart(eqx.Module):
 
     def __repr__(self):
         return f"{type(self).__name__}({listed(signals(self.states, self.units))})"
+
+
+def _require_names(cls: type) -> None:
+    """**Raises:** `DefinitionError` for `states` of a class that are no sequence of names."""
+    states = inspect.getattr_static(cls, "states")
+    is_sequence = isinstance(states, tuple | list)
+    if is_sequence and all(isinstance(name, str) for name in states):
+        return
+    if not isinstance(states, property):
+        meant = (states,) if isinstance(states, str) else ("y", "v")
+        raise DefinitionError(
+            f"`states` of {cls.__name__} must be a tuple of names, such as {meant}, not "
+            f"{show(states)}."
+        )
 
 
 class FieldChart(Chart):

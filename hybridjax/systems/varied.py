@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._core.arguments import require_among
+from .._core.boundary.leads import about_parameter
 from .._core.executor import Array
+from ..errors import DefinitionError
 from .structure import Structure
 from .system import HybridSystem, parameters_of
 
@@ -20,7 +21,8 @@ def parameter_of(system: HybridSystem, parameter: str) -> Array:
     **Raises:** `DefinitionError` if there is none.
     """
     numbers = parameters_of(system)
-    require_among("parameter", [parameter], numbers, f"{type(system).__name__}: ")
+    if parameter not in numbers:
+        raise DefinitionError(about_parameter(type(system), parameter, list(numbers)))
     return numbers[parameter]
 
 

@@ -46,7 +46,7 @@ def synthetic_ldtp() -> LDTP:
     3, 2.
 
     Its matrices are arbitrary, without a physical system and without symmetries that could hide an
-    error. Its multipliers are 0.3270675 ± 0.05964059i; at the sections of dimension 3 there is a
+    error. Its multipliers are 0.3270675 ± 0.05964059j; at the sections of dimension 3 there is a
     structural zero, too.
 
     **Returns:** `hj.linear.LDTP`, without units.

@@ -58,7 +58,7 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
         in repr(plan)
     )
     assert re.search(
-        r"cycles +1280 +1280\n  standard error of -0.249\+0.6993i", repr(plan)
+        r"cycles +1280 +1280\n  standard error of -0.249\+0.6993j", repr(plan)
     )
     assert_allclose(plan.rms["u"], plan.usual_rms["u"])
 

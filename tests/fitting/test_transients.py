@@ -5,7 +5,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -89,11 +89,21 @@ def test_times_of_events_alone_identify_the_restitution():
     assert seen.rank == 2
 
 
+def test_values_of_one_output_need_no_second_axis():
+    begin = hj.Guess("main", (1.0, 0.0))
+    y = np.linspace(1.0, 0.5, 4)
+    row = hj.fitting.ObservedTrajectory(begin, (0.1, 0.2, 0.3, 0.4), "y", y)
+    column = hj.fitting.ObservedTrajectory(begin, (0.1, 0.2, 0.3, 0.4), "y", y[:, None])
+    assert_array_equal(row.values, column.values)
+    with pytest.raises(hj.errors.DefinitionError, match=r"of shape \(4 times, 2 outp"):
+        hj.fitting.ObservedTrajectory(begin, (0.1, 0.2, 0.3, 0.4), ("y", "v"), y)
+
+
 def test_prints_have_the_digits_that_errors_leave():
     data = observed(1.0, seed=0)
     assert " known=" not in repr(data)  # (It would list the place of each sample.)
     table = repr(hj.fit_model(ball(), data, ("e", "drag")))
-    assert re.search(r"e  +0\.\d{5} +± 0\.00\d\d\n", table)
+    assert re.search(r"e  +0\.\d{4} +± 0\.00\d\d\n", table)
 
 
 @pytest.mark.slow

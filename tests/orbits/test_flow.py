@@ -626,6 +626,12 @@ def test_events_at_the_start_and_at_the_end():
     rolls = hj.flow(ball(), hj.Guess("main", (0.0, -1.0)), 1.0)
     assert [x.cause for x in rolls.findings] == ["on a guard"]
     assert hj.flow(ball(), hj.Guess("main", (0.0, 1.0)), 0.1).findings == ()
+    falls = hj.flow(ball(), hj.Guess("main", (0.0, 0.0)), 0.1)
+    assert [x.cause for x in falls.findings] == [
+        "on a guard"
+    ]  # though it is at rest there
+    rises = hj.flow(ball(g=-9.81), hj.Guess("main", (0.0, 0.0)), 0.1)
+    assert rises.findings == ()
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,16 @@ def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kin
     assert v < -1, "both events lie above"
     written = [text.get_text() for text in texts]
     numbers = ["0", "4", "8", "12", "16", "20", "24", "28"]
-    assert written == ["liftoff", "touchdown", *numbers]
+    assert written == ["touchdown", "liftoff", *numbers]
+
+
+def test_names_of_events_keep_apart(hopper_cycle):
+    """In the small picture of an animation both events lie above."""
+    figure = hj.plot.animate(hopper_cycle).figure
+    (ax,) = [x for x in figure.axes if x.get_xlabel() == "yM (m)"]
+    written = [x for x in ax.texts if x.get_text() in ("liftoff", "touchdown")]
+    first, second = (x.get_window_extent() for x in written)
+    assert not first.padded(3).overlaps(second)
 
 
 def test_a_cycle_that_was_not_found_is_refused():

@@ -183,6 +183,7 @@ class _Kinds:
         """
         positional, further = self.in_order
         taken = []
+        by_name = False
         name = ""
         kind: Kind | None = None
         value: Any = None
@@ -190,11 +191,12 @@ class _Kinds:
             for k, value in enumerate(args):
                 name, kind = positional[k] if k < len(positional) else further
                 taken.append(value if kind is None else kind.take(value))
+            by_name = True
             for name, value in kwargs.items():
                 kind = self.by_name.get(name)
                 kwargs[name] = value if kind is None else kind.take(value)
         except Misfit as misfit:
-            lead = functools.partial(self._lead, name, kind, value, args)
+            lead = functools.partial(self._lead, name, kind, value, args, by_name)
             raise misfit.of(name).leading(lead) from None
         return taken, kwargs
 
@@ -235,16 +237,22 @@ class _Kinds:
         name = next(x for x in names.in_order if x in names.required - given)
         return leads.about_missing(function, name, self.by_name[name], args)
 
-    def _lead(self, name: str, kind: Kind | None, value: Any, args: tuple) -> str:
+    def _lead(
+        self, name: str, kind: Kind | None, value: Any, args: tuple, by_name: bool
+    ) -> str:
         """Return the rest of the sentence about a value that does not fit."""
-        positional, _ = self.in_order
+        percent = leads.about_percent(kind, value)
+        if percent:
+            return percent
+        # (What is given by name is not in the wrong order.)
+        positional = [] if by_name else self.in_order[0]
         for (other, other_kind), given in zip(positional, args, strict=False):
             if other == name or kind is None or other_kind is None:
                 continue
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
         called = self.function if self.cls is None else self.cls
-        return leads.about_object(called.__name__, kind, value, args)
+        return leads.about_object(called.__qualname__, kind, value, args)
 
     @functools.cached_property
     def _names(self) -> "_Names":

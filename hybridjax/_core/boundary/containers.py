@@ -210,6 +210,8 @@ class Stream(Kind):
 
     def __init__(self, cls: type, argument: str):
         self.item = Instance(cls)
+        if getattr(cls, "_is_protocol", False):
+            self.item.allowed = Having(cls).allowed
         self.argument = argument
         self.allowed = f"an iterable of items, each {self.item.allowed}"
 

@@ -5,17 +5,17 @@ Users guess with the words of other libraries, and give an object of an earlier 
 """
 
 import dataclasses
-import difflib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..public import about_word, is_namespace, place_of
+from ..spelling import spelled_alike
 from . import words
 from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
 from .guesses.keywords import KEYWORDS, NEEDS
 from .guesses.objects import MAKERS, OBJECTS, STEPS
-from .values import Kind, show, with_article
+from .values import Kind, Number, show, with_article
 
 
 # Attributes or arguments that a message lists. Fewer: the right one is left out. More: the message
@@ -23,10 +23,7 @@ from .values import Kind, show, with_article
 _LISTED = 24
 
 
-# Likeness of two spellings, from 0 to 1, at which one is taken for a slip in the other, and at
-# which it is the last guess. Lower: names of other things are suggested. Higher: slips lead
-# nowhere.
-_SLIP = 0.85
+# Likeness of two spellings at which one is the last guess for the other; see `SLIP`.
 _ALIKE = 0.7
 
 
@@ -64,11 +61,11 @@ def _leads_of_name(
     yield words.lead_of(NAMES, [own], name)
     yield place(words.same_word(name, places))
     yield words.lead_of(NAMES, [""], name)
-    yield place(_spelled_alike(name, places, _SLIP))
+    yield place(spelled_alike(name, places))
     yield words.lead_of_library([""], name)
     for part in words.parts(name):
         yield words.lead_of(NAMES, [own, ""], part)
-    yield place(_spelled_alike(name, places, _ALIKE))
+    yield place(spelled_alike(name, places, _ALIKE))
     for part in words.parts(name):
         yield place(words.with_part(part, places))
 
@@ -125,6 +122,10 @@ def _about_part(thing: Any, name: str) -> str:
         return f": `cycle.trajectory()('{name}')` has times and values of a signal"
     if callable(thing):
         return f": `trajectory('{name}')` has times and values of a signal"
+    if not hasattr(type(thing), "__getitem__"):
+        return (
+            ": `state` has the states at the end, in the order of its chart's `states`"
+        )
     return f": `['{name}']` has the values of a signal"
 
 
@@ -147,12 +148,12 @@ def _leads_of_attribute(
     yield _use(_error_bars(name, attributes))
     yield _use(_attribute_of_part(cls, name))
     yield words.lead_of_library(owners, name)
-    yield _use(_spelled_alike(name, attributes, _SLIP))
+    yield _use(spelled_alike(name, attributes))
     yield _use(_documented(cls, name))
     for part in words.parts(name):
         yield words.lead_of(ATTRIBUTES, owners, part)
         yield _use(words.with_part(part, attributes))
-    yield _use(_spelled_alike(name, attributes, _ALIKE))
+    yield _use(spelled_alike(name, attributes, _ALIKE))
     function = place_of(name)
     if function is not None and not is_namespace(name):
         yield f"`{function}` is a function that may take it"
@@ -173,9 +174,9 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
     """Return the sentence about a parameter that a class has not."""
     alike = (
         _synonym(name, known),
-        _spelled_alike(name, known, _SLIP),
+        spelled_alike(name, known),
         _documented(cls, name),
-        _spelled_alike(name, known, _ALIKE),
+        spelled_alike(name, known, _ALIKE),
     )
     meant = next((x for x in alike if x is not None), None)
     lead = "" if meant is None else f": use `{meant}`"
@@ -186,12 +187,15 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
 
 
 def _documented(cls: type, name: str) -> str | None:
-    """Return the parameter of a system whose description has this word."""
-    if dataclasses.is_dataclass(cls):
-        for field in dataclasses.fields(cls):
-            if name in field.metadata.get("doc", "").split():
-                return field.name
-    return None
+    """Return the parameter of a system whose description has this word, or one like it."""
+    if not dataclasses.is_dataclass(cls):
+        return None
+    parameters: dict[str, str] = {}
+    for field in dataclasses.fields(cls):
+        for word in field.metadata.get("doc", "").split():
+            parameters.setdefault(word, field.name)
+    word = name if name in parameters else spelled_alike(name, parameters)
+    return None if word is None else parameters[word]
 
 
 def _attribute_of_part(cls: type, name: str) -> str | None:
@@ -308,15 +312,15 @@ def _leads_of_argument(
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
     yield words.lead_of(KEYWORDS, owners, name)
-    yield _use(_spelled_alike(name, parameters, _SLIP))
+    yield _use(spelled_alike(name, parameters))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
         yield words.lead_of(KEYWORDS, owners, part)
-    yield _use(_spelled_alike(name, parameters, _ALIKE))
+    yield _use(spelled_alike(name, parameters, _ALIKE))
 
 
 def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
-    return name if name in parameters else _spelled_alike(name, parameters, _SLIP)
+    return name if name in parameters else spelled_alike(name, parameters)
 
 
 def _synonym(name: str, among: Collection[str]) -> str | None:
@@ -327,27 +331,32 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
     return words.same_word(name, among)
 
 
-def _spelled_alike(name: str, among: Collection[str], likeness: float) -> str | None:
-    alike = difflib.get_close_matches(name, among, n=1, cutoff=likeness)
-    return alike[0] if alike else None
-
-
 def about_object(
     function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
 ) -> str:
     """Return the call that makes what a function needs instead of a value, or the part of it that
     is needed, as the rest of a sentence; "" if none is known.
 
-    **Arguments:** `given`: all arguments, whose names the call has.
+    **Arguments:** `function`: its name, of a method with its class. `given`: all arguments, whose
+    names the call has.
     """
     return _in_names_of(given, _about_object(function, kind, value))
 
 
+def about_percent(kind: Kind | None, value: Any) -> str:
+    """Return the number that a percentage means, as the rest of a sentence; "" for others."""
+    if not isinstance(kind, Number) or not isinstance(value, int | float):
+        return ""
+    is_share = max(kind.low, kind.above) == 0 and min(kind.high, kind.below) == 1
+    return f": {value:g} % is {value / 100:g}" if is_share and 1 < value <= 100 else ""
+
+
 def _about_object(function: str, kind: Kind | None, value: Any) -> str:
-    for base in type(value).__mro__:
-        lead = OBJECTS.get(f"{function}.{base.__name__}")
-        if lead is not None:
-            return f": {lead}"
+    for name in (function, function.rpartition(".")[2]):
+        for base in type(value).__mro__:
+            lead = OBJECTS.get(f"{name}.{base.__name__}")
+            if lead is not None:
+                return f": {lead}"
     wanted = list(classes_in(kind))
     if _is_class_of(value, wanted):
         return f": make one, as `{value.__name__}()`"

@@ -24,7 +24,7 @@ from ..._core.boundary.values import Integers
 from ..._core.findings import Finding, warn_of
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.text import signal_values
+from ..._core.text import how_many, signal_values
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, all_harmonics, check_harmonics
@@ -225,7 +225,8 @@ class LDTPFit(WithCost, MultiplierFit):
         about = f"chi-square per degree of freedom {self.chi2_per_dof:.3g} (dof {self.dof:.0f})"
         if self.noise is not None:
             about = f"errors one step ahead {signal_values(self.outputs, self.noise)}"
-        return f"{about}; {self.unknowns} unknowns, {self.n_sections} sections"
+        sections = how_many(self.n_sections, "section", "sections")
+        return f"{about}; {self.unknowns} unknowns, {sections}"
 
 
 @checked

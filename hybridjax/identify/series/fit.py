@@ -33,7 +33,7 @@ from ..._core.findings import Finding, refuse, warn_of
 from ..._core.memo import remembered
 from ..._core.precision import require_x64
 from ..._core.results import Result
-from ..._core.text import signal_values
+from ..._core.text import how_many, signal_values
 from ...errors import DefinitionError
 from ...experiments.record import RecordedData
 from ...linear.frequency_response import Harmonics, check_harmonics
@@ -210,7 +210,8 @@ class SeriesFit(MultiplierFit):
         )
         return (
             f"{loop}noise {signal_values(self.outputs, self.noise)}; "
-            f"{self.n_sections} sections, {self.numerators.shape[1]} lags"
+            f"{how_many(self.n_sections, 'section', 'sections')}, "
+            f"{how_many(self.numerators.shape[1], 'lag', 'lags')}"
         )
 
     @property

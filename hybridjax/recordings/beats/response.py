@@ -16,6 +16,7 @@ from ..._core.progress import say, working
 from ..._core.results import Result
 from ..._core.showable import Showable
 from ..._core.signal import Signal, with_unit
+from ..._core.text import rounded, standard_error
 from ...errors import DefinitionError
 from ...orbits.crossing import AtEvent, Crossing
 from ...orbits.responses import PhaseCurve
@@ -230,8 +231,8 @@ class PhaseResponse(PhaseCurve):
         return (
             f"PhaseResponse({self.detail:.1f} effective parameters, {self.intervals} intervals of "
             f"{len(self.rates)} trials, {self.miscounted} of them miscounted)\n"
-            f"  mean {with_unit('Z', self.unit)}  {mean:.4g} ± {error:.2g} (standard error); from "
-            f"{self.values.min():.4g} to {self.values.max():.4g}\n"
+            f"  mean {with_unit('Z', self.unit)}  {rounded(mean, error)} ± {standard_error(error)} "
+            f"(standard error); from {self.values.min():.4g} to {self.values.max():.4g}\n"
             f"  rates        {self.rates.min():.4g} to {self.rates.max():.4g} cycles/s, jitter "
             f"{100 * self.jitter:.2g} % of a cycle{self._about_wander()}\n"
             f"  R2 left out  {self.left_out:.3f}; of a flat curve {self.left_out_flat:.3f}\n"

@@ -85,6 +85,9 @@ ATTRIBUTES = {
         "`hj.validate(model, data).plot()` shows residuals": (
             "plot_residuals plot_resid plot_diagnostics diagnostics"
         ),
+        "`fit.interval(level)` has intervals, which follow from `fit.covariance`": (
+            "bootstrap jackknife resample profile_likelihood conf_region"
+        ),
         COMPARE: "pvalue tvalues t_test f_test wald_test",
         "`hj.validate(fit, data)` compares a fit with data; `validation.fit` is the share "
         "explained": "score r2 rsquared rmse mse nrmse goodness",

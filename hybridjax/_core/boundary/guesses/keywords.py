@@ -28,6 +28,9 @@ KEYWORDS = {
         "results and systems do not change: functions return new ones": (
             "copy inplace copy_x"
         ),
+        "the same call gives the same numbers always: there is nothing to seed": (
+            "seed random_state rng key random_seed"
+        ),
     },
     "bode": {
         "`unit='Hz'` with `period=cycle` draws frequencies in Hz": "hz rad",

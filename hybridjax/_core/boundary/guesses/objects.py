@@ -144,6 +144,9 @@ OBJECTS = {
     "save.Showable": "`hj.save('name.npz', result)` takes the name first",
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
     "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
+    "Branch.__getitem__.str": "`branch.values` has the values of the parameter, and "
+    "`branch.to_pandas()` all numbers",
+    "LimitCycle.trajectory.str": "`cycle.trajectory()('y')` has times and values of a signal",
     "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
     "multipliers.list": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
