@@ -14,6 +14,7 @@ saltation matrices.
 """
 
 import argparse
+import functools as ft
 import time
 from typing import NamedTuple
 
@@ -685,7 +686,8 @@ def random(options) -> None:
 
 
 def speed(_) -> None:
-    """CPU seconds of the gradient of a loss after ten bounces, by the start and two parameters."""
+    """CPU seconds of the gradient of a loss after ten bounces, by the start and two parameters;
+    `quick`: by XLA's older generator of code (docs/how-to/speed-up.md)."""
 
     def loss(height, g, e):
         start = hj.Guess("air", (height, 0.0))
@@ -693,19 +695,25 @@ def speed(_) -> None:
         return found.t**2 + found.state[1] ** 2
 
     point = 1.0, 9.81, 0.9
-    gradient = jax.jit(jax.grad(loss, (0, 1, 2)))
-    begin = time.process_time()
-    jax.block_until_ready(gradient(*point))
-    show("speed.gradient.first", time.process_time() - begin)
-    show("speed.gradient.again", again(lambda: jax.block_until_ready(gradient(*point))))
+    older = {"xla_cpu_use_fusion_emitters": False}
+    for name, options in {"gradient": None, "quick": older}.items():
+        jax.clear_caches()
+        gradient = jax.jit(jax.grad(loss, (0, 1, 2)), compiler_options=options)
+        call = ft.partial(of_program, gradient, point)
+        show(f"speed.{name}.first", again(call, 1))
+        show(f"speed.{name}.again", again(call))
     program = jax.jit(loss)
-    jax.block_until_ready(program(*point))
-    show("speed.value.again", again(lambda: jax.block_until_ready(program(*point))))
+    of_program(program, point)
+    show("speed.value.again", again(ft.partial(of_program, program, point)))
 
     def differences():
         return [scipy_bounces(1.0 + h) for h in (1e-6, -1e-6)]
 
     show("speed.differences_of_scipy.one_parameter", again(differences, 3))
+
+
+def of_program(program, point):
+    return jax.block_until_ready(program(*point))
 
 
 def again(function, repeat: int = 20) -> float:

@@ -18,7 +18,8 @@ the same by the sweep in C (`c`; `times_c`: as multiples of it). `sweep`: `hj.sw
 `branch`: README's continuation; each a second time. `repeats`: `find_limit_cycle` from a known
 cycle after a small change of a parameter, when four such calls have gone before. `in_program`:
 inside of `jit`, the gradient of the square of the monodromy's trace by the hopper's nine
-parameters. `neurons`, `bucks`, `compasses`: `find_limit_cycles` of 2500 of each (`found`: the
+parameters; `linearized`: that of the matrices between sections; `..._quick`: with an option of the
+compiler. `neurons`, `bucks`, `compasses`: `find_limit_cycles` of 2500 of each (`found`: the
 share). Calls of these and of `cycles` again count by the least time of three.
 `second_process`: the sweep in a process that finds the compiled programs of another. `walkers`: a
 cycle of the hopper and of the five-link biped, and 80 experiments on a kneed walker (32 cycles, 16
@@ -54,6 +55,9 @@ JOBS = (
     "walkers",
     "repeats",
     "in_program",
+    "in_program_quick",
+    "linearized",
+    "linearized_quick",
     "neurons",
     "bucks",
     "compasses",
@@ -320,6 +324,47 @@ def repeats() -> dict[str, float]:
 
 def in_program() -> dict[str, float]:
     """CPU seconds of a gradient by nine parameters inside of `jit`, after the cycle was found."""
+    return gradient_inside(multiplied_factors)
+
+
+def in_program_quick() -> dict[str, float]:
+    """The same by XLA's older generator of code (docs/how-to/speed-up.md)."""
+    return gradient_inside(multiplied_factors, xla_cpu_use_fusion_emitters=False)
+
+
+def linearized() -> dict[str, float]:
+    """The same of the matrices between eight sections."""
+    return gradient_inside(multiplied_matrices)
+
+
+def linearized_quick() -> dict[str, float]:
+    """The same by XLA's older generator of code."""
+    return gradient_inside(multiplied_matrices, xla_cpu_use_fusion_emitters=False)
+
+
+def multiplied_factors(cycle):
+    """The monodromy matrix of the cycle."""
+    import jax.numpy as jnp
+
+    return jnp.linalg.multi_dot(list(cycle.factors[::-1]))
+
+
+def multiplied_matrices(cycle):
+    """The same on sections of a clock."""
+    import jax.numpy as jnp
+
+    import hybridjax as hj
+
+    sections = hj.ClockPhase(8, anchor=hj.Crossing("vM", "falling"))
+    model = hj.linearize(cycle, sections, outputs=("yM", "vM"))
+    return jnp.linalg.multi_dot(list(model.A[::-1]))
+
+
+def gradient_inside(monodromy: Callable, **options: object) -> dict[str, float]:
+    """CPU seconds of the gradient of a number of a hopper's cycle by its nine parameters.
+
+    **Arguments:** `options`: of the compiler.
+    """
     import equinox as eqx
     import jax
     import jax.numpy as jnp
@@ -332,11 +377,10 @@ def in_program() -> dict[str, float]:
 
     def square(system):
         """Of the sum of the multipliers, which has derivatives where two of them meet, too."""
-        factors = hj.find_limit_cycle(system, cycle).factors
-        monodromy = jnp.linalg.multi_dot(list(factors[::-1]))
-        return jnp.trace(monodromy) ** 2
+        found = hj.find_limit_cycle(system, cycle)
+        return jnp.trace(monodromy(found)) ** 2
 
-    gradient = eqx.filter_jit(eqx.filter_grad(square))
+    gradient = eqx.filter_jit(eqx.filter_grad(square), compiler_options=options or None)
     return twice(
         gradient=lambda: jax.block_until_ready(gradient(hopper)), repeat=REPEAT
     )

@@ -8,7 +8,6 @@ import numpy as np
 
 from . import jax_compat
 from .exceptions import PrecisionError
-from .executor import is_inside_program
 
 
 def enable_x64() -> None:
@@ -57,12 +56,12 @@ def real(x: Any) -> jax.Array:
     """`x` as an array of floating-point numbers: a converter for fields of definitions.
 
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
-    that a definition may be built before. Arrays of JAX remain what they are.
+    that a definition may be built before. They have values inside of programs, too: what is known
+    while a program is traced need not be searched by it. Arrays of JAX remain what they are.
     """
     leaves = jax.tree_util.tree_leaves(x)
-    made_by_jax = any(isinstance(leaf, jax.Array) for leaf in leaves)
-    if made_by_jax or is_inside_program():
+    if any(isinstance(leaf, jax.Array) for leaf in leaves):
         return jnp.asarray(x, float)
     # (No program is compiled for numbers of Python and NumPy.)
-    with jax.enable_x64(True):
+    with jax_compat.outside(), jax.enable_x64(True):
         return jax.device_put(np.asarray(x, float))

@@ -153,25 +153,15 @@ def walked(
     """The sections of a family on a cycle, and the derivatives of (t, q) on each next section by
     (t, q) and the inputs on this one. The result of sections that leave the walk is a code."""
     map = cycle.return_map
-    start = map.anchor.t[0], map.anchor.q[:, 0]
-    begin = start
-    code = jnp.zeros((), jnp.int32)
-    if walk.lead is not None:
-        assert isinstance(family.anchor, Crossing)
-        at_anchor = ListLevels((family.anchor,))
-        free = jnp.full_like(walk.lead.ends, jnp.inf)
-        lead = _followed(map, walk, walk.lead, at_anchor, start, free, columns=False)
-        begin = lead.t, lead.q
-        code = _code(map, walk.lead, lead, start[0])
-    orbit = map.anchor._replace(
-        t=begin[0][None], q=begin[1][:, None], chart=walk.chart_at_anchor
-    )
-    bound = bind_at(map, family, orbit)
-    bound = dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
-    known = _known_ends(map, walk, bound)
-    passage = _followed(map, walk, walk.path, bound.levels, begin, known, columns=True)
-    of_walk = _code(map, walk.path, passage, begin[0])
-    code = jnp.where(code == Result.OK, of_walk, code)
+    traced = [x.size for x in jax.tree_util.tree_leaves((map, family)) if is_tracer(x)]
+    few = sum(traced) <= JACOBIAN_COLUMNS
+
+    def find(moving):
+        return _passed(walk, *moving, reverse=not (few or walk.forwards))
+
+    by_columns = few and not walk.forwards
+    begin, passage, code = (by_jacobian(find) if by_columns else find)((map, family))
+    bound = _bound(map, family, walk, begin)
     N = family.n_sections
     lanes = Lanes(
         t=passage.pieces_t,
@@ -185,6 +175,46 @@ def walked(
     fields = bound, lanes, None, duration, jnp.full(N, code)
     placed = PlacedSections(cycle, family, *fields, *coordinates_on(map, bound, lanes))
     return placed, passage.factors
+
+
+def _passed(
+    walk: Walk, map: ReturnMap, family: AbstractSections, reverse: bool
+) -> tuple[tuple, Passage, Int[Array, ""]]:
+    """The time and the state at the anchor, the passage from there to all sections, and the code of
+    both ways.
+
+    **Arguments:** `reverse`: whether reverse mode differentiates every row of the walk.
+    """
+    start = map.anchor.t[0], map.anchor.q[:, 0]
+    begin = start
+    code = jnp.zeros((), jnp.int32)
+    options: Any = dict(reverse=reverse)
+    if walk.lead is not None:
+        assert isinstance(family.anchor, Crossing)
+        levels = ListLevels((family.anchor,))
+        free = jnp.full_like(walk.lead.ends, jnp.inf)
+        lead = _followed(
+            map, walk, walk.lead, levels, start, free, columns=False, **options
+        )
+        begin = lead.t, lead.q
+        code = _code(map, walk.lead, lead, start[0])
+    bound = _bound(map, family, walk, begin)
+    known = _known_ends(map, walk, bound)
+    path = _followed(
+        map, walk, walk.path, bound.levels, begin, known, columns=True, **options
+    )
+    of_path = _code(map, walk.path, path, begin[0])
+    return begin, path, jnp.where(code == Result.OK, of_path, code)
+
+
+def _bound(
+    map: ReturnMap, family: AbstractSections, walk: Walk, begin: tuple
+) -> BoundSections:
+    """The family evaluated from the time and the state at its anchor."""
+    t, q = begin
+    anchor = map.anchor._replace(t=t[None], q=q[:, None], chart=walk.chart_at_anchor)
+    bound = bind_at(map, family, anchor)
+    return dataclasses.replace(bound, time=bound.time + walk.late * map.expected)
 
 
 def _known_ends(map: ReturnMap, walk: Walk, bound: BoundSections) -> Float[Array, " E"]:
@@ -203,33 +233,32 @@ def _followed(
     begin: tuple,
     known: Float[Array, " E"],
     columns: bool,
+    reverse: bool,
 ) -> Passage:
-    """A trajectory of a system on a path of a walk, with derivatives.
+    """A trajectory of a system on a path of a walk.
 
     **Arguments:** `known`: ends of legs where they are known, otherwise infinite.
     """
-    everything = map, begin, known, levels
-    leaves = jax.tree_util.tree_leaves(everything)
-    few = sum(x.size for x in leaves if is_tracer(x)) <= JACOBIAN_COLUMNS
-    few = few or walk.forwards
-
-    def passage(moving) -> Passage:
-        map, begin, known, levels = moving
-        maps = maps_of(map)
-        travelers = Travelers(
-            of=lambda numbers: maps.of(numbers).structure,
-            numbers=maps.numbers,
-            many=False,
-            structure=map.structure,
-        )
-        settings = jax.lax.stop_gradient(map.settings)
-        table = path.form, path.rows, path.count if few else None
-        ends = begin[0] + path.ends * (map.expected / walk.period)
-        options: Any = dict(columns=columns, known=known, passes=_PASSES)
-        return follow(travelers, levels, settings, *table, begin, ends, **options)
-
-    by_columns = few and not walk.forwards
-    return (by_jacobian(passage) if by_columns else passage)(everything)
+    maps = maps_of(map)
+    travelers = Travelers(
+        of=lambda numbers: maps.of(numbers).structure,
+        numbers=maps.numbers,
+        many=False,
+        structure=map.structure,
+    )
+    return follow(
+        travelers,
+        levels,
+        jax.lax.stop_gradient(map.settings),
+        path.form,
+        path.rows,
+        None if reverse else path.count,
+        begin,
+        begin[0] + path.ends * (map.expected / walk.period),
+        columns=columns,
+        known=known,
+        passes=_PASSES,
+    )
 
 
 def _code(map: ReturnMap, path: Plan, passage: Passage, begin) -> Int[Array, ""]:

@@ -55,6 +55,15 @@ def test_a_traced_model_is_that_outside_of_the_program(name, known, no_search):
         np.testing.assert_allclose(matrix, true, rtol=0, atol=1e-11)
 
 
+def test_sections_that_are_made_inside_of_a_program_need_no_search(known, no_search):
+    def model(system):
+        anchor = hj.Crossing("vM", "falling", value=0.0)
+        return model_of(system, known, hj.ClockPhase(5, anchor=anchor))
+
+    shapes = eqx.filter_eval_shape(model, HOPPER)
+    assert shapes.A.shape == (5, 5, 5)
+
+
 @pytest.mark.slow
 def test_derivatives_of_a_traced_model_are_differences(known, no_search):
     family = FAMILIES["angles"]
