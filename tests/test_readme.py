@@ -98,7 +98,8 @@ def test_the_section_on_fits_finds_the_parameters(read_section):
 def test_the_section_on_recordings_finds_the_multipliers(read_section):
     made = read_section("From a recording")
     found = made.result.fit.compare(made.cycle.multipliers)
-    assert found.max_error < 1e-2 and Path("report/report.html").exists()
+    assert found.max_error < 1e-2
+    assert Path("report/report.html").exists()
 
 
 def test_links_lead_somewhere():
@@ -125,7 +126,8 @@ def test_there_is_one_test_command_for_ci_to_find():
     ]
     assert len(found) == 1
     script = ROOT / ".ci/run"
-    assert script.stat().st_mode & 0o100 and "README.md" in script.read_text()
+    assert script.stat().st_mode & 0o100
+    assert "README.md" in script.read_text()
 
 
 def test_claims_name_tests_that_exist():

@@ -80,7 +80,8 @@ def test_primitives_of_inner_programs():
 def test_needed_part():
     program = program_of(lambda x, y, z: (jnp.sin(y), 0 * x)[0], 1.0, 2.0, 3.0)
     needed, uses = jax_compat.needed_part(program)
-    assert uses == [False, True, False] and len(needed.invars) == 1
+    assert uses == [False, True, False]
+    assert len(needed.invars) == 1
     needed, _ = jax_compat.needed_part(program, every_argument=True)
     assert len(needed.invars) == 3
     assert jax_compat.primitives_of(needed) == {"sin"}
@@ -98,8 +99,10 @@ def test_changed_programs_run():
 def test_variables_and_constants():
     equation = only_equation(lambda x: x + 1.0, 2.0)
     x, one = equation.invars
-    assert jax_compat.is_variable(x) and not jax_compat.is_constant(x)
-    assert jax_compat.is_constant(one) and one.val == 1.0
+    assert jax_compat.is_variable(x)
+    assert not jax_compat.is_constant(x)
+    assert jax_compat.is_constant(one)
+    assert one.val == 1.0
     assert jax_compat.bits_of(x) == 64
     assert jax_compat.bits_of(only_equation(lambda k: k + k, 1).invars[0]) is None
 
@@ -142,13 +145,16 @@ def test_parts_of_a_linear_system():
         (program,) = (p for x in program.eqns for p in jax_compat.inner_programs(x))
     (system,) = [x for x in program.eqns if jax_compat.function_of(x) == "solve"]
     matrix, right, factors, product = jax_compat.solved_by(system)
-    assert matrix.aval.shape == (3, 3) and right.aval.shape == (3,)
-    assert factors and jax_compat.function_of(product) == "product"
+    assert matrix.aval.shape == (3, 3)
+    assert right.aval.shape == (3,)
+    assert factors
+    assert jax_compat.function_of(product) == "product"
 
 
 def test_calls_and_rules():
     jitted = only_equation(jax.jit(jnp.sin), 1.0)
-    assert jax_compat.is_call(jitted) and jax_compat.is_outer(jitted)
+    assert jax_compat.is_call(jitted)
+    assert jax_compat.is_outer(jitted)
 
     @jax.custom_jvp
     def with_rule(x):
@@ -269,13 +275,15 @@ def test_inside_and_outside():
 
     def function(x):
         inside.append(jax_compat.is_outside())
-        assert jax_compat.is_tracer(x) and jax_compat.is_tracer(x + 1)
+        assert jax_compat.is_tracer(x)
+        assert jax_compat.is_tracer(x + 1)
         with jax_compat.outside():
             assert not jax_compat.is_tracer(jnp.sin(1.0))
         return x
 
     jax.jit(function)(1.0)
-    assert inside == [False] and jax_compat.is_outside()
+    assert inside == [False]
+    assert jax_compat.is_outside()
 
 
 def test_own_traces():
@@ -295,7 +303,8 @@ def test_settings():
         assert jax_compat.settings_of_programs() != before
     with jax.disable_jit():
         assert not jax_compat.runs_programs_as_they_are()
-    assert jax_compat.runs_programs_as_they_are() and jax_compat.combines_as_numpy()
+    assert jax_compat.runs_programs_as_they_are()
+    assert jax_compat.combines_as_numpy()
     with jax.numpy_rank_promotion("raise"):
         assert not jax_compat.combines_as_numpy()
     with jax.default_device(jax.devices("cpu")[0]):

@@ -68,7 +68,8 @@ def test_later_results_take_the_place_of_earlier_ones(full):
     after = tree(full)
     assert after["report.html"] == "new page"
     assert "figures/old.png" not in after
-    assert all(after[name] == text for name, text in MINE.items())
+    for name, text in MINE.items():
+        assert after[name] == text
     assert set(json.loads(after[LIST])) == set(RESULTS)
 
 

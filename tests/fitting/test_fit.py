@@ -54,18 +54,17 @@ def test_the_unit_of_residuals_does_not_count():
 def test_errors_that_no_residual_shows_are_unknown():
     juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
     fit = hj.fit_model(juggler, hj.fitting.ObservedCycle(impact, times=[0.15]), "A")
-    assert fit.result == hj.errors.Result.OK and np.isnan(fit.standard_errors).all()
+    assert fit.result == hj.errors.Result.OK
+    assert np.isnan(fit.standard_errors).all()
     with pytest.raises(hj.errors.DefinitionError, match="no residual is left"):
         fit.contains({"A": 0.2})
     speed = hj.fitting.ObservedCycle(
         impact, "v", [[-3.0]]
     )  # which is g T / 2 for any amplitude
     fit = hj.fit_model(juggler, speed, "A")
-    assert (
-        fit.result == hj.errors.Result.OK
-        and fit.identifiability.rank == 0
-        and fit.contains({"A": 0.2})
-    )
+    assert fit.result == hj.errors.Result.OK
+    assert fit.identifiability.rank == 0
+    assert fit.contains({"A": 0.2})
     with pytest.raises(hj.errors.DefinitionError, match="of all data, or of none"):
         hj.fitting.identifiability(
             juggler,
@@ -90,16 +89,16 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
             where, times=[begin, begin + gap], times_std=0.1
         )
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
-        assert fit.dof == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
+        assert fit.dof == 0
+        assert fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
         data = hj.fitting.ObservedCycle(
             where, "x", [[0.1], [-2.0]], times=[begin, begin + gap]
         )
         rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
     assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
-    assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(
-        rough[0]
-    )
+    assert rough[0].result == 0
+    assert "mu reaches its bound 0 within its error" in repr(rough[0])
     with pytest.raises(
         hj.errors.DefinitionError, match="another 'mass', which was not fitted"
     ):
@@ -110,7 +109,8 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
     fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
-    assert fit.result == hj.errors.Result.OK and fit.cost < 1e-12
+    assert fit.result == hj.errors.Result.OK
+    assert fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p / fit.system.q == pytest.approx(
@@ -120,8 +120,10 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
     assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
     (lost,) = fit.findings
-    assert lost.cause == "not identified" and lost.text.startswith("p and q apart")
-    assert repr(lost) in repr(fit) and "1 of 1 guesses" in repr(fit)
+    assert lost.cause == "not identified"
+    assert lost.text.startswith("p and q apart")
+    assert repr(lost) in repr(fit)
+    assert "1 of 1 guesses" in repr(fit)
     np.testing.assert_allclose(fit.multipliers, oscillation.multipliers, atol=1e-8)
     assert isinstance(fit, hj.identify.Fit)
 
@@ -130,7 +132,9 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
     fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
-    assert fit.weighted and fit.dof == 7 and fit.result == hj.errors.Result.OK
+    assert fit.weighted
+    assert fit.dof == 7
+    assert fit.result == hj.errors.Result.OK
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
@@ -182,9 +186,8 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     several = hj.fit_model(
         oscillation.system, nothing_fits, free, guess=oscillation, guesses=2
     )
-    assert len(several.guesses) == 2 and several.cost == min(
-        g.cost for g in several.guesses
-    )
+    assert len(several.guesses) == 2
+    assert several.cost == min(g.cost for g in several.guesses)
     assert np.ptp([g.values[0] for g in several.guesses]) > 0
     one = hj.fit_model(
         oscillation.system, observed(oscillation), free, guess=oscillation, guesses=2
@@ -194,7 +197,8 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
 
 @pytest.mark.slow
 def test_data_of_the_hopper_do_not_see_all_parameters(seen_in_htf, seen_in_cycle):
-    assert seen_in_htf.rank == 5 and seen_in_cycle.rank == 6
+    assert seen_in_htf.rank == 5
+    assert seen_in_cycle.rank == 6
     assert sorted(seen_in_htf.descriptions()) == [
         "a common factor of (a, g), only a/g",
         "l0",

@@ -104,7 +104,8 @@ def test_standard_errors_are_those_of_many_draws():
         size = fit.standard_errors[:2]
         errors.append((fit.values[:2] - tuple(TRUE.values())) / size)
     spread = np.std(errors, axis=0)
-    assert (0.75 < spread).all() and (spread < 1.3).all()
+    assert (0.75 < spread).all()
+    assert (spread < 1.3).all()
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,8 @@ def test_fits_of_multipliers_are_fits(fits):
         assert (low < fit.multipliers.real).all() and (high > MULTIPLIERS).all(), name
     for name in ("series", "ldtp of series"):
         np.testing.assert_allclose(fits[name].noise, 0.1, rtol=0.1)
-    assert fits["multipliers"].noise is None and fits["ldtp of HTFs"].noise is None
+    assert fits["multipliers"].noise is None
+    assert fits["ldtp of HTFs"].noise is None
 
 
 def test_intervals_of_moduli():
@@ -143,14 +144,16 @@ def test_a_controller_is_a_finding(plant):
     for fit in (hj.fit_series(data, 2, check=False), hj.fit_ldtp(data, 2, check=False)):
         assert "feedback" in causes(fit)
         text = next(f.text for f in fit.findings if f.cause == "feedback")
-        assert "(force)" in text and "name their `references`" in text
+        assert "(force)" in text
+        assert "name their `references`" in text
 
 
 def test_a_misfit_is_a_finding(plant):
     htf = uncertain(plant)
     bold = dataclasses.replace(htf, variance=np.asarray(htf.variance) / 100)
     fit = hj.fit_ldtp(bold, 2)
-    assert "misfit" in causes(fit) and fit.cost > 50 * fit.dof
+    assert "misfit" in causes(fit)
+    assert fit.cost > 50 * fit.dof
 
 
 def test_findings_are_warned_of_and_saved(plant, tmp_path):

@@ -87,7 +87,8 @@ def test_plant_and_controller_of_exact_data(plant):
     )
     f = loop.plant.frequencies
     exact = plant.feedback(GAIN)
-    assert len(f) == 12 and not loop.missing
+    assert len(f) == 12
+    assert not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
     np.testing.assert_allclose(loop.closed.H, exact.htf(f).H, atol=1e-9)
@@ -108,7 +109,8 @@ def test_plant_and_controller_of_exact_data(plant):
         data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
     )
     one = hj.identify.estimate_loop(data, at_input="r")
-    assert one.controller is None and "controller is not estimated" in repr(one)
+    assert one.controller is None
+    assert "controller is not estimated" in repr(one)
 
 
 def test_faint_lines_of_a_reference_are_left_out(plant):
@@ -126,10 +128,8 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
         htf = hj.estimate_htf(data, references="r", threshold=threshold)
-        assert (
-            len(htf.frequencies) == lines
-            and htf.error(plant.htf(htf.frequencies)) < 1e-9
-        )
+        assert len(htf.frequencies) == lines
+        assert htf.error(plant.htf(htf.frequencies)) < 1e-9
 
 
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
@@ -147,7 +147,8 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
             held.append(np.mean(np.abs(htf.H - true.H) <= htf.confidence_radius()))
         fit = hj.fit_multipliers(loop.plant, 2, check=False)
         regions.append(fit.contains(plant.multipliers)[0])
-    assert 0.92 < np.mean(held[::2]) < 0.985 and 0.92 < np.mean(held[1::2]) < 0.985
+    assert 0.92 < np.mean(held[::2]) < 0.985
+    assert 0.92 < np.mean(held[1::2]) < 0.985
     assert np.mean(regions) > 0.8
 
 

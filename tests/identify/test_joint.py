@@ -129,7 +129,8 @@ def test_derivatives_are_those_of_jax(model, errors):
 def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
     fit = hj.fit_ldtp(htf, initial=shaken(model, np.random.default_rng(1)))
-    assert fit.result == hj.errors.Result.OK and "too few dimensions" not in repr(fit)
+    assert fit.result == hj.errors.Result.OK
+    assert "too few dimensions" not in repr(fit)
     assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1).findings)
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
@@ -163,7 +164,8 @@ def test_undetermined_responses_have_infinite_variance():
     draw = noisy(htf, np.full(htf.H.shape, 1e-6), np.random.default_rng(0))
     fit = hj.fit_ldtp(draw, initial=shaken(small, np.random.default_rng(1)))
     variance = fit.htf(f, (-2, -1, 0, 1)).variance
-    assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
+    assert np.isinf(variance[0]).all()
+    assert variance[1:].max() < 1e-6
     assert fit.contains(small.multipliers[:2], 0.999).all()
 
 

@@ -133,7 +133,8 @@ def test_too_few_dimensions_are_named(small):
             (small.dims + 1, spare),
         ):
             fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
-            assert doubt in repr(fit.findings) and bool(doubt) == bool(fit.findings)
+            assert doubt in repr(fit.findings)
+            assert bool(doubt) == bool(fit.findings)
 
 
 @pytest.mark.parametrize("through", (0.0, 1.0))
@@ -210,7 +211,8 @@ def test_noise_that_drives_the_system_is_found(small):
     fit = hj.fit_ldtp(data, small.dims, noise="innovations")
     f = np.linspace(0.05, 0.45, 9)
     ratio = fit.noise_spectrum(f) / noise_spectrum(noise, f)
-    assert np.abs(np.log(ratio)).max() < 0.6 and abs(np.log(ratio).mean()) < 0.1
+    assert np.abs(np.log(ratio)).max() < 0.6
+    assert abs(np.log(ratio).mean()) < 0.1
     assert fit.contains(small.multipliers, 0.999).all()
     assert hj.validate(fit, other, alpha=1e-3).white
     assert not hj.validate(fit.model, other, alpha=1e-3).white

@@ -20,13 +20,14 @@ def test_two_multipliers_are_two(size, small, variance):
     _, htf = small
     data = noisy(htf, size * variance, np.random.default_rng(0))
     found = hj.select_order(data, 4)
-    assert np.all(found.deviation[:2] > 10) and np.all(
-        np.abs(found.strength[2:] - 1) < 0.2
-    )
+    assert np.all(found.deviation[:2] > 10)
+    assert np.all(np.abs(found.strength[2:] - 1) < 0.2)
     np.testing.assert_allclose(found.cost[2:] / found.dof[2:], 1.0, atol=0.2)
     blind = hj.select_order(with_variance(htf, data.H, None), 4)
-    assert all((x.by_rank, x.by_mdl, x.order) == (2, 2, 2) for x in (found, blind))
-    assert "by rank: 2" in repr(found) and len(repr(found).splitlines()) == 7
+    for x in (found, blind):
+        assert (x.by_rank, x.by_mdl, x.order) == (2, 2, 2)
+    assert "by rank: 2" in repr(found)
+    assert len(repr(found).splitlines()) == 7
 
 
 @pytest.mark.parametrize(("few", "runs"), [(False, 50), (True, 12)])
@@ -56,11 +57,10 @@ def test_exact_htfs_have_no_more_multipliers(small):
     ):
         hj.fit_multipliers(htf, 3)
     spurious = hj.fit_multipliers(htf, 3, check=False)
-    assert np.isinf(spurious.standard_errors).all() and "± inf" in repr(spurious)
-    assert (
-        spurious.contains(0.5).all()
-        and "support 2 multipliers, not 3" in spurious.findings[0].text
-    )
+    assert np.isinf(spurious.standard_errors).all()
+    assert "± inf" in repr(spurious)
+    assert spurious.contains(0.5).all()
+    assert "support 2 multipliers, not 3" in spurious.findings[0].text
     assert (
         hj.select_order(scaled(12, (1, 1), 1, 1).htf(np.arange(1, 46) / 46)).order == 1
     )

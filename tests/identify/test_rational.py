@@ -10,7 +10,8 @@ def test_the_bias_on_exact_data(exact, multipliers):
     fit = hj.identify.fit_rational(exact)
     errors = [fit.compare(multipliers, name).max_error for name in fit.outputs]
     np.testing.assert_allclose(errors, (2.6e-3, 1.07e-2), atol=0.05e-3)
-    assert np.all(fit.result == hj.errors.Result.OK) and fit.outputs == ("yM", "vM")
+    assert np.all(fit.result == hj.errors.Result.OK)
+    assert fit.outputs == ("yM", "vM")
     np.testing.assert_array_equal(fit.multipliers, fit.poles**32)
 
 

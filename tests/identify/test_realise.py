@@ -24,7 +24,8 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     np.testing.assert_array_equal(model.dims, MINIMAL)
     np.testing.assert_allclose(model.multipliers, multipliers, atol=1e-11)
     assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
-    assert model.inputs == ("u",) and model.outputs == ("yM", "vM")
+    assert model.inputs == ("u",)
+    assert model.outputs == ("yM", "vM")
 
 
 @settings(max_examples=5)

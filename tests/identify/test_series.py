@@ -62,7 +62,8 @@ def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
     np.testing.assert_allclose(
         fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12
     )
-    assert fit.result == hj.errors.Result.OK and np.all(fit.noise < 1e-14)
+    assert fit.result == hj.errors.Result.OK
+    assert np.all(fit.noise < 1e-14)
 
 
 @settings(max_examples=6)
@@ -100,7 +101,8 @@ def test_inputs_before_the_start_act_through_all_lags():
     rough = total_least_squares(late_outputs(problem_of(data, 1, 4), 1))
     fit = hj.fit_series(data, 1)
     np.testing.assert_allclose([rough, fit.coefficients], -0.7, atol=1e-9)
-    assert (found := hj.validate(fit, data)).white and found.fit.min() > 99.999
+    assert (found := hj.validate(fit, data)).white
+    assert found.fit.min() > 99.999
 
 
 def test_outputs_that_depend_on_later_inputs(small):

@@ -94,8 +94,7 @@ def test_no_input_gives_the_cycle():
     error = abs(motion.interval * len(motion.times) - 2 * float(cycle.period))
     assert error < 1e-9
     motion.figure.draw_without_rendering()
-    assert all(
-        motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes
-    )
+    for x in motion.figure.axes:
+        assert motion.figure.bbox.y1 > x.title.get_tightbbox().y1
     with pytest.raises(hj.errors.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)

@@ -47,7 +47,9 @@ def test_a_rhythm_without_noise_is_found_exactly():
     exact = hj.recordings.phase_response(beats(0.0, trials=3), BEAT, input="u")
     np.testing.assert_allclose(exact.values, CURVE, atol=0.02)
     np.testing.assert_allclose(exact.rates, 10, atol=5e-3)
-    assert exact.left_out > 0.9999 and exact.result == 0 and exact.miscounted == 0
+    assert exact.left_out > 0.9999
+    assert exact.result == 0
+    assert exact.miscounted == 0
     # With an offset of the sensor, or under a constant current, the curve is the same.
     r = beats(0.0, trials=3)
     u = [
@@ -61,11 +63,9 @@ def test_a_rhythm_without_noise_is_found_exactly():
 def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     low, high = found.interval(X, 0.99)
     assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
-    assert (
-        3 < found.detail < 10
-        and abs(found.jitter - 0.05) < 0.01
-        and found.p_flat < 1e-3
-    )
+    assert 3 < found.detail < 10
+    assert abs(found.jitter - 0.05) < 0.01
+    assert found.p_flat < 1e-3
     assert rms(found.values - CURVE) < 0.12
     assert found.left_out_flat + 0.01 < found.left_out < 1
     assert "Resolution: the jitter" in repr(found)
@@ -84,7 +84,8 @@ def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
     """Of trials that were left out: with the curve, with its mean, and with no jitter."""
     others = beats(0.05, trials=8, seed=7)
     ahead = found.forecast(others, BEAT)
-    assert ahead.result == 0 and ahead.counted.all()
+    assert ahead.result == 0
+    assert ahead.counted.all()
     assert found.left_out_flat + 0.01 < ahead.explained < 1
     missed = (ahead.measured - ahead.duration) * 10
     assert missed.std() == pytest.approx(0.05, rel=0.2)
@@ -153,9 +154,8 @@ def test_events_alone_are_identified(noisy, tmp_path):
     found = hj.identify_recording(
         noisy, BEAT, inputs="u", outputs=(), order=1, n_sections=1
     )
-    assert (
-        found.fit.outputs == ("duration",) and np.isfinite(found.fit.numerators).all()
-    )
+    assert found.fit.outputs == ("duration",)
+    assert np.isfinite(found.fit.numerators).all()
     assert (found.write_report(tmp_path).parent / "figures" / "curve.png").exists()
     assert any("Resolution: the jitter" in repr(x) for x in found.diagnosis.findings)
 
@@ -232,7 +232,8 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
     off = (found.coefficients[0] - truth) / error
     causes = [x.cause for x in found.findings]
     if adapts:
-        assert off > 5 and found.carried < -0.3
+        assert off > 5
+        assert found.carried < -0.3
         assert "memory" in causes
     else:
         assert abs(off) < 3

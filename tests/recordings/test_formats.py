@@ -39,7 +39,8 @@ def check_two_rates(path, x="x", f="f", digits=15, **how):
 def refused(says, *paths, kind=FileFormatError, **how):
     with pytest.raises(kind, match=says) as error:
         hj.read_recording(*paths, **how)
-    assert str(paths[0]) in str(error.value) and "\n" not in str(error.value)
+    assert str(paths[0]) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 # MATLAB and HDF5
@@ -100,7 +101,8 @@ def test_matlab(tmp_path, write):
         kind=hj.errors.DefinitionError,
     )
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
-    assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
+    assert only.signals == ("pair.0", "pair.1")
+    assert only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
     says = "no signal 'f'; it has .*force.f"
     refused(says, tmp_path / "x.mat", signals="f", kind=hj.errors.DefinitionError)
@@ -130,7 +132,8 @@ def test_hdf5(tmp_path):
         file["daq/time"].attrs["units"], file["daq/f"].attrs["units"] = "ms", "N"
         file["note"] = "left leg"
     found = check_two_rates(path, f="daq/f")
-    assert found.unit("daq/f") == "N" and found.unit("x") == ""
+    assert found.unit("daq/f") == "N"
+    assert found.unit("x") == ""
     assert hj.read_recording(path, signals="daq").signals == ("daq/f",)
     with h5py.File(path, "r+") as file:
         file["x"].attrs["units"] = np.nan
@@ -163,7 +166,8 @@ def test_feather(tmp_path):
     table(y=X).to_feather(tmp_path / "x.feather")
     found = hj.read_recording(tmp_path / "x.feather", signals="x")
     np.testing.assert_array_equal(samples(found, "x")[1], X)
-    assert found.unit("x") == "m" and found.trials[0].events["go"] == [SLOW[7]]
+    assert found.unit("x") == "m"
+    assert found.trials[0].events["go"] == [SLOW[7]]
     refused(
         "no signal 'z'; it has ",
         tmp_path / "x.feather",
@@ -220,9 +224,8 @@ def test_trc(tmp_path):
     path = tmp_path / "walk.trc"
     path.write_text(TRC)
     found = hj.read_recording(path)
-    assert (
-        found.signals[:2] == ("R.ASIS.x", "R.ASIS.y") and found.unit("L.ASIS.z") == "mm"
-    )
+    assert found.signals[:2] == ("R.ASIS.x", "R.ASIS.y")
+    assert found.unit("L.ASIS.z") == "mm"
     np.testing.assert_array_equal(
         samples(found, "R.ASIS.x"), [[0, 0.01, 0.02], [1, 1.5, 2]]
     )
@@ -275,7 +278,8 @@ def test_c3d(tmp_path):
         found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7
     )
     analog = hj.read_recording(path, signals="Fz1")
-    assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
+    assert analog.signals == ("Fz1",)
+    assert "Left Strike" in analog.trials[0].events
     refused(
         "no signal 'EMG1'; it has LASI.x",
         path,

@@ -168,9 +168,8 @@ def test_an_order_that_is_too_low_is_named():
         )
         untried = hj.identify_recording(twice, TOP, **names)
     told = Counter(str(x.message) for x in seen)
-    assert set(told.values()) == {1} and set(told) >= {
-        repr(x) for x in untried.findings
-    }
+    assert set(told.values()) == {1}
+    assert set(told) >= {repr(x) for x in untried.findings}
     assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
     constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
     with pytest.raises(
@@ -202,7 +201,8 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
     names = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16, "order": 2}
     result = hj.identify_recording(made, APEX, **names)
     validation = result.held_out.validation
-    assert validation.independent and validation.fit.min() > 99
+    assert validation.independent
+    assert validation.fit.min() > 99
     for fit, named in (99.3, False), (70.0, True):
         tests = np.full(2, fit), np.zeros(2), np.full(2, float(named))
         worse = eqx.tree_at(
@@ -218,7 +218,8 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
         lambda x: x.diagnosis.expected, result, result.diagnosis.expected.copy()
     )
     few.diagnosis.expected[0] = np.inf
-    assert "<td>300</td>" in _page(few, {}) and "<td>inf" not in _page(few, {})
+    assert "<td>300</td>" in _page(few, {})
+    assert "<td>inf" not in _page(few, {})
 
 
 APEX = hj.Crossing("vM", "falling")

@@ -56,7 +56,8 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("time (s);force [N];event strike\n0;1;0\n1;;1\n2;NA;0\n3;4;0\n")
     found = hj.read_recording(path)
-    assert found.signals == ("force",) and found.units == ("N",)
+    assert found.signals == ("force",)
+    assert found.units == ("N",)
     np.testing.assert_array_equal(found.trials[0].values[:, 0], [1, np.nan, np.nan, 4])
     np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
     assert found.trials[0].name == "x"
@@ -67,7 +68,8 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
         **{"event strike": [1.5]},
     )
     both = hj.read_recording([path, tmp_path / "x.npz"], units={"force": "kN"})
-    assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
+    assert both.units == ("kN",)
+    assert both.trials[1].events["strike"] == [1.5]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +98,8 @@ def test_what_spreadsheets_write(tmp_path, text, encoding):
     found = hj.read_recording(
         tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time"
     )
-    assert found.signals == ("F",) and found.units == ("µN",)
+    assert found.signals == ("F",)
+    assert found.units == ("µN",)
     np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)
     np.testing.assert_array_equal(found.trials[0].values[:, 0], [1.0, -0.25])
 
@@ -213,7 +216,8 @@ def test_the_unit_of_time(tmp_path):
     (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
     both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
     assert "the times in 'frame' have no unit: taken as seconds" in repr(both)
-    assert "every 1 s (1 Hz, longest 1 s)" in repr(both) and len(both.findings) == 1
+    assert "every 1 s (1 Hz, longest 1 s)" in repr(both)
+    assert len(both.findings) == 1
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
     with pytest.raises(
         hj.errors.DefinitionError, match="are in 'samples': convert them"

@@ -43,9 +43,11 @@ def test_a_circle(wave):
         np.diff(area) / 3 / np.diff(times),
         atol=2e-3,
     )
-    assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
+    assert record.lead == 1
+    assert sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
-    assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
+    assert timed.outputs == ("x", "v", "time")
+    assert timed.rms()[1][2] < 1e-4
     with pytest.raises(
         hj.errors.DefinitionError, match="different n_sections: 16 and 8"
     ):
@@ -141,12 +143,14 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     names = {"inputs": "force", "outputs": ("x", "v"), "n_sections": 8}
     found = hj.identify_recording(paused, hj.AtEvent("top"), order=1, **names)
     assert found.fit.contains([MULTIPLIER], 0.999).all()
-    assert found.phase.dropped == 10 and len(found.phase.stretches[0]) == 12
+    assert found.phase.dropped == 10
+    assert len(found.phase.stretches[0]) == 12
     assert found.phase.cycles + found.phase.missed == 199
     held = found.held_out.validation
     assert f"compare, left out: {held.left_out}" in repr(found)
     assert max(map(len, repr(found.held_out).splitlines())) <= 100
-    assert held.independent and held.fit.min() > 50
+    assert held.independent
+    assert held.fit.min() > 50
 
 
 def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
@@ -165,9 +169,8 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
         hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)
     ]
     clean, dirty = (sample(x, top, **options) for x in both)
-    assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(
-        clean.cycles - 10, abs=0.1
-    )
+    assert len(dirty.records) == 6
+    assert dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
     (before,) = clean.times
     for record, times in zip(dirty.records, dirty.times, strict=True):
         first = int(np.argmin(np.abs(before - times[0])))
@@ -239,7 +242,8 @@ def test_designs_as_tables(tmp_path, wave):
     ):
         hj.recordings.attach_design(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
-    assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
+    assert experiments.u.shape[1] % 8 == 0
+    assert experiments.n_sections == 8
 
 
 @pytest.fixture(scope="module")

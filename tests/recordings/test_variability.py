@@ -174,4 +174,5 @@ def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
     assert list(feedback(given)) == []
     loop = hj.recordings.sample_sections(marked, inputs="x", outputs="v", **sections)
     (finding,) = feedback(loop)
-    assert finding.cause == "feedback" and "repeats with the cycle" in finding.text
+    assert finding.cause == "feedback"
+    assert "repeats with the cycle" in finding.text
