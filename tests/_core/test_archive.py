@@ -105,7 +105,9 @@ def refused(call, path, says):
         tracemalloc.stop()
     assert peak < 2**25
     assert str(path) in str(error.value)
-    assert len(str(error.value)) < 400 + len(str(path))
+    text = str(error.value)
+    longest = 400 + len(str(path))
+    assert len(text) < longest
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
@@ -140,7 +142,8 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     from pyarrow import parquet
 
     path = tmp_path / "hostile.parquet"
-    values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
+    indices = np.zeros(2**24, np.int8)
+    values = pyarrow.DictionaryArray.from_arrays(indices, [0.0])
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
     refused(

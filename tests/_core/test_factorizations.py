@@ -74,4 +74,6 @@ def test_matrices_that_are_not_positive_are_seen():
     x = jax.jit(jax.vmap(solve_positive))(
         jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
     )
-    assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)
+    unknown = [[np.nan] * 2] * 3
+    known = [[1e30] * 2]
+    assert_allclose(x, unknown + known, rtol=1e-15)

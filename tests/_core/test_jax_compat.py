@@ -93,7 +93,9 @@ def test_changed_programs_run():
     cosine = jax_compat.in_place_of(first, only_equation(jnp.cos, 2.0), first.invars)
     program = jax_compat.with_equations(whole.jaxpr, [cosine, second])
     run = jax_compat.as_function(jax_compat.with_program(whole, program))
-    np.testing.assert_allclose(run(2.0)[0], np.cos(2.0) + 1.0)
+    found = run(2.0)[0]
+    expected = np.cos(2.0) + 1.0
+    np.testing.assert_allclose(found, expected)
 
 
 def test_variables_and_constants():
@@ -104,13 +106,16 @@ def test_variables_and_constants():
     assert jax_compat.is_constant(one)
     assert one.val == 1.0
     assert jax_compat.bits_of(x) == 64
-    assert jax_compat.bits_of(only_equation(lambda k: k + k, 1).invars[0]) is None
+    doubled = only_equation(lambda k: k + k, 1)
+    bits = jax_compat.bits_of(doubled.invars[0])
+    assert bits is None
 
 
 def test_lines_of_an_equation():
     lines = jax_compat.lines_of(only_equation(lambda x: jnp.sin(x), 1.0))
     here = [line for file, line in lines if file == __file__]
-    text = pathlib.Path(__file__).read_text().splitlines()[here[0] - 1]
+    source = pathlib.Path(__file__).read_text()
+    text = source.splitlines()[here[0] - 1]
     assert "jnp.sin(x)" in text
 
 
@@ -207,11 +212,14 @@ def test_suddenness(how):
     (equation, *_) = program_of(SUDDEN[how], 1.0, 2.0).eqns
     while jax_compat.inner_programs(equation):
         (equation,) = jax_compat.inner_programs(equation)[0].eqns
-    assert jax_compat.suddenness(equation, [True] * len(equation.invars)) == [how]
+    varies = [True] * len(equation.invars)
+    found = jax_compat.suddenness(equation, varies)
+    assert found == [how]
 
 
 def test_smooth_operations():
-    for equation in program_of(lambda x: jnp.sum(x * jnp.sin(x) - 1.0), X).eqns:
+    smooth = program_of(lambda x: jnp.sum(x * jnp.sin(x) - 1.0), X)
+    for equation in smooth.eqns:
         assert jax_compat.suddenness(equation, [True] * len(equation.invars)) == []
 
 
@@ -255,7 +263,8 @@ def test_programs_of_lapack_are_recognized(name, inside):
 
 
 def test_every_public_factorization_is_in_the_table():
-    public = {x for x in dir(jax.lax.linalg) if not x.startswith("_")}
+    everything = dir(jax.lax.linalg)
+    public = {x for x in everything if not x.startswith("_")}
     without_lapack = {"lu_pivots_to_permutation", "qdwh"}
     known = jax_compat._LAPACK | without_lapack
     names = {x for x in public if not x.endswith("_p") and not x[0].isupper()}
@@ -350,4 +359,5 @@ def test_a_branch_on_some_lanes_stays_a_branch_under_vmap():
     masks = jnp.array([[False, True], [False, False]])
     assert "select_n" not in str(jax.make_jaxpr(jax.vmap(function))(masks))
     assert jax.vmap(function)(masks).tolist() == [1.0, 1.0]
-    assert jax.vmap(function)(masks[1:]).tolist() == [0.0]
+    found = jax.vmap(function)(masks[1:])
+    assert found.tolist() == [0.0]

@@ -571,7 +571,8 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
     for k in (1.0, 1.0 + 1e-15, 2.0):
         way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
         assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
-    digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
+    factors = (1.0, 1.0, 1.0 + 1e-15, 2.0)
+    digests = [code_digest(system(k)) for k in factors]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
 

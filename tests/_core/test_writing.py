@@ -58,8 +58,10 @@ def test_results_stand_beside_what_is_there(full):
     before = tree(full)
     write(full, RESULTS)
     after = tree(full)
-    assert {k: v for k, v in after.items() if k in before} == before
-    assert {k: v for k, v in after.items() if k not in before and k != LIST} == RESULTS
+    kept = {k: v for k, v in after.items() if k in before}
+    assert kept == before
+    added = {k: v for k, v in after.items() if k not in before and k != LIST}
+    assert added == RESULTS
 
 
 def test_later_results_take_the_place_of_earlier_ones(full):
@@ -149,7 +151,8 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     monkeypatch.undo()
     assert all((full / name).exists() for name in RESULTS)
     write(full, new)
-    assert {k: v for k, v in tree(full).items() if v == "new"} == new
+    replaced = {k: v for k, v in tree(full).items() if v == "new"}
+    assert replaced == new
     assert not [
         name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST
     ]

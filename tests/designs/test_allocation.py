@@ -27,7 +27,8 @@ def criterion(slopes):
 
 def limits(cost, curved=None):
     cost = np.atleast_2d(cost)
-    empty = np.zeros((0, cost.shape[1], cost.shape[1]))
+    n = cost.shape[1]
+    empty = np.zeros((0, n, n))
     return PowerLimits(
         tuple("abc"[: len(cost)]), cost, empty if curved is None else curved
     )
@@ -72,7 +73,8 @@ def test_several_limits(linear, quadratic):
 
 
 def test_unidentifiable_unknowns_are_named():
-    same = criterion(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
+    rows = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]])
+    same = criterion(rows)
     with pytest.raises(
         hj.errors.DefinitionError, match=r"no response changes along .*x0 .*x1"
     ):

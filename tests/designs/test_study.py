@@ -53,7 +53,8 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
     assert strides_of_first > 4 * end.cycles[-1]
     # The bound of as many strides, all of them with the best design for the true model.
     bound_of_plan = np.linalg.norm(plan.standard_errors)
-    bound = bound_of_plan * np.sqrt(plan.cycles / end.cycles[-1])
+    left = plan.cycles / end.cycles[-1]
+    bound = bound_of_plan * np.sqrt(left)
     assert error > 0.95 * bound
 
 
@@ -100,7 +101,9 @@ def test_goals(model, first, goal):
     study = study.add(measured(model, first))
     assert study.standard_errors.shape == (1, 1)
     assert study.plan.saved > 3
-    assert study.standard_errors[0, 0] <= study.fit.standard_errors[0] * (1 + 1e-12)
+    found = study.standard_errors[0, 0]
+    by_fit = study.fit.standard_errors[0]
+    assert found <= by_fit * (1 + 1e-12)
 
 
 def test_repeated_windows_count(model, first):
@@ -112,7 +115,8 @@ def test_repeated_windows_count(model, first):
     study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
-    assert once.cycles[0] == twice.cycles[0] == 2 * first.cycles(0)
+    both = 2 * first.cycles(0)
+    assert once.cycles[0] == twice.cycles[0] == both
     assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
@@ -175,7 +179,8 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     """Where Student's intervals are half as wide again, a study is not done at the standard error
     that was asked, and the next block is longer by 1.5 squared, or as long as it may be."""
     data = measured(model, first)
-    error = hj.designs.SequentialDesign(first, 2, 1.0).add(data).standard_errors[0, 0]
+    study = hj.designs.SequentialDesign(first, 2, 1.0).add(data)
+    error = study.standard_errors[0, 0]
     # The scatter of few lines understates the error of a first block, but the noise level does not.
     plan = hj.optimal_design(model, first, noise=NOISE)
     assert error > 0.95 * np.linalg.norm(plan.usual_standard_errors)
@@ -207,7 +212,8 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     """Return two outputs of rms one, the second with a transient, larger in the first cycle."""
     cycle = np.repeat(np.arange(before + P * repeats), N)
     n = np.arange(len(cycle))
-    wave = np.sqrt(2) * np.cos(2 * np.pi * n / (N * P))
+    angle = 2 * np.pi * n / (N * P)
+    wave = np.sqrt(2) * np.cos(angle)
     transient = size * (0.8**cycle + 3 * (cycle == 0))
     y = np.stack([wave, wave + transient], axis=1)
     rng = np.random.default_rng(seed)

@@ -24,7 +24,8 @@ STEP = 1e-6
 
 def flow(s, t, q, u, end):
     """(t, q) at the end, the lanes at the start, the target and the tape."""
-    lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
+    charts = np.zeros(1, np.int32)
+    lanes = start_lanes(s, np.array([t]), charts, q[:, None])
     target = until(np.array([end]))
     sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
@@ -54,7 +55,9 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     end = sample.start.t + 3.0
 
     def run(x):
-        return flow(s, x[0], x[1 : 1 + s.d], x[1 + s.d :], end)
+        q = x[1 : 1 + s.d]
+        u = x[1 + s.d :]
+        return flow(s, x[0], q, u, end)
 
     states = range(1, 1 + s.dims[0])
     inputs = range(1 + s.d, len(x))

@@ -23,7 +23,9 @@ def crossing(v0, v1, d0, d1, armed=True):
 def cubic(v0, v1, d0, d1):
     """Its coefficients, the highest first."""
     rise = v1 - v0
-    return np.array([d0 + d1 - 2 * rise, 3 * rise - 2 * d0 - d1, d0, v0])
+    third = d0 + d1 - 2 * rise
+    second = 3 * rise - 2 * d0 - d1
+    return np.array([third, second, d0, v0])
 
 
 def real_roots(coefficients):
@@ -45,7 +47,8 @@ def first_fall(coefficients, armed):
     if not falls:
         return np.inf
     # The guard must have been positive before: at once if it is armed, else after a rise.
-    was_positive = armed or coefficients[-1] > 0 or any(r < falls[0] for r in rises)
+    rose = any(r < falls[0] for r in rises)
+    was_positive = armed or coefficients[-1] > 0 or rose
     if was_positive:
         return falls[0]
     return falls[1] if len(falls) > 1 else np.inf

@@ -65,7 +65,8 @@ def agree(system, chart, state, u, begin, duration):
     t = np.array([begin], float)
     inputs = np.reshape(u, (s.nu, 1))
     settings = Settings(1e-9, 1e-9, max_steps=400)
-    arguments = (t, np.array([chart], np.int32), q, inputs, t + duration, settings)
+    charts = np.array([chart], np.int32)
+    arguments = (t, charts, q, inputs, t + duration, settings)
     with unchecked_host():
         host = flow(system, *to_host(arguments))
         whole = flow(system, *to_host(arguments), at_once=True)
@@ -191,7 +192,10 @@ def test_searches_with_moves_side_by_side_end_at_the_same_cycle(name, monkeypatc
     rng = np.random.default_rng(5)
 
     def move(x):
-        return x * (1 + 0.01 * rng.uniform(-1, 1)) if eqx.is_inexact_array(x) else x
+        if not eqx.is_inexact_array(x):
+            return x
+        change = 0.01 * rng.uniform(-1, 1)
+        return x * (1 + change)
 
     guess = hj.find_limit_cycle(system)
     moved = jax.tree_util.tree_map(move, system)
@@ -214,7 +218,8 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
 
     call = compilation.host_first(function)
     monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
-    results = [call(from_host(np.arange(3.0))) for _ in range(3)]
+    numbers = np.arange(3.0)
+    results = [call(from_host(numbers)) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
     assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
     with jax.default_matmul_precision("highest"):
@@ -233,7 +238,8 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
             {"x": Field(("x",), rates)},
             period=2 * np.pi,
         )
-        map = to_host(hj.find_limit_cycle(grow, hj.Guess("x", (0.4,))).return_map)
+        unstable = hj.find_limit_cycle(grow, hj.Guess("x", (0.4,)))
+        map = to_host(unstable.return_map)
         q = map.anchor.q[:, 0]
         turn = map.turn_with_jacobian(q)
         recorded = (turn.pieces, side_by_side(turn.tapes))

@@ -57,8 +57,10 @@ def draw(rng, tolerance):
     turns = np.sort(p.deriv().roots.real)
     turns = turns[(turns > 0) & (turns < 1)]
     ends = np.concatenate([[0.0], turns, [1.0]])
-    p = p * rng.choice([-1, 1]) / np.abs(p(ends)).max()
-    near = max(tolerance, 1e-10) * 10 ** rng.uniform(1, 4) * rng.choice([-1, 1])
+    largest = np.abs(p(ends)).max()
+    p = p * rng.choice([-1, 1]) / largest
+    factor = 10 ** rng.uniform(1, 4)
+    near = max(tolerance, 1e-10) * factor * rng.choice([-1, 1])
     return p - p(rng.choice(turns)) + near, ends
 
 
@@ -66,7 +68,8 @@ def falls(p, ends):
     """The zeros through which p falls, and how far it goes above and below them."""
     for left, right in zip(ends[:-1], ends[1:], strict=True):
         if p(left) > 0 > p(right):
-            yield brentq(p, left, right, xtol=1e-15), min(p(left), -p(right))
+            root = brentq(p, left, right, xtol=1e-15)
+            yield root, min(p(left), -p(right))
 
 
 def test_no_event_of_200_polynomials_is_missed_or_invented():
@@ -76,7 +79,8 @@ def test_no_event_of_200_polynomials_is_missed_or_invented():
     flows = [draw(rng, x) for x in tolerance]
     s = Structure(chain())
     q = np.stack([start(p) for p, _ in flows], axis=1)
-    lanes = start_lanes(s, jnp.zeros(L), jnp.zeros(L, jnp.int32), jnp.asarray(q))
+    zeros = jnp.zeros(L, jnp.int32)
+    lanes = start_lanes(s, jnp.zeros(L), zeros, jnp.asarray(q))
     # Each polynomial has a tolerance of its own.
     settings = eqx.tree_at(
         lambda settings: (settings.rtol, settings.atol),
@@ -112,11 +116,13 @@ def times(trajectory):
 @pytest.mark.parametrize("depth", [1e-3, 1e-9])
 def test_two_dips_within_a_step(depth):
     """Chebyshev's polynomial of degree 4 touches -1 twice: shifted, it dips below zero twice."""
-    chebyshev = np.polynomial.Chebyshev([1 - depth, 0, 0, 0, 1], domain=[0, 1])
+    coefficients = [1 - depth, 0, 0, 0, 1]
+    chebyshev = np.polynomial.Chebyshev(coefficients, domain=[0, 1])
     powers = chebyshev.convert(kind=np.polynomial.Polynomial)
     p = np.poly1d(powers.coef[::-1])
     extrema = np.sort(p.deriv().roots)
-    first, second = [time for time, _ in falls(p, [0.0, *extrema, 1.0])]
+    ends = [0.0, *extrema, 1.0]
+    first, second = [time for time, _ in falls(p, ends)]
 
     found = hj.simulate(chain(), "a", start(p), 1.0)
     assert_allclose(times(found), [first, second], atol=1e-7)
@@ -134,7 +140,8 @@ def test_a_guard_that_is_faster_than_the_state():
     """Steps are long where the state is linear in time, but the guard turns 80 times."""
 
     def guard(t, q, u):
-        return jnp.sin(500 * t) + 0.3 + 0 * q[0]
+        wave = jnp.sin(500 * t) + 0.3
+        return wave + 0 * q[0]
 
     fall = hj.Transition("fall", "a", "a", guard)
 
@@ -145,7 +152,8 @@ def test_a_guard_that_is_faster_than_the_state():
     found = hj.simulate(
         system, "a", (0.0,), 1.0, settings=hj.orbits.Settings(1e-6, 1e-6)
     )
-    truth = (np.pi + np.arcsin(0.3) + 2 * np.pi * np.arange(80)) / 500
+    turns = 2 * np.pi * np.arange(80)
+    truth = (np.pi + np.arcsin(0.3) + turns) / 500
     truth = truth[truth < 1]
     assert_allclose([e.time for e in found.events], truth, atol=1e-9)
 
@@ -175,7 +183,8 @@ def test_the_state_halfway_has_its_order(method, order):
 
     begin = 0.8
     lengths = np.array([0.4, 0.2])
-    end = step(np.zeros(2), np.full((1, 2), begin), lengths)
+    start = np.full((1, 2), begin)
+    end = step(np.zeros(2), start, lengths)
     state = begin / (1 - begin * np.sin(lengths / 2))
     rate = state**2 * np.cos(lengths / 2)
     state_error = np.abs(np.asarray(end.middle)[0] - state)

@@ -22,7 +22,8 @@ def ball(restitution, duration=60.0, **options):
 
 
 def times(trajectory, name=None):
-    return np.array([e.time for e in trajectory.events if name in (None, e.name)])
+    named = [e.time for e in trajectory.events if name in (None, e.name)]
+    return np.array(named)
 
 
 def ceiling(height):
@@ -78,7 +79,8 @@ def close(gap, k):
         return q[0] - 0.5
 
     def curved(t, q, u):
-        return jnp.exp(k * (q[0] - 0.5 - gap)) - 1
+        above = q[0] - 0.5 - gap
+        return jnp.exp(k * above) - 1
 
     transitions = (
         hj.Transition("plain", "turn", "turn", plain),
@@ -118,7 +120,8 @@ BLOWUP = toy({"x": Field(("x",), x_rates)})
 
 def test_a_hundred_bounces():
     bounces = ball(1.0, 200 * FALL)
-    assert_allclose(times(bounces), FALL * np.arange(1, 200, 2), rtol=1e-11)
+    expected = FALL * np.arange(1, 200, 2)
+    assert_allclose(times(bounces), expected, rtol=1e-11)
     first = bounces.events[0]
     assert first.name == "bounce"
     assert first.source == "fall"
@@ -145,8 +148,10 @@ def test_zeno_is_seen_before_its_limit(e):
 def test_grazing(gap):
     """A ball that would rise to 1 + 1e-16, under a ceiling at 1 + gap."""
     system = Toys(ceiling, [1 + gap])
-    found = hj.simulate(system, "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
-    hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
+    start = (0.0, np.sqrt(2.0))
+    found = hj.simulate(system, "air", start, 2.0, throw=False)
+    left = np.sqrt(max(-2 * gap, 0.0))
+    hit = np.sqrt(2.0) - left
     if abs(gap) < 1e-10:
         assert found.result == hj.errors.Result.GRAZING
         assert np.all(np.abs(times(found) - hit) < 1e-6)
@@ -162,7 +167,8 @@ def test_a_guard_that_dips_within_a_step_fires(exponent):
     system = Toys(dip, [depth])
     found = hj.simulate(system, "dip", (1.0 - depth, 0.0), 3.0)
     assert_allclose(times(found), [1 - np.sqrt(depth)], atol=1e-11)
-    above = hj.simulate(Toys(dip, [-depth]), "dip", (1.0 + depth, 0.0), 3.0)
+    dips = Toys(dip, [-depth])
+    above = hj.simulate(dips, "dip", (1.0 + depth, 0.0), 3.0)
     assert not above.events
     assert above.result == hj.errors.Result.OK
 
@@ -184,7 +190,8 @@ def test_blow_up():
 )
 def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, first):
     system = Toys(turning, [low, high])
-    found = hj.simulate(system, "turn", (0.0, -1.0, 0.0), 2 * np.pi)
+    start = (0.0, -1.0, 0.0)
+    found = hj.simulate(system, "turn", start, 2 * np.pi)
     names = [e.name for e in found.events if e.name != "gated"]
     assert names[0] == first
     assert sorted(names) == ["high", "low"]
@@ -205,9 +212,11 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, fi
 )
 def test_close_crossings_of_different_shape(gap, sign, k):
     system = Toys(close, [sign * gap, k])
-    found = hj.simulate(system, "turn", (0.0, -1.0), 2 * np.pi)
+    start = (0.0, -1.0)
+    found = hj.simulate(system, "turn", start, 2 * np.pi)
     plain = np.pi / 2 + np.arccos(0.5)
-    curved = np.pi / 2 + np.arccos(0.5 + sign * gap)
+    angle = np.arccos(0.5 + sign * gap)
+    curved = np.pi / 2 + angle
     assert_allclose(times(found, "plain"), [plain], atol=1e-11)
     assert_allclose(times(found, "curved"), [curved], atol=1e-11)
     if gap > 1e-11:  # otherwise they are at the same instant, up to rounding
@@ -250,9 +259,11 @@ def test_an_input_that_varies_in_time():
         system, "fall", (5.0, 0.0), 1.0, input=lambda t: jnp.sin(3 * t) + G
     )
     t, y = found("y")
-    assert_allclose(y[-1], 5 + 1 / 3 - np.sin(3.0) / 9, rtol=1e-10)
+    expected_end = 5 + 1 / 3 - np.sin(3.0) / 9
+    assert_allclose(y[-1], expected_end, rtol=1e-10)
     # between steps too
-    expected = 5 + t / 3 - np.sin(3 * t) / 9
+    wave = np.sin(3 * t) / 9
+    expected = 5 + t / 3 - wave
     assert_allclose(y, expected, atol=2e-5)
     constant = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=G)
     assert_allclose(constant.after[-1], [5.0, 0.0], atol=1e-14)
@@ -269,7 +280,8 @@ def test_feet_that_land_together():
     rotation = 0.0
     J = 0.2
     for s in (-0.5, 0.55):  # two impulses, one after the other
-        impulse = -0.2 * (speed + s * rotation) / (1 + s**2 / J)
+        mass = 1 + s**2 / J
+        impulse = -0.2 * (speed + s * rotation) / mass
         speed = speed + impulse
         rotation = rotation + s * impulse / J
     after = found.events[-1].after
@@ -285,7 +297,9 @@ def test_samples_between_steps(reference, hopper_cycle):
     for event in orbit.events:
         assert np.sum(t == event.time) == 2
     clock = np.round(t % 1, 12)
-    expected = np.interp(clock, data["orbit_clock"], data["orbit_q"][:, 0], period=1.0)
+    times = data["orbit_clock"]
+    states = data["orbit_q"][:, 0]
+    expected = np.interp(clock, times, states, period=1.0)
     assert_allclose(q[:, 0], expected, atol=2e-5)
     t2, yM, ym = orbit("yM", "ym", per_step=4)
     assert_array_equal(t2, t)
@@ -308,7 +322,8 @@ def test_every_turn_of_a_fast_guard_is_seen():
 
     fast = toy(LINE, [hj.Transition("fall", "line", "line", guard)])
     run = hj.simulate(fast, "line", (0.1,), 3.0)
-    falls = (2 * np.arange(1000) + 1) * np.pi / 61.0 - 0.1
+    odd = 2 * np.arange(1000) + 1
+    falls = odd * np.pi / 61.0 - 0.1
     expected = falls[(falls > 0) & (falls < 3.0)]
     assert_allclose(times(run), expected, atol=1e-12)
 
@@ -346,7 +361,8 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     """A tenth of the time makes 1e34 of 1, and even more of rounding errors."""
 
     def duffing(t, q, cos):
-        return q[1], -0.3 * q[1] - q[0] - q[0] ** 3 + 0.3 * cos(1.2 * t)
+        spring = -0.3 * q[1] - q[0] - q[0] ** 3
+        return q[1], spring + 0.3 * cos(1.2 * t)
 
     def rates(t, q, u):
         return duffing(t, q, jnp.cos)
@@ -359,4 +375,5 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     path = solve_ivp(
         scipy_rates, (0, duration), [1.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13
     )
-    assert_allclose(found.after[-1], path.y[:, -1], rtol=0, atol=1e-9)
+    expected = path.y[:, -1]
+    assert_allclose(found.after[-1], expected, rtol=0, atol=1e-9)

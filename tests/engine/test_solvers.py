@@ -32,7 +32,8 @@ FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
 
 # One mode decays in 3 s, one in 0.3 ms.
 def rates(t, q, u):
-    return (q[1], STIFF[1] @ q + force(t) + u[0])
+    rate = STIFF[1] @ q + force(t) + u[0]
+    return (q[1], rate)
 
 
 DAMPED = toy(
@@ -65,7 +66,8 @@ def test_radau_is_a_collocation_method(stages):
         assert_allclose(a @ power, c**k / k, atol=1e-14)
         assert_allclose(error @ power, 0, atol=1e-13)
     for k in range(1, 2 * stages):
-        assert_allclose(b @ c ** (k - 1), 1 / k, rtol=0, atol=1e-14)
+        moment = b @ c ** (k - 1)
+        assert_allclose(moment, 1 / k, rtol=0, atol=1e-14)
     first_error = abs(error @ c**stages)
     assert first_error > 1e-5, "the estimate is not zero"
 
@@ -75,13 +77,16 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
     """Of a mode that follows, or is excited, by however little, and dies out within the step."""
 
     def field(t, q):
-        return -rate * (q - jnp.cos(t)) - jnp.sin(t)
+        distance = q - jnp.cos(t)
+        return -rate * distance - jnp.sin(t)
 
     excited = np.array([[0.0, 1.0, 1e-4, 1e-8]])
     h = 0.4
     radau = as_method(hj.systems.Radau())
-    step = take_step(radau, field, jnp.zeros(4), 1.0 + excited, jnp.array([h]))
-    expected = np.cos(h) + excited * np.exp(-rate * h)
+    start = 1.0 + excited
+    step = take_step(radau, field, jnp.zeros(4), start, jnp.array([h]))
+    transient = excited * np.exp(-rate * h)
+    expected = np.cos(h) + transient
     error = np.abs(np.asarray(step.q) - expected)
     estimate = np.asarray(step.error)
     assert np.all(error < 5 * estimate + 1e-15)
@@ -100,13 +105,15 @@ def test_a_landing_is_as_stiff_as_its_chart():
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
     one = np.ones(1)
     none = np.zeros(1, np.int32)
-    lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
+    state = np.array([[0.0], [1e-3]])
+    lanes = to_host(start_lanes(s, np.zeros(1), none, state))
     target = Target(
         np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.errors.Result.OK
     )
     settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
     stride = Stride(one, 0.9975 * one, 1e7 * one)
-    moved = move(s, lanes, np.zeros((s.nu, 1)), target, settings, stride)
+    no_input = np.zeros((s.nu, 1))
+    moved = move(s, lanes, no_input, target, settings, stride)
     assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
 
 
@@ -120,12 +127,16 @@ def test_estimates_are_of_the_size_of_errors(solver):
 
     def field(t, q):
         x, y = q
-        return jnp.stack([-(x**2), -30 * (y - jnp.cos(t)) - jnp.sin(t)])
+        apart = y - jnp.cos(t)
+        return jnp.stack([-(x**2), -30 * apart - jnp.sin(t)])
 
-    step = take_step(method, field, jnp.zeros(1), jnp.ones((2, 1)), jnp.array([h]))
+    start = jnp.ones((2, 1))
+    step = take_step(method, field, jnp.zeros(1), start, jnp.array([h]))
     exact = [1 / (1 + h), np.cos(h)]
-    error = np.abs(np.asarray(step.q[:, 0]) - exact).max()
-    estimate = np.abs(np.asarray(step.estimate)).max() ** method.gain
+    found = np.asarray(step.q[:, 0])
+    error = np.abs(found - exact).max()
+    largest = np.abs(np.asarray(step.estimate)).max()
+    estimate = largest**method.gain
     assert 0.5 < estimate / error < 10
 
 
@@ -148,11 +159,15 @@ def test_derivatives_of_implicit_steps(solver):
 
     def end(x):
         def field(t, q, x=x):
-            return jnp.stack([-50.0 * (q[0] - jnp.sin(q[1] + x)), q[0] * q[1] + x])
+            fast = -50.0 * (q[0] - jnp.sin(q[1] + x))
+            slow = q[0] * q[1] + x
+            return jnp.stack([fast, slow])
 
         still = ft.partial(field, x=jax.lax.stop_gradient(x))
-        q = jnp.stack([0.3 + x, jnp.cos(x)])[:, None]
-        return take_step(method, field, jnp.zeros(1), q, h, still=still).q[:, 0]
+        start = jnp.stack([0.3 + x, jnp.cos(x)])
+        q = start[:, None]
+        step = take_step(method, field, jnp.zeros(1), q, h, still=still)
+        return step.q[:, 0]
 
     d = 1e-2
     lowest, low, middle, high, highest = jax.jit(jax.vmap(end))(
@@ -160,7 +175,8 @@ def test_derivatives_of_implicit_steps(solver):
     )
     first = jax.jit(jax.jacfwd(end))(0.0)
     second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
-    by_differences = (lowest - 8 * low + 8 * high - highest) / (12 * d)
+    combined = lowest - 8 * low + 8 * high - highest
+    by_differences = combined / (12 * d)
     assert_allclose(first, by_differences, rtol=1e-6)
     twice = (16 * (low + high) - 30 * middle - lowest - highest) / (12 * d**2)
     assert_allclose(second, twice, rtol=1e-5)

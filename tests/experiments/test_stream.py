@@ -57,7 +57,8 @@ def records(parts):
 
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
     u = DESIGN.signals(9)
-    parts = [DESIGN.signals(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
+    starts = range(0, COUNT, 5)
+    parts = [DESIGN.signals(9, slice(k, k + 5)) for k in starts]
     assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
@@ -106,7 +107,8 @@ def test_batches_are_alike_and_keep_all_workers_busy():
             if S >= 64 * workers:  # every worker has about the same to do
                 assert used == workers
                 assert number * size < 1.2 * S
-    assert divide(1000, hj.scale.Execution(256, 8)) == hj.scale.Execution(256, 4)
+    whole = hj.scale.Execution(256, 8)
+    assert divide(1000, whole) == hj.scale.Execution(256, 4)
     assert divide(80, hj.scale.Execution(workers=2)) == hj.scale.Execution(40, 2)
 
 
@@ -122,7 +124,8 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert made.summary() == whole.summary() == "12/12 ok"
     assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
     assert made.dataset.y.dims == ("experiment", "sample", "output")
-    assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
+    stored = made.dataset.y.sel(output="v")
+    assert_array_equal(stored, whole.y[..., 1])
     assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
 
 
@@ -189,9 +192,12 @@ def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = RunOptions(start=start, discard=8)
-    job = ExperimentJob(prepare(*arguments, options, 2), Blocks((COUNT,), (2,)))
+    plan = prepare(*arguments, options, 2)
+    blocks = Blocks((COUNT,), (2,))
+    job = ExperimentJob(plan, blocks)
     _, layout = job.begin()
-    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
+    pickled = cloudpickle.dumps(job.resume(layout, job.arrays()))
+    sent = cloudpickle.loads(pickled)
     mine = job.run(0, None)
     theirs = sent.run(0, 1)
     assert mine.keys() == theirs.keys()
@@ -204,8 +210,10 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
 ):
     other = hj.experiments.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
-    good = np.cos(2 * np.pi * n / 64 * 3)
-    high = np.cos(2 * np.pi * n / 64 * 19)
+    phase = 2 * np.pi * n / 64
+    good = np.cos(phase * 3)
+    fast = 2 * np.pi * n / 64 * 19
+    high = np.cos(fast)
     good, bad = (
         hj.experiments.ExperimentData(u, u, n_sections=4, periods=16)
         for u in (good, good + high)

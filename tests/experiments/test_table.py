@@ -35,7 +35,8 @@ def campaign():
 def responses(campaign):
     """By the search; along the table near the cycle; and along that for other experiments."""
     u = campaign.inputs.part(slice(0, EXPERIMENTS))
-    start = np.tile(np.asarray(campaign.placed.section_zero)[:, None], EXPERIMENTS)
+    begin = np.asarray(campaign.placed.section_zero)
+    start = np.tile(begin[:, None], EXPERIMENTS)
     arguments = campaign._arguments(u, start, slice(0, EXPERIMENTS))
     made = tables(campaign.placed, campaign.stepping.plan)
     assert made is not None
@@ -49,9 +50,11 @@ def responses(campaign):
 def test_lanes_that_leave_the_table_say_so(campaign, responses):
     """What follows the table is as accurate as planned; some lanes leave it, and some do not."""
     searched, *along = responses
-    sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
+    magnitude = np.abs(np.asarray(searched.y))
+    sizes = magnitude.max(axis=(0, 1))
     for part, left in along:
-        error = np.abs(np.asarray(part.y) - np.asarray(searched.y)) / sizes
+        difference = np.asarray(part.y) - np.asarray(searched.y)
+        error = np.abs(difference) / sizes
         follows = ~np.asarray(left)
         assert 0 < follows.sum() < EXPERIMENTS
         assert (np.asarray(searched.result)[follows] == 0).all()
@@ -69,9 +72,11 @@ def test_experiments_that_leave_the_table_are_run_again(campaign, responses):
     """`run` returns what a search finds, whatever the table can follow."""
     searched = responses[0]
     data = campaign.run()
-    y = data.y + np.resize(data.cycle_outputs, data.y.shape[1:])
+    on_cycle = np.resize(data.cycle_outputs, data.y.shape[1:])
+    y = data.y + on_cycle
     assert_array_equal(data.result, searched.result)
-    sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
+    magnitude = np.abs(np.asarray(searched.y))
+    sizes = magnitude.max(axis=(0, 1))
     error = np.nanmax(np.abs(y - searched.y) / sizes)
     assert error < 2e-9
 

@@ -17,7 +17,8 @@ STD = {"std": 1e-3, "period_std": 1e-3}
 
 def observed(cycle, noise=0.0):
     """Outputs at four phases, and the period."""
-    values, _, period = hj.fitting.ObservedCycle.of(cycle, PHASES, ("x", "v")).measured
+    observed = hj.fitting.ObservedCycle.of(cycle, PHASES, ("x", "v"))
+    values, _, period = observed.measured
     drawn = noise * np.random.default_rng(0).normal(size=9)
     values = values + drawn[:8].reshape(4, 2)
     return hj.fitting.ObservedCycle(
@@ -118,7 +119,9 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     )  # it did not move
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
     assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
-    assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
+    period = float(fit.cycle.period)
+    true_period = float(oscillation.period)
+    assert period == pytest.approx(true_period, rel=1e-9)
     (lost,) = fit.findings
     assert lost.cause == "not identified"
     assert lost.text.startswith("p and q apart")
@@ -147,8 +150,11 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         )
 
     usual = numbers()
-    J = np.stack([numbers(p=0.501) - usual, numbers(w=1.001) - usual], axis=1) / 1e-3
-    errors = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    by_p = numbers(p=0.501) - usual
+    by_w = numbers(w=1.001) - usual
+    J = np.stack([by_p, by_w], axis=1) / 1e-3
+    covariance = np.linalg.inv(J.T @ J)
+    errors = np.sqrt(np.diag(covariance))
     assert fit.standard_errors[2] == pytest.approx(errors[1], rel=0.02)
     with pytest.raises(hj.errors.DefinitionError, match="the other values lack 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
@@ -210,7 +216,8 @@ def test_data_of_the_hopper_do_not_see_all_parameters(seen_in_htf, seen_in_cycle
 def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
     hopper_cycle, hopper_htf
 ):
-    u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
+    rng = np.random.default_rng(0)
+    u = 0.05 * rng.normal(size=(2, 8 * SECTIONS.n_sections, 1))
     data = hj.run_experiments(
         hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0
     )
@@ -224,7 +231,8 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
         hj.fit_model(wrong, x, HOPPER, guess=hopper_cycle, guesses=4) for x in observed
     )
     np.testing.assert_allclose(by_htf.values[:4], true[:4], rtol=1e-9)  # (not l0)
-    assert by_htf.values[5] / by_htf.values[6] == pytest.approx(10.0, rel=1e-9)
+    ratio = by_htf.values[5] / by_htf.values[6]
+    assert ratio == pytest.approx(10.0, rel=1e-9)
     assert by_series.identifiability.complete
     np.testing.assert_allclose(by_series.values, true, rtol=1e-6)
 

@@ -14,7 +14,8 @@ from hybridjax.errors import ComputationError, DefinitionError
 
 def ball(**numbers):
     def fall(t, q, u, p):
-        return q[1], -p.g - p.drag * jnp.abs(q[1]) * q[1]
+        drag = p.drag * jnp.abs(q[1]) * q[1]
+        return q[1], -p.g - drag
 
     def bounce(t, q, u, p):
         return q[0], -p.e * q[1]
@@ -33,7 +34,8 @@ def drop(height):
     """Heights at TIMES and times of two bounces, by scipy."""
 
     def fall(t, q):
-        return q[1], -9.81 - TRUE["drag"] * abs(q[1]) * q[1]
+        drag = TRUE["drag"] * abs(q[1]) * q[1]
+        return q[1], -9.81 - drag
 
     def ground(t, q):
         return q[0]
@@ -44,10 +46,13 @@ def drop(height):
     while t < TIMES[-1]:
         options = dict(rtol=1e-12, atol=1e-14, method="DOP853", dense_output=True)
         found = solve_ivp(fall, (t, 1.5), q, events=ground, **options)
-        own = TIMES[(TIMES > t) & (TIMES <= found.t[-1])]
+        is_later = TIMES > t
+        has_come = TIMES <= found.t[-1]
+        own = TIMES[is_later & has_come]
         heights.append(found.sol(own)[0])
         t = found.t[-1]
-        q = np.array([0.0, -TRUE["e"] * found.y[1, -1]])
+        speed = -TRUE["e"] * found.y[1, -1]
+        q = np.array([0.0, speed])
         bounces.append(t)
     return np.concatenate(heights), bounces[:2]
 
@@ -73,7 +78,8 @@ def test_parameters_and_starts_of_two_drops_are_those_of_scipy():
         "y at start 2",
         "v at start 2",
     )
-    assert_allclose(fit.values, (*TRUE.values(), 1.0, 0.0, 1.5, 0.0), atol=1e-6)
+    expected = (*TRUE.values(), 1.0, 0.0, 1.5, 0.0)
+    assert_allclose(fit.values, expected, atol=1e-6)
     assert len(fit.residuals) == 2 * (len(TIMES) - 1)
     assert fit.cycle is None
     assert_allclose(float(fit.system.e), TRUE["e"], atol=1e-6)
@@ -102,7 +108,8 @@ def test_standard_errors_are_those_of_many_draws():
     for seed in range(60):
         fit = hj.fit_model(ball(), observed(1.0, seed), ("e", "drag"))
         size = fit.standard_errors[:2]
-        errors.append((fit.values[:2] - tuple(TRUE.values())) / size)
+        true = tuple(TRUE.values())
+        errors.append((fit.values[:2] - true) / size)
     spread = np.std(errors, axis=0)
     assert (0.75 < spread).all()
     assert (spread < 1.3).all()

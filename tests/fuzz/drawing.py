@@ -38,7 +38,8 @@ def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]
         A[k : k + 2, k : k + 2] = [[-z, w], [-w, -z]]
     if n % 2:
         A[-1, -1] = -rng.uniform(0.2, 1.0)
-    basis = np.linalg.qr(rng.normal(size=(n, n)))[0] * rng.uniform(0.7, 1.4, n)
+    rotation = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    basis = rotation * rng.uniform(0.7, 1.4, n)
     mild = float(rng.random() < 0.5)
     return still(
         n,
@@ -149,7 +150,8 @@ def kicks(rng) -> Sample:
     arrows = [arrow(rng, 3, 3, m=np.zeros(2), V=np.zeros((3, 2))) for _ in range(3)]
     for x in arrows:
         if rng.random() < 0.5:
-            x |= {"R": np.eye(3), "r": x["r"] - x["n"] * (x["n"] @ x["r"])}
+            along = x["n"] @ x["r"]
+            x |= {"R": np.eye(3), "r": x["r"] - x["n"] * along}
     return Sample([swinging(rng, 3)], arrows, start(rng, 3))
 
 
@@ -179,9 +181,11 @@ def hop(rng) -> Sample:
     the systems where touchdown's guard is zero."""
     air = swinging(rng, 4)
     ground = swinging(rng, 2)
-    land = arrow(rng, 4, 2, n=unit(4, 2), R=np.eye(4)[:2], r=rng.normal(0.0, 0.1, 2))
+    upper = np.eye(4)[:2]
+    land = arrow(rng, 4, 2, n=unit(4, 2), R=upper, r=rng.normal(0.0, 0.1, 2))
     land |= {"c": 0.0, "m": np.zeros(2)}
-    lift = arrow(rng, 2, 4, R=np.eye(4)[:, :2], V=np.zeros((4, 2)))
+    left = np.eye(4)[:, :2]
+    lift = arrow(rng, 2, 4, R=left, V=np.zeros((4, 2)))
     if rng.random() < 0.5:  # start right on the guard of touchdown
         lift["r"][2] = 0.0
     return Sample([air, ground], [land, lift], start(rng, 4))

@@ -40,7 +40,8 @@ def rounded(level):
     grow with the state and with time."""
 
     def guard(t, q, u):
-        return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level
+        wave = 0.1 * jnp.sin(2 * jnp.pi * t)
+        return q[0] + 1.1 * q[1] + wave - level
 
     def line_rates(t, q, u):
         return (-1.0, -1.0)
@@ -66,7 +67,8 @@ def two_pieces(x, first, second):
         ).moved
         lanes = moved.lanes
         h = moved.h
-    return hj.errors.Result(int(moved.result[0])), int(lanes.events[0])
+    code = int(moved.result[0])
+    return hj.errors.Result(code), int(lanes.events[0])
 
 
 def test_a_guard_that_a_new_input_makes_positive_is_armed():
@@ -77,7 +79,8 @@ def test_a_guard_that_a_new_input_makes_positive_is_armed():
 def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size, time):
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32
-    result, events = across(size * jnp.linspace(0.5, 2.0, 100), time, duration)
+    sizes = size * jnp.linspace(0.5, 2.0, 100)
+    result, events = across(sizes, time, duration)
     assert_array_equal(result, hj.errors.Result.OK)
     assert_array_equal(events, 1)
 
@@ -89,8 +92,11 @@ def across(x, time, duration):
     t = jnp.full(1, time)
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
-    level = -0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))
+    wave = jnp.sin(2 * jnp.pi * (time + hit))
+    level = -0.1 * x - 2.1 * hit + 0.1 * wave
     s = Structure(Toys(rounded, [level]))
     lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
-    moved = move(s, lanes, jnp.zeros((1, 1)), until(t + duration), SETTINGS).moved
+    no_input = jnp.zeros((1, 1))
+    target = until(t + duration)
+    moved = move(s, lanes, no_input, target, SETTINGS).moved
     return moved.result[0], moved.lanes.events[0]

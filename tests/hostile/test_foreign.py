@@ -111,7 +111,8 @@ def test_bandwidths_and_drifts_beyond_all_records():
         for cycles in (1e9, 1e300)
     ]
     assert_allclose(*flat, rtol=1e-6)  # a straight line is left out
-    slopes = (np.polyfit(time, values, 1)[0] for values in (flat[1][:, 0], x))
+    sides = (flat[1][:, 0], x)
+    slopes = (np.polyfit(time, values, 1)[0] for values in sides)
     assert_allclose(*slopes, atol=2e-4)
     refused(
         "`drift` must be two cycles or more",

@@ -108,7 +108,8 @@ class Turning:
 
     def signals(self):
         t, x = self.state
-        return {"x": x * np.cos(2 * np.pi * t), "v": -x * np.sin(2 * np.pi * t)}
+        angle = 2 * np.pi * t
+        return {"x": x * np.cos(angle), "v": -x * np.sin(angle)}
 
     def get_state(self):
         return self.state

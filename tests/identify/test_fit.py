@@ -28,8 +28,10 @@ def plant():
 def recorded(plant, noise=0.1, cycles=300, drift=0.0):
     rng = np.random.default_rng(0)
     u = rng.normal(size=(N * cycles, 1))
-    y = np.asarray(plant.simulate(u)) + noise * rng.normal(size=u.shape)
-    slow = drift * np.linspace(-1, 1, len(y)) ** 3
+    clean = np.asarray(plant.simulate(u))
+    y = clean + noise * rng.normal(size=u.shape)
+    line = np.linspace(-1, 1, len(y))
+    slow = drift * line**3
     return hj.experiments.SectionSeries(u, y + slow[:, None], n_sections=N)
 
 
@@ -37,7 +39,8 @@ def uncertain(plant):
     """Responses with errors of known variance."""
     exact = plant.htf(np.linspace(0.02, 1.98, 60))
     H = np.asarray(exact.H)
-    size = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    power = np.mean(np.abs(H) ** 2)
+    size = 1e-3 * np.sqrt(power)
     rng = np.random.default_rng(0)
     error = (
         size * np.sqrt(0.5) * (rng.normal(size=H.shape) + 1j * rng.normal(size=H.shape))
@@ -66,7 +69,8 @@ def fits(plant):
 def test_fits_of_multipliers_are_fits(fits):
     for name, fit in fits.items():
         assert isinstance(fit, hj.identify.Fit), name
-        assert np.abs(np.sort(fit.multipliers.real) - np.sort(MULTIPLIERS)).max() < 0.02
+        found = np.sort(fit.multipliers.real)
+        assert np.abs(found - np.sort(MULTIPLIERS)).max() < 0.02
         assert fit.covariance.shape == (2, 2) and fit.dof > 100, name
         assert fit.findings == (), f"{name}: {fit.findings}"
         low, high = fit.interval(0.99).T
@@ -83,10 +87,13 @@ def test_intervals_of_moduli():
         np.array([-0.5 + 0j]), np.array([0.5]), np.array([[0.01]]), 7.0
     )
     reach = 0.1 * stats.t.ppf(0.975, 7)
-    np.testing.assert_allclose(one.interval(), [[0.5 - reach, 0.5 + reach]])
+    expected = [[0.5 - reach, 0.5 + reach]]
+    np.testing.assert_allclose(one.interval(), expected)
     z = 0.8 * np.exp(0.7j)
     c = np.array([-2 * z.real, abs(z) ** 2])  # (the modulus is the root of c_2 alone)
-    pair = MultiplierEstimate(np.array([z, z.conj()]), c, np.diag([0.3, 0.04]), np.inf)
+    roots = np.array([z, z.conj()])
+    variances = np.diag([0.3, 0.04])
+    pair = MultiplierEstimate(roots, c, variances, np.inf)
     error = 0.2 / (2 * 0.8)
     np.testing.assert_allclose(
         np.diff(pair.interval(0.6827), axis=1), 2 * error, rtol=1e-3
@@ -106,7 +113,8 @@ def causes(fit):
 def test_an_order_that_is_too_low_is_a_finding(plant):
     assert causes(hj.fit_multipliers(uncertain(plant), 1)) == {"order"}
     # (A missing multiplier may look like drift, too.)
-    assert causes(hj.fit_series(recorded(plant), 1)) in ({"order"}, {"drift"})
+    found = causes(hj.fit_series(recorded(plant), 1))
+    assert found in ({"order"}, {"drift"})
     assert causes(hj.fit_ldtp(recorded(plant), 1)) == {"left over"}
 
 
@@ -136,7 +144,8 @@ def test_a_controller_is_a_finding(plant):
     for k in range(N * 500):
         n = k % N
         y = C[n] @ x + rng.normal(size=1)
-        u = 0.3 * rng.normal(size=1) - 0.2 * (signals[-1][1] if signals else 0.0)
+        last = signals[-1][1] if signals else 0.0
+        u = 0.3 * rng.normal(size=1) - 0.2 * last
         signals.append((u, y))
         x = A[n] @ x + B[n] @ u
     u, y = np.swapaxes(signals, 0, 1)

@@ -21,7 +21,8 @@ def plant():
     rng = np.random.default_rng(3)
     c = np.cos(0.225)
     s = np.sin(0.225)
-    turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
+    rotation = np.array([[c, -s], [s, c]])
+    turn = 0.8 ** (1 / N) * rotation
     T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
     return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
@@ -41,14 +42,19 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     last = np.zeros(S)
     for i in range(n):
         k = i % N
-        free = x @ C[k, 0] + d[:, i] + e[:, i] / 4
+        process = d[:, i]
+        sensor = e[:, i] / 4
+        free = x @ C[k, 0] + process + sensor
         answer = 0.3 * last if waits else free
         command = r[:, i] + c[:, i]
-        u[:, i] = command - GAIN[k, 0, 0] * answer
+        answered = GAIN[k, 0, 0] * answer
+        u[:, i] = command - answered
         last = free + through * u[:, i]
         y[:, i] = last
         drive = u[:, i] + w[:, i]
-        x = x @ A[k].T + drive[:, None] * B[k, :, 0]
+        carried = x @ A[k].T
+        forced = drive[:, None] * B[k, :, 0]
+        x = carried + forced
     return u, y
 
 
@@ -67,7 +73,8 @@ def experiments(model, seed, count, noise=0.0, discard=30, together=False):
     )
     z = design.realizations(count, seed).signals(8 + discard)
     r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
-    u, y = run(model, r, d, np.random.default_rng(seed), noise)
+    rng = np.random.default_rng(seed)
+    u, y = run(model, r, d, rng, noise)
     inputs = np.concatenate(
         [u[..., None], z * [1, 1e-9]], axis=2
     )  # (a unit of its own)
@@ -93,7 +100,8 @@ def test_plant_and_controller_of_exact_data(plant):
     assert loop.controller.error(controller().htf(f)) < 1e-9
     np.testing.assert_allclose(loop.closed.H, exact.htf(f).H, atol=1e-9)
     # u = r - K y
-    entered = -np.array((controller().htf(f) @ exact.htf(f)).H)
+    around = controller().htf(f) @ exact.htf(f)
+    entered = -np.array(around.H)
     entered[loop.closed.harmonics.index(0)] += 1
     np.testing.assert_allclose(loop.sensitivity.H, entered, atol=1e-9)
     both = hj.estimate_htf(
@@ -120,7 +128,8 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     r = design.signals(208)[..., 0]
     faint = np.ones(8 * N)
     faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
-    u, y = run(plant, r, 0 * r, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    u, y = run(plant, r, 0 * r, rng)
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
     inputs = np.stack([u, r], axis=2)
     data = hj.experiments.ExperimentData(
@@ -144,7 +153,8 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
             controller().htf(loop.plant.frequencies),
         )
         for htf, true in zip((loop.plant, loop.controller), truth, strict=True):
-            held.append(np.mean(np.abs(htf.H - true.H) <= htf.confidence_radius()))
+            error = np.abs(htf.H - true.H)
+            held.append(np.mean(error <= htf.confidence_radius()))
         fit = hj.fit_multipliers(loop.plant, 2, check=False)
         regions.append(fit.contains(plant.multipliers)[0])
     assert 0.92 < np.mean(held[::2]) < 0.985
@@ -173,7 +183,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         fit = hj.fit_series(series(plant, seed, noise=0.7), 2, references="r")
         held.append(fit.contains(plant.multipliers)[0])
         htf = fit.htf(truth.frequencies)
-        discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
+        error = np.abs(htf.H - truth.H)
+        discs.append(np.mean(error <= htf.confidence_radius()))
         few = hj.fit_series(
             series(plant, seed, 40, noise=0.5), 2, references="r", check=False
         )
@@ -187,7 +198,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     assert 0.88 < np.mean(discs) < 0.98
     assert not fit.findings
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
-    moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
+    slow = np.sin(np.arange(600) / 38)
+    moved.y[:, 0] += 30 * slow
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
     assert hj.fit_series(moved, 2, references="r").standard_errors[0] < 0.2
     with pytest.raises(
@@ -202,7 +214,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
 
 def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     rng = np.random.default_rng(1)
-    root = np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
+    moduli = np.array([0.8, 0.5, 0.3])
+    root = np.diag(moduli ** (1 / N))
     T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(
@@ -222,7 +235,8 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
             data.u[:, :1], data.y, n_sections=N, inputs="u"
         )
         fit = hj.fit_ldtp(data, 2, noise="innovations")
-        assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
+        has_direct = np.asarray(fit.model.D).any()
+        assert not has_direct or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
         biased = hj.fit_series(data, 2, check=False)
         (doubt,) = (x for x in biased.findings if x.cause == "feedback")
@@ -230,7 +244,8 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
-    data = hj.experiments.SectionSeries(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    u = data.u[:, 1:]
+    data = hj.experiments.SectionSeries(u, data.y, n_sections=N, inputs="r")
     assert not hj.fit_series(data, 2, check=False).findings
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
@@ -241,13 +256,15 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         noise = 0.1 * np.random.default_rng(0).normal(size=data.y.shape)
         moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
         fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
-        assert bool(np.asarray(fit.model.D).any()) == bool(through)
+        has_direct = bool(np.asarray(fit.model.D).any())
+        assert has_direct == bool(through)
         np.testing.assert_allclose(fit.model.D, through, atol=0.1)
         assert fit.contains(plant.multipliers, 0.999).all()
     r = np.sin(0.2 * np.pi * np.arange(60 * N))[
         None
     ]  # (a statistic of -5e-4, by rounding)
-    u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
+    rng = np.random.default_rng(0)
+    u, y = run(plant, r, 0 * r, rng, waits=True)
     data = hj.experiments.SectionSeries(
         np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
     )
@@ -263,8 +280,11 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     # x[n + 1] = 1.2 x + u, u = r - 0.9 y
     one = np.ones((N, 1, 1))
     plant = hj.linear.LDTP(1.2 * one, one, one)
-    r, e = np.random.default_rng(0).normal(size=(2, N * 400))
-    x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
+    rng = np.random.default_rng(0)
+    r, e = rng.normal(size=(2, N * 400))
+    loop = plant.feedback([[0.9]])
+    push = (r - 0.27 * e)[:, None]
+    x = np.asarray(loop.simulate(push))[:, 0]
     y = x + 0.3 * e
     data = hj.experiments.SectionSeries(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
@@ -288,7 +308,8 @@ def test_residuals_tell_of_the_loop(plant):
     )
     biased = hj.fit_series(alone, 2, check=False)
     assert not hj.validate(biased, late, references="r").independent
-    driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
+    push = early.u[:, 1:]
+    driven = dataclasses.replace(early, u=push, inputs=("r",))
     for record, answers in (alone, True), (driven, False):
         fit = hj.fit_series(record, 2, check=False)
         grid = CycleGrid.from_records([record])

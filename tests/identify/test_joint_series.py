@@ -27,8 +27,10 @@ ONE = np.ones(2)
 
 def driven(model, size, sensor=0.1):
     """Noise that enters where the inputs do, and noise of the sensors."""
-    still = np.broadcast_to(sensor * np.eye(2), (model.n_sections, 2, 2))
-    B = np.concatenate([size * model.B, np.zeros((*model.B.shape[:2], 2))], axis=2)
+    shape = (model.n_sections, 2, 2)
+    still = np.broadcast_to(sensor * np.eye(2), shape)
+    none = np.zeros((*model.B.shape[:2], 2))
+    B = np.concatenate([size * model.B, none], axis=2)
     D = np.concatenate([size * model.D, still], axis=2)
     return hj.linear.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)
 
@@ -44,7 +46,8 @@ def noisy(model, noise, cycles, seed):
 
 
 def with_gaps(whole, share, seed):
-    whole.y[np.random.default_rng(seed).random(whole.y.shape) < share] = np.nan
+    rng = np.random.default_rng(seed)
+    whole.y[rng.random(whole.y.shape) < share] = np.nan
     return whole
 
 
@@ -58,7 +61,8 @@ def gappy(small):
 def in_innovation_form(model, seed=0):
     rng = np.random.default_rng(seed)
     model = PeriodicModel.of(model, ONE)
-    return model._replace(K=[0.1 * rng.normal(size=(len(A), 2)) for A in model.A])
+    gains = [0.1 * rng.normal(size=(len(A), 2)) for A in model.A]
+    return model._replace(K=gains)
 
 
 COVARIANCES = np.array([[1, 0.3], [0.3, 0.5]]) * np.arange(1, 5)[:, None, None]
@@ -76,11 +80,14 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
             e = y - model.C[n] @ x - model.D[n] @ u
             seen = np.isfinite(e)
             S = COVARIANCES[n]
-            mean = S[:, seen] @ np.linalg.solve(S[np.ix_(seen, seen)], e[seen])
+            of_seen = S[np.ix_(seen, seen)]
+            mean = S[:, seen] @ np.linalg.solve(of_seen, e[seen])
             np.testing.assert_allclose(
                 path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11
             )
-            x = model.A[n] @ x + model.B[n] @ u + model.K[n] @ mean
+            carried = model.A[n] @ x
+            forced = model.B[n] @ u
+            x = carried + forced + model.K[n] @ mean
 
 
 @pytest.mark.parametrize("free", (True, False))
@@ -94,26 +101,30 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     step = np.random.default_rng(1).normal(size=coordinates.size)
     ahead, back = (problem.cost(coordinates.moved(h * step)) for h in (1e-6, -1e-6))
     gradient = problem.linearize(coordinates).gradient
-    assert (ahead - back) / 2e-6 == pytest.approx(-2 * gradient @ step, rel=1e-5)
+    by_differences = (ahead - back) / 2e-6
+    assert by_differences == pytest.approx(-2 * gradient @ step, rel=1e-5)
 
 
 @pytest.mark.parametrize("start", ("free", "cycle"))
 def test_series_without_noise_are_met_exactly(small, start):
     x0 = np.ones(3) if start == "free" else None
-    data = with_gaps(record(small, 4 * 60 + 3, 0, first_section=1, x0=x0), 0.02, 0)
+    whole_record = record(small, 4 * 60 + 3, 0, first_section=1, x0=x0)
+    data = with_gaps(whole_record, 0.02, 0)
     fit = hj.fit_ldtp(
         data, initial=eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start=start
     )
     assert fit.compare(small.multipliers).max_error < 1e-9
     f = np.array([0.1, 0.4])
-    assert fit.htf(f).error(small.htf(f)).max() < 1e-9
+    error = fit.htf(f).error(small.htf(f))
+    assert error.max() < 1e-9
     assert fit.unknowns == local_coordinates(PeriodicModel.of(small, ONE), True).size
 
 
 def test_a_drift_is_found_where_samples_are_missing(small):
     """A constant at each section, of each output."""
     whole = record(small, 4 * 60, 0)
-    y = whole.y + np.tile(np.arange(8.0).reshape(4, 2), (60, 1))
+    levels = np.arange(8.0).reshape(4, 2)
+    y = whole.y + np.tile(levels, (60, 1))
     data = with_gaps(
         hj.experiments.SectionSeries(whole.u, y, n_sections=4, drift=np.inf), 0.05, 0
     )
@@ -121,7 +132,8 @@ def test_a_drift_is_found_where_samples_are_missing(small):
         data, initial=eqx.tree_at(lambda m: m.B, small, 1.05 * small.B), start="cycle"
     )
     assert fit.compare(small.multipliers).max_error < 1e-9
-    assert fit.dof == np.isfinite(data.y).sum() - 8 - fit.unknowns  # (8 constants)
+    samples = np.isfinite(data.y).sum()
+    assert fit.dof == samples - 8 - fit.unknowns  # (8 constants)
 
 
 def test_too_few_dimensions_are_named(small):
@@ -150,7 +162,8 @@ def test_inputs_that_their_past_determines(through):
         u, np.asarray(model.simulate(u)) + noise, n_sections=3
     )
     fit = hj.fit_ldtp(data, 2, noise="innovations", check=False)
-    assert bool(np.asarray(fit.model.D).any()) == bool(through)
+    has_direct = bool(np.asarray(fit.model.D).any())
+    assert has_direct == bool(through)
 
 
 def test_residuals_of_exact_data_tell_nothing(small):
@@ -162,7 +175,8 @@ def test_residuals_of_exact_data_tell_nothing(small):
     for size, told in ((1e-3, True), (1e-13, False)):
         found = about_misfit(grid, grid, size * response, False, direct=True)
         assert bool(found) == told == ("noise='innovations'" in repr(found))
-    feedback = np.roll(response.reshape(1, -1, 2), 1, axis=1).reshape(response.shape)
+    in_order = response.reshape(1, -1, 2)
+    feedback = np.roll(in_order, 1, axis=1).reshape(response.shape)
     assert not about_answers(grid, 1e-13 * feedback, ("u",), "")
 
 
@@ -189,8 +203,10 @@ def test_periodic_series_and_their_htfs_agree(small):
     )
     in_time = hj.fit_ldtp(data, initial=small)
     htf = hj.estimate_htf(data)
-    sigma = np.sqrt(in_time.noise_spectrum(htf.frequencies[:1], (0,))[0, 0])
-    each = design.expected_variance(1.0)[:, None, :] * sigma[:, None] ** 2
+    spectrum = in_time.noise_spectrum(htf.frequencies[:1], (0,))
+    sigma = np.sqrt(spectrum[0, 0])
+    by_line = design.expected_variance(1.0)[:, None, :]
+    each = by_line * sigma[:, None] ** 2
     each = np.broadcast_to(each, htf.H.shape)
     htf = hj.linear.HTF(
         htf.frequencies, htf.H, htf.harmonics, 4, htf.inputs, htf.outputs, variance=each
@@ -228,7 +244,8 @@ def test_errors_are_as_large_as_said(small):
         for seed in range(runs)
     ]
     square = [fit.distance(small.multipliers)[0] for fit in fits]
-    assert 1e-3 < stats.chi2(2 * runs).cdf(sum(square)) < 1 - 1e-3
+    below = stats.chi2(2 * runs).cdf(sum(square))
+    assert 1e-3 < below < 1 - 1e-3
     assert covered(
         sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits), runs
     )
@@ -250,7 +267,8 @@ def test_the_spectrum_of_noise(small):
     found = noise_spectrum(noise, f, (-1, 1))
     for row, m in zip(found, (-1, 1), strict=True):
         H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
-        np.testing.assert_allclose(row, (np.abs(H) ** 2).sum(axis=(0, 3)), rtol=1e-9)
+        power = np.abs(H) ** 2
+        np.testing.assert_allclose(row, power.sum(axis=(0, 3)), rtol=1e-9)
 
 
 @pytest.mark.parametrize("size, cause", [(0.0, None), (0.5, "process noise")])
@@ -263,7 +281,9 @@ def test_noise_of_the_states_is_named_where_only_sensors_were_fitted(size, cause
     y = np.zeros((600, 2))
     for i in range(600):
         y[i] = x + 0.3 * rng.normal(size=2)
-        x = (turn if i % 3 == 2 else np.eye(2)) @ x + [u[i, 0], 0.3 * u[i, 0]]
+        A = turn if i % 3 == 2 else np.eye(2)
+        push = [u[i, 0], 0.3 * u[i, 0]]
+        x = A @ x + push
         x = x + size * rng.normal(size=2)
     data = hj.experiments.SectionSeries(u, y, n_sections=3)
     found = [finding.cause for finding in hj.fit_ldtp(data, 2).findings]
@@ -282,9 +302,12 @@ def test_a_controller_at_the_section_of_its_measurement_is_no_lack_of_dimensions
     for i in range(1200):
         y[i] = x + 0.1 * rng.normal(size=2)
         u[i] = rng.normal() - 0.3 * y[i, 0] - 0.2 * y[i, 1]
-        x = (turn if i % 2 else np.eye(2)) @ x + [u[i, 0], 0.3 * u[i, 0]]
+        A = turn if i % 2 else np.eye(2)
+        push = [u[i, 0], 0.3 * u[i, 0]]
+        x = A @ x + push
         x = x + 0.3 * rng.normal(size=2)
     data = hj.experiments.SectionSeries(u, y, n_sections=2)
     fit = hj.fit_ldtp(data, 2, noise="innovations")
     assert {finding.cause for finding in fit.findings} == {"feedback"}
-    assert fit.contains(turn[0, 0] + 1j * turn[0, 1]).all()
+    multiplier = turn[0, 0] + 1j * turn[0, 1]
+    assert fit.contains(multiplier).all()

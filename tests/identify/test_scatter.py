@@ -35,7 +35,8 @@ def inside(model, count, repeats, variance, runs=40, **more):
     for seed in range(runs):
         data = realized(model, count, repeats, seed=seed, **more)
         estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
-        error = np.abs(estimate[0] - model.htf(estimate.frequencies, 0)[0])
+        exact = model.htf(estimate.frequencies, 0)[0]
+        error = np.abs(estimate[0] - exact)
         hits.append((error <= estimate.confidence_radius()[0])[::3])
     return np.sum(hits), np.size(hits)
 
@@ -65,7 +66,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     runs = 20_000
     phases = 2 * np.pi * rng.random((R, runs))
     parts = np.sqrt(0.5) * rng.normal(size=(R, runs, 2))
-    error = constant * np.exp(1j * phases) + noise * parts @ [1, 1j]
+    bias = constant * np.exp(1j * phases)
+    error = bias + noise * parts @ [1, 1j]
     shares = np.full((R, 1), 1 / R)
     if constant == 0:
         # Of experiments of different strengths; Gaussian errors know nothing of it.
@@ -80,7 +82,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     dof = np.full(runs, R - 1.0)
     variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
     for level in (0.5, 0.8, 0.95, 0.99):
-        quantile = np.asarray(variance_dof.quantile(level))[0, :, 0, 0]
+        quantiles = np.asarray(variance_dof.quantile(level))
+        quantile = quantiles[0, :, 0, 0]
         inside = np.abs(mean) ** 2 <= quantile * variance
         if constant == 0:
             assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
@@ -115,7 +118,8 @@ def test_distortion_is_what_noise_is_not(model):
     assert np.all(estimate.variance > 1e-8)
     exact = model.htf(estimate.frequencies, 0)[0]
     # The best linear approximation is not the linear part, by 3 u^3 -> 9 var(u) u for many lines.
-    assert np.all(np.abs(estimate[0] - exact) > estimate.confidence_radius()[0])
+    error = np.abs(estimate[0] - exact)
+    assert np.all(error > estimate.confidence_radius()[0])
 
 
 def test_sums_of_parts_are_those_of_the_whole(model):
@@ -145,7 +149,9 @@ def test_a_failed_realization_leaves_the_others(model):
     )
     estimate = hj.estimate_htf(data)
     lost = np.isin(estimate.frequencies, LINES.frequency[LINES.experiment == 0])
-    ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
+    of_lost = np.mean(estimate.variance[:, lost])
+    of_others = np.mean(estimate.variance[:, ~lost])
+    ratio = of_lost / of_others
     assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
     np.testing.assert_array_equal(
         estimate.variance_dof.dof, np.where(lost, (~lost).sum(), 1)
@@ -174,7 +180,9 @@ def test_pairs_cancel_even_distortion(model):
 def test_noise_by_its_ratio(model):
     data = realized(model, 1, 4)
     noisy = hj.experiments.add_noise(data, snr=20, seed=3)
-    ratio = np.var(noisy.y - data.y, axis=(0, 1)) / np.mean(data.y**2, axis=(0, 1))
+    noise = np.var(noisy.y - data.y, axis=(0, 1))
+    power = np.mean(data.y**2, axis=(0, 1))
+    ratio = noise / power
     np.testing.assert_allclose(ratio, 0.01, rtol=0.2)
 
 
@@ -195,9 +203,11 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
     weight = dof / rng.gamma(dof, size=(4000, 300))
     error = rng.normal(size=weight.shape)
     estimate = (weight * error).sum(axis=1) / weight.sum(axis=1)
-    misfit = np.mean(weight * (error - estimate[:, None]) ** 2) * 300 / 299
+    squares = (error - estimate[:, None]) ** 2
+    misfit = np.mean(weight * squares) * 300 / 299
     _, deviation = estimated_noise(dof / (dof - 1), misfit)
-    actual = np.mean(estimate**2) / np.mean(1 / weight.sum(axis=1))
+    weights = weight.sum(axis=1)
+    actual = np.mean(estimate**2) / np.mean(1 / weights)
     assert actual == pytest.approx(
         deviation**2, rel=0.12
     )  # (freedom / (freedom - 2) at most)

@@ -58,7 +58,8 @@ def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
     )
     assert fit.compare(multipliers).max_error < 1e-13
     f = np.array([0.0, 0.3, 1.7, 16.0])
-    assert fit.htf(f).error(hopper.htf(f)).max() < 1e-12
+    error = fit.htf(f).error(hopper.htf(f))
+    assert error.max() < 1e-12
     np.testing.assert_allclose(
         fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12
     )
@@ -77,7 +78,8 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     for k in range(2):
         section = (first + k) % N
         x0 = rng.normal(size=model.dims[section])
-        whole = record(model, 60 * N + 1 + k, seed + k, first_section=section, x0=x0)
+        length = 60 * N + 1 + k
+        whole = record(model, length, seed + k, first_section=section, x0=x0)
         whole.y[rng.random(whole.y.shape) < 0.02] = np.nan
         whole.u[25 * N + 2, 0] = np.nan
         records.append(whole)
@@ -93,7 +95,9 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
 
 def test_inputs_before_the_start_act_through_all_lags():
     """A register of one cycle beside a multiplier of 0.7; records begin in any section."""
-    A = np.diag([0.7**0.25, 0, 0, 0, 0]) + np.diag([0.0, 1, 1, 1], -1)
+    decay = np.diag([0.7**0.25, 0, 0, 0, 0])
+    chain = np.diag([0.0, 1, 1, 1], -1)
+    A = decay + chain
     B = np.array([[1.0], [1], [0], [0], [0]])
     C = np.array([[1.0, 0, 0, 0, 1]])
     model = hj.linear.LDTP.from_blocks(*([x] * 4 for x in (A, B, C, np.zeros((1, 1)))))
@@ -111,12 +115,14 @@ def test_outputs_that_depend_on_later_inputs(small):
     fit = hj.fit_series(
         hj.experiments.SectionSeries(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
     )
-    expected = np.roll(small.impulse_response(22), -2, axis=0)[:, 2:]
+    response = small.impulse_response(22)
+    expected = np.roll(response, -2, axis=0)[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
     ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[
         ..., None, None
     ]
-    np.testing.assert_allclose(fit.htf(f).H, ahead * small.htf(f).H, atol=1e-9)
+    expected_htf = ahead * small.htf(f).H
+    np.testing.assert_allclose(fit.htf(f).H, expected_htf, atol=1e-9)
 
 
 def test_regions_cover(small):
@@ -170,7 +176,8 @@ def test_the_covariance_of_the_gradient_with_process_noise():
     rng = np.random.default_rng(0)
 
     def noise():
-        return 0.1 * np.asarray(model.simulate(rng.normal(size=(N * cycles, 1))))
+        white = rng.normal(size=(N * cycles, 1))
+        return 0.1 * np.asarray(model.simulate(white))
 
     estimated = 0.0
     measured = 0.0
@@ -284,7 +291,8 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     ):
         hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
-    assert (len(begun.u), begun.drift, with_drift([begun])) == (4000, 20, [])
+    found = (len(begun.u), begun.drift, with_drift([begun]))
+    assert found == (4000, 20, [])
 
 
 def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
@@ -293,9 +301,11 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
     C = np.array([[0.1, 0.5]])
     D = np.zeros((1, 1))
     for multiplier, late in (0.98, 0), (1.0, 50):
-        model = hj.linear.LDTP.from_blocks([np.diag([multiplier, -0.7])], [B], [C], [D])
+        A = np.diag([multiplier, -0.7])
+        model = hj.linear.LDTP.from_blocks([A], [B], [C], [D])
         data = record(model, 400, noise=0.2)
-        signals = (np.pad(x, ((late, 0), (0, 0))) for x in (data.u, data.y))
+        before = ((late, 0), (0, 0))
+        signals = (np.pad(x, before) for x in (data.u, data.y))
         fit = hj.fit_series(
             hj.experiments.SectionSeries(*signals, n_sections=1), 2, check=False
         )
@@ -306,7 +316,9 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
 def test_how_far_another_fit_contradicts():
     """By 1, 2.5 and 4 standard errors: an order does at 95 %, a drift at 99.9 %."""
     covariance = np.array([[0.01]]), np.inf
-    fit = MultiplierEstimate(np.array([0.5 + 0j]), np.array([-0.5]), *covariance)
+    root = np.array([0.5 + 0j])
+    coefficient = np.array([-0.5])
+    fit = MultiplierEstimate(root, coefficient, *covariance)
     others = [
         [lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)
     ]
@@ -325,7 +337,8 @@ def test_announced_drift_is_removed(small):
     cycle = n // 4 + 0.5
     section = n % 4
     plain = record(small, 4 * T, noise=0.1, drift=50)
-    wave = 5 * np.cos(np.pi * 3 * cycle / T) * np.cos(section) + 7
+    slow = np.cos(np.pi * 3 * cycle / T)
+    wave = 5 * slow * np.cos(section) + 7
     moved = with_outputs(plain, plain.y + wave[:, None])
     without = hj.fit_series(plain, 2)
     fit = hj.fit_series(moved, 2)
@@ -433,8 +446,10 @@ def test_a_multiplier_that_changes_along_the_data_is_named():
             x = np.zeros(161)
             for i in range(160):
                 # Two sections in a period.
-                x[i + 1] = (z if i % 2 else 1.0) * x[i] + u[i, 0]
-            y = x[:160, None] + 0.1 * rng.normal(size=(160, 1))
+                factor = z if i % 2 else 1.0
+                x[i + 1] = factor * x[i] + u[i, 0]
+            noise = 0.1 * rng.normal(size=(160, 1))
+            y = x[:160, None] + noise
             each.append(hj.experiments.SectionSeries(u, y, n_sections=2))
         return each
 

@@ -23,7 +23,8 @@ def simulate_blocks(blocks, u, x0, start=0):
     ys = []
     for i, value in enumerate(u):
         n = (start + i) % len(A)
-        ys.append(C[n] @ x + D[n] @ value)
+        output = C[n] @ x + D[n] @ value
+        ys.append(output)
         x = A[n] @ x + B[n] @ value
         xs.append(x)
     return xs, np.array(ys)

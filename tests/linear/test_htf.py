@@ -36,7 +36,8 @@ def test_three_ways_agree(seed, shape, f):
     # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
     omega = 2 * np.pi * f / N
     h = np.asarray(ldtp.impulse_response(120))
-    G = np.einsum("nrij,r->nij", h, np.exp(-1j * omega * np.arange(120)))
+    delays = np.exp(-1j * omega * np.arange(120))
+    G = np.einsum("nrij,r->nij", h, delays)
     fourier = np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N) / N
     expected = np.einsum("mn,nij->mij", fourier, G)
     assert_allclose(H, expected, rtol=0, atol=1e-12)
@@ -75,7 +76,8 @@ def test_prediction_is_the_periodic_response(seed, shape):
 def test_derivatives_by_matrices_and_frequencies(synthetic):
     @jax.jit
     def values(A, B, C, D, f):
-        htf = hj.linear.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
+        model = hj.linear.LDTP(A, B, C, D)
+        htf = model.htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
 
     f = np.array([0.4, 1.7])
@@ -85,7 +87,8 @@ def test_derivatives_by_matrices_and_frequencies(synthetic):
 
 def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     htf = synthetic.htf([0.5])
-    wave = np.cos(2 * np.pi * 0.5 * np.arange(12) / 6)
+    angle = 2 * np.pi * 0.5 * np.arange(12) / 6
+    wave = np.cos(angle)
     u = np.stack([wave, wave], axis=1)
 
     @jax.jit
@@ -99,7 +102,8 @@ def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     step = np.zeros(htf.H.shape)
     step[entry] = h
     H = np.asarray(htf.H)
-    difference = (loss(H + step) - loss(H - step)) / (2 * h)
+    change = loss(H + step) - loss(H - step)
+    difference = change / (2 * h)
     assert_allclose(difference, gradient[entry].real, rtol=1e-6)
 
 
@@ -129,4 +133,5 @@ def test_frequencies_are_given_once():
     with pytest.raises(
         hj.errors.DefinitionError, match="`frequencies` holds 0.1 .* twice"
     ):
-        hj.linear.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)
+        values = np.ones((1, 2, 1, 1))
+        hj.linear.HTF([0.1, 0.1], values, 0, 4)

@@ -60,10 +60,12 @@ def test_jit_vmap_and_gradients(synthetic):
     assert_allclose(
         eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u), plain, atol=1e-14
     )
-    many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
+    inputs = np.stack([u, 2 * u])
+    many = jax.vmap(synthetic.simulate)(inputs)
     assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
-    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    direct = batch.D.at[1].set(0.0)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, direct)
     many = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
     assert_allclose(many[0], plain, atol=1e-14)
     assert not np.allclose(many[1], plain)
@@ -73,7 +75,9 @@ def test_jit_vmap_and_gradients(synthetic):
         ldtp = hj.linear.LDTP(
             s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
         )
-        return jnp.concatenate([ldtp.simulate(u)[-1], ldtp.periodic_state(u, 3)])
+        end = ldtp.simulate(u)[-1]
+        periodic = ldtp.periodic_state(u, 3)
+        return jnp.concatenate([end, periodic])
 
     jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("rev",), eps=1e-6)
 
@@ -84,12 +88,14 @@ def test_jit_and_vmap(synthetic):
     plain = synthetic.simulate(u)
     compiled = eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u)
     assert_allclose(compiled, plain, atol=1e-14)
-    two_inputs = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
+    inputs = np.stack([u, 2 * u])
+    two_inputs = jax.vmap(synthetic.simulate)(inputs)
     assert_allclose(two_inputs, np.stack([plain, 2 * plain]), atol=1e-13)
 
     # The second system of a batch has no feedthrough.
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
-    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    direct = batch.D.at[1].set(0.0)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, direct)
     two_systems = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
     assert_allclose(two_systems[0], plain, atol=1e-14)
     assert not np.allclose(two_systems[1], plain)
@@ -161,12 +167,15 @@ def test_bad_definitions(change, message):
 
 def test_single_precision_is_refused():
     with pytest.raises(hj.errors.PrecisionError, match="A.*float32"):
-        hj.linear.LDTP(**(GOOD | {"A": jnp.zeros((2, 3, 3), jnp.float32)}))
+        single = jnp.zeros((2, 3, 3), jnp.float32)
+        hj.linear.LDTP(**(GOOD | {"A": single}))
 
 
 def test_a_response_without_bounds_is_refused():
     quarter_turn = [[[0.0, -1.0], [1.0, 0.0]]]
-    rotation = hj.linear.LDTP(quarter_turn, np.ones((1, 2, 1)), np.ones((1, 1, 2)))
+    B = np.ones((1, 2, 1))
+    C = np.ones((1, 1, 2))
+    rotation = hj.linear.LDTP(quarter_turn, B, C)
     rotation.periodic_state(np.ones((3, 1)), 3)
     with pytest.raises(
         hj.errors.DefinitionError, match="f = 0.25 cycles per period is unbounded"

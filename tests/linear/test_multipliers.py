@@ -19,7 +19,8 @@ def basis_at_random(rng, d):
     """A matrix with condition number at most 9."""
     left, _ = np.linalg.qr(rng.normal(size=(d, d)))
     right, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    sizes = np.exp(rng.uniform(-np.log(3), np.log(3), d))
+    logarithms = rng.uniform(-np.log(3), np.log(3), d)
+    sizes = np.exp(logarithms)
     return left * sizes @ right
 
 
@@ -36,7 +37,9 @@ def chain(rng, multipliers, extra):
     factors = []
     for n in range(N):
         after = (n + 1) % N
-        core = rng.normal(size=(modes + extra[after], modes + extra[n])) / 2
+        rows = modes + extra[after]
+        columns = modes + extra[n]
+        core = rng.normal(size=(rows, columns)) / 2
         core[:, :modes] = 0
         k = 0
         for m in multipliers:
@@ -46,9 +49,11 @@ def chain(rng, multipliers, extra):
                 core[k : k + 2, k : k + 2] = [[z.real, -z.imag], [z.imag, z.real]]
                 k += 2
             else:
-                core[k, k] = np.sign(m) * size if n == 0 else size
+                signed = np.sign(m) * size
+                core[k, k] = signed if n == 0 else size
                 k += 1
-        factors.append(S[after] @ core @ np.linalg.inv(S[n]))
+        inverse = np.linalg.inv(S[n])
+        factors.append(S[after] @ core @ inverse)
     return factors
 
 
@@ -70,7 +75,8 @@ def relative_error(found, multipliers):
 
 
 def assert_conjugate_and_sorted(found):
-    assert np.all(np.diff(np.abs(found)) <= 1e-15 * np.abs(found[:-1]))
+    moduli = np.abs(found)
+    assert np.all(np.diff(moduli) <= 1e-15 * np.abs(found[:-1]))
     values = list(found)
     for value in values:
         assert np.conj(value) in values
@@ -108,7 +114,8 @@ def test_dimensions_that_vary_add_no_multipliers(multipliers):
     factors = chain(rng, multipliers, extra)
     found = product_eigenvalues(factors, RTOL)
     assert relative_error(found, multipliers) < 1e-10
-    assert product_rank(factors[5:] + factors[:5], RTOL) == len(found)
+    rotated = factors[5:] + factors[:5]
+    assert product_rank(rotated, RTOL) == len(found)
 
 
 @settings(max_examples=20)
@@ -123,7 +130,8 @@ def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
     expected, vectors = np.linalg.eig(product)
     # Backward error of the product, magnified by the sensitivity of its eigenvalues.
     size = np.prod([np.linalg.norm(factor, 2) for factor in factors])
-    bound = 1e-14 * d * sections * size * np.linalg.cond(vectors)
+    condition = np.linalg.cond(vectors)
+    bound = 1e-14 * d * sections * size * condition
     assert largest_difference(found, expected, relative=False) <= bound
     assert_conjugate_and_sorted(found)
 
@@ -131,7 +139,8 @@ def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
 def test_structural_zeros_are_counted_not_guessed():
     nilpotent = np.diag([1.0, 1.0], 1)  # dies after three cycles
     assert len(product_eigenvalues([nilpotent], RTOL)) == 0
-    ranks = [product_rank([nilpotent] * cycles, RTOL) for cycles in (1, 2, 3)]
+    lengths = (1, 2, 3)
+    ranks = [product_rank([nilpotent] * cycles, RTOL) for cycles in lengths]
     assert ranks == [2, 1, 0]
 
     mixed = np.zeros((4, 4))
@@ -158,9 +167,11 @@ def test_products_that_leave_the_range_of_numbers():
 
 
 def test_defective_and_cyclic_products():
-    jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
+    block = np.array([[0.9, 0.3], [0.0, 0.9]])
+    jordan = [block] * 8
     assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
-    roots = product_eigenvalues([np.roll(np.eye(6), 1, axis=0)], RTOL)
+    shift = np.roll(np.eye(6), 1, axis=0)
+    roots = product_eigenvalues([shift], RTOL)
     assert_allclose(roots**6, 1, atol=1e-13)
     assert_conjugate_and_sorted(roots)
     measured = product_eigenvalues([np.eye(3)] * 4, RTOL)
@@ -171,7 +182,8 @@ def test_hopper(hopper, reference):
     data = reference("ldtp_isochron")
     found = hopper.multipliers
     assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
-    assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
+    ranks = [hopper.rank(n) for n in range(32)]
+    assert ranks == list(data["rank_monodromy"])
     assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
 
 
@@ -195,7 +207,8 @@ def test_factors_that_are_not_finite():
         with pytest.raises(
             hj.errors.ComputationError, match="1\\] holds NaN or infinity"
         ):
-            function([np.eye(2), np.full((2, 2), np.nan)], RTOL)
+            unknown = np.full((2, 2), np.nan)
+            function([np.eye(2), unknown], RTOL)
 
 
 def test_multipliers_refuse_to_be_traced(synthetic):

@@ -14,7 +14,8 @@ F = np.arange(1, 20) / 20
 
 def an_htf(**more):
     rng = np.random.default_rng(0)
-    H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
+    parts = rng.normal(size=(3, len(F), 2, 1, 2))
+    H = parts @ [1, 1j]
     return hj.linear.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
@@ -27,13 +28,16 @@ def htf():
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
-    expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
+    quantile = stats.f.ppf(0.95, 2, 8)
+    expected = np.sqrt(quantile * np.asarray(htf.variance))
     plain = an_htf(
         variance=htf.variance, variance_dof=hj.linear.VarianceDof(htf.variance_dof.dof)
     )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
-    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.variance_dof.roundness) - 1))
-    expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
+    unevenness = np.asarray(htf.variance_dof.roundness) - 1
+    level = 1 - 0.05 * (1 + 0.95**2 * unevenness)
+    quantile = stats.f.ppf(level, 2, 8)
+    expected = np.sqrt(quantile * np.asarray(htf.variance))
     for radius in (
         hj.linear.HTF.confidence_radius,
         jax.jit(hj.linear.HTF.confidence_radius),

@@ -40,7 +40,8 @@ def free_ball():
     """A ball in the plane; the term linear in v has no effect on its motion."""
 
     def kinetic(q, v):
-        return 0.5 * M * jnp.sum(v**2) + v[0]
+        square = jnp.sum(v**2)
+        return 0.5 * M * square + v[0]
 
     def potential(q):
         return M * G * q[1]
@@ -57,16 +58,20 @@ def test_a_double_pendulum_moves_as_textbooks_say():
     @jax.jit
     def motion(q, v, f):
         acceleration = pendulum.acceleration(q, v, f)
-        _, power = jax.jvp(pendulum.energy, (q, v), (v, acceleration))
+        tangents = (v, acceleration)
+        _, power = jax.jvp(pendulum.energy, (q, v), tangents)
         return pendulum.mass(q), pendulum.bias(q, v), acceleration, power
 
     mass, bias, acceleration, power = motion(q, v, f)
     s = jnp.sin(q[0] - q[1])
     c = jnp.cos(q[0] - q[1])
-    expected_mass = m * L**2 * jnp.array([[2, c], [c, 1]])
+    ratios = jnp.array([[2, c], [c, 1]])
+    expected_mass = m * L**2 * ratios
     assert_allclose(mass, expected_mass, rtol=1e-12)
-    centrifugal = m * L**2 * s * jnp.array([v[1] ** 2, -(v[0] ** 2)])
-    weight = m * G * L * jnp.array([2, 1]) * jnp.sin(q)
+    squares = jnp.array([v[1] ** 2, -(v[0] ** 2)])
+    centrifugal = m * L**2 * s * squares
+    masses = jnp.array([2, 1])
+    weight = m * G * L * masses * jnp.sin(q)
     assert_allclose(bias, centrifugal + weight, rtol=1e-12)
     expected = np.linalg.solve(expected_mass, f - centrifugal - weight)
     assert_allclose(acceleration, expected, rtol=1e-12)
@@ -79,7 +84,9 @@ def test_a_contact_that_holds_is_a_rod():
     rate = 1.2
 
     def position(angles):
-        return L * jnp.stack([jnp.sin(angles[0]), -jnp.cos(angles[0])])
+        x = jnp.sin(angles[0])
+        y = -jnp.cos(angles[0])
+        return L * jnp.stack([x, y])
 
     def rod(q):
         return jnp.sum(q**2) / 2
@@ -94,7 +101,8 @@ def test_a_contact_that_holds_is_a_rod():
 
     q, v = jax.jvp(position, (jnp.array([angle]),), (jnp.array([rate]),))
     found = held(q, v)
-    tension = M * (G * np.cos(angle) + L * rate**2)
+    gravity = G * np.cos(angle)
+    tension = M * (gravity + L * rate**2)
     assert_allclose(found.force * L, [-tension], rtol=1e-13)
     tangent = jnp.array([np.cos(angle), np.sin(angle)])
     expected = L * acceleration[0]
@@ -108,7 +116,8 @@ def test_impacts(restitution):
     pendulum = double_pendulum()
 
     def tip(q):
-        return [L * (jnp.sin(q[0]) + jnp.sin(q[1]))]
+        height = jnp.sin(q[0]) + jnp.sin(q[1])
+        return [L * height]
 
     @jax.jit
     def impact(restitution):
@@ -130,7 +139,9 @@ def worn(t, q, u):
     """The second body wears away as the first moves, until x = 1."""
 
     def lost(q, v):
-        return 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2
+        first = 0.5 * v[0] ** 2
+        mass = jnp.maximum(1 - q[0], 0.0)
+        return first + 0.5 * mass * v[1] ** 2
 
     return jnp.concatenate(
         [q[2:], hj.systems.Mechanism(lost).acceleration(q[:2], q[2:])]

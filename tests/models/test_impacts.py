@@ -60,5 +60,6 @@ def test_each_order_of_the_feet_has_its_derivative():
         for order, derivative in zip(both.orders, both.derivatives, strict=True):
             sign = 1 if order[0].startswith("hind") else -1
             expected = np.eye(4)
-            expected[1::2, ::2] = size * np.array([[1, sign], [1, 1]])
+            signs = np.array([[1, sign], [1, 1]])
+            expected[1::2, ::2] = size * signs
             assert_allclose(derivative, expected, atol=1e-6)

@@ -60,10 +60,12 @@ def _top(cycle, near):
     """The largest v, where w is on the nullcline of v: the cycle's next crossing of that."""
 
     def level(t, q):
-        return q[0] - q[0] ** 3 / 3 - q[1] + 0.5
+        cubic = q[0] - q[0] ** 3 / 3
+        return cubic - q[1] + 0.5
 
     falls = hj.sections.SectionList([hj.Crossing(level, "falling")])
-    return float(hj.sections.place_sections(cycle, falls).lanes.q[0, 0])
+    placed = hj.sections.place_sections(cycle, falls)
+    return float(placed.lanes.q[0, 0])
 
 
 def test_the_hopper_on_a_compliant_ground():
@@ -75,7 +77,9 @@ def test_the_hopper_on_a_compliant_ground():
         -7.3255629625297901e-5,
         0.0016616904927162742,
     ]
-    found = np.array(list(cycle.state.values())) / list(cycle.scale.values())
+    states = np.array(list(cycle.state.values()))
+    scales = list(cycle.scale.values())
+    found = states / scales
     expected = state / np.array(list(cycle.scale.values()))
     assert_allclose(found, expected, atol=1e-11)
     z = -0.24885118328047069434 + 0.69922500780850327787j

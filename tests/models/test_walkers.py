@@ -52,7 +52,8 @@ def test_A_and_B(name):
 
     d = len(state)
     leg = np.zeros(d)
-    leg[: len(WALKERS[name][0])] = WALKERS[name][0]
+    values = WALKERS[name][0]
+    leg[: len(values)] = values
     for n in range(4):
         out_before = int(sections.drop[n]) - 1
         out_after = int(sections.drop[(n + 1) % 4]) - 1

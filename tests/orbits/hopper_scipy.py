@@ -14,16 +14,21 @@ NAMES = ("t", "yM", "vM", "ym", "vm")
 
 
 def _leg(t, yM, ym):
-    return 10.0 * (2.0 - (yM - ym)) + 20.0 * np.sin(2 * np.pi * t)
+    spring = 10.0 * (2.0 - (yM - ym))
+    motor = 20.0 * np.sin(2 * np.pi * t)
+    return spring + motor
 
 
 def _field(t, q, u):
     yM, vM = q[:2]
     if len(q) == 2:
-        return np.array([vM, (_leg(t, yM, 0.0) + u) / 2.0 - 2.0])
+        acceleration = (_leg(t, yM, 0.0) + u) / 2.0 - 2.0
+        return np.array([vM, acceleration])
     ym, vm = q[2:]
     leg = _leg(t, yM, ym)
-    return np.array([vM, (leg + u) / 2.0 - 2.0, vm, -leg - 5.0 * vm - 2.0])
+    body = (leg + u) / 2.0 - 2.0
+    foot = -leg - 5.0 * vm - 2.0
+    return np.array([vM, body, vm, foot])
 
 
 def plane(point):
@@ -48,7 +53,9 @@ def _polish(function, t, q, u):
     for _ in range(2):
         e = 1e-6
         f = _field(t, q, u)
-        rate = (function(t + e, q + e * f) - function(t - e, q - e * f)) / (2 * e)
+        later = function(t + e, q + e * f)
+        earlier = function(t - e, q - e * f)
+        rate = (later - earlier) / (2 * e)
         dt = -function(t, q) / rate
         t = t + dt
         q = q + dt * f
@@ -91,7 +98,8 @@ def flow(point, section, u=0.0, retention=1.0):
         if end > before:
             last = solve(before, path.y[:, -2], u, end)
             watched = level if at_section else guard
-            t, q = _polish(watched, end, last.y[:, -1], u)
+            start = last.y[:, -1]
+            t, q = _polish(watched, end, start, u)
         if at_section:
             return np.array([t, *q])
         if len(q) == 4:  # touchdown
@@ -107,10 +115,12 @@ def onto(section, point, names):
     if kind == "clock":
         point[0] = value
     elif "vM" not in names:
-        point[2] = 1.9 * np.tan(value) * (point[1] - 1.9) / 0.3
+        height = point[1] - 1.9
+        point[2] = 1.9 * np.tan(value) * height / 0.3
     else:
         assert "yM" not in names
-        point[1] = 1.9 + 0.3 * (point[2] / 1.9) / np.tan(value)
+        ratio = point[2] / 1.9
+        point[1] = 1.9 + 0.3 * ratio / np.tan(value)
     return point
 
 

@@ -29,11 +29,13 @@ class Balls(hj.HybridSystem):
 
         def impact(k, retention):
             def guard(t, q, u):
-                return q[2 * k] - A * jnp.sin(w * t)
+                table = A * jnp.sin(w * t)
+                return q[2 * k] - table
 
             def reset(t, q, u):
                 v = -retention * q[2 * k + 1] + (1 + retention) * A * w * jnp.cos(w * t)
-                height = q[2 - 2 * k] - A * jnp.sin(w * t)  # of the other ball
+                table_height = A * jnp.sin(w * t)
+                height = q[2 - 2 * k] - table_height  # of the other ball
                 q = jnp.asarray(q).at[2 * k + 1].set(v)
                 return q.at[2 * k + 1].add(self.coupling * height)
 
@@ -47,7 +49,8 @@ class Balls(hj.HybridSystem):
 
 # A ball that falls through its floor, whose guard should rise.
 def above_floor(t, q, u):
-    return q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)
+    wave = jnp.sin(2 * jnp.pi * t)
+    return q[0] - 0.1 * wave
 
 
 def air_rates(t, q, u):
@@ -67,7 +70,8 @@ WRONG_WAY = toy(
 
 # A pushed mass on a spring with a dashpot that is much too strong.
 def force(t, q):
-    return -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)
+    spring = -1e5 * q[0] - 3e3 * q[1]
+    return spring + 20 * jnp.sin(2 * jnp.pi * t)
 
 
 def rates(t, q, u):
@@ -94,7 +98,8 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     }
     z = 0.399920196836063 + 0.574511824214789j
     assert_allclose(cycle.multipliers.real, [z.real] * 4, rtol=1e-7)
-    assert_allclose(np.abs(cycle.multipliers.imag), [z.imag] * 4, rtol=1e-7)
+    frequencies = np.abs(cycle.multipliers.imag)
+    assert_allclose(frequencies, [z.imag] * 4, rtol=1e-7)
 
 
 def test_events_whose_order_matters_have_a_derivative_for_each():
@@ -115,7 +120,8 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     orbit = cycle.trajectory(2.0)
     is_impact = (orbit.event >= 0) & (orbit.t > both.time - 1e-6)
     y, v = orbit.before[np.flatnonzero(is_impact)[0], :2]
-    ball = [y - v * half - 9.81 * half**2 / 2, v + 9.81 * half]
+    height = y - v * half - 9.81 * half**2 / 2
+    ball = [height, v + 9.81 * half]
     start = np.array([*ball, *ball])
     fall = np.kron(np.eye(2), [[1.0, half], [0.0, 1.0]])
 

@@ -39,7 +39,8 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
     until = hj.flow(ball(), DROP, 1.0)
     left = 1.0 - FIRST
     speed = 0.7 * 9.81 * FIRST
-    state = speed * left - 9.81 * left**2 / 2, speed - 9.81 * left
+    height = speed * left - 9.81 * left**2 / 2
+    state = height, speed - 9.81 * left
     assert_allclose(until.state, state, rtol=1e-12)
     assert [x.name for x in until.events] == ["bounce"]
 
@@ -65,8 +66,10 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
 def test_figures_and_tables_are_those_of_its_steps():
     found = hj.flow(ball(), DROP, 1.0)
     assert found.plot().axes.shape == (2, 1)
-    assert found.to_pandas()["y"].iloc[-1] == found.state[0]
-    many = hj.flow(ball(), hj.Guess("main", jnp.ones((2, 2))), 0.1)
+    heights = found.to_pandas()["y"]
+    assert heights.iloc[-1] == found.state[0]
+    starts = hj.Guess("main", jnp.ones((2, 2)))
+    many = hj.flow(ball(), starts, 0.1)
     with pytest.raises(DefinitionError, match="only a single flow"):
         many.plot()
 
@@ -80,7 +83,8 @@ def test_what_goes_on_from_a_flow():
     mass = hj.HybridSystem.from_functions(("x",), pushed)
     start = hj.Guess("main", (0.0,))
     first = hj.flow(mass, start, 1.0, input=lambda t: jnp.stack([jnp.cos(t)]))
-    assert_allclose(hj.flow(mass, first, 2.0).state, [np.sin(2.0)], rtol=1e-11)
+    onward = hj.flow(mass, first, 2.0)
+    assert_allclose(onward.state, [np.sin(2.0)], rtol=1e-11)
     constant = hj.flow(mass, first, 2.0, input=3.0)
     assert_allclose(constant.state, [np.sin(1.0) + 3.0], rtol=1e-11)
 
@@ -107,7 +111,8 @@ def test_events_are_counted_from_each_start():
         return hj.flow(ball(), second, events=2, within=3.0)
 
     fourth = program(1.0)
-    assert_allclose(fourth.t, FIRST * (1 + 2 * (0.7 + 0.49 + 0.343)), rtol=1e-12)
+    times = 1 + 2 * (0.7 + 0.49 + 0.343)
+    assert_allclose(fourth.t, FIRST * times, rtol=1e-12)
     assert fourth.count == 2
 
 
@@ -139,7 +144,8 @@ def test_states_at_times_between():
     assert_allclose(
         states[:, 0], begin + speed * since - 9.81 * since**2 / 2, rtol=1e-12
     )
-    assert np.isnan(hj.flow(ball(), DROP, 1.0).at([1.1])[1]).all()
+    late = hj.flow(ball(), DROP, 1.0).at([1.1])
+    assert np.isnan(late[1]).all()
 
 
 def test_a_sample_at_an_event_is_the_state_after_it():
@@ -181,7 +187,8 @@ def test_samples_are_those_of_their_charts():
     hot = np.log(12 / 8)
     cold = hot + np.log(22 / 18)
     assert_allclose(found.event_times[:2], [hot, cold], rtol=1e-11)
-    charts, states = found.at([hot - 0.1, hot + 0.1, cold + 0.05])
+    times = [hot - 0.1, hot + 0.1, cold + 0.05]
+    charts, states = found.at(times)
     assert charts.tolist() == [0, 1, 0]
     expected = [
         30 - 12 * np.exp(0.1 - hot),
@@ -194,13 +201,16 @@ def test_samples_are_those_of_their_charts():
 def third_bounce(height, g, e):
     start = hj.Guess("main", jnp.stack([height, 0.0]))
     found = hj.flow(ball(g=g, e=e), start, events=3, within=9.0)
-    return jnp.stack([found.t, found.before[2, 1], found.event_times[1]])
+    speed = found.before[2, 1]
+    return jnp.stack([found.t, speed, found.event_times[1]])
 
 
 def third_bounce_exactly(height, g, e):
     first = jnp.sqrt(2 * height / g)
     speed = -(e**2) * jnp.sqrt(2 * height * g)
-    return jnp.stack([first * (1 + 2 * e + 2 * e**2), speed, first * (1 + 2 * e)])
+    third = first * (1 + 2 * e + 2 * e**2)
+    second = first * (1 + 2 * e)
+    return jnp.stack([third, speed, second])
 
 
 def test_derivatives_through_events_are_those_of_the_closed_form():
@@ -240,7 +250,8 @@ def test_derivatives_by_the_end_the_section_the_input_and_times_between():
         return hj.flow(mass, start, section, within=9.0, input=2.0).t
 
     def by_time(t):
-        return hj.flow(mass, start, 3.0, input=2.0).at(jnp.stack([t]))[1][0, 0]
+        path = hj.flow(mass, start, 3.0, input=2.0)
+        return path.at(jnp.stack([t]))[1][0, 0]
 
     # x = t + t^2, or t + u t^2 / 2.
     assert_allclose(jax.grad(by_end)(3.0), 7.0, rtol=1e-12)
@@ -253,7 +264,8 @@ def test_derivatives_at_a_state_of_rest():
     """Its own error would allow any step, but that of the derivative does not."""
 
     def field(t, q, u, p):
-        return q[1], -(1 + p.a * jnp.cos(t)) * q[0]
+        stiffness = 1 + p.a * jnp.cos(t)
+        return q[1], -stiffness * q[0]
 
     mathieu = hj.HybridSystem.from_functions(
         ("x", "v"), field, parameters={"a": 0.5}, period=2 * np.pi, inputs=()
@@ -265,13 +277,15 @@ def test_derivatives_at_a_state_of_rest():
     def rates(t, columns):
         x = columns[:2]
         v = columns[2:]
-        return np.concatenate([v, -(1 + 0.5 * np.cos(t)) * x])
+        stiffness = 1 + 0.5 * np.cos(t)
+        return np.concatenate([v, -stiffness * x])
 
     true = solve_ivp(
         rates, (0, 7), np.eye(2).ravel(), method="DOP853", rtol=1e-12, atol=1e-14
     )
     own = jax.jit(jax.jacfwd(end))(jnp.zeros(2))
-    assert_allclose(own, true.y[:, -1].reshape(2, 2), rtol=1e-9)
+    expected = true.y[:, -1].reshape(2, 2)
+    assert_allclose(own, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -285,7 +299,8 @@ def test_derivatives_where_states_are_small_for_a_moment():
 
     slope = jax.grad(height)(10.0)
     step = 1e-5
-    difference = (height(10.0 + step) - height(10.0 - step)) / (2 * step)
+    change = height(10.0 + step) - height(10.0 - step)
+    difference = change / (2 * step)
     assert_allclose(slope, difference, rtol=1e-7)
 
 
@@ -304,7 +319,8 @@ def test_many_flows_one_of_which_fails():
         hj.flow(ball(), hj.Guess("main", states), 0.9)
 
     def height(x):
-        return hj.flow(ball(), hj.Guess("main", x), 0.9).state[0]
+        end = hj.flow(ball(), hj.Guess("main", x), 0.9)
+        return end.state[0]
 
     slopes = jax.vmap(jax.grad(height))(states)
     assert np.isnan(slopes[1]).all()
@@ -354,7 +370,8 @@ def test_flows_without_events_one_of_which_blows_up():
 
     def total(a):
         found = hj.flow(tower.replace(a=a), starts, 1.0, throw=False)
-        return jnp.where(found.result == 0, found.state[:, 0], 0.0).sum()
+        height = found.state[:, 0]
+        return jnp.where(found.result == 0, height, 0.0).sum()
 
     # x = 1 / (1 / x(0) - a t)
     assert_allclose(total(1.0), 1.0, rtol=1e-11)
@@ -390,7 +407,8 @@ def test_a_guard_that_is_touched():
 
     @jax.jit
     def swing(a):
-        return hj.flow(Wall(), hj.Guess("swing", jnp.stack([-a, 0.0])), 4.0)
+        start = hj.Guess("swing", jnp.stack([-a, 0.0]))
+        return hj.flow(Wall(), start, 4.0)
 
     def end(a):
         return swing(a).state[0]
@@ -405,12 +423,16 @@ def test_a_guard_that_is_touched():
     def exact(a):
         hit = jnp.pi - jnp.arccos(1 / a)
         left = 4.0 - hit
-        return jnp.cos(left) - 0.5 * a * jnp.sin(hit) * jnp.sin(left)
+        kick = 0.5 * a * jnp.sin(hit)
+        return jnp.cos(left) - kick * jnp.sin(left)
 
     for a in (1.0 + 1e-6, 1.1):
         assert_allclose(end(a), exact(a), rtol=1e-9)
-        assert_allclose(jax.grad(end)(a), jax.grad(exact)(a), rtol=1e-6)
-    assert_allclose(jax.grad(end)(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
+        found = jax.grad(end)(a)
+        expected = jax.grad(exact)(a)
+        assert_allclose(found, expected, rtol=1e-6)
+    found = jax.grad(end)(1.0 - 1e-6)
+    assert_allclose(found, -np.cos(4.0), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -450,10 +472,12 @@ def test_steps_after_events_are_not_tried_with_the_length_of_the_first_one():
 
 def test_a_flow_until_its_start_stays_there():
     """It moves on with the end, at the rate of the field."""
-    assert_allclose(hj.flow(ball(), DROP, 0.0).state, (1.0, 0.0), rtol=1e-15)
+    same = hj.flow(ball(), DROP, 0.0)
+    assert_allclose(same.state, (1.0, 0.0), rtol=1e-15)
     program = jax.jit(lambda end: hj.flow(ball(), DROP, end).state)
     assert_allclose(program(0.0), (1.0, 0.0), rtol=1e-15)
-    assert_allclose(jax.jit(jax.jacrev(program))(0.0), (0.0, -9.81), atol=1e-12)
+    slope = jax.jit(jax.jacrev(program))(0.0)
+    assert_allclose(slope, (0.0, -9.81), atol=1e-12)
 
 
 def test_an_end_before_the_start_is_a_code_in_programs():
@@ -475,7 +499,8 @@ def test_a_flow_that_ends_where_it_starts(time):
         return hj.flow(ball(), start, t).state
 
     assert_allclose(jax.jit(end)(time), (1.0, 2.0))
-    assert_allclose(jax.jit(jax.jacfwd(end))(time), (2.0, -9.81))
+    slope = jax.jit(jax.jacfwd(end))(time)
+    assert_allclose(slope, (2.0, -9.81))
 
 
 @pytest.mark.parametrize("transformed", [jax.grad, jax.vmap, jax.jit])
@@ -551,10 +576,12 @@ class Pair(hj.HybridSystem):
 
     def transitions(self):
         def left(t, q, u):
-            return q[0], -0.5 * q[1], q[2], q[3] + self.push * q[1]
+            push = self.push * q[1]
+            return q[0], -0.5 * q[1], q[2], q[3] + push
 
         def right(t, q, u):
-            return q[0], q[1] + self.push * q[3], q[2], -0.5 * q[3]
+            push = self.push * q[3]
+            return q[0], q[1] + push, q[2], -0.5 * q[3]
 
         return [
             hj.Transition("left", "air", "air", lambda t, q, u: q[0], reset=left),
@@ -572,7 +599,8 @@ def test_events_that_coincide():
     # (Programs do not compare the orders.)
     program = jax.jit(lambda x: hj.flow(Pair(), hj.Guess("air", x), 2.0))
     assert program(together.state).result == Result.SIMULTANEOUS
-    assert np.isnan(program(together.state).at([1.9])[1]).all()
+    late = program(together.state).at([1.9])[1]
+    assert np.isnan(late).all()
     assert np.isfinite(found.at([1.9])[1]).all()
     apart = program(jnp.array([1.0, 0.0, 1.1, 0.0]))
     assert apart.result == Result.OK
@@ -602,11 +630,13 @@ def test_each_of_several_events_that_coincide_happens_once(n):
     start = hj.Guess("main", jnp.zeros(n + 1))
     for end in (dict(until=1.0), dict(events=n, within=1.0)):
         found = hj.flow(counters(n), start, **end)
-        assert found.event_index[: n + 1].tolist() == [*range(n), -1]
+        indices = found.event_index[: n + 1].tolist()
+        assert indices == [*range(n), -1]
         assert_allclose(found.state[:n], 0.5, rtol=1e-12)
     program = jax.jit(lambda x: hj.flow(counters(n), hj.Guess("main", x), 1.0))
     found = program(start.state)
-    assert found.event_index[: n + 1].tolist() == [*range(n), -1]
+    later_indices = found.event_index[: n + 1].tolist()
+    assert later_indices == [*range(n), -1]
     assert found.result == Result.SIMULTANEOUS
 
 
@@ -623,9 +653,11 @@ def test_events_at_the_start_and_at_the_end():
         ends = hj.flow(ball(), DROP, end)
         assert [x.cause for x in ends.findings] == ["ends at an event"]
     assert hj.flow(ball(), DROP, FIRST * 0.999).findings == ()
-    rolls = hj.flow(ball(), hj.Guess("main", (0.0, -1.0)), 1.0)
+    start = hj.Guess("main", (0.0, -1.0))
+    rolls = hj.flow(ball(), start, 1.0)
     assert [x.cause for x in rolls.findings] == ["on a guard"]
-    assert hj.flow(ball(), hj.Guess("main", (0.0, 1.0)), 0.1).findings == ()
+    thrown = hj.flow(ball(), hj.Guess("main", (0.0, 1.0)), 0.1)
+    assert thrown.findings == ()
 
 
 @pytest.mark.parametrize(
@@ -678,7 +710,8 @@ def test_ends_that_are_not_reached():
         hj.flow(ball(), DROP, events=3, within=0.5)
     with pytest.raises(ComputationError, match="'bounce' did not happen within 0.2"):
         hj.flow(ball(), DROP, "bounce", within=0.2)
-    starts = hj.Guess("main", jnp.array([(0.1, 0.0), (1.0, 0.0)]))
+    states = jnp.array([(0.1, 0.0), (1.0, 0.0)])
+    starts = hj.Guess("main", states)
     with pytest.raises(ComputationError, match="start 1: the event 'bounce' did not"):
         hj.flow(ball(), starts, "bounce", within=0.2)
     below = hj.Guess("main", (-0.1, 0.0))

@@ -36,7 +36,8 @@ def juggler():
 def _at_impact(cycle):
     orbit = cycle.trajectory()
     (impact,) = orbit.events
-    return impact.time, float(orbit.after[list(orbit.t).index(impact.time)][1])
+    k = list(orbit.t).index(impact.time)
+    return impact.time, float(orbit.after[k][1])
 
 
 @pytest.mark.core
@@ -48,7 +49,8 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
     assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
     assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
     white = cycle.fluctuations(white={"u": 0.01})  # its integral with exp(t) / 1.2
-    assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
+    expected = 1e-4 * 35 / 2 / 1.44
+    assert_allclose(white.durations(), [[expected]], rtol=1e-12)
     assert "standard deviation from spike to spike" in str(white)
 
 
@@ -66,16 +68,21 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     noisy = cycle.fluctuations({"x": strength})
 
     # The amplitude r follows r' = -2 mu r + cos(omega t) dW.
-    double = 0.4 * np.cos(2 * angle) + 2 * omega * np.sin(2 * angle)
-    variance = strength**2 / 2 * (1 / 0.4 + double / (0.4**2 + 4 * omega**2))
+    even = 0.4 * np.cos(2 * angle)
+    odd = 2 * omega * np.sin(2 * angle)
+    double = even + odd
+    size = 0.4**2 + 4 * omega**2
+    variance = strength**2 / 2 * (1 / 0.4 + double / size)
     # At equal phases d angle = alpha dr / r, so that deviations have one direction.
     x = np.cos(angle) - alpha * np.sin(angle)
     y = np.sin(angle) + alpha * np.cos(angle)
     now = noisy.covariance(phases)
-    assert_allclose(now[:, 0, 1], variance * x * y, rtol=1e-11)
+    expected_now = variance * x * y
+    assert_allclose(now[:, 0, 1], expected_now, rtol=1e-11)
     later = noisy.covariance(phases, 1)
     decay = np.exp(-2 * mu * 2 * np.pi / omega)
-    assert_allclose(later[:, 1, 1], decay * variance * y**2, rtol=1e-11)
+    expected_later = decay * variance * y**2
+    assert_allclose(later[:, 1, 1], expected_later, rtol=1e-11)
 
     diffusion = strength**2 * (1 + alpha**2) / (2 * mu) / omega**2
     assert_allclose(noisy.diffusion, diffusion, rtol=1e-11)
@@ -87,7 +94,8 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
 
 
 def test_states_may_have_no_correlation():
-    noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
+    cycle = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0))
+    noisy = cycle.fluctuations({"u": 0.2})
     assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
 
 
@@ -102,12 +110,17 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     time = np.array([landing, -1.0, -1.0]) / relative
     duration = time - [1, 0, 0]
     height = slope(t) * time
-    speed = 1.7 * bend(t) * time + 0.7 * G * duration - [0, 0, 0.7]
+    by_bend = 1.7 * bend(t) * time
+    by_fall = 0.7 * G * duration
+    speed = by_bend + by_fall - [0, 0, 0.7]
     step = np.stack([time, height, speed])
     # How they depend on a height of the table, and on a speed that is added after the bounce.
-    by_time = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G])
+    change = 1.7 * bend(t) + 0.7 * G
+    by_time = np.array([1.0, slope(t), change])
     by_table = by_time / relative + [0, 1, 0]
-    noise = TABLE**2 * np.outer(by_table, by_table) + np.diag([0, 0, SPEED**2])
+    of_table = np.outer(by_table, by_table)
+    of_speed = np.diag([0, 0, SPEED**2])
+    noise = TABLE**2 * of_table + of_speed
     C = solve_discrete_lyapunov(step, noise)
 
     since = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
@@ -139,19 +152,23 @@ def test_a_million_simulated_bounces_scatter_as_computed(juggler):
         table = TABLE * rng.normal(size=jugglers)
         duration = np.ones(jugglers)
         for _ in range(8):  # Newton's method
-            height = y + v * duration - G / 2 * duration**2
+            fallen = G / 2 * duration**2
+            height = y + v * duration - fallen
             gap = height - paddle(t + duration) - table
             rate = v - G * duration - slope(t + duration)
             duration = duration - gap / rate
         t = t + duration
         y = paddle(t) + table
-        v = 1.7 * slope(t) - 0.7 * (v - G * duration)
+        impact = v - G * duration
+        v = 1.7 * slope(t) - 0.7 * impact
         v = v + SPEED * rng.normal(size=jugglers)
         if bounce >= transient:
             deviations.append(duration - 1)
     x = np.array(deviations)
     for lag in (0, 1, 2):
-        products = x[lag:] * x[: len(x) - lag]
+        later = x[lag:]
+        earlier = x[: len(x) - lag]
+        products = later * earlier
         covariance = products.mean(axis=0)  # of each of the independent jugglers
         standard_error = covariance.std(ddof=1) / np.sqrt(jugglers)
         error = covariance.mean() - noisy.durations(lag)[0, 0]
@@ -183,7 +200,8 @@ class _Adaptive(hj.Chart):
     states = ("v", "w")
 
     def field(self, t, q, u):
-        return 1.2 - q[0], q[0] - q[1] + u[0]
+        follow = q[0] - q[1] + u[0]
+        return 1.2 - q[0], follow
 
 
 class _Follower(hj.HybridSystem):

@@ -25,7 +25,8 @@ def kicked(beat=1.0, schedule=0.0):
     kick = hj.Transition("kick", "a", "a", guard, reset=kick_reset)
 
     def rates(t, q, u):
-        return (-q[0] + 0.0 * jnp.sin(t) + u[0],)
+        no_wave = 0.0 * jnp.sin(t)
+        return (-q[0] + no_wave + u[0],)
 
     charts = {"a": Field(("x",), rates)}
     return toy(charts, [kick], beat)
@@ -81,7 +82,8 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     system = Toys(make, [3.2])
     guess = hj.Guess("a", (0.8,))
     cycle = hj.find_limit_cycle(system, guess, multiplicity=2)
-    result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
+    program = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
+    result = program
     measured = [result(np.array([r])) for r in (3.3, 2.8)]
     assert measured == [
         hj.errors.Result.OK,
@@ -153,7 +155,8 @@ def test_failed_cycles_of_a_sweep_have_no_period():
     section = hj.Crossing("x", "falling")
     guess = hj.Guess("a", (0.1, 1.0))
     cycle = hj.find_limit_cycle(Toys(make, [1.0]), guess, section=section)
-    found = hj.orbits.find_limit_cycles([Toys(make, [mu]) for mu in (1.0, -1.0)], cycle)
+    systems = [Toys(make, [mu]) for mu in (1.0, -1.0)]
+    found = hj.orbits.find_limit_cycles(systems, cycle)
     assert_array_equal(found.ok, [True, False])
     assert_allclose(found.period, [2 * np.pi, np.nan], rtol=1e-8)
 
@@ -162,7 +165,8 @@ def oscillator(force):
     """Van der Pol's oscillator with a further force."""
 
     def field(t, q, u):
-        return q[1], (1 - q[0] ** 2) * q[1] - q[0] + force(t, q)
+        damping = (1 - q[0] ** 2) * q[1]
+        return q[1], damping - q[0] + force(t, q)
 
     return toy({"a": Field(("x", "v"), field)})
 
@@ -171,7 +175,8 @@ def oscillator(force):
     "force", [lambda t, q: 0.0 * t, lambda t, q: 0 * jnp.sin(t) * q[0]]
 )
 def test_time_times_zero_is_no_clock(force):
-    cycle = hj.find_limit_cycle(oscillator(force), hj.Guess("a", (2.0, 0.0)))
+    guess = hj.Guess("a", (2.0, 0.0))
+    cycle = hj.find_limit_cycle(oscillator(force), guess)
     assert_allclose(cycle.period, 6.663286859, rtol=1e-8)
 
 
@@ -191,7 +196,8 @@ def test_a_field_in_float32_is_named(force):
 
 def test_constants_in_float32_are_exact():
     guess = hj.Guess("a", (2.0, 0.0))
-    cycle = hj.find_limit_cycle(oscillator(lambda t, q: jnp.float32(0.0) * q[0]), guess)
+    system = oscillator(lambda t, q: jnp.float32(0.0) * q[0])
+    cycle = hj.find_limit_cycle(system, guess)
     assert_allclose(cycle.period, 6.663286859, rtol=1e-8)
 
 
@@ -215,4 +221,5 @@ def test_zeno_is_named_although_newton_went_elsewhere():
         hj.Transition("x low", "second", "first", x_low_guard),
     ]
     with pytest.raises(hj.errors.ComputationError, match="accumulate in finite time"):
-        hj.find_limit_cycle(toy(charts, events), hj.Guess("first", (1.5, 1.5)))
+        guess = hj.Guess("first", (1.5, 1.5))
+        hj.find_limit_cycle(toy(charts, events), guess)

@@ -24,7 +24,8 @@ class Charging(hj.Chart):
     states = ("x",)
 
     def field(self, t, q, u):
-        return ((self.output - q[0] + u[0]) / self.circuit.tau,)
+        rise = self.output - q[0] + u[0]
+        return (rise / self.circuit.tau,)
 
 
 class SchmittTrigger(hj.HybridSystem):
@@ -35,7 +36,8 @@ class SchmittTrigger(hj.HybridSystem):
     ripple: hj.Parameter = hj.parameter(0.1)
 
     def threshold(self, t):
-        return self.width + self.ripple * jnp.sin(2 * jnp.pi * t)
+        wave = jnp.sin(2 * jnp.pi * t)
+        return self.width + self.ripple * wave
 
     def charts(self):
         return {"up": Charging(self, 1.0), "down": Charging(self, -1.0)}
@@ -102,7 +104,8 @@ def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
     while len(times) < count:
         wait = np.log((drive - v) / (drive - 1.0))
         k = int(np.argmin(wait))
-        v = drive + (v - drive) * np.exp(-wait[k])
+        decay = np.exp(-wait[k])
+        v = drive + (v - drive) * decay
         t += wait[k]
         v[1 - k] -= inhibition
         v[k] = 0.0
@@ -220,7 +223,8 @@ class Switched(hj.HybridSystem):
 def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard():
     cycle = hj.find_limit_cycle(Switched(), hj.Guess("up", (0.0,), time=0.0))
     half = np.exp(-0.5)
-    at_switch = 1 - (1 - cycle.anchor.q[0, 0]) * np.exp(-0.25)
+    since = np.exp(-0.25)
+    at_switch = 1 - (1 - cycle.anchor.q[0, 0]) * since
     assert at_switch == pytest.approx((1 - half) / (1 + half), abs=1e-12)
     assert cycle.multipliers == pytest.approx([np.exp(-1)], abs=1e-12)
 
@@ -258,7 +262,8 @@ class Driven(hj.HybridSystem):
 def test_a_clock_that_is_too_long_is_a_doubt(turns):
     """The multiplier of two periods is the square of that of one: the print says so."""
     cycle = hj.find_limit_cycle(Driven(turns))
-    assert cycle.multipliers[0] == pytest.approx(np.exp(-0.2 * np.pi * turns), rel=1e-8)
+    expected = np.exp(-0.2 * np.pi * turns)
+    assert cycle.multipliers[0] == pytest.approx(expected, rel=1e-8)
     causes = [finding.cause for finding in cycle.findings]
     assert ("a long clock" in causes) == (turns > 1)
     assert ("shortest period" in repr(cycle)) == (turns == 1)

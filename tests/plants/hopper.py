@@ -32,16 +32,21 @@ class Hopper:
     @staticmethod
     def leg(t, yM, ym):
         """The force of the leg."""
-        return 10 * (2 - (yM - ym)) + 20 * math.sin(2 * math.pi * t)
+        spring = 10 * (2 - (yM - ym))
+        motor = 20 * math.sin(2 * math.pi * t)
+        return spring + motor
 
     def stance(self, t, q, u):
         yM, vM = q
-        return vM, (self.leg(t, yM, 0.0) + u) / 2 - 2
+        acceleration = (self.leg(t, yM, 0.0) + u) / 2 - 2
+        return vM, acceleration
 
     def flight(self, t, q, u):
         yM, vM, ym, vm = q
         leg = self.leg(t, yM, ym)
-        return vM, (leg + u) / 2 - 2, vm, -leg - 5 * vm - 2
+        body = (leg + u) / 2 - 2
+        foot = -leg - 5 * vm - 2
+        return vM, body, vm, foot
 
     def reset(self, seed):
         self.set_state((0.0, 2.2, -0.5, 0.3, -0.5))
