@@ -50,7 +50,8 @@ def test_the_lifted_system_is_the_periodic_one(model):
         return np.exp(2j * np.pi * np.outer(f, np.arange(N)) / N)
 
     for m in H.harmonics:
-        found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
+        back = wave(-(f + m))
+        found = np.einsum("fnyru,fn,fr->fyu", G, back, wave(f)) / N
         assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
@@ -82,17 +83,20 @@ def test_python_control_gets_frequency_responses(model):
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
     assert_allclose(data.omega, 2 * np.pi * f / 2.0)
     of_harmonic = data(1j * data.omega)
-    assert_array_equal(of_harmonic[1], np.asarray(H[-1])[:, 0].T)
+    response = np.asarray(H[-1])[:, 0]
+    assert_array_equal(of_harmonic[1], response.T)
 
     one = convert.to_control(H.select([0]))[0, 0]
     drawn = control.bode_plot(one).lines[0, 0][0]
-    assert_allclose(drawn.get_ydata(), np.abs(H[0][:, 0, 0]))
+    modulus = np.abs(H[0][:, 0, 0])
+    assert_allclose(drawn.get_ydata(), modulus)
 
 
 def recording():
     """Two trials of two signals, one of them with a missing sample."""
     t = np.arange(5) / 10
-    signals = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
+    with_gap = np.where(t == 0.2, np.nan, t**2)
+    signals = {"a": t, "b": with_gap}
     events = {"e": [0.1, 0.3], "never": []}
     trials = []
     for name in ("first", "second"):
@@ -107,9 +111,11 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
     one = dataset.H.sel(frequency=0.4, harmonic=-1, input="w", output="y")
-    assert one.item() == complex(H[-1][-1, 0, 1])
+    expected = complex(H[-1][-1, 0, 1])
+    assert one.item() == expected
     assert dataset.input_unit.sel(input="u").item() == "N"
-    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(frequency=slice(0, 0.2))
+    cut = dataset.isel(harmonic=[1, 2], input=[0])
+    part = cut.sel(frequency=slice(0, 0.2))
     fewer = convert.from_xarray(part)
     assert fewer.harmonics == (-1, 0)
     assert fewer.inputs == ("u",)
@@ -122,7 +128,8 @@ def test_a_dataset_of_a_recording_knows_units_and_events():
     assert dataset.a.attrs["units"] == "N"
     assert "units" not in dataset.b.attrs
     second = dataset.isel(sample=dataset.trial.values == 1)
-    assert_array_equal(second.b, recording().trials[1].values[:, 1])
+    values = recording().trials[1].values
+    assert_array_equal(second.b, values[:, 1])
     times = dataset.event_time[dataset.event == "e"]
     assert times.values.tolist() == [0.1, 0.3, 0.1, 0.3]
 
@@ -192,7 +199,8 @@ def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     table = H.to_pandas()
-    row = table.loc[-1, H.frequencies[1].item(), "y", "w"]
+    frequency = H.frequencies[1].item()
+    row = table.loc[-1, frequency, "y", "w"]
     value = complex(H[-1][1, 0, 1])
     assert tuple(row) == (value.real, value.imag, np.abs(value))
     assert np.asarray(H).tobytes() == H.H.tobytes()

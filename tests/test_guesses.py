@@ -621,12 +621,14 @@ def test_p_values_are_those_of_the_coefficients(names):
     missed = fit.coefficients - np.poly(true).real[1:]
     distance = missed @ np.linalg.solve(fit.covariance, missed)
     dof = fit.covariance_dof
-    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    ratio = distance * (dof - 1) / (2 * dof)
+    expected = stats.f.sf(ratio, 2, dof - 1)
     assert_allclose(fit.compare(true).p_value, expected, rtol=1e-6)
     missed = fit.coefficients - other.coefficients
     distance = missed @ np.linalg.solve(fit.covariance + other.covariance, missed)
     dof = min(dof, other.covariance_dof)
-    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    ratio = distance * (dof - 1) / (2 * dof)
+    expected = stats.f.sf(ratio, 2, dof - 1)
     assert_allclose(fit.compare(other).p_value, expected, rtol=1e-6)
 
 
@@ -657,13 +659,15 @@ def test_a_fit_of_some_harmonics_says_so_where_it_is_validated(names):
 def test_tables_hold_the_numbers(names):
     data = names["data"]
     table = data.to_pandas()
-    row = table[(table.experiment == 3) & (table.cycle == 5) & (table.section == 2)]
+    of_cycle = (table.experiment == 3) & (table.cycle == 5)
+    row = table[of_cycle & (table.section == 2)]
     assert row.vM.item() == data.y[3, 42, 1]
     assert_array_equal(data["u"], data.u[:, :, 0])
     states = names["traj"].to_pandas()
     assert set(states.chart) == {"flight", "stance"}
     assert states[states.chart == "stance"].ym.isna().all()
-    assert_allclose(states.yM.iloc[-1], names["traj"].after[-1, 0])
+    end = names["traj"].after[-1, 0]
+    assert_allclose(states.yM.iloc[-1], end)
     one = names["cycle"].to_pandas()
     assert one.k.item() == 10.0
     assert_allclose(one["multipliers.0.modulus"], names["cycle"].modulus[0])
@@ -700,7 +704,9 @@ def test_a_system_from_functions_is_that_of_a_class():
         *_, multipliers = hj.models.PaddleJuggler(restitution=e).exact()
         return -jnp.sum(multipliers).real
 
-    assert_allclose(jax.grad(trace)(0.7), jax.grad(exact_trace)(0.7), rtol=1e-8)
+    slope = jax.grad(trace)(0.7)
+    exact_slope = jax.grad(exact_trace)(0.7)
+    assert_allclose(slope, exact_slope, rtol=1e-8)
     with pytest.raises(hj.errors.DefinitionError, match="another attribute 'inputs'"):
         hj.HybridSystem.from_functions("x", lambda t, q, u, p: -q, (), {"inputs": 1.0})
 

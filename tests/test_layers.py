@@ -30,7 +30,8 @@ def imported(file):
         if isinstance(node, ast.ImportFrom):
             module = tuple(node.module.split(".")) if node.module else ()
             if node.level:
-                module = package[: len(package) - (node.level - 1)] + module
+                up = node.level - 1
+                module = package[: len(package) - up] + module
             elif module[:1] == ("hybridjax",):
                 module = module[1:]
             else:

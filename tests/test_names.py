@@ -71,7 +71,8 @@ def test_each_name_has_one_place():
     places = [
         x.rpartition(".")[2] for x, _ in all_members() if not x.startswith("hj.plot.")
     ]
-    assert [name for name, count in Counter(places).items() if count > 1] == []
+    repeated = [name for name, count in Counter(places).items() if count > 1]
+    assert repeated == []
 
 
 def test_no_class_has_the_name_of_another():
@@ -123,7 +124,8 @@ def test_one_thing_has_one_word():
             words |= {(name, x) for x in vars(thing) if not x.startswith("_")}
             words |= {(name, x) for x in getattr(thing, "__annotations__", {})}
     models = {(name, word) for name, word in words if name.startswith("hj.models.")}
-    assert {(name, word) for name, word in words - models if word in ONE_WORD} == set()
+    others = {(name, word) for name, word in words - models if word in ONE_WORD}
+    assert others == set()
 
 
 # Words that are no nouns, and say where or which.

@@ -81,7 +81,8 @@ def play(found):
 
 
 def sweep(found):
-    error = abs(np.abs(found.best.multipliers).max() - found.winner[2])
+    largest = np.abs(found.best.multipliers).max()
+    error = abs(largest - found.winner[2])
     assert error < 1e-3
 
 
@@ -91,12 +92,15 @@ def recording(found):
 
 def neurons(found):
     assert found.found.left_out > found.found.left_out_flat + 0.02
-    assert np.mean((found.low <= found.true) & (found.true <= found.high)) > 0.7
+    above = found.low <= found.true
+    below = found.true <= found.high
+    assert np.mean(above & below) > 0.7
 
 
 def responses(found):
     # The regulator follows slow changes of its reference.
-    error = abs(abs(found.htf[0][0, 0, 0]) - 1)
+    modulus = abs(found.htf[0][0, 0, 0])
+    error = abs(modulus - 1)
     assert error < 0.05
 
 
@@ -114,7 +118,8 @@ def walking(found):
 def population(found):
     low = found.test["low"][0]
     high = found.test["high"][0]
-    assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
+    difference = np.mean(found.true[6:]) - np.mean(found.true[:6])
+    assert low < difference < high < 0
 
 
 def in_the_loop(found):

@@ -31,7 +31,8 @@ def test_a_newcomer_meets_a_picture_and_code_first():
     lines = (ROOT / "README.md").read_text().splitlines()
     picture = next(n for n, line in enumerate(lines, 1) if line.startswith("!["))
     code = next(n for n, line in enumerate(lines, 1) if line.startswith("import "))
-    assert (picture <= 8, code <= 12, len(lines) <= 90) == (True, True, True)
+    found = (picture <= 8, code <= 12, len(lines) <= 90)
+    assert found == (True, True, True)
 
 
 def test_every_how_to_page_is_one_click_from_the_index():
@@ -77,7 +78,8 @@ def read_section(tmp_path_factory):
 
 # (What they begin with takes as long as each, so one worker gets them.)
 def section(test):
-    return pytest.mark.slow(pytest.mark.long(pytest.mark.xdist_group("tour")(test)))
+    grouped = pytest.mark.xdist_group("tour")(test)
+    return pytest.mark.slow(pytest.mark.long(grouped))
 
 
 @section
@@ -103,7 +105,8 @@ def test_the_section_on_recordings_finds_the_multipliers(read_section):
 
 
 def test_links_lead_somewhere():
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    documents = (ROOT / "docs").rglob("*.md")
+    pages = [*ROOT.glob("*.md"), *documents]
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if "://" not in link:
@@ -115,7 +118,8 @@ def test_files_that_documents_name_are_there():
         if page.name != "CHANGELOG.md":
             for name in re.findall(r"`(\w+/[\w/]+\.py)\b", page.read_text()):
                 places = ROOT / name, ROOT / "hybridjax" / name
-                assert any(place.exists() for place in places), f"{page.name}: {name}"
+                is_there = any(place.exists() for place in places)
+                assert is_there, f"{page.name}: {name}"
 
 
 def test_there_is_one_test_command_for_ci_to_find():
@@ -134,7 +138,8 @@ def test_claims_name_tests_that_exist():
     for path, name in re.findall(
         r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()
     ):
-        assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
+        text = (ROOT / path).read_text()
+        assert f"def {name}" in text, f"there is no {path}::{name}"
 
 
 PAGES = ["docs/index.md", "docs/experiments.md"]

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 import hybridjax as hj
 
 
-MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+ONES = np.ones((4, 1, 1))
+MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), ONES, ONES)
 USUAL = hj.multisine(4, 16, frequencies=(0, 2.0))
 GOAL = hj.designs.MultiplierGoal(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
@@ -19,10 +20,12 @@ def plan():
 
 
 def test_the_spectrum_of_a_design(plan):
-    above, below = hj.plot.spectrum(plan, MODEL).axes[:, 0]
+    axes = hj.plot.spectrum(plan, MODEL).axes
+    above, below = axes[:, 0]
     f = np.unique(plan.frequencies)
     htf = MODEL.htf(f, 0)
-    modulus = np.abs(np.asarray(htf.H)[0, :, 0, 0])
+    H = np.asarray(htf.H)[0, :, 0, 0]
+    modulus = np.abs(H)
     (drawn,) = above.get_lines()
     assert_allclose(drawn.get_ydata(), modulus / modulus.max())
 

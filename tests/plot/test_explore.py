@@ -52,13 +52,16 @@ def test_the_widget_sends_pictures():
     assert widget.answer["number"] == 1
     assert widget.answer["picture"] != before["picture"]
     # Only what moves is drawn anew, and the picture is that of the whole figure.
-    with io.BytesIO(base64.b64decode(widget.answer["picture"].split(",")[1])) as file:
-        sent = np.asarray(Image.open(file).convert("RGB")).astype(int)
+    encoded = widget.answer["picture"].split(",")[1]
+    with io.BytesIO(base64.b64decode(encoded)) as file:
+        pixels = np.asarray(Image.open(file).convert("RGB"))
+        sent = pixels.astype(int)
     canvas = FigureCanvasAgg(explorer.figure)
     for artist in explorer.figure.findobj():
         artist.set_animated(False)
     canvas.draw()
-    error = np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64)
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3]
+    error = np.mean(np.abs(sent - drawn) > 64)
     assert error < 1e-3
 
 
@@ -136,6 +139,7 @@ setTimeout(() => {{
     budget = "--virtual-time-budget=1500"
     run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
     shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout
-    lines = shown.split('<pre id="log">')[1].split("</pre>")[0].splitlines()
+    log = shown.split('<pre id="log">')[1]
+    lines = log.split("</pre>")[0].splitlines()
     searching = "0.25: searching for the cycle; the picture is that before"
     assert lines == ["1: nothing", searching, "1: nothing"]

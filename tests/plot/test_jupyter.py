@@ -37,7 +37,8 @@ def images(cell):
 
 
 def test_every_figure_is_shown_once(outputs):
-    assert [len(images(cell)) for cell in outputs[:4]] == [0, 1, 1, 1]
+    counts = [len(images(cell)) for cell in outputs[:4]]
+    assert counts == [0, 1, 1, 1]
 
 
 def test_a_column_has_150_points_per_inch(outputs):

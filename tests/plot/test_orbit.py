@@ -9,7 +9,8 @@ from .test_plots import labeled
 
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
     lanes = placed_kinematic.lanes
-    start = np.asarray(lanes.q[:, 0]) + [0.03, 0, 0, 0]
+    push = [0.03, 0, 0, 0]
+    start = np.asarray(lanes.q[:, 0]) + push
     perturbed = hj.simulate(
         hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0])
     )
@@ -53,10 +54,12 @@ def test_bars_lie_on_their_sections(hopper_cycle, placed_kinematic):
     bars = drawn.reshape(32, 3, 2)[:, :2]  # the third point is a gap
     middles = bars.mean(axis=1).T
     assert_allclose(middles, placed_kinematic.lanes.q[:2], atol=1e-9)
-    x, y = np.moveaxis((bars - [1.9, 0.0]) / [0.3, 1.9], 2, 0)
+    scaled = (bars - [1.9, 0.0]) / [0.3, 1.9]
+    x, y = np.moveaxis(scaled, 2, 0)
     angle = np.unwrap(np.arctan2(y, x), axis=0)
     assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
-    assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
+    turns = np.diff(angle[:, 0])
+    assert_allclose(turns, -2 * np.pi / 32, atol=1e-9)
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):

@@ -28,7 +28,8 @@ def test_magnitude_draws_the_values(estimate, exact):
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
     assert_array_equal(drawn.get_xdata(), estimate.frequencies)
-    assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
+    modulus = np.abs(estimate[1][:, 1, 0])
+    assert_array_equal(drawn.get_ydata(), modulus)
     assert (
         drawn.get_color()
         == lines["$H_{-1}$"].get_color()
@@ -55,7 +56,8 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
     f, size = drawn.get_xydata().T
     assert f[0] == 0
     assert f[-1] == 16
-    assert_allclose(size, abs(hopper.htf(f, harmonics=0).H[0, :, 0, 0]), rtol=1e-9)
+    H = hopper.htf(f, harmonics=0).H[0, :, 0, 0]
+    assert_allclose(size, abs(H), rtol=1e-9)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
@@ -98,7 +100,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
-    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    f = np.linspace(0.05, 1.4, 12)
+    exact = hj.testing.synthetic_ldtp().htf(f, 0)
     swapped = hj.linear.HTF(
         exact.frequencies,
         exact.H[..., ::-1, ::-1],
@@ -120,7 +123,8 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     for draw, shown in ((hj.plot.htf, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
-        assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
+        modulus = np.abs(exact[0][:, 0, 1])
+        assert_allclose(first.get_ydata(), modulus)
         assert_array_equal(first.get_ydata(), second.get_ydata())
     fit = hj.identify.fit_rational(exact, input=1)
     with pytest.raises(
@@ -133,13 +137,15 @@ def test_bode_in_hertz_and_decibels(estimate):
     """As python-control draws it, with a gain of 20 log10 and the frequencies in units of time."""
 
     def drawn(**options):
-        upper, lower = hj.plot.bode(estimate, outputs="vM", **options).axes[:, 0]
+        axes = hj.plot.bode(estimate, outputs="vM", **options).axes
+        upper, lower = axes[:, 0]
         return upper, lower, labeled(upper)["vM"]
 
     upper, lower, gain = drawn(unit="Hz", period=0.5, log=True)
     f = np.asarray(estimate.frequencies)
     assert_allclose(gain.get_xdata(), f / 0.5)
-    decibels = 20 * np.log10(np.abs(estimate[0][:, 1, 0]))
+    modulus = np.abs(estimate[0][:, 1, 0])
+    decibels = 20 * np.log10(modulus)
     assert_allclose(gain.get_ydata(), decibels)
     assert_allclose(lower.get_lines()[0].get_xdata(), f / 0.5)
     assert (upper.get_xscale(), lower.get_xscale()) == ("log", "log")
@@ -189,7 +195,8 @@ def harmonics(*given, **options):
 @pytest.fixture
 def two_inputs():
     """An exact HTF from two inputs to two outputs."""
-    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    f = np.linspace(0.05, 1.4, 12)
+    exact = hj.testing.synthetic_ldtp().htf(f, 0)
     assert len(exact.inputs) == 2
     assert len(exact.outputs) == 2
     return exact
@@ -202,8 +209,11 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
     pairs = [(0, 0), (0, 1), (1, 0), (1, 1)]
     names = []
     for curve, (i, j) in zip(curves, pairs, strict=True):
-        assert_allclose(curve.get_ydata(), np.abs(two_inputs[0][:, i, j]))
-        names.append(f"{two_inputs.outputs[i]} from {two_inputs.inputs[j]}")
+        modulus = np.abs(two_inputs[0][:, i, j])
+        assert_allclose(curve.get_ydata(), modulus)
+        output = two_inputs.outputs[i]
+        source = two_inputs.inputs[j]
+        names.append(f"{output} from {source}")
     assert list(labeled(upper)) == [*names, "exact"]
     colors = {curve.get_color() for curve in curves}
     assert len(colors) == 4, "a color for each pair"
@@ -212,7 +222,8 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bode(families, fits={"b": rational}).figure
-    measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
+    lower_axes = np.reshape(figure.axes, (2, 2))[1]
+    measured = [len(ax.get_lines()) for ax in lower_axes]
     assert measured == [4, 4]
     with pytest.raises(hj.errors.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bode(families, fits={"c": rational})
@@ -297,7 +308,8 @@ def test_experiment(hopper):
 
 def test_saved_in_several_formats(tmp_path):
     plot = hj.plot.multipliers([0.5])
-    png, pdf, svg = plot.save(tmp_path / "multipliers.png", ("png", "pdf", "svg"))
+    formats = ("png", "pdf", "svg")
+    png, pdf, svg = plot.save(tmp_path / "multipliers.png", formats)
     assert png.read_bytes()[:4] == b"\x89PNG"
     assert pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
@@ -329,7 +341,8 @@ def test_bands_hold_the_values(estimate):
     heights = band.get_paths()[0].vertices[:, 1]
     assert_allclose(heights.max(), modulus.max() + radius)
 
-    upper, lower = hj.plot.bode(sure, outputs="yM").axes[:, 0]
+    axes = hj.plot.bode(sure, outputs="yM").axes
+    upper, lower = axes[:, 0]
     phase = lower.get_lines()[0].get_ydata()
     assert_array_equal(np.isfinite(phase), modulus > radius)
     assert len(upper.collections) == 1
@@ -341,7 +354,8 @@ def found(hopper):
     u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
     rng = np.random.default_rng(1)
-    y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
+    size = 0.1 * y.std(axis=0)
+    y = y + size * rng.normal(size=y.shape)
     return hj.validate(
         hopper, hj.experiments.SectionSeries(u, y, n_sections=32, outputs=("yM", "vM"))
     )
@@ -355,12 +369,14 @@ def test_validation_draws_signals_and_correlations(found):
     assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
     assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
     assert lower[0].get_ylabel() == r"$\delta$ vM"
-    assert upper[0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
+    title = f"fit {found.fit[0]:.3g} %\n"
+    assert upper[0].get_title("right") == title
     drawn = {upper[1]: found.autocorrelation, upper[2]: found.cross_correlation}
     for ax, correlation in drawn.items():
         bars = ax.collections[0].get_paths()
         heights = [bar.vertices[1, 1] for bar in bars]
-        expected = correlation[:, :, 0].sum(axis=0).ravel() / np.sqrt(32)
+        over_sections = correlation[:, :, 0].sum(axis=0)
+        expected = over_sections.ravel() / np.sqrt(32)
         assert_allclose(heights, expected, atol=1e-12)
 
 
@@ -393,9 +409,11 @@ def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())
     blue = [0, 0x72, 0xB2]
-    is_blue = np.abs(picture[..., :3] - blue).sum(axis=2) < 60
+    distance = np.abs(picture[..., :3] - blue).sum(axis=2)
+    is_blue = distance < 60
     for end in (value - half_width, value + half_width):
-        column, height = plot.ax.transData.transform((end, 0)).round().astype(int)
+        place = plot.ax.transData.transform((end, 0)).round()
+        column, height = place.astype(int)
         row = len(picture) - height
         cap = is_blue[row - 8 : row + 8, column - 2 : column + 3]
         pixels_high = cap.any(axis=1).sum()
@@ -405,7 +423,8 @@ def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
     coefficients = np.poly(true).real[1:]
-    estimate = MultiplierEstimate(true * 1.01, coefficients, 1e-4 * np.eye(2), np.inf)
+    covariance = 1e-4 * np.eye(2)
+    estimate = MultiplierEstimate(true * 1.01, coefficients, covariance, np.inf)
     border = estimate.ellipse(0)
     (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
     ellipses = [line for line in inset.get_lines() if len(line.get_xdata()) == 100]

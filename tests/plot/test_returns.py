@@ -51,13 +51,16 @@ def test_the_logistic_map_and_its_cobweb():
     assert_allclose(after, r * x * (1 - x), atol=1e-12)
     assert "slope -0.8: multiplier" in lines  # 2 - r
     near, tangent = lines["slope -0.8: multiplier"]
-    assert_allclose(np.diff(tangent) / np.diff(near), 2 - r, rtol=1e-9)
+    slope = np.diff(tangent) / np.diff(near)
+    assert_allclose(slope, 2 - r, rtol=1e-9)
     iterates = [0.4]
     for _ in range(6):
-        iterates.append(r * iterates[-1] * (1 - iterates[-1]))
+        last = iterates[-1]
+        iterates.append(r * last * (1 - last))
     corners_x, corners_y = lines["from 0.4"]
     assert_allclose(corners_x, np.repeat(iterates, 2)[:-1], atol=1e-12)
-    assert_allclose(corners_y[1:], np.repeat(iterates[1:], 2), atol=1e-12)
+    twice = np.repeat(iterates[1:], 2)
+    assert_allclose(corners_y[1:], twice, atol=1e-12)
     (fixed,), _ = lines["cycle"]
     assert_allclose(fixed, 1 - 1 / r, atol=1e-12)
     bare = lines_of(hj.plot.return_map(cycle, cobweb=False))
@@ -83,7 +86,8 @@ def test_the_slope_in_several_dimensions_is_the_multiplier():
     for coordinate in (None, "x", "y"):
         lines = lines_of(hj.plot.return_map(cycle, coordinate, cobweb=False))
         x, after = lines["return map"]
-        assert_allclose(np.diff(after) / np.diff(x), np.exp(-0.2), rtol=1e-4)
+        slope = np.diff(after) / np.diff(x)
+        assert_allclose(slope, np.exp(-0.2), rtol=1e-4)
         assert f"slope {np.exp(-0.2):.4g}: multiplier" in lines
 
 

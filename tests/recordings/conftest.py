@@ -34,7 +34,8 @@ def wave():
     x_noise, v_noise = 1e-6 * rng.normal(size=(2, len(t)))
     x = np.cos(2 * np.pi * t) + x_noise
     v = -np.sin(2 * np.pi * t) + v_noise
-    return hj.Recording(t, {"f": np.cos(3 * t), "x": x, "v": v})
+    signals = {"f": np.cos(3 * t), "x": x, "v": v}
+    return hj.Recording(t, signals)
 
 
 @pytest.fixture(scope="session")
@@ -48,18 +49,21 @@ def rhythm():
     steps = 2  # from one sample to the next
     h = 1 / RATE / steps
     sampled = np.arange(len(force)) / RATE
-    halves = np.arange(2 * steps * len(force) + 1) * h / 2
+    steps_in_half = np.arange(2 * steps * len(force) + 1)
+    halves = steps_in_half * h / 2
     fine = np.interp(halves, sampled, force)
 
     def field(w, f, turn):
         """Of w = z exp(-2 pi i t), with turn = exp(-2 pi i t)."""
         pull = -1j * DECAY * 2 * np.angle(w) * w
-        return DECAY * (1 - abs(w) ** 2) * w + pull + f * turn
+        growth = DECAY * (1 - abs(w) ** 2) * w
+        return growth + pull + f * turn
 
     w = 1.0 + 0j
     samples = []
     for k in range(steps * len(force)):
-        begin, middle, end = np.exp(-2j * np.pi * halves[2 * k : 2 * k + 3])
+        phases = -2j * np.pi * halves[2 * k : 2 * k + 3]
+        begin, middle, end = np.exp(phases)
         f_begin, f_middle, f_end = fine[2 * k : 2 * k + 3]
         if k % steps == 0:
             samples.append(w / begin)
@@ -67,6 +71,7 @@ def rhythm():
         b = field(w + h / 2 * a, f_middle, middle)
         c = field(w + h / 2 * b, f_middle, middle)
         d = field(w + h * c, f_end, end)
-        w = w + h / 6 * (a + 2 * b + 2 * c + d)
+        slopes = a + 2 * b + 2 * c + d
+        w = w + h / 6 * slopes
     z = np.array(samples)
     return hj.Recording(sampled, {"force": force, "x": z.real, "v": z.imag})

@@ -23,7 +23,8 @@ class Scene(NamedTuple):
 
     @property
     def period(self):
-        return float(np.median(np.diff(self.trial.events[self.event])))
+        durations = np.diff(self.trial.events[self.event])
+        return float(np.median(durations))
 
     @property
     def cycles(self):
@@ -33,7 +34,8 @@ class Scene(NamedTuple):
     @property
     def from_middle(self):
         """Distances of samples from the middle of the trial, in cycles."""
-        return np.abs(self.trial.time - self.trial.time.mean()) / self.period
+        distance = np.abs(self.trial.time - self.trial.time.mean())
+        return distance / self.period
 
     def normal(self):
         return self.rng.normal(size=len(self.trial.time))
@@ -134,7 +136,8 @@ def scaled(which, gain=1.0, offset=0.0):
 def overflow(bits):
     def wrap(x, s):
         step = 0.8 * np.ptp(x) / 2**bits
-        return np.round((x - x.min()) / step) % 2**bits * step + x.min()
+        codes = np.round((x - x.min()) / step)
+        return codes % 2**bits * step + x.min()
 
     return wrap
 
@@ -145,7 +148,8 @@ def renumbered(trial, s):
     t = kept(
         trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False))
     )
-    time = trial.time[0] + step * np.arange(len(t.time))
+    elapsed = step * np.arange(len(t.time))
+    time = trial.time[0] + elapsed
     events = {k: np.interp(at, t.time, time) for k, at in t.events.items()}
     return replace(t, time=time, events=events)
 
@@ -162,8 +166,10 @@ def hidden(choose):
     def hide(trial, s):
         values = trial.values.copy()
         middles = choose(trial.events[s.event], s)
-        away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
-        values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
+        distance = np.abs(trial.time[:, None] - middles)
+        away = distance.min(axis=1) < 0.075 * s.period
+        columns = [s.recording.column(x) for x in s.outputs]
+        values[np.ix_(away, columns)] = np.nan
         return replace(trial, values=values)
 
     return trials(hide)
@@ -197,7 +203,8 @@ def late(samples, only=None):
 
 def other_clock(x, s):
     start = s.trial.time[0]
-    return np.interp(start + (s.trial.time - start) * (1 - 0.005), s.trial.time, x)
+    since = s.trial.time - start
+    return np.interp(start + since * (1 - 0.005), s.trial.time, x)
 
 
 def misjudged(lost=0.0, doubled=0.0, off=0.0):
@@ -208,9 +215,13 @@ def misjudged(lost=0.0, doubled=0.0, off=0.0):
         at = trial.events[s.event]
         order = s.rng.permutation(len(at))
         n = round(lost * len(at))
-        again = order[n : n + round(doubled * len(at))]
-        at = np.concatenate([np.delete(at, order[:n]), at[again] + 0.05 * s.period])
-        at = np.sort(at + off * s.period * s.rng.normal(size=len(at)))
+        count = round(doubled * len(at))
+        again = order[n : n + count]
+        missed = np.delete(at, order[:n])
+        doubles = at[again] + 0.05 * s.period
+        at = np.concatenate([missed, doubles])
+        errors = s.rng.normal(size=len(at))
+        at = np.sort(at + off * s.period * errors)
         return replace(trial, events=trial.events | {s.event: at})
 
     return trials(misjudge)
@@ -222,7 +233,8 @@ def with_copies(recording, *_):
 
 
 def with_end(recording, *_):
-    end = kept(recording.trials[0], slice(len(recording.trials[0].time) // 2, None))
+    half = len(recording.trials[0].time) // 2
+    end = kept(recording.trials[0], slice(half, None))
     return [*recording.trials, replace(end, name="end")]
 
 

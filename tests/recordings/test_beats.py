@@ -72,8 +72,10 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     curve = PhaseCurve(X, CURVE, "u", time_unit="ms")
     drawn = hj.plot.phase_response(curve, model=found).ax
     band = found.interval(found.phase)[0]
-    np.testing.assert_allclose(drawn.lines[1].get_ydata(), found.values / 1000)
-    heights = drawn.collections[0].get_paths()[0].vertices[:, 1]
+    line = drawn.lines[1].get_ydata()
+    np.testing.assert_allclose(line, found.values / 1000)
+    path = drawn.collections[0].get_paths()[0]
+    heights = path.vertices[:, 1]
     assert heights.min() == pytest.approx(band.min() / 1000)
     other = [PhaseCurve(X, CURVE, Signal("u", unit)) for unit in ("nA", "pA")]
     with pytest.raises(hj.errors.DefinitionError, match="different units: nA and pA"):
@@ -91,7 +93,8 @@ def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
     assert missed.std() == pytest.approx(0.05, rel=0.2)
     np.testing.assert_allclose(ahead.rates, 10, rtol=0.03)
     # The averaged curve varies less, most at the end of the cycle.
-    assert np.ptp(found.with_jitter(X)) < np.ptp(found(X))
+    smoothed = found.with_jitter(X)
+    assert np.ptp(smoothed) < np.ptp(found(X))
     np.testing.assert_allclose(found.with_jitter([0.0]), found([0.0]))
     assert "free of jitter" in repr(found)
 
@@ -99,13 +102,17 @@ def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
 def test_a_rate_that_wanders_is_no_memory():
     """The rate makes a random walk, 2 % from a cycle to the next, under a slow input."""
     rng = np.random.default_rng(0)
-    force = 2 * slow_noise(rng, trials=1, samples=2501, highest=0.5 * 10 / 100)[0]
-    walk = np.cumsum(0.2 * np.sqrt(0.1) * rng.normal(size=2501))
+    noise = slow_noise(rng, trials=1, samples=2501, highest=0.5 * 10 / 100)
+    force = 2 * noise[0]
+    steps = 0.2 * np.sqrt(0.1) * rng.normal(size=2501)
+    walk = np.cumsum(steps)
     phase = 0.0
     events = []
     for k in range(2500):
-        rate = max(10 + walk[k], 2.0) + CURVE[int(200 * phase)] * force[k]
-        step = max(rate, 0.0) * 0.01 + 0.05 * np.sqrt(0.1) * rng.normal()
+        response = CURVE[int(200 * phase)]
+        rate = max(10 + walk[k], 2.0) + response * force[k]
+        jitter = 0.05 * np.sqrt(0.1) * rng.normal()
+        step = max(rate, 0.0) * 0.01 + jitter
         phase = max(phase + step, 0.0)
         if phase >= 1:
             phase -= 1
@@ -117,7 +124,8 @@ def test_a_rate_that_wanders_is_no_memory():
     assert found.wander > 0.01
     assert "memory" not in [x.cause for x in found.findings]
     error = np.sqrt(found.covariance[0, 0])
-    assert abs(found.coefficients[0] - CURVE.mean()) < 3 * error
+    bias = abs(found.coefficients[0] - CURVE.mean())
+    assert bias < 3 * error
 
 
 def rms(values):
@@ -131,7 +139,8 @@ def test_slopes_are_derivatives(noisy):
     rates = np.full(8, 10.0)
     base = forecast(intervals, table, a, rates)
     for k in range(5):
-        moved = forecast(intervals, table, a + 1e-5 * np.eye(5)[k], rates)
+        ahead = a + 1e-5 * np.eye(5)[k]
+        moved = forecast(intervals, table, ahead, rates)
         difference = (moved.duration - base.duration) / 1e-5
         np.testing.assert_allclose(base.slopes[:, k], difference, atol=0.02 * 0.1)
     difference = (
@@ -142,11 +151,13 @@ def test_slopes_are_derivatives(noisy):
 
 def test_intervals_of_all_lengths_are_no_missed_events():
     """A slow current makes some intervals three times as long as others."""
-    slow = 5 * np.sin(np.pi * np.arange(0, 20.0005, 1e-3))[None]
+    times = np.arange(0, 20.0005, 1e-3)
+    slow = 5 * np.sin(np.pi * times)[None]
     slow = hj.testing.simulate_beats([1.0], slow, rate=1000, rhythm=10.0, jitter=0.03)
     (periods,) = hj.recordings.estimate_phase(slow, BEAT).periods
     assert periods.max() > 1.8 * np.median(periods)
-    assert len(periods) == len(slow.trials[0].events["beat"]) - 1
+    beats = slow.trials[0].events["beat"]
+    assert len(periods) == len(beats) - 1
 
 
 @pytest.mark.slow
@@ -193,16 +204,19 @@ def spikes_of_izhikevich(current, noise, adapts, step=0.05):
     spikes = [[] for _ in range(trials)]
     for i in range(current.shape[1]):
         before = v
-        rate_v = 0.04 * v**2 + 5 * v + 140 - w + current[:, i]
+        voltage = 0.04 * v**2 + 5 * v + 140
+        rate_v = voltage - w + current[:, i]
         rate_w = a * (0.2 * v - w)
         middle_v = v + step / 2 * rate_v
         middle_w = w + step / 2 * rate_w
-        rate_v = 0.04 * middle_v**2 + 5 * middle_v + 140 - middle_w + current[:, i]
+        middle_voltage = 0.04 * middle_v**2 + 5 * middle_v + 140
+        rate_v = middle_voltage - middle_w + current[:, i]
         v = v + step * rate_v + noise[:, i]
         w = w + step * a * (0.2 * middle_v - middle_w)
         fires = v >= 30
         for k in np.flatnonzero(fires):
-            spikes[k].append((i + (30 - before[k]) / (v[k] - before[k])) * step)
+            part = (30 - before[k]) / (v[k] - before[k])
+            spikes[k].append((i + part) * step)
         v = np.where(fires, -65.0, v)
         w = np.where(fires, w + jump, w)
     return [np.array(x) for x in spikes]
@@ -215,13 +229,17 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
     rng = np.random.default_rng(1)
     n = 20_000
     still = np.zeros((2, n))
-    steady = spikes_of_izhikevich(np.array([[9.0], [11.0]]) + still, still, adapts)
-    slower, faster = [1e3 / np.diff(x)[20:].mean() for x in steady]
+    currents = np.array([[9.0], [11.0]])
+    steady = spikes_of_izhikevich(currents + still, still, adapts)
+    rates = [1e3 / np.diff(x)[20:].mean() for x in steady]
+    slower, faster = rates
     truth = (faster - slower) / 2
     period = 2e-3 / (slower + faster) * 1e3
     push = 0.4 * slow_noise(rng, trials=4, samples=n + 1, highest=0.05e-3 / period)
-    kicks = 0.5 * np.sqrt(0.05) * rng.normal(size=(4, n))
-    spikes = spikes_of_izhikevich(10 + (push[:, 1:] + push[:, :-1]) / 2, kicks, adapts)
+    size = 0.5 * np.sqrt(0.05)
+    kicks = size * rng.normal(size=(4, n))
+    middle = (push[:, 1:] + push[:, :-1]) / 2
+    spikes = spikes_of_izhikevich(10 + middle, kicks, adapts)
     time = np.arange(n + 1) * 0.05e-3
     trials = [
         hj.Recording(time, {"u": u}, events={"beat": 1e-3 * x}, name=f"trial {k}")
@@ -242,7 +260,9 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
 
 def test_what_is_refused(noisy):
     t = np.arange(0.0, 10, 0.01)
-    wave = {"u": np.sin(t), "a": np.cos(6 * t), "b": np.sin(6 * t)}
+    sine = np.sin(6 * t)
+    cosine = np.cos(6 * t)
+    wave = {"u": np.sin(t), "a": cosine, "b": sine}
     beat = {"beat": np.arange(9.0)}
     angle = hj.KinematicPhase(4, position="a", velocity="b")
     for message, signals, phase in [

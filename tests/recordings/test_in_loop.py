@@ -16,7 +16,8 @@ RATE = 100
 
 def field(t, x, u=0.0):
     """x'' + 2 x' + (30 + 8 cos 2 pi t) x = u."""
-    return np.array([x[1], u - 2 * x[1] - (30 + 8 * np.cos(2 * np.pi * t)) * x[0]])
+    stiffness = 30 + 8 * np.cos(2 * np.pi * t)
+    return np.array([x[1], u - 2 * x[1] - stiffness * x[0]])
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,8 @@ def recording():
     n = 310 * RATE
     h = 1 / RATE
     r, w = (hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
-    e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
+    sizes = np.array([0.002, 0.01])[:, None]
+    e = sizes * rng.normal(size=(2, n))
     x = np.zeros(2)
     y = np.zeros((2, n))
     u = np.zeros(n)
@@ -42,8 +44,10 @@ def recording():
         y[:, i] = x + e[:, i]
         u[i] = r[i] - 4 * y[0, i] - y[1, i]
         for t in (i * h, i * h + h / 2):  # two steps of the midpoint rule
-            middle = x + h / 4 * field(t, x, u[i] + 0.2 * w[i])
-            x = x + h / 2 * field(t + h / 4, middle, u[i] + 0.2 * w[i])
+            force = u[i] + 0.2 * w[i]
+            middle = x + h / 4 * field(t, x, force)
+            half_later = t + h / 4
+            x = x + h / 2 * field(half_later, middle, u[i] + 0.2 * w[i])
     t = np.arange(n) * h
     clock = np.cos(2 * np.pi * t)
     signals = {"time": t, "clock": clock, "u": u, "r": r, "x": y[0] + clock, "v": y[1]}

@@ -109,16 +109,20 @@ def test_gaps_are_masked_and_cut(wave):
         np.nan
     )  # of an output, too short to lose the count
     values[(t > 9.1) & (t < 9.3), 0] = np.nan  # of the input, longer than a section
-    values[(t > 14) & (t < 16), 1:] = np.nan
+    hidden = (t > 14) & (t < 16)
+    values[hidden, 1:] = np.nan
     data = sample(
         hj.Recording(t, dict(zip("fxv", values.T, strict=True))), timing="duration"
     )
     assert len(data.records) == 2
     for record, times in zip(data.records, data.times, strict=True):
-        lost, x = np.isnan(record.y[:, [0, 2]]).T
-        np.testing.assert_array_equal(x, lost | np.append(True, lost[:-1]))
+        y = record.y[:, [0, 2]]
+        lost, x = np.isnan(y).T
+        lost_before = np.append(True, lost[:-1])
+        np.testing.assert_array_equal(x, lost | lost_before)
         np.testing.assert_array_equal(lost & (times > 4.29) & (times < 4.51), lost)
-        end = np.append(times[1:], times[-1] + 0.125)
+        last = times[-1] + 0.125
+        end = np.append(times[1:], last)
         np.testing.assert_array_equal(
             np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29)
         )
@@ -163,7 +167,8 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
     hidden = values.copy()
     for at in rng.choice(np.arange(10, 190), 5, replace=False):
         start = at + 0.5 - rng.uniform(0.02, 0.18)
-        hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
+        is_hidden = (t > start) & (t < start + 0.2)
+        hidden[is_hidden, 1:] = np.nan
     options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
     both = [
         hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)
@@ -173,7 +178,8 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
     assert dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
     (before,) = clean.times
     for record, times in zip(dirty.records, dirty.times, strict=True):
-        first = int(np.argmin(np.abs(before - times[0])))
+        distance = np.abs(before - times[0])
+        first = int(np.argmin(distance))
         true = slice(first, first + len(times))
         np.testing.assert_allclose(times, before[true], atol=2e-3)
         assert (
@@ -228,11 +234,14 @@ def test_designs_as_tables(tmp_path, wave):
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
         hj.recordings.attach_design(wave, phase, tmp_path / "time.csv")
     lines = (tmp_path / "phase.csv").read_text().splitlines()
-    (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
+    head = lines[: 1 + 19 * 8]
+    (tmp_path / "one.csv").write_text("\n".join(head))
     told = hj.recordings.attach_design(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
-    section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
-    u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
+    record = data.records[0]
+    section = (record.first_section + np.arange(len(record.u))) % 8
+    of_cycle = data.cycle_inputs[section, 0]
+    u = data.records[0].u[:, 0] + of_cycle
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(
         u[first : first + 150], design.signals(19)[0, :150, 0], atol=1e-9
@@ -276,7 +285,8 @@ def identify(files, out, *more):
         "--sections",
         "16",
     ]
-    return main(["identify", *trials, *options, "--out", str(out), *more])
+    arguments = ["identify", *trials, *options, "--out", str(out), *more]
+    return main(arguments)
 
 
 @pytest.fixture(scope="module")
@@ -356,7 +366,8 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(
     with pytest.raises(SystemExit, match=f"{name}' is in the way"):
         identify(files, tmp_path)
     assert not capsys.readouterr().out
-    assert [p.read_text() for p in tmp_path.rglob("*") if p.is_file()] == ["mine"]
+    written = [p.read_text() for p in tmp_path.rglob("*") if p.is_file()]
+    assert written == ["mine"]
 
 
 def test_signals_with_clocks_of_their_own(rhythm):
@@ -391,23 +402,28 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     b = np.array([1.0, 2.0, 3.0, 4.0])
     c = np.array([5.0, 7.0, 11.0, 13.0])
     columns = (x[:, None, None] for x in (b, c))
-    model = hj.linear.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
+    A = np.full((N, 1, 1), a)
+    model = hj.linear.LDTP(A, *columns, inputs="f", outputs="x")
     zero = np.zeros((N, 7, 1, 1))
-    grid = (np.arange(N) / N, np.arange(7) / N)
+    phases = np.arange(N) / N
+    grid = (phases, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
     times = np.cumsum(np.tile(np.roll(steps, 1), 60))
     found = ImpulseResponses(zero, zero, *grid, 0.0, steps, ("f",), ("x",))
     m = np.arange(N)[:, None]
     r = np.arange(1, 7)
-    expected = b[m] * a ** (r - 1) * c[(m + r) % N] / steps[m]
-    np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
+    answer = b[m] * a ** (r - 1) * c[(m + r) % N]
+    expected = answer / steps[m]
+    found_responses = found.of_model(model)[:, 1:, 0, 0]
+    np.testing.assert_allclose(found_responses, expected, rtol=1e-13)
     # Their standard errors are the scatter of fits.
     apart = []
     rng = np.random.default_rng(0)
     about = dict(inputs=("f",), outputs=("x",))
     for _ in range(60):
         u = rng.normal(size=(240, 1))
-        y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
+        response = np.asarray(model.simulate(u))
+        y = response + 20 * rng.normal(size=(240, 1))
         record = hj.experiments.SectionSeries(u, y, n_sections=N, **about)
         cycle = np.zeros((N, 1))
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))

@@ -34,12 +34,15 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
             y.append(gains[n % N] * np.real(x))
             x = multiplier ** (1 / N) * x + rng.normal()
         y = np.array(y)
-        slow = drift * np.sin(np.arange(len(y))[:, None] / 800)
-        y += y.std(axis=0) * (noise * rng.normal(size=y.shape) + slow)
+        places = np.arange(len(y))[:, None]
+        slow = drift * np.sin(places / 800)
+        errors = noise * rng.normal(size=y.shape)
+        y += y.std(axis=0) * (errors + slow)
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
         t = np.arange(len(y)) / N
         events = {"e": np.arange(count)}
-        trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
+        name = f"{len(trials)}"
+        trials.append(hj.Recording(t, signals, events=events, name=name))
     return hj.Recording.join(trials)
 
 
@@ -68,7 +71,8 @@ def test_a_pair_has_one_interval_that_contains_the_estimate():
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.2, 0.6, 500)
     ratio = rng.uniform(1.1, 1.8, 500)
-    pairs = 0.5 * np.exp(1j * np.stack([angle, -angle], axis=1))
+    angles = np.stack([angle, -angle], axis=1)
+    pairs = 0.5 * np.exp(1j * angles)
     both_real = 0.5 * np.stack([1 / ratio, ratio], axis=1)
     draws = np.concatenate([pairs, both_real])
     noise = 1 + 0.1 * rng.normal(size=(1000, 1))
@@ -105,7 +109,8 @@ def test_too_few_multipliers_are_a_finding():
     assert "Order: 2 multipliers give 0.5" in repr(single)
     require_no_finding("order", hj.recordings.natural_multipliers(pair, 2))
     # (One of two intervals is enough.)
-    half = hj.recordings.natural_multipliers(variable(0.1, (60, 60), 0.3 + 0.5j, 2))
+    recording = variable(0.1, (60, 60), 0.3 + 0.5j, 2)
+    half = hj.recordings.natural_multipliers(recording)
     require_no_finding("order", half)
 
 
@@ -135,7 +140,8 @@ def test_short_records_are_drawn_whole():
 
 def test_intervals_of_few_blocks_are_wider_than_percentiles():
     found = hj.recordings.natural_multipliers(variable(0.3, strides=(39, 40)))
-    plain = np.ptp(np.quantile(np.abs(found.draws[:, 0]), [0.025, 0.975]))
+    moduli = np.abs(found.draws[:, 0])
+    plain = np.ptp(np.quantile(moduli, [0.025, 0.975]))
     assert 1.1 < np.ptp(found.interval()[0]) / plain < 1.4
 
 
@@ -145,7 +151,8 @@ def turning(modulus, angle, cycles, seed):
     z = np.zeros(cycles * N, complex)
     for k in range(1, len(z)):
         noise = rng.normal() + 1j * rng.normal()
-        z[k] = modulus ** (1 / N) * np.exp(1j * angle / N) * z[k - 1] + noise
+        turn = modulus ** (1 / N) * np.exp(1j * angle / N)
+        z[k] = turn * z[k - 1] + noise
     signals = {"a": z.real, "b": z.imag}
     recording = hj.Recording(
         np.arange(len(z)) / N, signals, events={"e": np.arange(cycles)}

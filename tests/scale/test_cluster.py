@@ -27,7 +27,8 @@ class Plane(hj.Chart):
     states = ("x", "v")
 
     def field(self, t, q, u):
-        return q[1], u[0] + jnp.cos(2 * jnp.pi * t) - 20.0 * q[0] - 1.0 * q[1]
+        push = u[0] + jnp.cos(2 * jnp.pi * t)
+        return q[1], push - 20.0 * q[0] - 1.0 * q[1]
 
 
 class Driven(hj.HybridSystem):
@@ -75,7 +76,8 @@ def test_draws_have_streams_of_their_own(whole):
         expected = walk(np.random.default_rng(stream))
         assert_array_equal(whole.end[i], expected["end"])
         assert whole.far[i] == expected["far"]
-    assert_array_equal(hj.scale.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
+    fewer = hj.scale.monte_carlo(walk, 3, seed=7)
+    assert_array_equal(fewer.end, whole.end[:3])
 
 
 def test_draws_that_fail_are_named():
@@ -145,7 +147,8 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         (values / "c").symlink_to(victim)
     elif harm == "shape":
         about = (values / "zarr.json").read_text()
-        (values / "zarr.json").write_text(re.sub(r"\b4\b", f"{10**12}", about, count=1))
+        larger = re.sub(r"\b4\b", f"{10**12}", about, count=1)
+        (values / "zarr.json").write_text(larger)
     elif harm == "absent":
         shutil.rmtree(values)
     elif harm == "start":
@@ -247,4 +250,6 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     whole = hj.fit_series(data, 2, check=False)
     assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
     assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
-    assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))
+    of_store = repr(hj.validate(whole, stored))
+    of_data = repr(hj.validate(whole, data))
+    assert of_store == of_data

@@ -43,7 +43,8 @@ def whole(wheel, options):
 
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
-    expected = np.broadcast_to(np.cos(2 * np.pi / OVER["spokes"]) ** 2, (3, 3))
+    multiplier = np.cos(2 * np.pi / OVER["spokes"]) ** 2
+    expected = np.broadcast_to(multiplier, (3, 3))
     assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
     assert (whole.result == 0).all()
@@ -67,7 +68,8 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
     assert np.flatnonzero(found.result).tolist() == [2]
     assert np.isnan(found.period[2])
-    expected = np.delete(np.cos(2 * np.pi / found.spokes.values) ** 2, 2)
+    multiplier = np.cos(2 * np.pi / found.spokes.values) ** 2
+    expected = np.delete(multiplier, 2)
     assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
 
@@ -126,14 +128,16 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     def twice(cycle):
         if float(cycle.system.slope) > 0.08:
             raise hj.errors.ComputationError("too steep")
-        return jnp.stack([cycle.period, cycle.trajectory(2.0).t[-1]])
+        two_periods = cycle.trajectory(2.0)
+        return jnp.stack([cycle.period, two_periods.t[-1]])
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
     assert found.period.dims == ("point",)
     assert set(found.coords) == {"slope", "spokes"}
     expected = whole.period.values[::2, ::2].T.ravel()
     assert_allclose(found.period, expected, rtol=1e-9)
-    expected = float(found.period[0]) * np.array([1, 2])
+    period = float(found.period[0])
+    expected = period * np.array([1, 2])
     assert_allclose(found.twice[0], expected)
     assert np.isnan(found.twice[1]).all()
     for wrong, message in (

@@ -35,7 +35,8 @@ class Chosen(hj.sections.AbstractSections):
         return hj.sections.BoundSections.at_times(self.values * orbit.period)
 
     def describe(self, i):
-        return f"section {i} (at {float(self.values[i]):.3g})"
+        value = float(self.values[i])
+        return f"section {i} (at {value:.3g})"
 
 
 class Levels(hj.sections.AbstractLevels):
@@ -81,8 +82,10 @@ def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
     family = hj.sections.ArcLength(8, OUTPUTS, APEX, scale=scale)
     placed = hj.sections.place_sections(hopper_cycle, family)
     t, *signals = hopper_cycle.trajectory(3.0)(*OUTPUTS, per_step=200)
-    steps = np.diff(np.stack(signals) / scale[:, None], axis=1)
-    length = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=0)))
+    scaled = np.stack(signals) / scale[:, None]
+    steps = np.diff(scaled, axis=1)
+    lengths = np.linalg.norm(steps, axis=0)
+    length = np.append(0.0, np.cumsum(lengths))
     at = np.append(placed.lanes.t, placed.lanes.t[0] + 1.0) + np.ceil(
         t[0] - placed.lanes.t[0]
     )

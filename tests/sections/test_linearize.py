@@ -30,7 +30,8 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
     assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
     assert_array_equal(isochron_ldtp.dims, data["dim"])
     assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
-    assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
+    expected = padded(data["B"])
+    assert_allclose(isochron_ldtp.B[..., 0], expected, atol=1e-8)
     assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
     assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
     markov = isochron_ldtp.impulse_response(97)[..., 0]
@@ -39,9 +40,12 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
 
 def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
     data = reference("htf_exact_isochron")
-    H = np.asarray(isochron_ldtp.htf(data["f"]).H)[..., 0].transpose(1, 0, 2)
-    largest = np.abs(data["H"][:, 16]).max(axis=0)
-    assert np.all(np.abs(H - data["H"]).max(axis=(0, 1)) <= 1e-8 * largest)
+    values = np.asarray(isochron_ldtp.htf(data["f"]).H)[..., 0]
+    H = values.transpose(1, 0, 2)
+    modulus = np.abs(data["H"][:, 16])
+    largest = modulus.max(axis=0)
+    error = np.abs(H - data["H"]).max(axis=(0, 1))
+    assert np.all(error <= 1e-8 * largest)
 
 
 @pytest.mark.parametrize("family", ["isochron_ldtp", "kinematic_ldtp"])
@@ -51,7 +55,8 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
     assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
-        found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
+        monodromy = np.asarray(ldtp.monodromy(i))
+        found = sorted(np.linalg.eigvals(monodromy), key=abs)
         measured = sorted(found[-2:], key=np.imag)
         assert_allclose(measured, truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
@@ -277,7 +282,8 @@ def test_second_derivatives_of_a_period():
         return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), cycle).period
 
     h = 1e-3
-    second = (period(1 + h) - 2 * period(1.0) + period(1 - h)) / h**2
+    change = period(1 + h) - 2 * period(1.0) + period(1 - h)
+    second = change / h**2
     exact = jax.jacrev(jax.jacfwd(period))(1.0)
     assert_allclose(exact, second, rtol=1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="jacrev.*jacfwd"):

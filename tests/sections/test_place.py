@@ -65,7 +65,8 @@ def test_an_angle_as_the_anchor(hopper_cycle):
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     placed = hj.sections.place_sections(hopper_cycle, family)
     height, speed = np.asarray(placed.lanes.q)[:2]
-    angle = np.unwrap(np.arctan2(speed / 1.9, (height - 1.9) / 0.3))
+    height_in_sizes = (height - 1.9) / 0.3
+    angle = np.unwrap(np.arctan2(speed / 1.9, height_in_sizes))
     expected = 0.3 - np.pi / 2 * np.arange(4)
     assert_allclose(angle, expected, atol=1e-10)
 
@@ -210,12 +211,14 @@ def test_outputs_of_any_kind_and_feedthrough(
 
     outputs = ["vM", hj.Output("aM", acceleration)]
     ldtp = hj.linearize(hopper_cycle, placed_isochrons, outputs)
-    assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
+    found = ldtp.C[:, 0]
+    assert_array_equal(found, isochron_ldtp.C[:, 1])
     in_flight = np.asarray(ldtp.dims) == 4
     for section in range(32):
         assert_allclose(ldtp.D[section, :, 0], [0.0, 0.5], atol=1e-15)
         by_foot = 5.0 if in_flight[section] else 0.0
-        assert_allclose(ldtp.C[section, 1], [-5.0, 0.0, by_foot, 0.0])
+        expected = [-5.0, 0.0, by_foot, 0.0]
+        assert_allclose(ldtp.C[section, 1], expected)
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):

@@ -87,9 +87,12 @@ def run(system):
 
 def test_kinds_are_found():
     assert Structure(Circle()).kinds == [(0, 2, 4), (1, 3, 5)]
-    assert Structure(Circle(apart=True)).kinds == [(g,) for g in range(6)]
-    assert Structure(hj.models.BouncingChain(n=3)).kinds == [(0, 1, 2)]
-    assert Structure(hj.models.TwoLeggedBar()).kinds == [(g,) for g in range(8)]
+    apart = Structure(Circle(apart=True))
+    assert apart.kinds == [(g,) for g in range(6)]
+    chain = Structure(hj.models.BouncingChain(n=3))
+    assert chain.kinds == [(0, 1, 2)]
+    bar = Structure(hj.models.TwoLeggedBar())
+    assert bar.kinds == [(g,) for g in range(8)]
 
 
 @pytest.mark.parametrize("other", [Circle(apart=True)])
@@ -98,16 +101,23 @@ def test_events_are_those_of_transitions_of_their_own(other):
     two = run(other)
     assert len(one.events) == 8
     assert [e.name for e in one.events] == [e.name for e in two.events]
-    assert_allclose([e.time for e in one.events], [e.time for e in two.events])
-    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+    times = [e.time for e in one.events]
+    other_times = [e.time for e in two.events]
+    assert_allclose(times, other_times)
+    counts = [e.after["n"] for e in one.events]
+    other_counts = [e.after["n"] for e in two.events]
+    assert counts == other_counts
 
 
 def test_numbers_are_those_of_python():
     """In JAX, an integer to the power of one that is negative is another number."""
     one = run(Circle(mark=Halving))
     two = run(Circle(mark=Halving, apart=True))
-    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
-    assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
+    counts = [e.after["n"] for e in one.events]
+    other_counts = [e.after["n"] for e in two.events]
+    assert counts == other_counts
+    steps = np.diff([e.after["n"] for e in one.events])
+    assert set(steps) == {1.0, 0.5, 0.25}
 
 
 def test_jacobians_are_those_of_each():

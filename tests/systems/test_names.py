@@ -20,7 +20,9 @@ class Plane(hj.Chart):
     def field(self, t, q, u):
         x, y = q
         growth = 1 - x**2 - y**2
-        return growth * x - ANGULAR * y + u[0], growth * y + ANGULAR * x
+        x_rate = growth * x - ANGULAR * y + u[0]
+        y_rate = growth * y + ANGULAR * x
+        return x_rate, y_rate
 
 
 class Oscillator(hj.HybridSystem):

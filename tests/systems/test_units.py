@@ -15,7 +15,8 @@ def units(names):
 
 
 def small_htf(**names):
-    return hj.linear.HTF([0.1, 0.2], np.ones((1, 2, 1, 1)), 0, 8, **names)
+    values = np.ones((1, 2, 1, 1))
+    return hj.linear.HTF([0.1, 0.2], values, 0, 8, **names)
 
 
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
