@@ -79,7 +79,8 @@ def _observations(families: Mapping[str, Any]) -> list[dict]:
         )
 
     def top(family, m):
-        return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
+        modulus = np.abs(np.asarray(family.estimate[m])[:, :, 0])
+        return modulus.max(axis=0)
 
     iso = families["isochron"]
     kin = families["kinematic"]
@@ -190,12 +191,14 @@ def table(summary: dict) -> str:
             "computed here.",
             "The reproduction has not failed: docs/paper-errata.md explains each difference.",
         ]
-    return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s.", ""])
+    time = f"Time: {summary['seconds']:.1f} s."
+    return "\n".join([*rows, "", time, ""])
 
 
 def complex_pairs(values) -> list[list[float]]:
     """Return real and imaginary parts, as JSON holds them."""
-    return [[float(z.real), float(z.imag)] for z in np.asarray(values).ravel()]
+    flat = np.asarray(values).ravel()
+    return [[float(z.real), float(z.imag)] for z in flat]
 
 
 def _pairs(values) -> str:

@@ -121,7 +121,8 @@ def reset(
     """The state after transitions of one kind, and (on the host) its derivatives."""
     if on_host(q):
         return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
-    return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
+    by_lane = s.by_lane(ft.partial(_reset, g.kind))
+    return by_lane(t, q, u, g.place)[:, None]
 
 
 def enabled(
@@ -141,7 +142,8 @@ def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
 def by_parameter_of_period(s: Structure) -> Any:
     """The derivative of the period of a clock by the only input, which is added to a parameter."""
     if is_traced(s):
-        return jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))(jnp.zeros(1))[0, 0]
+        by_input = jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))
+        return by_input(jnp.zeros(1))[0, 0]
     t = np.zeros(1)
     no_state = np.zeros((0, 1))
     u = np.zeros((1, 1))
@@ -263,7 +265,9 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
             return function(*bound, t, q, u, *further)
 
         def split(x):
-            return (x[0], x[1 : 1 + n], x[1 + n :])
+            q = x[1 : 1 + n]
+            u = x[1 + n :]
+            return (x[0], q, u)
 
         def push(dx):
             return jax.jvp(at, (t, q, u), split(dx))

@@ -91,20 +91,23 @@ def _replayed(
     """The end of a recorded piece of flow, and if it `keeps` them, the ends of all moves."""
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     scheduled = jnp.array([*is_scheduled, False])
+    level = len(s.transitions)
 
     def row(carry, row):
         h, code, at_once = row
 
         def move(carry):
             t, q, chart = carry
-            by_clock = (code >= 0) & scheduled[code]
+            is_event = code >= 0
+            by_clock = is_event & scheduled[code]
             due = scheduled_time(s, code, t + h)
             length = jnp.where(by_clock, due - t, h)
             length = jnp.where(code == ARRIVE_TIME, target.time - t, length)
-            which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
+            which = jnp.where(code == ARRIVE_LEVEL, level, code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            t, q = _advance(s, begin, code != IDLE, u, target, length, which)
+            is_move = code != IDLE
+            t, q = _advance(s, begin, is_move, u, target, length, which)
             event = jnp.maximum(code, -1)
             after, chart = apply_resets(s, t, chart, q, u, event)
             return (t, after, chart), kept(t, q, after)
@@ -139,7 +142,8 @@ def _replayed(
     at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
     code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
     begin = lanes.t, lanes.q, lanes.chart
-    (t, q, _), ways = jax.lax.scan(block, begin, (h, code, at_once))
+    rows_of_blocks = (h, code, at_once)
+    (t, q, _), ways = jax.lax.scan(block, begin, rows_of_blocks)
     in_rows = jax.tree_util.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ways)
     return (t, q), in_rows
 
@@ -186,7 +190,8 @@ def _advance(
         if flow.rows:
             t1, q1 = jax.lax.cond(some(crossing >= 0), land, lambda: (t1, q1))
         t_out = jnp.where(here, t1, t_out)
-        q_out = q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+        moved = jnp.where(here, q1, q_out[:n])
+        q_out = q_out.at[:n].set(moved)
         return t_out, q_out
 
     return for_each_chart(s, chart, moving, work, (t, q))
@@ -230,7 +235,8 @@ def chain(
         f = slopes(s, moves.t, moves.chart, moves.q, u).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
         project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
-        by[flows, :, 1:n] = by[flows, :, 1:n] @ project
+        by_state = by[flows, :, 1:n]
+        by[flows, :, 1:n] = by_state @ project
     columns = _products(moves, by, len(lanes.t))
     ends = np.concatenate([lanes.t[None], lanes.q])
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
@@ -279,7 +285,8 @@ class Variation:
             return np.repeat(x, n + P, axis=-1)
 
         M = len(moves.t)
-        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), M)
+        each_start = np.tile(np.eye(n, n + P), M)
+        aside = 1j * kernels.TINY * each_start
         along = Moves(*map(many, moves))
         direction = np.arange(len(along.t)) % (n + P)
         lane = along.lane * (n + P) + direction
@@ -292,8 +299,10 @@ class Variation:
         moves_more = s.moving | times.any(axis=1)
         is_first = np.arange(P) == 0
         self._unit = np.eye(P)[moves_more | is_first]
-        needed = np.append(np.full(n, twice), self._unit.any(axis=0))
-        along = Moves(*(x[..., np.tile(needed, M)] for x in along))
+        own_lane = self._unit.any(axis=0)
+        needed = np.append(np.full(n, twice), own_lane)
+        of_moves = np.tile(needed, M)
+        along = Moves(*(x[..., of_moves] for x in along))
         unmoved = np.zeros((n, len(lanes.t)))
         later = np.concatenate([unmoved, times]).T.ravel()
         index = np.broadcast_to(target.index, target.time.shape)
@@ -307,7 +316,8 @@ class Variation:
         end = end.reshape(M, -1, n)
         self._by = np.real(by[:, 0])
         self._change = np.imag(by) / kernels.TINY
-        kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
+        of_directions = end[:, -len(self._unit) :]
+        kick = np.imag(of_directions) / kernels.TINY
         self._kick = np.moveaxis(kick, 1, 2) @ self._unit
 
     def tangents(
@@ -315,8 +325,10 @@ class Variation:
     ) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
         starts = [begin]
-        for by, kick in zip(self._by[:, :, : len(begin)], self._kick, strict=True):
-            starts.append(by @ starts[-1] + kick)
+        by_start = self._by[:, :, : len(begin)]
+        for by, kick in zip(by_start, self._kick, strict=True):
+            carried = by @ starts[-1]
+            starts.append(carried + kick)
         return np.stack(starts)
 
     def jacobians(
@@ -334,16 +346,20 @@ class Variation:
         change = change.reshape(M, P, n, m)
         by = self._by[:, None] + 1j * kernels.TINY * change
         if sizes is not None:
-            f = slopes(self._s, *self.points(tangents, np.arange(M)))
+            points = self.points(tangents, np.arange(M))
+            f = slopes(self._s, *points)
             f = f.T.reshape(M, P, n - 1)
             flows = ~moves.at_once
             size = sizes[moves.chart[flows]]
             project = projections(f[flows], size[:, None])
-            by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
+            by_state = by[flows, ..., 1:n]
+            by[flows, ..., 1:n] = by_state @ project
         direction = np.arange(M * P) % P
         lane = np.repeat(moves.lane, P) * P + direction
-        each = moves._replace(lane=lane, order=np.repeat(moves.order, P))
-        columns = _products(each, by.reshape(-1, n, m), len(self.first) * P)
+        order = np.repeat(moves.order, P)
+        each = moves._replace(lane=lane, order=order)
+        lanes = len(self.first) * P
+        columns = _products(each, by.reshape(-1, n, m), lanes)
         return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
@@ -370,7 +386,8 @@ def _until_ticks(
         if isinstance(transition.guard, Scheduled) and at.any():
             end = (t + h).real[at] + 0j
             u = kernels.unpushed(s, lane[at])
-            late = kernels.due(s, g, end, q[:, at], u)[0, 0]
+            rows_due = kernels.due(s, g, end, q[:, at], u)
+            late = rows_due[0, 0]
             h[at] = end + late - t[at]
     return h
 
@@ -469,7 +486,8 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     moved = np.intersect1d(code, varied).astype(int)
     for g in moved.tolist():
         now = np.flatnonzero(code == g)
-        due = kernels.due(s, g, t[now], q[:, now], u[:, now])[0]
+        rows_due = kernels.due(s, g, t[now], q[:, now], u[:, now])
+        due = rows_due[0]
         by_parameter = due[2 + n :].T
         longer[now, 0, 1 + n :] = by_parameter
     dt = longer.copy()
@@ -521,7 +539,8 @@ def _at_zeros(
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     is_crossed = np.array(flow.rows)[:, None] == crossed
     row = np.argmax(is_crossed, axis=0)
-    watched = watched[row, :, np.arange(len(lands))][:, None]
+    own = watched[row, :, np.arange(len(lands))]
+    watched = own[:, None]
 
     # (Over the time past: nothing but rounding errors, with derivatives.)
     past = zero.past[:, None, None]

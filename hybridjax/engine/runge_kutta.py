@@ -215,7 +215,8 @@ def _decoupled(method: Method) -> _Decoupled:
     kept = np.imag(values) >= 0  # one of each conjugate pair, twice
     values = values[kept]
     times = np.where(np.imag(values) > 0, 2, 1)
-    return _Decoupled(T[:, kept] * times, np.diag(values), np.linalg.inv(T)[kept])
+    inverse_rows = np.linalg.inv(T)[kept]
+    return _Decoupled(T[:, kept] * times, np.diag(values), inverse_rows)
 
 
 def _implicit_step(
@@ -278,7 +279,8 @@ def errors(
     # takes the place of the step. It has not where a fast mode was excited, by however little, and
     # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
     def divide(x):
-        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
+        size = jnp.where(x == 0, 1.0, jnp.abs(x))
+        return jnp.abs(estimate) / size
 
     larger = jnp.maximum(divide(rough), 1 - divide(plain))
     ratio = jnp.where(rough == 0, 1.0, larger)
@@ -299,7 +301,8 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
     J = _jacobian(field, t, q)
     c = np.array(method.c)[:, None]
     left, R, right = _decoupled(method)
-    solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
+    factors = set(np.diag(R))
+    solve = {g: inverse(_shifted(J, g * h)) for g in factors if g != 0}
     evaluate = jax.vmap(field)
 
     def correction(w):
@@ -381,7 +384,8 @@ class StageEquations(NamedTuple):
         eye = jnp.eye(len(q))[..., None]
         blocks = {}
         for i, j in np.argwhere(A).tolist():
-            blocks[i, j] = -A[i, j] * h * J[i]
+            coupling = -A[i, j] * h
+            blocks[i, j] = coupling * J[i]
         for k in range(len(A)):
             blocks[k, k] = eye + blocks.get((k, k), 0.0)
         return cls.factored(blocks, len(A))
@@ -415,7 +419,8 @@ class StageEquations(NamedTuple):
         for k in reversed(range(len(rows))):
             for j in range(k + 1, len(rows)):
                 if (k, j) in self.upper:
-                    rows[k] = rows[k] - _apply(self.upper[k, j], rows[j])
+                    known = _apply(self.upper[k, j], rows[j])
+                    rows[k] = rows[k] - known
             rows[k] = _apply(self.inverses[k], rows[k])
         return jnp.stack(rows)
 
@@ -462,6 +467,7 @@ def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
         is_row = (rows == k)[:, None]
         return jnp.where(is_row, pivot, X - column * pivot)
 
-    eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
+    unit = jnp.eye(n, dtype=matrix.dtype)[..., None]
+    eye = jnp.broadcast_to(unit, matrix.shape)
     X = jnp.concatenate([matrix, eye], axis=1)
     return jax.lax.fori_loop(0, n, eliminate, X)[:, n:]

@@ -136,7 +136,8 @@ class Trajectory(Showable, eqx.Module):
         the same time.
         """
         duration = np.diff(self.t)[:, None, None]
-        part = np.linspace(0.0, 1.0, per_step + 1)[None, :, None]
+        fractions = np.linspace(0.0, 1.0, per_step + 1)
+        part = fractions[None, :, None]
         states = interpolate(
             part,
             duration,
@@ -145,15 +146,18 @@ class Trajectory(Showable, eqx.Module):
             self.slope_after[:-1, None],
             self.slope_before[1:, None],
         )
-        times = self.t[:-1, None] + (duration * part)[..., 0]
+        since = (duration * part)[..., 0]
+        times = self.t[:-1, None] + since
         charts = np.broadcast_to(self.chart[:-1, None], times.shape)
         # (The start of a step repeats the end of the last one, but for resets.)
         is_new = np.ones(times.shape, bool)
         is_new[1:, 0] = self.event[1:-1] >= 0
+        # (-1, the last row, if the trajectory ends with a reset; else no row.)
         final_reset = np.flatnonzero(self.event[-1:] >= 0) - 1
         t = np.append(times[is_new], self.t[final_reset])
         chart = np.append(charts[is_new], self.chart[final_reset])
-        return t, chart, np.vstack([states[is_new], self.after[final_reset]])
+        state = np.vstack([states[is_new], self.after[final_reset]])
+        return t, chart, state
 
     def at(
         self, t: Annotated[Numbers, Reals("p")]
@@ -164,17 +168,27 @@ class Trajectory(Showable, eqx.Module):
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
         t = np.asarray(t)
-        if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
-            raise DefinitionError(
-                f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}."
-            )
+        begin = self.t[0]
+        end = self.t[-1]
+        if len(t) and not begin <= t.min() <= t.max() <= end:
+            raise DefinitionError(f"times must lie between {begin:.9g} and {end:.9g}.")
         k = np.searchsorted(self.t, t, side="right") - 1
         j = np.minimum(k + 1, len(self.t) - 1)
-        h = (self.t[j] - self.t[k])[:, None]
+        duration = (self.t[j] - self.t[k])[:, None]
         since = t[:, None] - self.t[k, None]
-        x = np.divide(since, h, out=np.zeros_like(h), where=h > 0)
-        ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
-        return self.chart[k], interpolate(x, h, *ends)
+        # (A time at the very end lies in a step without duration.)
+        part = np.divide(
+            since, duration, out=np.zeros_like(duration), where=duration > 0
+        )
+        states = interpolate(
+            part,
+            duration,
+            self.after[k],
+            self.before[j],
+            self.slope_after[k],
+            self.slope_before[j],
+        )
+        return self.chart[k], states
 
     def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
@@ -228,11 +242,14 @@ def observed(
         at = chart == a
         states = s.charts[a].states
         if all(item in states for item in items):  # (without compiling a function)
-            values[:, at] = q[at].T[[states.index(item) for item in items]]
+            columns = [states.index(item) for item in items]
+            values[:, at] = q[at].T[columns]
             continue
         u = np.zeros((s.nu, 1))
-        point = t[at], q[at, : s.dims[a]].T, u
-        values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
+        state = q[at, : s.dims[a]].T
+        point = t[at], state, u
+        rows = kernels.outputs(s, int(a), items, *point)
+        values[:, at] = rows[:, 0]
     return values
 
 
@@ -382,7 +399,8 @@ def recorded(
     for tape in tapes:
         lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = lane.t, lane.before, lane.after, lane.chart, lane.code
-        rows.append(tuple(x[lane.code != IDLE] for x in columns))
+        is_move = lane.code != IDLE
+        rows.append(tuple(x[is_move] for x in columns))
     joined = [np.concatenate(x) for x in zip(*rows, strict=True)]
     t, before, after, chart, event = joined
     source = np.append(chart[:1], chart[:-1])
@@ -464,14 +482,16 @@ def guards_reached(
     for g, row in zip(guards, rows, strict=True):
         if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
             continue
+        value = float(row[0])
         slope = row[1 : 2 + n]
         noise = _SAME * np.abs(slope * point).sum()
         rate = slope @ flow
-        falls = rate < -_SAME * np.abs(slope * flow).sum()
-        if row[0] < -noise:
-            yield g, float(row[0]), False
-        elif falls and row[0] <= noise - instant * rate:
-            yield g, float(row[0]), True
+        noise_of_rate = _SAME * np.abs(slope * flow).sum()
+        falls = rate < -noise_of_rate
+        if value < -noise:
+            yield g, value, False
+        elif falls and value <= noise - instant * rate:
+            yield g, value, True
 
 
 def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
@@ -486,23 +506,32 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
         n = s.dims[a]
         rows = events[charts[events] == a]
         sizes = np.abs(after[:, :n]).max(axis=0)
-        state = after[rows, :n].T
-        guard = _guards_at(s, a, t[rows], state, u)
+        # Values of the guards before the event, after it, and at the end of the next step.
         begin = before[rows, :n].T
+        state = after[rows, :n].T
         end = before[rows + 1, :n].T
         value_before = _guards_at(s, a, t[rows], begin, u)[:, 0]
-        value_later = _guards_at(s, a, t[rows + 1], end, u)[:, 0]
+        guard = _guards_at(s, a, t[rows], state, u)
         value = guard[:, 0]
+        later = t[rows + 1]
+        value_later = _guards_at(s, a, later, end, u)[:, 0]
+
+        # Their rates along the field after the event.
         slope = guard[:, 2 : 2 + n]
         field = kernels.field(s, a, t[rows], state, u)[:, 0]
         rate = guard[:, 1] + np.einsum("gnk,nk->gk", slope, field)
+
         # (Zeros are parts of the terms of values and rates.)
-        zero = _SAME * np.einsum("gnk,n->gk", np.abs(slope), sizes)
-        zero_rate = _SAME * np.einsum("gnk,nk->gk", np.abs(slope), np.abs(field))
-        still = np.abs(rate) <= zero_rate
+        steepness = np.abs(slope)
+        zero = _SAME * np.einsum("gnk,n->gk", steepness, sizes)
+        zero_rate = _SAME * np.einsum("gnk,nk->gk", steepness, np.abs(field))
+
+        is_still = np.abs(rate) <= zero_rate
         had_guard = dims[charts[rows - 1]] == n
-        crosses = had_guard & (np.abs(value_before) <= zero) & (~still)
-        through = (np.abs(value) <= zero) & (value_later < 0) & ~crosses
+        was_on_guard = np.abs(value_before) <= zero
+        crosses = had_guard & was_on_guard & ~is_still
+        is_on_guard = np.abs(value) <= zero
+        through = is_on_guard & (value_later < 0) & ~crosses
         passed += rows[through.any(axis=0)].tolist()
     return min(passed, default=None)
 

@@ -161,7 +161,8 @@ def residuals_of(
         count = jnp.cumsum(is_own)
         number = jnp.arange(1, len(measured) + 1)
         row = jnp.argmax(count == number[:, None], axis=1)
-        time = jnp.where(count[-1] >= number, found.event_times[row], jnp.nan)
+        has_come = count[-1] >= number
+        time = jnp.where(has_come, found.event_times[row], jnp.nan)
         parts.append((time - measured) / observation.event_scale)
     return jnp.concatenate(parts)
 

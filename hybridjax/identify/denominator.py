@@ -41,7 +41,8 @@ def divided_by_chi(
 ) -> Complex[np.ndarray, "*d M F ny nu"]:
     r"""Return $\sum_r b_m[r] z^{-r} / \chi(z^{-N})$ at frequencies f, with r from -lead on."""
     delay = np.exp(-2j * np.pi / N * f)
-    powers = delay[:, None] ** (np.arange(numerators.shape[-3]) - lead)
+    exponents = np.arange(numerators.shape[-3]) - lead
+    powers = delay[:, None] ** exponents
     values = np.einsum("fr,...mrij->...mfij", powers, numerators)
     return values / chi(delay**N, c)[:, None, None]
 

@@ -144,7 +144,8 @@ def spectral_products(
     else:
         unit = like.unit
     classes = np.arange(P // 2 + 1)
-    bins = (classes[:, None] + P * np.arange(N)) % (N * P)
+    harmonics = P * np.arange(N)
+    bins = (classes[:, None] + harmonics) % (N * P)
     windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
     spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
@@ -336,7 +337,8 @@ def _solve_classes(
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
     counted = dof + _diagonal(left).sum(axis=1)
-    total = variance(G, counted[:, None, None] + 2 * edge[:, None])
+    twice = counted[:, None, None] + 2 * edge[:, None]
+    total = variance(G, twice)
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
     return _ClassEstimates(
         H=H,

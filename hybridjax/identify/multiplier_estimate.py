@@ -369,7 +369,8 @@ class MultiplierFit(Fit):
                 continue
             # (As many digits as the interval leaves.)
             width = max(bounds[1] - bounds[0], 1e-12)
-            digits = max(2, int(np.ceil(-np.log10(width / 2))))
+            magnitude = -np.log10(width / 2)
+            digits = max(2, int(np.ceil(magnitude)))
             low, high = np.maximum(bounds, 0.0)
             shown.append(
                 f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
@@ -493,7 +494,8 @@ def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
     with suppress(DefinitionError):
         coefficients, covariance = higher()
         matrix, dof = covariance()
-        distance = float(coefficients[-1] ** 2 / matrix[-1, -1])
+        last = coefficients[-1] ** 2
+        distance = float(last / matrix[-1, -1])
         if _tail(distance, 1, dof) < _NEEDED:
             order = len(coefficients)
             text = (

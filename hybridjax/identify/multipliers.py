@@ -354,7 +354,8 @@ def compare_orders(htf: HTF, max_order: int, extra_lags: int | None) -> OrderSel
         likelihood = data * np.log(np.maximum(cost, 1e-300))
     else:
         most = weights.largest_misfit(htf)
-        level, _ = weights.estimated_noise(most, cost[-1] / dof[-1])
+        usual = cost[-1] / dof[-1]
+        level, _ = weights.estimated_noise(most, usual)
         likelihood = cost / level
     exact = bool(noise.max() < ROUNDING)
     values, spread = noise_ratios(largest, htf, c, exact)

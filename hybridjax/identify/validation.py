@@ -160,7 +160,8 @@ class Validation(Showable, eqx.Module):
     def unexplained(self) -> tuple[str, ...]:
         """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
         pairs = zip(self.outputs, self.no_better, strict=True)
-        return tuple(name for name, p in pairs if p > self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return tuple(name for name, p in pairs if p > threshold)
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]
@@ -196,7 +197,8 @@ class Validation(Showable, eqx.Module):
 
     def _repr_html_(self) -> str:
         k = slice(0, _DRAWN * self.n_sections)
-        t = (self.first_section + np.arange(len(self.measured[k]))) / self.n_sections
+        sections = self.first_section + np.arange(len(self.measured[k]))
+        t = sections / self.n_sections
         curves = [
             Curve(t, self.measured[k, 0], "measured", COLORS[-1]),
             Curve(t, self.simulated[k, 0], "simulated"),
@@ -406,7 +408,8 @@ def _lags(prepared: PreparedRecords, grid: CycleGrid) -> int:
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:
         """Return how often each section was sampled with so many samples before it."""
-        return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
+        is_late = (grid.age > lags)[..., None]
+        return (grid.sampled & is_late).sum(axis=(0, 1))
 
     few = int(prepared.sampled.min())
     if few < FEWEST_SAMPLES:
@@ -429,7 +432,8 @@ def _no_better(y: Signals, error: Signals) -> Float[np.ndarray, " ny"]:
     mean of the other cycles, cycle by cycle (Diebold and Mariano 1995)."""
     sampled = np.isfinite(y)
     n = np.maximum(sampled.sum(axis=(0, 1)), 2)
-    alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
+    mean = np.nanmean(y, axis=(0, 1))
+    alone = (y - mean) * n / (n - 1)
     by_cycle = np.nansum(alone**2 - error**2, axis=2)
     gain = by_cycle[sampled.any(axis=(2, 3))]
     deviate = gain.mean(axis=0) * np.sqrt(len(gain))

@@ -13,7 +13,8 @@ from ..systems.transition import Transition
 
 def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
     """The ground under a stance foot at the origin, which falls towards x > 0."""
-    way = length * jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+    direction = jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+    way = length * direction
     return jnp.stack([-way, way])
 
 
@@ -71,12 +72,14 @@ class RimlessWheel(HybridSystem):
     def exact(self):
         """Speed right after an impact, and the multiplier."""
         spread = jnp.sin(self.alpha) * jnp.sin(self.slope)
-        w = jnp.sqrt(4 * self.rate * spread) / jnp.tan(2 * self.alpha)
+        square = 4 * self.rate * spread
+        w = jnp.sqrt(square) / jnp.tan(2 * self.alpha)
         return w, jnp.cos(2 * self.alpha) ** 2
 
     def charts(self):
         def swing(t, q, u):
-            return (q[1], self.rate * jnp.sin(q[0]) + u[0])
+            gravity = self.rate * jnp.sin(q[0])
+            return (q[1], gravity + u[0])
 
         return {"swing": FieldChart(swing, ("th", "w"), ("rad", "rad/s"))}
 
@@ -131,7 +134,8 @@ class SimplestWalker(HybridSystem):
     def _step(self, t, q, u):
         th, phi, w, p = q
         stance = jnp.sin(th - self.slope)
-        swing = (w**2 - jnp.cos(th - self.slope)) * jnp.sin(phi)
+        pull = w**2 - jnp.cos(th - self.slope)
+        swing = pull * jnp.sin(phi)
         return w, p, stance, stance + swing + u[0]
 
     def transitions(self):
@@ -164,11 +168,13 @@ class SimplestWalker(HybridSystem):
 def _heelstrike(t, q, u):
     th, _, w, _ = q
     c = jnp.cos(2 * th)
-    return -th, -2 * th, c * w, c * (1 - c) * w
+    hip = c * (1 - c) * w
+    return -th, -2 * th, c * w, hip
 
 
 def _after_heelstrike(th, w):
-    return Guess("step", (th, 2 * th, w, (1 - jnp.cos(2 * th)) * w))
+    swing = (1 - jnp.cos(2 * th)) * w
+    return Guess("step", (th, 2 * th, w, swing))
 
 
 class CompassGait(HybridSystem):

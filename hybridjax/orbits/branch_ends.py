@@ -96,7 +96,8 @@ def _touched_section(cycle: LimitCycle) -> End | None:
     expanded = kernels.watched(s, a, target.levels, t, q, u, first)
     row = expanded[-1, :, 0]
     field = kernels.field(s, a, t, q, u)[:, 0, 0]
-    if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
+    period = float(cycle.period)
+    if not _is_slow(row, field, map.scale[a, :n], period):
         return None
     text = (
         f"the cycle touches its section ({map.base}) tangentially, and does not cross it any more: "
@@ -202,8 +203,10 @@ def _near_rest(cycle: LimitCycle, visits: list[Visit], result: Result) -> End | 
     u = np.zeros((s.nu, 1))
     slowest = np.inf
     for visit in visits:
-        rates = kernels.field(s, visit.chart, visit.t, visit.q, u)[:, 0]
-        speeds = np.abs(rates) / scale[visit.chart, : len(rates), None]
+        rows = kernels.field(s, visit.chart, visit.t, visit.q, u)
+        rates = rows[:, 0]
+        sizes = scale[visit.chart, : len(rates), None]
+        speeds = np.abs(rates) / sizes
         slowest = min(slowest, float(speeds.max(axis=0).min()))
     if slowest * float(cycle.period) > _REST:
         return None

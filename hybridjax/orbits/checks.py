@@ -103,10 +103,12 @@ def check_claims(
     for a in np.unique(chart).tolist():
         n = s.dims[a]
         rows = np.flatnonzero(chart == a)
-        sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
+        of_states = np.asarray(scale)[a, :n]
+        sizes = np.concatenate([[time], of_states])
         # (As many times of one period in all as show pulses.)
         every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
-        times = t[rows, None] + time * (_BASE + np.arange(every) / every)
+        parts = _BASE + np.arange(every) / every
+        times = t[rows, None] + time * parts
         states = q[:n, rows].repeat(every, axis=1)
         for name, function in _functions(s, a):
             _compare(s, name, function, times.ravel(), states, sizes)
@@ -155,7 +157,8 @@ def _check_output_period(cycle: LimitCycle, output: Output) -> None:
     scale = np.asarray(cycle.settings.scale)
     for a, t, q in points(s, cycle.pieces):
         if s.resolve_outputs(output).defined(a):
-            sizes = np.append(float(cycle.period), scale[a, : len(q)])
+            of_states = scale[a, : len(q)]
+            sizes = np.append(float(cycle.period), of_states)
             name, function = _output(s, a, output)
             _compare(s, name, function, t, q, sizes)
 
@@ -203,7 +206,8 @@ def _functions(s: Structure, a: int) -> Iterator[tuple[str, Callable]]:
 
     yield f"the field of chart '{s.names[a]}'", field
     for k, g in enumerate(s.guards(a)):
-        yield f"the guard of '{s.transitions[g].name}'", _guard(s, a, k)
+        guard_of = _guard(s, a, k)
+        yield f"the guard of '{s.transitions[g].name}'", guard_of
     for g in s.guards(a) + s.schedules(a):
         name = s.transitions[g].name
         yield f"the reset of '{name}'", _reset(s, g)
@@ -220,7 +224,8 @@ def _guard(s: Structure, a: int, k: int) -> Callable:
     index = np.zeros(1, np.int32)
 
     def guard(t, q):
-        return kernels.watched(s, a, None, t, q, u, index)[k : k + 1]
+        rows = kernels.watched(s, a, None, t, q, u, index)
+        return rows[k : k + 1]
 
     return guard
 
@@ -318,7 +323,8 @@ def check_jumps(cycle: LimitCycle) -> None:
         for time, column, jump in jumps(
             s, a, samples[before], samples[before + 1], sizes
         ):
-            apart = np.abs(time - events + period / 2) % period - period / 2
+            shifted = np.abs(time - events + period / 2)
+            apart = shifted % period - period / 2
             if np.abs(apart).min(initial=np.inf) > SAME * period:
                 raise DefinitionError(
                     f"the {column_name(s, a, column)} in chart '{s.names[a]}' jumps by {jump:.3g} "

@@ -236,7 +236,8 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
     found = set()
     for g in s.guards(a):
         event = jump(s, g, times, states, u)
-        was_positive = event.level[0] > TOGETHER * period * abs(event.rate[0])
+        zero = TOGETHER * period * abs(event.rate[0])
+        was_positive = event.level[0] > zero
         falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
         predicate = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u)
         holds = predicate.all()
@@ -262,7 +263,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     for order in orders:
         derivative = order.derivative * scale[a, :n]
         rows.append(np.column_stack([order.state, derivative]))
-    apart = np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]
+    of_states = scale[orders[0].chart, :m, None]
+    apart = np.ptp(rows, axis=0) / of_states
     return bool(np.max(apart) < SAME)
 
 
@@ -315,10 +317,12 @@ def _guards_due(
     if not guards:
         return []
     first = np.zeros(1, np.int32)
-    watched = kernels.watched(s, a, None, time, q.T, u, first)[:, :, 0]
+    rows = kernels.watched(s, a, None, time, q.T, u, first)
+    watched = rows[:, :, 0]
     field = kernels.field(s, a, time, q.T, u)[:, 0, 0]
     level, by_t = watched[:, 0], watched[:, 1]
-    rate = by_t + watched[:, 2 : 2 + len(field)] @ field
+    by_state = watched[:, 2 : 2 + len(field)]
+    rate = by_t + by_state @ field
     return [guards[k] for k in np.flatnonzero(falls_within(level, rate, due))]
 
 
@@ -356,4 +360,5 @@ def about_begin(map: ReturnMap, g: int) -> str:
 def _at_anchor(map: ReturnMap):
     """The guards (G,) at the anchor, and their rates."""
     watched = map.watch(map.anchor, until(map.anchor.t))
-    return watched.value[:-1, 0], watched.rate[:-1, 0]
+    value = watched.value[:-1, 0]
+    return value, watched.rate[:-1, 0]

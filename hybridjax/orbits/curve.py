@@ -251,7 +251,8 @@ class Curve:
                 steps=k,
             )
             equations = np.vstack([point.scaled, row * size])
-            residual = np.append(turn.residual / size[:-1], row @ (z - z0))
+            along = row @ (z - z0)
+            residual = np.append(turn.residual / size[:-1], along)
             (change,) = newton_steps(equations[None], residual[None], rounding)
             length = np.linalg.norm(change)
             only_rounding = length <= _ROUNDING and length >= 0.5 * last
@@ -297,7 +298,8 @@ class Curve:
         ranges = self._ranges(point.turn.pieces)
         if self.map.base is not None and np.max(ranges) <= self.least_range:
             return Result.EQUILIBRIUM
-        sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)
+        widest = np.maximum(ranges, _LEAST_RANGE)
+        sizes = scale[int(point.anchor.chart[0])] * widest
         point = dataclasses.replace(point, size=np.append(sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
         same = right[-1] @ point.tangent >= 0

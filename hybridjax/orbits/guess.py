@@ -101,7 +101,8 @@ def return_map_near(
     given_period = s.system.period()
     period = None if given_period is None else float(given_period)
     a = int(lane.chart[0])
-    near = sizes_near(s, a, lane.t[0], lane.q[:, 0], period)
+    state = lane.q[:, 0]
+    near = sizes_near(s, a, lane.t[0], state, period)
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
     charts = np.arange(len(s.charts))
     times = np.repeat(lane.t, len(charts))
@@ -203,7 +204,8 @@ def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     s = map.structure
     lane = to_host(lanes)
     a = int(lane.chart[0])
-    (rate,) = fastest(s, a, lane.t, lane.q[: s.dims[a]])
+    state = lane.q[: s.dims[a]]
+    (rate,) = fastest(s, a, lane.t, state)
     return bool(rate > 0)
 
 
@@ -351,7 +353,8 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     a = int(tape.chart[row, 0])
     state = np.asarray(tape.after)[row, : s.dims[a], 0]
     name = s.transitions[g].name
-    return Guess(s.names[a], state, time=float(tape.t[row, 0]), after=name)
+    time = float(tape.t[row, 0])
+    return Guess(s.names[a], state, time=time, after=name)
 
 
 def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
@@ -363,12 +366,14 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
     moves = recorded_moves(pieces, tape)
     lane, row = np.nonzero(tape.code.T != IDLE)
     ends = tape.before[row, :, lane].T
-    f = slopes(s, pieces.t, pieces.chart, pieces.q, np.zeros((s.nu, 1)))
+    no_input = np.zeros((s.nu, 1))
+    f = slopes(s, pieces.t, pieces.chart, pieces.q, no_input)
     (begins,) = np.nonzero(moves.order == 0)
     for k in range(1, len(pieces.t)):
         a = int(pieces.chart[k])
         n = s.dims[a]
-        plane = _across(map, a, pieces.q[:n, k], f[:n, k])
+        state = pieces.q[:n, k]
+        plane = _across(map, a, state, f[:n, k])
         signal: Any = plane.signal
         point = np.asarray(signal.point)
         normal = np.asarray(signal.normal)
@@ -392,7 +397,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     t = lane.t
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
-    field = kernels.field(s, a, t, lane.q[:n], u)[..., 0]
+    rows = kernels.field(s, a, t, lane.q[:n], u)
+    field = rows[..., 0]
     scale = np.asarray(map.scale)[a, :n]
     sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
     rate = field[:, 0] / sizes
@@ -432,9 +438,12 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
 @host_first
 def _at_anchor(map: ReturnMap):
     """The field (d,), and the value and rate of the level of a crossing."""
-    watched = map.watch(map.anchor, to_section(until(map.anchor.t), map.base, -1))
+    section = to_section(until(map.anchor.t), map.base, -1)
+    watched = map.watch(map.anchor, section)
     slope = map.slopes(map.anchor)[:, 0]
-    return slope, watched.value[-1, 0], watched.rate[-1, 0]
+    value = watched.value[-1, 0]
+    rate = watched.rate[-1, 0]
+    return slope, value, rate
 
 
 def _go(map: ReturnMap, doing: str, lanes: Lanes, target: Target) -> Lanes:

@@ -82,7 +82,8 @@ class Many(NamedTuple):
         """Newton's method for some systems on a route, from states and ends of legs."""
         itinerary = route.finer if finer else route.first
         found: Corrected = self._in_tiles(_correct, route, itinerary, rows, q, ends)
-        code = np.array(judge(route, found, self.t[rows], self.expected[rows]))
+        codes = judge(route, found, self.t[rows], self.expected[rows])
+        code = np.array(codes)
         good = np.flatnonzero(code == Result.OK)
         if len(good):
             start = found.q[good], found.passage.ends[good]
@@ -170,7 +171,8 @@ class Solver:
                 return
             distance, near = self.nearest(self.pending, known)
             first = np.argmin(distance)
-            map = self._search(int(self.pending[first]), int(near[first]), self)
+            first_near = int(near[first])
+            map = self._search(int(self.pending[first]), first_near, self)
             if map is None:
                 return
             before = len(self.pending)

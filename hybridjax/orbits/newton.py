@@ -163,7 +163,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
     if factors:
         pieces = turn.pieces
-        by_factor = orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
+        by_all = orbit.jacobians(tangents)
+        by_factor = by_all[..., 1:, 1 : 1 + len(sizes)]
         if map.base is not None:
             f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(
                 *by_factor.shape[:3]
@@ -356,7 +357,8 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             break
         else:
             damping *= 4
-        jacobian[len(x) :] = np.sqrt(damping) * np.eye(len(x))
+        penalty = np.sqrt(damping) * np.eye(len(x))
+        jacobian[len(x) :] = penalty
         step = -np.linalg.lstsq(jacobian, error)[0]
         # (Short steps are at the end, or where none helps.)
         history.append(least)

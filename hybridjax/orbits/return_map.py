@@ -227,7 +227,8 @@ class ReturnMap(eqx.Module):
 
     def slopes(self, lanes: Lanes) -> Float[Array, "d L"]:
         """The vector field at lanes, without input."""
-        u = namespace(lanes.t).zeros((self.structure.nu, lanes.t.shape[0]))
+        shape = (self.structure.nu, lanes.t.shape[0])
+        u = namespace(lanes.t).zeros(shape)
         return slopes(self._structure_of(lanes), lanes.t, lanes.chart, lanes.q, u)
 
     def _structure_of(self, lanes: Lanes) -> Structure:
@@ -388,11 +389,14 @@ class ReturnMap(eqx.Module):
         if self.base is None:
             longer = kernels.by_parameter_of_period(varied) * self.multiplicity
             later = longer / self.expected
-        column = later * t0 * by[0, :, 0] + by[0, :, -1]
+        by_begin = later * t0 * by[0, :, 0]
+        column = by_begin + by[0, :, -1]
         for piece in by[1:]:
-            column = piece[:, 1:-1] @ column + piece[:, -1]
+            carried = piece[:, 1:-1] @ column
+            column = carried + piece[:, -1]
         end = self.anchor._replace(t=ends[:1, -1], q=ends[1:, -1:])
-        return column + later * (t0 + self.expected) * self.slopes(end)[:, 0]
+        moved = later * (t0 + self.expected)
+        return column + moved * self.slopes(end)[:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
@@ -401,30 +405,38 @@ class ReturnMap(eqx.Module):
         defect = self._defect(q, turn)
         existing = self.valid.sum(axis=-1)[..., None]
         counts = np.arange(self.structure.d) < existing
-        smallest = xp.min(xp.where(counts, svdvals(defect), np.inf), axis=-1)
+        singular_values = xp.where(counts, svdvals(defect), np.inf)
+        smallest = xp.min(singular_values, axis=-1)
         # (Where derivatives are large, rounding errors of the start are, too, at the end.)
         grown = xp.max(xp.abs(defect), axis=(-2, -1))
         assert self.settings.rtol is not None
         accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
-        closed_enough = turn.closed & (turn.distance <= accuracy)
+        is_accurate = turn.distance <= accuracy
+        closed_enough = turn.closed & is_accurate
         code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
+        is_known = ~xp.isnan(smallest)
+        code = xp.where(closed_enough & is_known, closed, code)
         if self.base is not None:
             if self.event >= 0:
-                ends_at_once = turn.closed & (self.followed(turn.end) >= 0)
+                is_followed = self.followed(turn.end) >= 0
+                ends_at_once = turn.closed & is_followed
                 code = xp.where(ends_at_once, Result.EVENT_ORDER, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             at_rest = turn.closed & self._rests(q, turn)
             code = xp.where(at_rest, Result.EQUILIBRIUM, code)
-        code = xp.where(turn.closed & self._beyond(turn), Result.GUARD_BEYOND, code)
+        is_beyond = turn.closed & self._beyond(turn)
+        code = xp.where(is_beyond, Result.GUARD_BEYOND, code)
         for d in range(1, self.multiplicity):
             if self.multiplicity % d:
                 continue
+            # (A cycle that closes after a part of its turns is one of lower multiplicity.)
             sooner = self.expected * (d / self.multiplicity)
-            part = dataclasses.replace(self, multiplicity=d, expected=sooner).turn(q)
-            early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
+            shorter = dataclasses.replace(self, multiplicity=d, expected=sooner)
+            part = shorter.turn(q)
+            misfit = xp.max(xp.abs(part.residual) / sizes, axis=-1)
+            early = misfit <= CLOSED
             code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
 
@@ -455,12 +467,12 @@ class ReturnMap(eqx.Module):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
         lanes = turn.pieces
-        if shape:  # (turns of many systems: their pieces side by side)
-            lanes = side_by_side(
-                jax.tree_util.tree_map(
-                    lambda x: xp.moveaxis(x, (-1, 0), (0, -1)), lanes
-                )
+        if shape:
+            # (The pieces of turns of many systems stand side by side.)
+            by_piece = jax.tree_util.tree_map(
+                lambda x: xp.moveaxis(x, (-1, 0), (0, -1)), lanes
             )
+            lanes = side_by_side(by_piece)
         watched = self.watch(lanes, until(lanes.t))
         value = watched.value[:-1]
         rate = watched.rate[:-1]
@@ -471,17 +483,23 @@ class ReturnMap(eqx.Module):
         for g, transition in enumerate(s.transitions):
             source = lanes.chart == s.chart_index(transition.source)
             which = xp.where(source, np.int32(g), np.int32(-1))
-            holds.append(enabled(self._structure_of(lanes), lanes.t, lanes.q, u, which))
+            structure = self._structure_of(lanes)
+            holds.append(enabled(structure, lanes.t, lanes.q, u, which))
         codes = turn.codes.reshape(*shape, -1)
         fired = [xp.any(codes == g, axis=-1) for g in range(len(s.transitions))]
-        passed = here & ~lanes.armed & (value < -error)
-        fine = here & (lanes.armed | (value > error))
-        passed, fine = (
-            x.reshape(len(x), PIECES, *shape).any(axis=1)
-            for x in (passed & xp.stack(holds), fine)
-        )
+
+        def at_any_piece(x):
+            return x.reshape(len(x), PIECES, *shape).any(axis=1)
+
+        is_below = value < -error
+        is_above = value > error
+        passed = here & ~lanes.armed & is_below
+        fine = here & (lanes.armed | is_above)
+        passed = at_any_piece(passed & xp.stack(holds))
+        fine = at_any_piece(fine)
         # (An event that happens may leave the state beyond its guard.)
-        return (passed & ~fine & ~xp.stack(fired)).any(axis=0)
+        never_armed = passed & ~fine & ~xp.stack(fired)
+        return never_armed.any(axis=0)
 
     def followed(self, end: Lanes) -> Int[Array, ""]:
         """The transition (by index; -1: none) that follows at once on the event with which a turn
@@ -607,13 +625,16 @@ class ReturnMap(eqx.Module):
         t0 = self.each(self.anchor.t)
         expected = self.expected
         xp = namespace(self.expected)
-        k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
+        ones = [1] * expected.ndim
+        k = xp.arange(1, PIECES + 1).reshape(PIECES, *ones)
         if self.base is None:
-            return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
+            times = t0 + expected * k / PIECES
+            return toward(times, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
         grid = t0 + free * expected * k / (PIECES - 1)
         time = xp.where(k < PIECES, grid, np.inf)
-        section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
+        target = toward(time, -1, t0 + 3 * expected)
+        section = to_section(target, self.base, self.event)
         last = k == PIECES
         return dataclasses.replace(
             section,
@@ -628,10 +649,13 @@ class ReturnMap(eqx.Module):
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
             return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
-        level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
-        level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
+        section = to_section(until(pieces.t), self.base)
+        level = self.watch(pieces, section).value[-1]
+        level = level.reshape(PIECES, *shape)
+        events = pieces.events.reshape(PIECES, *shape)
         crosses = (level[1:-1] > 0) & (level[2:] <= 0)
-        falls = crosses & (events[1:-1] == events[2:])
+        without_event = events[1:-1] == events[2:]
+        falls = crosses & without_event
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 
 
@@ -669,13 +693,17 @@ def with_derivatives(
 
     def work(a, here, out):
         n = s.dims[a]
-        point = only(here, t), only(here, q[:n]), only(here, u)
+        time = only(here, t)
+        state = only(here, q[:n])
+        point = time, state, only(here, u)
         by = function(a, *point)
         inputs = slice(2 + s.d, 2 + s.d + s.nu)
-        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, inputs])
+        columns = np.r_[: 2 + n, inputs]
+        index = np.ix_(np.arange(len(by)), columns)
         return put(out, index, xp.where(here, by, out[index]))
 
-    begin = xp.zeros((rows, 2 + s.d + s.nu, L), t.dtype)
+    width = 2 + s.d + s.nu
+    begin = xp.zeros((rows, width, L), t.dtype)
     return for_each_chart(s, chart, xp.ones(L, bool), work, begin)
 
 

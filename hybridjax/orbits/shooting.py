@@ -104,7 +104,8 @@ def _shift(
     shift = changes[:-1] @ np.append(step * map.sizes, 1.0)
 
     end_after = end + np.matvec(by_point, shift)
-    h = end_after[:, 0] - starts[:, 0] - shift[:, 0]
+    duration = end_after[:, 0] - starts[:, 0]
+    h = duration - shift[:, 0]
     return step, shift, h
 
 
@@ -155,7 +156,8 @@ def _forwards(moves: Moves) -> Moves | None:
     h[back - 1] += h[back]
     code[back - 1] = code[back]
     kept = moves.h >= 0
-    moves = Moves(*(x[..., kept] for x in moves._replace(h=h, code=code)))
+    changed = moves._replace(h=h, code=code)
+    moves = Moves(*(x[..., kept] for x in changed))
     return moves if (moves.h >= 0).all() else None
 
 
@@ -295,7 +297,9 @@ def _setout(
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
     by_state = by[:, 1:, 1 : 1 + s.d]
-    goes_on = (np.diff(moves.lane) == 0) & (moves.code[:-1] < 0)
+    same_lane = np.diff(moves.lane) == 0
+    no_event = moves.code[:-1] < 0
+    goes_on = same_lane & no_event
     for k in np.flatnonzero(goes_on):
         along[:, k + 1] = by_state[k] @ along[:, k]
     return setout._replace(along=along)

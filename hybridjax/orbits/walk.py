@@ -96,7 +96,8 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
         for within, t, states in path:
             lane.append(lanes[within])
             time.append(t)
-            points.append(np.pad(states, [(0, d - n), (0, 0)]))
+            missing = [(0, d - n), (0, 0)]
+            points.append(np.pad(states, missing))
     all_lanes = np.concatenate(lane)
     times = np.concatenate(time)
     all_points = np.concatenate(points, axis=1)

@@ -260,7 +260,8 @@ class ReturnMap:
             10 * self.noise, 0.01 * np.abs(advance)
         )
         # (A state that is still settling does not advance at one rate.)
-        grows = np.abs(advance) > np.maximum(10 * self.noise, 1e-6 * self.size)
+        noticeable = np.maximum(10 * self.noise, 1e-6 * self.size)
+        grows = np.abs(advance) > noticeable
         grows = grows & steady
         tolerance = 10 * self.noise + 1e-6 * self.size
         travels = np.zeros(len(self.x), bool)
@@ -303,16 +304,21 @@ class ReturnMap:
         2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
         spacing the events that move through the time steps of a simulator.
         """
-        rounding = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
+        magnitude = np.maximum(np.abs(self.x), self.size)
+        rounding = np.finfo(float).eps * magnitude
+        rng = np.random.default_rng(0)
+        signs = rng.choice([-1, 1], (3, len(self.x)))
+        spacings = [1e-6, 1e-4, 1e-3]
         levels = []
-        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
-        for spacing, sign in zip([1e-6, 1e-4, 1e-3], signs, strict=True):
+        for spacing, sign in zip(spacings, signs, strict=True):
             along = spacing * self.size * sign
             line = [self(self.x + j * along) for j in range(-7, 8)]
             differences = np.diff(line, 4, axis=0)
-            level = np.sqrt((differences**2 / 70).mean(axis=0))
+            variance = (differences**2 / 70).mean(axis=0)
+            level = np.sqrt(variance)
             levels.append(np.maximum(level, rounding))
-        return levels[0], np.max(levels, axis=0)
+        narrowest = levels[0]
+        return narrowest, np.max(levels, axis=0)
 
     def slopes(self) -> Float[np.ndarray, "d d"]:
         """Return central differences of second order with the smallest steps."""
@@ -443,7 +449,8 @@ def _hides(resolved: "_Resolved") -> bool:
 def _is_curved(resolved: "_Resolved") -> bool:
     """Return whether narrow and wide steps give clearly different multipliers."""
     moduli = np.abs(resolved.multipliers)
-    return bool((np.abs(resolved.apart) > _CURVED * moduli.max(initial=0)).any())
+    allowed = _CURVED * moduli.max(initial=0)
+    return bool((np.abs(resolved.apart) > allowed).any())
 
 
 class _Jacobian(NamedTuple):

@@ -61,7 +61,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     nu = len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
-    values = np.concatenate([np.hstack([r.u, r.y]) for r in data.records])
+    by_record = [np.hstack([r.u, r.y]) for r in data.records]
+    values = np.concatenate(by_record)
     samples = [r.first_section + np.arange(len(r.u)) for r in data.records]
     at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
@@ -83,7 +84,8 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             if i < nu:
                 f, power = input_spectrum(data)
                 floor = 1e-12 * power[:, i].max()
-                last.semilogy(f, np.maximum(power[:, i], floor), color=CYCLE[1])
+                shown = np.maximum(power[:, i], floor)
+                last.semilogy(f, shown, color=CYCLE[1])
                 last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
             else:
                 last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
@@ -122,7 +124,8 @@ def impulse_responses(
             label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
             look.colored(plane, responses.lag, responses.phase, values, label)
             plane.set_ylabel("phase of the push")
-            for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
+            quarters = [0, N // 4, N // 2, 3 * N // 4]
+            for k, m in enumerate(dict.fromkeys(quarters)):
                 band = 1.96 * responses.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 arrow = {

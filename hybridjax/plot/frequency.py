@@ -317,7 +317,8 @@ class _BodePanels(NamedTuple):
         if radius is not None:
             is_certain = radius < size
             # (Parts of a line, no single points.)
-            is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1
+            neighbors = np.convolve(is_certain, np.ones(3))[1:-1]
+            is_certain &= neighbors > 1
         phase = _phase(f, values, is_certain, reference)
         shown = f * self.scale.factor
         self.upper.plot(shown, self.scale.magnitude(size), **line)
@@ -513,7 +514,8 @@ def _values(
     values = np.asarray(htf[m])[order, i, j]
     radius = None
     if htf.variance is not None:
-        radius = np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
+        radii = np.asarray(htf.select(m).confidence_radius())
+        radius = radii[0, order, i, j]
     return np.asarray(htf.frequencies)[order], values, radius
 
 

@@ -238,7 +238,8 @@ def _zoom(
     reach = 1.35 * max(reaches)
     side = 0.36
     far = ax.get_xlim()[1]
-    points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
+    values = np.concatenate([true, *series.values()])
+    points = (values / far + 1 + 1j) / 2
     places = np.array(
         [
             0.6 + 0.5j,
@@ -249,7 +250,8 @@ def _zoom(
         ]
     )
     apart = points - places[:, None]
-    room = np.maximum(np.abs(apart.real), np.abs(apart.imag)).min(axis=1)
+    larger = np.maximum(np.abs(apart.real), np.abs(apart.imag))
+    room = larger.min(axis=1)
     place = places[int(room.argmax())]
     if 2 * reach > side * far or room.max() < side / 2:
         return []

@@ -103,7 +103,8 @@ def return_map(
             first = line.fixed + 0.9 * (high - line.fixed) if start is None else start
             path = line.cobweb(first, iterates, (low, high))
             panel.plot(*path, color=COLORS["orange"], lw=0.9, label=f"from {first:.4g}")
-        near = line.fixed + np.array([-0.3, 0.3]) * (high - low) / 2
+        sides = np.array([-0.3, 0.3])
+        near = line.fixed + sides * (high - low) / 2
         tangent = line.fixed + line.multiplier * (near - line.fixed)
         label = f"slope {line.multiplier:.4g}: multiplier"
         panel.plot(near, tangent, "--", color=COLORS["red"], lw=1.2, label=label)
@@ -238,7 +239,8 @@ def _jacobian(
     cycle = np.asarray(returns.fixed_point)
     changes = np.diag(_STEP * scales)
     starts = cycle[:, None] + np.hstack([changes, -changes])
-    ahead, behind = np.hsplit(np.asarray(arrivals(returns, starts, _PATIENCE).q), 2)
+    ends = np.asarray(arrivals(returns, starts, _PATIENCE).q)
+    ahead, behind = np.hsplit(ends, 2)
     return (ahead - behind) / (2 * _STEP * scales)
 
 

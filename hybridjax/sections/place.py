@@ -125,7 +125,8 @@ def place_along(
 
     if isinstance(family.anchor, Crossing):
         levels = ListLevels((cast(Crossing, by_family.anchor),))
-        _, tangents, _ = follow(flows.pop(0), levels, np.zeros((P, 1)))
+        no_times = np.zeros((P, 1))
+        _, tangents, _ = follow(flows.pop(0), levels, no_times)
         x = tangents[-1]
     # The points of the orbit on which the family depends.
     M = family.points
@@ -139,7 +140,8 @@ def place_along(
     )
     if M > 1:
         share = np.arange(1, M + 1) / M
-        times = x[0][:, None] + longer[:, None] * share
+        along_period = longer[:, None] * share
+        times = x[0][:, None] + along_period
         variation, tangents, _ = follow(flows.pop(0), None, times)
         moved_points = tangents[variation.first]
     by_time = np.moveaxis(moved_points[:, 0], 1, 0)
@@ -150,11 +152,14 @@ def place_along(
     is_clock = np.isfinite(bound.time)
     late = 0.0
     if is_clock[0]:
-        late = np.rint((bound.time[0] - raw.time[0]) / cycle.period)
-    k = np.arange(N + 1)[-len(flows[0][1].time) :]
+        shift = bound.time[0] - raw.time[0]
+        late = np.rint(shift / cycle.period)
+    ends = len(flows[0][1].time)
+    k = np.arange(N + 1)[-ends:]
     by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     later = (late + k // N) * longer[:, None]
-    times = is_clock[k % N] * (by_time[:, k % N] + later)
+    moved_times = by_time[:, k % N] + later
+    times = is_clock[k % N] * moved_times
     variation, tangents, along = follow(flows[0], by_bound.levels, times, True)
     t, chart, q, u = variation.points(tangents, variation.first[-N:])
 

@@ -103,8 +103,9 @@ def noted(
 ) -> tuple[Flags, Bool[Array, " G"]]:
     """The flags at a row, where watched functions have these values, and the guards that are due
     there. `duration`: of the leg."""
-    guards = jnp.asarray([len(s.guards(a)) for a in form.charts])
-    is_guard = jnp.arange(form.watched) < guards[row.chart]
+    counts = [len(s.guards(a)) for a in form.charts]
+    guards = jnp.asarray(counts)[row.chart]
+    is_guard = jnp.arange(form.watched) < guards
     due = is_guard & _is_due(flags, now, duration)
     is_new = due.any() & ~row.at_once
     lost = row.at_once & ~row.scheduled
@@ -113,9 +114,12 @@ def noted(
     left = flags.left | is_new | lost | _has_left(row, flags.before, now)
     # (Where a reset puts the state on a guard, rounding gives this guard a sign. It does not fall
     # through its zero there, as it did not on the recorded trajectory.)
-    at_zero = jnp.abs(now.value) <= SAME_TIME * duration * jnp.abs(now.rate)
-    value = jnp.where((row.signs == 0) & at_zero, 0.0, now.value)
-    return flags._replace(before=now._replace(value=value), left=left), due
+    zero = SAME_TIME * duration * jnp.abs(now.rate)
+    at_zero = jnp.abs(now.value) <= zero
+    on_guard = (row.signs == 0) & at_zero
+    value = jnp.where(on_guard, 0.0, now.value)
+    before = now._replace(value=value)
+    return flags._replace(before=before, left=left), due
 
 
 def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:
@@ -133,12 +137,14 @@ def _fired(form: Form, s: Structure, row: Row) -> Int[Array, ""]:
     """The place of the guard of a jump among those of its chart."""
     places = []
     for kind in form.kinds:
-        guards = s.guards(s.chart_index(s.transitions[kind[0]].source))
+        source = s.transitions[kind[0]].source
+        guards = s.guards(s.chart_index(source))
         places.append([guards.index(g) if g in guards else 0 for g in kind])
-    most = max(map(len, places), default=1)
-    table = [x + [0] * (most - len(x)) for x in places]
-    # (The last one is for rows that are no jump.)
-    return jnp.asarray([*table, [0] * most])[row.kind, row.place]
+        most = max(map(len, places), default=1)
+        table = [x + [0] * (most - len(x)) for x in places]
+        # (The last row is for rows that are no jump.)
+        table.append([0] * most)
+        return jnp.asarray(table)[row.kind, row.place]
 
 
 def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
@@ -210,7 +216,8 @@ def entered(
     width = len(pending)
     if a == b:
         return Entry(jnp.ones(width, bool), pending)
-    if s.dims[a] != s.dims[b] or not (s.guards(a) and s.guards(b)):
+    have_guards = s.guards(a) and s.guards(b)
+    if s.dims[a] != s.dims[b] or not have_guards:
         return Entry.unknown(width)
 
     def values(chart, q):
@@ -219,7 +226,8 @@ def entered(
 
     own = values(a, q)
     others = values(b, q)
-    terms = jnp.abs(jax.jacfwd(values, 1)(b, q)) @ jnp.abs(q)
+    slopes = jax.jacfwd(values, 1)(b, q)
+    terms = jnp.abs(slopes) @ jnp.abs(q)
     noise = ROUNDING * (terms + jnp.abs(others))
     apart = jnp.abs(others[:, None] - own)
     equal = apart <= noise[:, None]

@@ -65,6 +65,19 @@ class Rows(NamedTuple):
     trajectory; 0 where they may have either. (See `Bodies` for their use.)"""
 
 
+_TYPES = {
+    "body": np.int32,
+    "leg": np.int32,
+    "fraction": float,
+    "target": np.int32,
+    "place": np.int32,
+    "piece": np.int32,
+    "onward": bool,
+    "section": np.int32,
+    "signs": np.int32,
+}
+
+
 class Body(NamedTuple):
     """What rows of one kind do, for the compiler."""
 
@@ -256,11 +269,15 @@ def recorded_walk(
     """
     legs = _legs(s, levels, walk, to)
     nodes = [leg.nodes(density) for leg in legs]
-    arrivals = np.flatnonzero(np.diff([leg.lane for leg in legs])) + 1
-    begins = {0, *arrivals.tolist()} if begins_on_section else {*arrivals.tolist()}
+    lanes = [leg.lane for leg in legs]
+    arrivals = np.flatnonzero(np.diff(lanes)) + 1
+    begins = set(arrivals.tolist())
+    if begins_on_section:
+        begins.add(0)
     begins.discard(len(legs))
     table = _Table(len(begins))
-    itinerary = _written(s, legs, nodes, table, {(k, -1) for k in begins})
+    pieces = {(k, -1) for k in begins}
+    itinerary = _written(s, legs, nodes, table, pieces)
     return itinerary, np.append(arrivals, len(legs)) - 1
 
 
@@ -281,14 +298,16 @@ def _written(
         goes_on = not is_last and (k + 1, -1) not in pieces
         before = leg.signs(times[-2]) if len(times) > 1 else leg.unknown
         _end(s, table, k, leg, before, goes_on, is_last)
-    ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
+    last_times = np.array([leg.times[-1] for leg in legs])
+    ends = last_times - legs[0].times[0]
+    no_more = np.repeat(ends[-1:], -len(ends) % _LEGS)
     form, rows, used = _finished(table)
     armed = np.array(begun.armed).reshape(len(begun.charts), len(s.transitions))
     return Itinerary(
         form,
         rows,
         count=used,
-        ends=np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS)),
+        ends=np.append(ends, no_more),
         last=len(ends) - 1,
         charts=np.array(begun.charts, np.int32),
         begins=np.array(begun.events, np.int32),
@@ -312,7 +331,8 @@ class _Pieces:
         """Begin a piece at a time in leg k, and return its number."""
         leg = self._legs[k]
         self.charts.append(leg.chart)
-        self.events.append(sum(before.code >= 0 for before in self._legs[:k]))
+        earlier = self._legs[:k]
+        self.events.append(sum(before.code >= 0 for before in earlier))
         self.armed.append(_armed(self._s, leg.chart, t, leg.signs(t)))
         return len(self.charts) - 1
 
@@ -354,14 +374,17 @@ def _is_certain(s: Structure, leg: _Leg) -> bool:
     if leg.code < 0:
         return True
     guards = s.guards(leg.chart)
+    before = leg.begins[-1]
+    after = leg.ends[-1]
     for place, g in enumerate(guards):
-        if g != leg.code and leg.begins[-1, place] > 0 and leg.ends[-1, place] == 0:
+        falls_to_zero = before[place] > 0 and after[place] == 0
+        if g != leg.code and falls_to_zero:
             return False
     if not leg.at_once:
         return bool(leg.times[-1] > leg.times[0])
     if _is_scheduled(s, leg.code):
         return False
-    return bool(leg.ends[-1, guards.index(leg.code)] < 0)
+    return bool(after[guards.index(leg.code)] < 0)
 
 
 def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
@@ -370,24 +393,33 @@ def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
     for place, g in enumerate(s.guards(a)):
         armed[g] = signs[place] > 0
     time = np.array([t])
-    return with_schedules(s, armed, await_schedules(s, armed, time, time))[:, 0]
+    awaited = await_schedules(s, armed, time, time)
+    return with_schedules(s, armed, awaited)[:, 0]
 
 
 def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
-    return np.diff(times) / (times[-1] - times[0]) if len(times) > 1 else np.zeros(0)
+    """Durations of the steps of a leg, as parts of its own."""
+    if len(times) < 2:
+        return np.zeros(0)
+    return np.diff(times) / (times[-1] - times[0])
 
 
 def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
     """The nodes at which pieces begin, by leg and number: nearly equal parts of the turn."""
-    places = [(k, j) for k, x in enumerate(nodes) for j in range(len(x) - 1)]
+    places = []
+    for k, of_leg in enumerate(nodes):
+        places += [(k, j) for j in range(len(of_leg) - 1)]
     times = np.array([nodes[k][j] for k, j in places])
-    whole = nodes[-1][-1] - nodes[0][0]
+    start = nodes[0][0]
+    whole = nodes[-1][-1] - start
     chosen = [0]
     for piece in range(1, PIECES):
-        first, last = chosen[-1] + 1, len(places) - (PIECES - piece)
-        goal = nodes[0][0] + piece * whole / PIECES
-        nearest = first + int(np.argmin(np.abs(times[first : last + 1] - goal)))
-        chosen.append(nearest)
+        # (Each piece after this one keeps a node of its own.)
+        first = chosen[-1] + 1
+        end = len(places) - (PIECES - piece) + 1
+        goal = start + piece * whole / PIECES
+        distance = np.abs(times[first:end] - goal)
+        chosen.append(first + int(np.argmin(distance)))
     return {places[k] for k in chosen}
 
 
@@ -453,15 +485,21 @@ def _legs(
     is_last[-1] = True
     if to is not None:
         is_last[:-1] |= np.diff(moves.lane) != 0
-    last = np.flatnonzero(is_last)
-    legs, first = [], 0
-    for end in last:
+    legs = []
+    first = 0
+    for end in np.flatnonzero(is_last):
         own = slice(first, end + 1)
-        times = np.append(moves.t[own], moves.t[end] + h[end])
-        code, at_once = int(moves.code[end]), bool(moves.at_once[end])
-        a = int(moves.chart[first])
-        where = int(moves.lane[end]), int(index[end])
-        legs.append(_Leg(a, times, begins[own], ends[own], code, at_once, *where))
+        leg = _Leg(
+            int(moves.chart[first]),
+            np.append(moves.t[own], moves.t[end] + h[end]),
+            begins[own],
+            ends[own],
+            int(moves.code[end]),
+            bool(moves.at_once[end]),
+            int(moves.lane[end]),
+            int(index[end]),
+        )
+        legs.append(leg)
         first = end + 1
     return legs
 
@@ -477,19 +515,22 @@ def _signs(s: Structure, levels, t, chart, q, index) -> Int[np.ndarray, "M G"]:
 
     **Arguments:** `index` (M,): of the level that is watched.
     """
-    width = max(len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims)))
-    signs = np.zeros((len(t), width), int)
+    counts = [len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims))]
+    signs = np.zeros((len(t), max(counts)), int)
     for a in np.unique(chart).tolist():
-        here = np.flatnonzero(chart == a)
-        point = t[here], q[: s.dims[a], here], np.zeros((s.nu, 1))
-        count = len(s.guards(a)) + levels_in(s, a, levels)
+        count = counts[a]
         if not count:
             continue
-        value = kernels.watched(s, a, levels, *point, index[here])[:, 0]
-        value = np.nan_to_num(value, posinf=np.inf, neginf=-np.inf)
+        here = np.flatnonzero(chart == a)
+        state = q[: s.dims[a], here]
+        no_input = np.zeros((s.nu, 1))
+        rows = kernels.watched(s, a, levels, t[here], state, no_input, index[here])
+        value = np.nan_to_num(rows[:, 0], posinf=np.inf, neginf=-np.inf)
         finite = np.where(np.isfinite(value), np.abs(value), 0.0)
-        known = np.abs(value) > _NEAR_ZERO * finite.max(axis=1, keepdims=True)
-        signs[here, :count] = np.where(known, np.sign(value), 0).T
+        largest = finite.max(axis=1, keepdims=True)
+        known = np.abs(value) > _NEAR_ZERO * largest
+        sign = np.where(known, np.sign(value), 0)
+        signs[here, :count] = sign.T
     return signs
 
 
@@ -510,12 +551,13 @@ def _finished(table: _Table) -> tuple[Form, Rows, int]:
     width = len(table.rows[0][-1])
     for _ in range(-used % _ROUND):
         table.add(Body(NOTHING), 0, np.zeros(width, int))
-    columns = [np.array(x) for x in zip(*table.rows, strict=True)]
-    number = np.int32
-    types = number, number, float, *[number] * 3, bool, number, number
-    rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
+    columns = {}
+    for name, values in zip(Rows._fields, zip(*table.rows, strict=True), strict=True):
+        columns[name] = np.array(values).astype(_TYPES[name])
+    rows = Rows(**columns)
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))
-    place = np.array([bodies.index(body) for body in table.bodies], number)
+    place = np.array([bodies.index(body) for body in table.bodies], np.int32)
     rows = rows._replace(body=place[rows.body])
-    return Form(bodies, width, table.sections), rows, used
+    form = Form(bodies, width, table.sections)
+    return form, rows, used

@@ -133,7 +133,8 @@ class _Steps:
         course, flags = self.travelers.each(of_lane)(*constants.begin, ends)
         # (Rows at which no piece begins write into one more place.)
         kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
-        begun = _Begun(*map(kept, (course.t, course.y, course.delay, course.rate)))
+        state = (course.t, course.y, course.delay, course.rate)
+        begun = _Begun(*map(kept, state))
         return _State(course, begun), flags
 
     def take(self, constants: Constants, k, state: "_State", flags: Flags):
@@ -235,7 +236,8 @@ def _passage(
     """What has been passed at the end."""
     (course, begun), K = state, form.pieces
     # (Columns begin anew with each piece: those before are the factors.)
-    factors = jnp.concatenate([begun.y[1:K], course.y[None]])[..., 1:, :]
+    ends = jnp.concatenate([begun.y[1:K], course.y[None]])
+    factors = ends[..., 1:, :]
     if form.sections and columns:
         delays = jnp.concatenate([begun.delay[1:K], course.delay[None]])
         factors = jnp.concatenate([delays[..., None], factors], axis=-1)

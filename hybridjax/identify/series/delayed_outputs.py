@@ -35,7 +35,8 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     delays = range(order + 1)
 
     def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
-        return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
+        delayed = [delay_cycles(part.y[:, :, n], j) for j in delays]
+        return np.stack(delayed, axis=3)
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
         columns = lagged_inputs(part.u, n, problem.lags, problem.records.lead)

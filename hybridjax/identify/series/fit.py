@@ -161,7 +161,8 @@ class SeriesFit(MultiplierFit):
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
         padding = cycles * N - R
-        h = np.pad(self.numerators, ((0, 0), (0, padding), (0, 0), (0, 0)))
+        widths = ((0, 0), (0, padding), (0, 0), (0, 0))
+        h = np.pad(self.numerators, widths)
         by_cycle = h.reshape(N, cycles, -1)
         h = divide_by_chi(self.coefficients, by_cycle).reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
@@ -189,13 +190,15 @@ class SeriesFit(MultiplierFit):
             return divided_by_chi(by_harmonic, c, f, N, self.lead)
 
         H = sum_up(self.numerators)
-        period_delay = np.exp(-2j * np.pi * f)[:, None, None]
+        turns = np.exp(-2j * np.pi * f)
+        period_delay = turns[:, None, None]
         below = chi(period_delay, c)
         lags = np.arange(1, len(c) + 1)[:, None, None, None, None]
         slope = sum_up(self.slopes) - period_delay**lags / below * H
         by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
         r = np.arange(self.numerators.shape[1]) - self.lead
-        powers = np.exp(-2j * np.pi / N * np.outer(f, r))
+        angles = np.outer(f, r)
+        powers = np.exp(-2j * np.pi / N * angles)
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
         power = (np.abs(spread / N) ** 2).sum(axis=(1, 4))
         by_b = power / np.abs(below) ** 2
@@ -478,12 +481,14 @@ def assemble(
     for n, to_lags in enumerate(problem.to_lags):
         for fit in solution.fits[n]:
             by_c = np.moveaxis(fit.slopes[..., 0], 1, 0)
-            numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
+            coefficients = fit.coefficients[..., 0]
+            numerators[n][:, fit.outputs] = to_lags @ coefficients
             slopes[:, n][..., fit.outputs] = to_lags @ by_c
             roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
-        b = b.reshape(*b.shape[:-2], lags, nu, ny) * problem.scale
+        by_lag = b.reshape(*b.shape[:-2], lags, nu, ny)
+        b = by_lag * problem.scale
         return b.mT
 
     result = int(Result.OK if converged else Result.NOT_CONVERGED)
@@ -505,7 +510,8 @@ def assemble(
 
 def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     """Return the standard deviation of each output's noise, in units of the problem's scale."""
-    left = solution.dof.sum(axis=0) - len(solution.c) / solution.dof.shape[1]
+    of_c = len(solution.c) / solution.dof.shape[1]
+    left = solution.dof.sum(axis=0) - of_c
     return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
 
 
@@ -533,7 +539,8 @@ def _noise_ratios(
     """Return the ratios of a fit to outputs with noise of this standard deviation."""
     rows = max(delayed.dof, 1)
     gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
-    return np.linalg.eigvalsh(gram) / rows, float(np.sqrt(2 / rows))
+    spread = float(np.sqrt(2 / rows))
+    return np.linalg.eigvalsh(gram) / rows, spread
 
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
@@ -675,7 +682,8 @@ def block_scores(
     first, second = squares[:, 1:].mean(axis=1)
     white = np.array([[solution.dof.sum(), first], [first, second]])
     of_white, of_filtered = amounts(white, squares[:, 0])
-    by_filtered = np.einsum("bcd,bce->de", score[:, 1:], score[:, 1:]) / _FILTERED_DRAWS
+    drawn = score[:, 1:]
+    by_filtered = np.einsum("bcd,bce->de", drawn, drawn) / _FILTERED_DRAWS
     expected = of_white * by_white.sum(axis=0) + of_filtered * by_filtered
     true = of_white * solution.curvature.sum(axis=0) + of_filtered * filtered
     # In units in which noise like that of the data makes the sum one.

@@ -64,7 +64,8 @@ def predicted(
     size = np.sqrt((grid.y**2).mean(axis=(0, 1, 2)))
     records.scale = np.maximum(size, RANK * records.scale)
     model = subspace_model(records, [order] * records.n_sections, False)
-    S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
+    unit = np.eye(len(records.outputs))
+    S = np.tile(unit, (records.n_sections, 1, 1))
     return Predictor(model, S).predicted(grid, False) * records.scale
 
 
@@ -132,7 +133,8 @@ class LoopEquations:
         z = predicted(plant, drive, order)
         span = N if extra_lags is None else extra_lags
         self.lags = self.records.lead + order * N + span + 1
-        self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
+        free = order + -(-span // N)
+        self.sections = [self._section(n, z, free) for n in range(N)]
 
     def _section(
         self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
@@ -142,10 +144,12 @@ class LoopEquations:
         _, T, _, nu = grid.u.shape
         ny = grid.y.shape[3]
         lead = self.records.lead
-        sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
+        of_section = grid.sampled[:, :, n]
+        sampled = [delay_cycles(of_section, j).all(axis=2) for j in delays]
         begun = np.arange(T) >= grid.first[:, n, None] + free
         used = np.all(sampled, axis=0) & begun
-        signals = [lagged_inputs(u, n, self.lags, lead) for u in (z[..., :nu], grid.u)]
+        inputs_of_section = (z[..., :nu], grid.u)
+        signals = [lagged_inputs(u, n, self.lags, lead) for u in inputs_of_section]
         for y in (z[..., nu:], grid.y):
             signals += [delay_cycles(y[:, :, n], j) for j in delays]
         columns = np.concatenate(signals, axis=2)
@@ -191,7 +195,8 @@ class LoopEquations:
         widest = max(x.root.shape[1] for x in self.sections)
         roots = np.zeros((N, ny, R, nu, widest))
         for n, x in enumerate(self.sections):
-            roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
+            columns = x.root.shape[1]
+            roots[n, ..., :columns] = x.root.reshape(R, nu, -1)
         return dict(
             multipliers=multipliers_of(c),
             coefficients=c,

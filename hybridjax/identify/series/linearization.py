@@ -100,7 +100,8 @@ def filtered_response(
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
     S, T = x.shape[:2]
-    delayed = np.zeros((S, T, len(c), *x.shape[2:]))
+    shape = (S, T, len(c), *x.shape[2:])
+    delayed = np.zeros(shape)
     for j in range(len(c)):
         delayed[:, :, j] = delay_cycles(filtered, j + 1)
     return delayed
@@ -130,7 +131,8 @@ class Linearization(NamedTuple):
         along = vectors.T @ self.gradient.sum(axis=0)
         along = np.where(size > 0, along / positive(size), 0.0)
         rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
-        jacobian = np.pad(size[:, None] * vectors.T, ((0, 1), (0, 0)))
+        scaled = size[:, None] * vectors.T
+        jacobian = np.pad(scaled, ((0, 1), (0, 0)))
         return np.append(along, rest), jacobian
 
 
@@ -191,7 +193,8 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
         columns = lagged_inputs(inputs[k], n, problem.lags, problem.records.lead)
         rows = columns @ problem.to_lags[n]
         T = part.y.shape[1]
-        starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
+        free = min(problem.free, T)
+        starts = start_responses(c, part.first[:, n], T, free)
         regressions = []
         for alike in problem.alike[n]:
             sampled = part.sampled[:, :, n, alike[0]]

@@ -217,7 +217,8 @@ def _require_different_inputs(
     nu = len(records.inputs)
     alone = [_independent(triangle[:, i::nu], 1).shape[1] for i in range(nu)]
     # (Ranks of inputs in a narrow band are not exact.)
-    if rank < min(len(triangle), sum(alone) - min(alone) / 2):
+    most = sum(alone) - min(alone) / 2
+    if rank < min(len(triangle), most):
         raise DefinitionError(
             f"{listed(records.inputs)} cannot be told apart: leave out what others determine."
         )

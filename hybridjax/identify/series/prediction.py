@@ -301,7 +301,8 @@ def recursion(
     starts = np.zeros_like(x)
     for k in range(T - 1):
         period = phi[:, min(k, phi.shape[1] - 1)]
-        starts[:, k + 1] = period @ starts[:, k] + x[:, k]
+        carried = period @ starts[:, k]
+        starts[:, k + 1] = carried + x[:, k]
     x = starts
     for n, step in enumerate(F):
         enter(n, x)
@@ -330,10 +331,13 @@ def slopes_of(
         later[..., place["Y"]] += _outer(by_Y, x)
         later[..., place["B"]] += _outer(unit, u)
         if model.K[n].shape[1]:
-            predicted = x @ model.C[n].T + u @ model.D[n].T
-            later[..., place["K"]] += _outer(unit, predicted + path.entering[n])
+            by_input = u @ model.D[n].T
+            predicted = x @ model.C[n].T + by_input
+            error = predicted + path.entering[n]
+            later[..., place["K"]] += _outer(unit, error)
         if coordinates.direct:
-            later[..., place["D"]] += _outer(model.gain[n] - gain, u)
+            by_direct = model.gain[n] - gain
+            later[..., place["D"]] += _outer(by_direct, u)
 
     ends = [max(block.stop for block in place.values()) for place in places]
     shape = (*part.shape, coordinates.size)

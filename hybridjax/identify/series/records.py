@@ -58,10 +58,12 @@ class CycleGrid(NamedTuple):
         T = max(map(count_cycles, records))
         N = records[0].n_sections
         u = np.zeros((S, T * N, len(records[0].inputs)))
-        y = np.full((S, T * N, len(records[0].outputs)), np.nan)
+        shape = (S, T * N, len(records[0].outputs))
+        y = np.full(shape, np.nan)
         inside = np.zeros((S, T * N), bool)
         waves = [drift_waves(record) for record in records]
-        drift = np.zeros((S, T, max(wave.shape[1] for wave in waves)))
+        widest = max(wave.shape[1] for wave in waves)
+        drift = np.zeros((S, T, widest))
         for s, (record, wave) in enumerate(zip(records, waves, strict=True)):
             first = record.first_section
             rows = slice(first, first + len(record.u))

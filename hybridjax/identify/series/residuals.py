@@ -67,7 +67,8 @@ def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
     for n, root in enumerate(spread):
         for i in range(error.shape[3]):
             sampled = np.isfinite(error[:, :, n, i])
-            left, size, _ = np.linalg.svd(root[:, :, i][sampled], full_matrices=False)
+            of_output = root[:, :, i][sampled]
+            left, size, _ = np.linalg.svd(of_output, full_matrices=False)
             along = left.T @ error[sampled, n, i]
             excess = 1 - 1 / np.sqrt(1 + size**2)
             error[sampled, n, i] -= left @ (along * excess)
@@ -104,7 +105,8 @@ def whiteness_test(
     if N > 1:
         p_deviations = stats.chi2.sf(deviations, sections.sum(axis=0) - degrees)
         # The smaller of two, as a p-value.
-        p = -np.expm1(2 * np.log1p(-np.minimum(p, p_deviations)))
+        smaller = np.minimum(p, p_deviations)
+        p = -np.expm1(2 * np.log1p(-smaller))
     return z, p
 
 
@@ -187,7 +189,8 @@ def _regressed(
     unexplained = (residual**2).sum() - explained
     degrees = left.shape[1], samples - left.shape[1]
     left_by_fit = (root**2).sum() - by_fit
-    ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
+    per_degree = explained / (degrees[0] + by_fit)
+    ratio = per_degree * (degrees[1] + left_by_fit) / unexplained
     p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
     return _Regressed(
         correlation=correlation,
@@ -301,7 +304,8 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     for n in range(N):
         is_late = grid.age[:, :, n] > lags + 1
         whole = grid.inside[:, :, n] & is_late
-        past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
+        lagged = lagged_inputs(grid.u, n, lags + 1, 0)
+        past = lagged[whole][:, nu:]
         u = grid.u[:, :, n][whole]
         by_past, *_ = np.linalg.lstsq(past, u)
         new[:, :, n][whole] = u - past @ by_past

@@ -63,14 +63,17 @@ def subspace_model(
     for section in sections:
         rows = np.concatenate([section.u * direct, section.past(past)], axis=1)
         rules.append(_regress(rows, section.y)[section.u.shape[1] :])
-    horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
+    rows_of_outputs = -(-most // ny) + 1
+    longest = min(past, N, default_horizon(0))
+    horizon = max(rows_of_outputs, longest)
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
         ahead = np.zeros((past * columns, horizon, ny))
         for i in range(min(horizon, past)):
             kept = (past - i) * columns
-            ahead[:kept, i] = rules[(n + i) % N][i * columns :]
+            older = rules[(n + i) % N]
+            ahead[:kept, i] = older[i * columns :]
         ahead = ahead.reshape(len(ahead), -1)
         root = np.linalg.qr(section.past(past), mode="r")
         _, size, directions = np.linalg.svd(root @ ahead, full_matrices=False)
@@ -107,7 +110,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     whole = 0.0
     age = records.whole().age.reshape(len(records.records), -1)
     for section in _sections(records, without_drift(drive.whole()).u):
-        length = max(min(len(section.y) // (_ROWS * columns), default_horizon(N)), 1)
+        by_samples = min(len(section.y) // (_ROWS * columns), default_horizon(N))
+        length = max(by_samples, 1)
         # (Zeros before a record are no past that determines inputs.)
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
@@ -118,12 +122,14 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         rows = np.concatenate([past, r], axis=1)
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
         gain = _log_size(past, y, floor) - _log_size(rows, y, floor)
-        degrees = len(y) - rows.shape[1] - (ny - nr + 1) / 2
+        correction = (ny - nr + 1) / 2
+        degrees = len(y) - rows.shape[1] - correction
         statistic += max(degrees, 0.0) * gain
         left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
-    p = special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2)
+    half = max(statistic, 0.0) / 2
+    p = special.gammaincc(N * ny * nr / 2, half)
     answer = bool(p <= ANSWER)
     if left <= _SHRINKAGE * whole:
         return answer or None
@@ -194,9 +200,11 @@ class _Section:
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
         record."""
-        back = self.time[:, None] + later - 1 - np.arange(length)
+        first = self.time[:, None] + later - 1
+        back = first - np.arange(length)
         is_inside = back >= 0
-        rows = self._z[self.record[:, None], np.maximum(back, 0)]
+        places = np.maximum(back, 0)
+        rows = self._z[self.record[:, None], places]
         rows = np.where(is_inside[..., None], rows, 0.0)
         return rows.reshape(len(back), -1)
 
