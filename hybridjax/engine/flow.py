@@ -109,7 +109,8 @@ def _passed(
 def _passed_jvp(primals, tangents):
     s, lanes, u, target, times, settings, options, most_events, result = primals
     still = fixed((s, lanes, u, target))
-    moved, tape = _recorded(*still, settings, options._replace(tangents=True), result)
+    with_tangents = options._replace(tangents=True)
+    moved, tape = _recorded(*still, settings, with_tangents, result)
     target, levels = target.split()
 
     def repeat(by_lane, common):
@@ -172,10 +173,14 @@ def _samples(
     # (No step is taken to times outside, where a state may leave all bounds.)
     every = jnp.where(within, times.ravel(), begin.t)
     row = blank_tape(1, begin)
-    row = row._replace(code=jnp.full((1, K * L), ARRIVE_TIME, jnp.int32))
-    inputs = u if u.shape[-1] == 1 else jnp.tile(u, (1, K))
+    code = jnp.full((1, K * L), ARRIVE_TIME, jnp.int32)
+    row = row._replace(code=code)
+    inputs = u
+    if u.shape[-1] > 1:
+        inputs = jnp.tile(u, (1, K))
     _, q = replay(s, begin, inputs, until(every), row)
-    q = jnp.moveaxis(q.reshape(-1, K, L), 1, 0)
+    by_time = q.reshape(-1, K, L)
+    q = jnp.moveaxis(by_time, 1, 0)
     return Samples(begin.chart.reshape(K, L), q)
 
 
@@ -185,7 +190,8 @@ def _is_within(
     """Test whether times lie between the start and the end, which other programs know but for
     rounding."""
     times, start, end = jax.lax.stop_gradient((times, lanes.t, end))
-    late = INSTANT * (end - start) + ROUNDING * jnp.abs(end)
+    duration = end - start
+    late = INSTANT * duration + ROUNDING * jnp.abs(end)
     return (times >= start) & (times <= end + late)
 
 
@@ -194,7 +200,8 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
     rows = jnp.arange(len(tape.code))[:, None]
     is_move = tape.code != IDLE
     # (The last move that ends before each time; -1 for none.)
-    ended = is_move & (tape.t <= jax.lax.stop_gradient(times)[:, None])
+    fixed_times = jax.lax.stop_gradient(times)[:, None]
+    ended = is_move & (tape.t <= fixed_times)
     row = jnp.max(jnp.where(ended, rows, -1), axis=1)
     first = row < 0
     place = jnp.maximum(row, 0)
@@ -208,7 +215,8 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
     K, d, L = q.shape
     t = chosen(lanes.t, ways.t)
     chart = chosen(lanes.chart, tape.chart)
-    q = jnp.moveaxis(q, 0, 1).reshape(d, K * L)
+    by_state = jnp.moveaxis(q, 0, 1)
+    q = by_state.reshape(d, K * L)
     armed = jnp.tile(lanes.armed, (1, K))
     no_event = chart * 0
     return Lanes(t, chart, q, armed, no_event, pace_of(no_event))
@@ -230,7 +238,8 @@ def _events(tape: Tape, ways: Ways, most: int) -> Events:
     first = ft.partial(jnp.searchsorted, v=number)
     row = jax.vmap(first, in_axes=1, out_axes=1)(tape.events)
     row = jnp.minimum(row, len(tape.events) - 1)
-    exists = jnp.take_along_axis(tape.events, row, axis=0) == number[:, None]
+    found = jnp.take_along_axis(tape.events, row, axis=0)
+    exists = found == number[:, None]
 
     def times(x):
         return jnp.take_along_axis(x, row, axis=0)

@@ -138,9 +138,12 @@ def _replayed(
     # mode keeps no more of a block than where it starts.
     rows, L = tape.h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
-    h = jnp.pad(tape.h, fill).reshape(-1, _BLOCK, L)
-    at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
-    code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    padded = jnp.pad(tape.h, fill)
+    h = padded.reshape(-1, _BLOCK, L)
+    padded_at_once = jnp.pad(tape.at_once, fill)
+    at_once = padded_at_once.reshape(-1, _BLOCK, L)
+    padded_code = jnp.pad(tape.code, fill, constant_values=IDLE)
+    code = padded_code.reshape(-1, _BLOCK, L)
     begin = lanes.t, lanes.q, lanes.chart
     rows_of_blocks = (h, code, at_once)
     (t, q, _), ways = jax.lax.scan(block, begin, rows_of_blocks)
@@ -234,7 +237,8 @@ def chain(
         u = np.zeros((s.nu, 1))
         f = slopes(s, moves.t, moves.chart, moves.q, u).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
-        project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
+        sizes = np.asarray(across)[moves.chart[flows]]
+        project = projections(f[flows], sizes)
         by_state = by[flows, :, 1:n]
         by[flows, :, 1:n] = by_state @ project
     columns = _products(moves, by, len(lanes.t))
@@ -246,7 +250,8 @@ def chain(
 def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
     """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
     n, m = by.shape[1:]
-    columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
+    unit = np.eye(n, m, dtype=by.dtype)
+    columns = np.tile(unit, (L, 1, 1))
     by_start = by[:, :, :n]
     by_input = by[:, :, n:]
     for order in range(1 + max(moves.order, default=-1)):
@@ -312,7 +317,8 @@ class Variation:
             index=many(index),
         )
         end, by = linear_moves(s, along, target)
-        by = by.reshape(M, -1, *by.shape[1:])
+        shape = by.shape[1:]
+        by = by.reshape(M, -1, *shape)
         end = end.reshape(M, -1, n)
         self._by = np.real(by[:, 0])
         self._change = np.imag(by) / kernels.TINY
@@ -341,10 +347,12 @@ class Variation:
         P = tangents.shape[2]
         unit = np.tile(self._unit, (M, 1, 1))
         along = np.concatenate([tangents[:-1], unit], axis=1)
-        by_direction = self._change.reshape(*along.shape[:2], n * m)
+        shape = along.shape[:2]
+        by_direction = self._change.reshape(*shape, n * m)
         change = np.moveaxis(along, 1, 2) @ by_direction
         change = change.reshape(M, P, n, m)
-        by = self._by[:, None] + 1j * kernels.TINY * change
+        aside = 1j * kernels.TINY * change
+        by = self._by[:, None] + aside
         if sizes is not None:
             points = self.points(tangents, np.arange(M))
             f = slopes(self._s, *points)
@@ -366,14 +374,16 @@ class Variation:
         """Times, charts, states and inputs where some moves start, in each direction."""
         moves = self._moves
         n, P = tangents.shape[1:]
-        by_direction = np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
+        moved = np.moveaxis(tangents[move], 1, 0)
+        by_direction = moved.reshape(n, -1)
         aside = 1j * kernels.TINY * by_direction
         t = np.repeat(moves.t[move], P)
         chart = np.repeat(moves.chart[move], P)
         q = np.repeat(moves.q[:, move], P, axis=-1)
         direction = np.arange(len(t)) % P
         inputs = self._s.pushed(direction)
-        return t + aside[0], chart, q + aside[1:], inputs
+        time = t + aside[0]
+        return time, chart, q + aside[1:], inputs
 
 
 def _until_ticks(
@@ -415,11 +425,15 @@ def projections(
     """Projections of states along the flow f, orthogonal in sizes."""
     xp = namespace(f)
     f = f / sizes
-    length = xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    square = xp.sum(f * f, axis=-1, keepdims=True)
+    length = xp.sqrt(square)
     f = f / length
-    along = f[..., :, None] * f[..., None, :]
+    column = f[..., :, None]
+    line = f[..., None, :]
+    along = column * line
     project = np.eye(f.shape[-1]) - along
-    return project * sizes[..., :, None] / sizes[..., None, :]
+    in_sizes = project * sizes[..., :, None]
+    return in_sizes / sizes[..., None, :]
 
 
 def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
@@ -472,21 +486,24 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     h = np.where(moves.at_once, 0.0, moves.h)
     h = np.where(on_time, goal - moves.t, h)
     t = np.where(on_time, goal, moves.t + h)
-    expanded = linear_step(s, a, moves.t, moves.q[:n], u, h)
+    state = moves.q[:n]
+    expanded = linear_step(s, a, moves.t, state, u, h)
     expanded = np.array(np.moveaxis(expanded, -1, 0))
     q = expanded[:, :, 0].T
     field = expanded[:, :, 1].T
     by_start = expanded[:, :, 2:-1]
     by_length = expanded[:, :, -1:]
     # A step to a known time shrinks with t, and lasts until a schedule has come.
-    longer = np.zeros((len(t), 1, by_start.shape[2]), by_start.dtype)
+    shape = (len(t), 1, by_start.shape[2])
+    longer = np.zeros(shape, by_start.dtype)
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
     # (Only a varied parameter moves a schedule.)
     varied = s.schedules(a) if isinstance(s, Varied) else []
     moved = np.intersect1d(code, varied).astype(int)
     for g in moved.tolist():
         now = np.flatnonzero(code == g)
-        rows_due = kernels.due(s, g, t[now], q[:, now], u[:, now])
+        due_of = kernels.due(s, g, t[now], q[:, now], u[:, now])
+        rows_due = due_of
         due = rows_due[0]
         by_parameter = due[2 + n :].T
         longer[now, 0, 1 + n :] = by_parameter
@@ -515,7 +532,8 @@ def _at_zeros(
     if not len(lands):
         return ends
     crossed = crossed[lands]
-    index = np.broadcast_to(target.index, target.time.shape)[moves.lane[lands]]
+    index_of_lane = np.broadcast_to(target.index, target.time.shape)
+    index = index_of_lane[moves.lane[lands]]
     landing = s.at(lands)
     flow = ChartFlow(
         s=landing,
@@ -524,14 +542,17 @@ def _at_zeros(
         levels=target.levels,
         index=index,
     )
-    at_end = ends.t[lands], ends.q[:, lands], ends.field[:, lands]
+    state_at_end = ends.q[:, lands]
+    field_at_end = ends.field[:, lands]
+    at_end = ends.t[lands], state_at_end, field_at_end
     zero = flow.locate(*at_end, crossed)
     t = ends.t.copy()
     q = ends.q.copy()
     t[lands] += zero.past
     q[:, lands] = zero.q
     at = t[lands], q[:, lands], u[:, lands]
-    expanded = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
+    rows = kernels.field(landing, a, *at)
+    expanded = np.moveaxis(rows, -1, 0)
     field = expanded[:, :, :1]
     by_field = by_point(expanded, n)
 
@@ -568,7 +589,8 @@ def _after_resets(
     M = len(ends.t)
     n = len(ends.q)
     end = np.zeros((M, 1 + s.d), ends.dq.dtype)
-    by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
+    shape = (M, 1 + s.d, 1 + s.d + s.nu)
+    by = np.zeros(shape, ends.dq.dtype)
     inputs = slice(1 + s.d, 1 + s.d + s.nu)
     columns = np.r_[: 1 + n, inputs]
     end[:, 0] = ends.t
@@ -581,10 +603,12 @@ def _after_resets(
         after = ends.q[:, now]
         by_start = ends.dq[now]
         if kind != (-1,):
-            is_member = np.array(kind)[:, None] == event[now]
+            members = np.array(kind)[:, None]
+            is_member = members == event[now]
             place = np.argmax(is_member, axis=0)
             member = Member(kind, place.astype(np.int32))
-            reset = kernels.reset(s.at(now), member, ends.t[now], after, u[:, now])
+            times = ends.t[now]
+            reset = kernels.reset(s.at(now), member, times, after, u[:, now])
             after = reset[:, 0]
             by_reset = by_point(np.moveaxis(reset, -1, 0), n)
             by_start = chained(by_reset, ends.dt[now], by_start)

@@ -115,8 +115,10 @@ class Trajectory(Showable, eqx.Module):
         s = self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
-            before = s.by_name(s.chart_index(tr.source), self.before[k])
-            after = s.by_name(s.chart_index(tr.target), self.after[k])
+            source = s.chart_index(tr.source)
+            before = s.by_name(source, self.before[k])
+            target = s.chart_index(tr.target)
+            after = s.by_name(target, self.after[k])
             events.append(
                 Event(
                     time=float(self.t[k]),
@@ -148,12 +150,14 @@ class Trajectory(Showable, eqx.Module):
         )
         since = (duration * part)[..., 0]
         times = self.t[:-1, None] + since
-        charts = np.broadcast_to(self.chart[:-1, None], times.shape)
+        chart_of_step = self.chart[:-1, None]
+        charts = np.broadcast_to(chart_of_step, times.shape)
         # (The start of a step repeats the end of the last one, but for resets.)
         is_new = np.ones(times.shape, bool)
         is_new[1:, 0] = self.event[1:-1] >= 0
         # (-1, the last row, if the trajectory ends with a reset; else no row.)
-        final_reset = np.flatnonzero(self.event[-1:] >= 0) - 1
+        ends_with_reset = self.event[-1:] >= 0
+        final_reset = np.flatnonzero(ends_with_reset) - 1
         t = np.append(times[is_new], self.t[final_reset])
         chart = np.append(charts[is_new], self.chart[final_reset])
         state = np.vstack([states[is_new], self.after[final_reset]])
@@ -221,7 +225,8 @@ class Trajectory(Showable, eqx.Module):
             f"{', '.join(events) or 'no events'}; ends in {s.names[self.chart[-1]]}: "
             f"{self.result.message})"
         )
-        return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
+        findings = print_findings(self.findings, "  ").splitlines()
+        return "\n".join([text, *findings])
 
 
 def observed(
@@ -237,7 +242,8 @@ def observed(
     """
     require_as_made(s.system, "this trajectory was computed")
     items = tuple(s.resolve_outputs(names).items)
-    values = np.full((len(names), len(t)), np.nan)
+    shape = (len(names), len(t))
+    values = np.full(shape, np.nan)
     for a in np.unique(chart):
         at = chart == a
         states = s.charts[a].states
@@ -312,7 +318,8 @@ def simulate(
     begin = lane_at(s, start.chart, start.state, start.time, "`state`")
     settings = settings.filled(SIMULATION)
     target = until(begin.t + float(length))
-    path, _ = integrate(s, begin, constant[:, None], target, settings, max_steps)
+    u = constant[:, None]
+    path, _ = integrate(s, begin, u, target, settings, max_steps)
     if throw and path.result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}': "
@@ -395,7 +402,8 @@ def recorded(
     """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
     under another one in each piece (nu, pieces)."""
     state = begin.q.T
-    rows = [(begin.t, state, state, begin.chart, np.full(1, -1))]
+    no_event = np.full(1, -1)
+    rows = [(begin.t, state, state, begin.chart, no_event)]
     for tape in tapes:
         lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = lane.t, lane.before, lane.after, lane.chart, lane.code
@@ -410,7 +418,8 @@ def recorded(
         counts = [len(x) for x, *_ in rows[1:]]
         of_step = np.repeat(u, counts, axis=1)
         u_before = np.hstack([of_step[:, :1], of_step])
-        u_after = np.hstack([of_step, of_step[:, -1:]])
+        last = of_step[:, -1:]
+        u_after = np.hstack([of_step, last])
     with at_ease():
         slope_before = slopes(s, t, source, before.T, u_before).T
         slope_after = slopes(s, t, chart, after.T, u_after).T
@@ -475,12 +484,15 @@ def guards_reached(
         return
     q = lane.q[:n]
     first = np.zeros(1, np.int32)
-    rows = kernels.watched(s, a, None, lane.t, q, u, first)[..., 0]
+    values = kernels.watched(s, a, None, lane.t, q, u, first)
+    rows = values[..., 0]
     point = np.append(lane.t, q)
-    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    field = kernels.field(s, a, lane.t, q, u)
+    rate = field[:, 0, 0]
     flow = np.append(1.0, rate)
     for g, row in zip(guards, rows, strict=True):
-        if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
+        holds = kernels.enabled(s, s.member(g), lane.t, q, u)
+        if not holds.all():
             continue
         value = float(row[0])
         slope = row[1 : 2 + n]
@@ -505,7 +517,8 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
             continue
         n = s.dims[a]
         rows = events[charts[events] == a]
-        sizes = np.abs(after[:, :n]).max(axis=0)
+        magnitude = np.abs(after[:, :n])
+        sizes = magnitude.max(axis=0)
         # Values of the guards before the event, after it, and at the end of the next step.
         begin = before[rows, :n].T
         state = after[rows, :n].T
@@ -518,8 +531,10 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
 
         # Their rates along the field after the event.
         slope = guard[:, 2 : 2 + n]
-        field = kernels.field(s, a, t[rows], state, u)[:, 0]
-        rate = guard[:, 1] + np.einsum("gnk,nk->gk", slope, field)
+        rows_of_field = kernels.field(s, a, t[rows], state, u)
+        field = rows_of_field[:, 0]
+        along = np.einsum("gnk,nk->gk", slope, field)
+        rate = guard[:, 1] + along
 
         # (Zeros are parts of the terms of values and rates.)
         steepness = np.abs(slope)
@@ -538,7 +553,8 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
 
 def _guards_at(s: Structure, a: int, t, q, u):
     """The guards of chart a at some points, with their derivatives."""
-    return kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))
+    first = np.zeros(1, np.int32)
+    return kernels.watched(s, a, None, t, q, u, first)
 
 
 @host_first

@@ -141,7 +141,8 @@ def _passing(
         lacks = duration * np.abs(samples.weights @ beside)
         if linear and len(k) > 1 and not only_poles:
             error = _errors_of_gains(k, rates[:, :, n:], duration, samples.probes)
-            lacks[:-1, n:] = np.maximum(lacks[:-1, n:], error)
+            of_gains = lacks[:-1, n:]
+            lacks[:-1, n:] = np.maximum(of_gains, error)
         part = _Part(
             moved=duration * (samples.weights @ np.abs(rates)),
             lacks=lacks,
@@ -158,7 +159,8 @@ def _passing(
     else:
         usual = settings.scale[a]
     size = whole.moved.sum(axis=0)
-    size[:n] = np.maximum(size[:n], usual[:n])
+    usual_states = usual[:n]
+    size[:n] = np.maximum(size[:n], usual_states)
     same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
     allowed = same * size + ROUNDING * size.max()
     wrong = whole.lacks > allowed
@@ -168,7 +170,8 @@ def _passing(
         fastest = np.maximum(fastest, usual_rate)
         # (The root of the accuracy, as at a kink. Less: kinks are refused. More: multipliers are
         # wrong beside steep functions that steps do not resolve.)
-        is_steep = whole.beside[:, :n] > np.sqrt(accuracy) * fastest
+        steep = np.sqrt(accuracy) * fastest
+        is_steep = whole.beside[:, :n] > steep
         wrong[:, :n] |= is_steep
     return np.concatenate([wrong, whole.falls], axis=1)
 
@@ -184,7 +187,8 @@ def _errors_of_gains(
 
     **Arguments:** `k`: the rows of the steps.
     """
-    pairs = np.concatenate([gains[:-1], gains[1:]], axis=1)
+    both = [gains[:-1], gains[1:]]
+    pairs = np.concatenate(both, axis=1)
     errors = np.abs(np.einsum("pf,kfj->kpj", probes, pairs))
     error = duration[:-1] * errors.max(axis=1, initial=0.0)
     follows = np.diff(k)[:, None] == 1
@@ -212,7 +216,8 @@ def _samples(method: Method, only_poles: bool, linear: bool) -> _Samples:
     legendre = np.polynomial.legendre
     coarse, _ = legendre.leggauss(8)
     inner, weights = legendre.leggauss(4)
-    within_pieces = np.arange(pieces)[:, None] + (inner + 1) / 2
+    number = np.arange(pieces)[:, None]
+    within_pieces = number + (inner + 1) / 2
     fine = 2 * within_pieces.ravel() / pieces - 1
     coefficients = np.linalg.inv(legendre.legvander(coarse, 7))
     of_step = np.tile(weights / 2 / pieces, pieces)
@@ -360,7 +365,8 @@ def jumps(
     quarters = np.arange(1, 4)[:, None, None] / 4
 
     def at(points):
-        return values_at(s, a, points, np.zeros(s.nu))[:, :m]
+        no_input = np.zeros(s.nu)
+        return values_at(s, a, points, no_input)[:, :m]
 
     def limits(first):
         """Magnitudes of the field and the gains, relative to which changes are judged."""
@@ -374,7 +380,8 @@ def jumps(
         rate_of_size = sizes[1:] / sizes[0]
         limit[:n] = np.maximum(limit[:n], rate_of_size)
         largest_gain = limit[n:].max(initial=0.0)
-        limit[n:] = np.maximum(limit[n:], _SAME_GAIN * largest_gain)
+        least = _SAME_GAIN * largest_gain
+        limit[n:] = np.maximum(limit[n:], least)
         limit[n:] += np.finfo(float).tiny
         return limit
 

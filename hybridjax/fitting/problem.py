@@ -178,7 +178,9 @@ def free_parameters(
         if AT_START in name:
             bounds = -jnp.inf, jnp.inf
         if bounds is None:  # it keeps its sign
-            bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
+            lowest = 0.0 if value > 0 else -jnp.inf
+            highest = 0.0 if value < 0 else jnp.inf
+            bounds = (lowest, highest)
         if not bounds[0] < value < bounds[1]:
             raise DefinitionError(
                 f"the bounds of '{name}', {bounds[0]:g} and {bounds[1]:g}, must enclose the value "

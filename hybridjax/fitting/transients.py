@@ -257,11 +257,15 @@ def _event_times(name: str, times: Any) -> Float[np.ndarray, " E"]:
 def _require_times(start: Guess, *lists: np.ndarray) -> None:
     """**Raises:** `DefinitionError` for times that do not increase, or come before the start."""
     for times in lists:
-        if len(times) and not (np.diff(times, prepend=float(start.time) - 1) > 0).all():
+        if not len(times):
+            continue
+        begin = float(start.time)
+        steps = np.diff(times, prepend=begin - 1)
+        if not (steps > 0).all():
             raise DefinitionError("times of a trajectory must increase.")
-        if len(times) and times[0] < float(start.time):
+        if times[0] < begin:
             raise DefinitionError(
-                f"a time, {times[0]:.6g}, comes before the start at {float(start.time):.6g}."
+                f"a time, {times[0]:.6g}, comes before the start at {begin:.6g}."
             )
 
 

@@ -146,7 +146,8 @@ def spectral_products(
     classes = np.arange(P // 2 + 1)
     harmonics = P * np.arange(N)
     bins = (classes[:, None] + harmonics) % (N * P)
-    windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
+    blocks = data.windows(repeats)
+    windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in blocks]
     spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
     spectra = np.moveaxis(spectra, 1, 4)

@@ -298,7 +298,9 @@ class OrderSelection(Showable, eqx.Module):
     @property
     def by_rank(self) -> int:
         small = self.deviation <= self.threshold
-        return int(np.argmax(small)) if small.any() else int(self.orders[-1])
+        if small.any():
+            return int(np.argmax(small))
+        return int(self.orders[-1])
 
     @property
     def by_mdl(self) -> int:

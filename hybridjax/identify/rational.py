@@ -292,6 +292,7 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)
-        a, *_ = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])
+        first = -columns[:, 0]
+        a, *_ = np.linalg.lstsq(columns[:, 1:], first)
         if step in _STARTS:
             yield a

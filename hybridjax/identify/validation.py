@@ -310,11 +310,17 @@ def validate(
                 "the simulation of an unstable plant grows without bound: validate "
                 "`fit_ldtp(series)`."
             )
-    rms = np.sqrt(np.nanmean(error**2, axis=(0, 1, 2)))
-    size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
+    square = np.nanmean(error**2, axis=(0, 1, 2))
+    rms = np.sqrt(square)
+    square_of_outputs = np.mean(simulated[grid.inside] ** 2, axis=0)
+    size = np.sqrt(square_of_outputs)
+
     autocorrelation, whiteness = whiteness_test(whitened(error, roots), lags)
-    late = np.where((grid.age >= lags)[..., None], error, np.nan)
-    inputs = CycleGrid.from_records(list(itertools.compress(outside, kept))).u
+    # (Inputs of so many lags are known from here on.)
+    is_late = (grid.age >= lags)[..., None]
+    late = np.where(is_late, error, np.nan)
+    driving = list(itertools.compress(outside, kept))
+    inputs = CycleGrid.from_records(driving).u
     cross_correlation, independence, visible = independence_test(
         inputs, late, lags, alpha / ny, roots
     )
@@ -324,8 +330,9 @@ def validate(
     # Inputs after the last samples are unknown.
     shown = slice(first, first + len(longest.u) - longest.lead)
     share = visible * rms / positive(size)
+    unexplained = rms / np.nanstd(y, axis=(0, 1, 2))
     return Validation(
-        fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
+        fit=100 * (1 - unexplained),
         noise=rms,
         no_better=no_better,
         whiteness=np.maximum(whiteness, rounding),

@@ -368,7 +368,8 @@ def _responses_of(
     half = np.sqrt(0.5)
     w = weight[row]
     v = weight[other]
-    alike = (np.abs(v - w) <= 10.0**-EQUAL_WEIGHTS * w).all(axis=0)
+    allowed = 10.0**-EQUAL_WEIGHTS * w
+    alike = (np.abs(v - w) <= allowed).all(axis=0)
     for channel in np.ndindex(alike.shape):
         at = (slice(None), *channel)
         h = H[row][at]

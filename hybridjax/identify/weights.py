@@ -117,7 +117,10 @@ def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
     **Returns:** L, and the deviation in units of L.
     """
     level = float(np.clip(misfit, 1.0, most))
-    return level, float(np.sqrt(level / (2 - level))) if level < 2 else np.inf
+    spread = np.inf
+    if level < 2:
+        spread = float(np.sqrt(level / (2 - level)))
+    return level, spread
 
 
 def largest_misfit(htf: HTF) -> float:

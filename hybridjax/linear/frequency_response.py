@@ -87,7 +87,8 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     A, B, C, _, f = (np.asarray(x)[first] for x in arrays[:5])
     tangents = [np.asarray(x) for x in arrays[5:]]
     # (directions, N, 1, rows, columns): frequencies have the axis after that of sections.
-    dA, dB, dC, dD = (x.reshape(-1, *x.shape[-3:])[:, :, None] for x in tangents)
+    along_sections = [x.reshape(-1, *x.shape[-3:]) for x in tangents]
+    dA, dB, dC, dD = (x[:, :, None] for x in along_sections)
     P, N, _, d, _ = dA.shape
     nu = B.shape[-1]
     F = f.size

@@ -520,7 +520,8 @@ class LDTP(WithMultipliers, eqx.Module):
 
 def _with_a_coordinate(A, B, C) -> tuple[Any, Any, Any]:
     """The matrices, padded to one coordinate if there is none: no axis of an array is empty."""
-    if 0 not in A.shape[1:] or A.shape[1] != A.shape[2]:
+    has_states = 0 not in A.shape[1:]
+    if has_states or A.shape[1] != A.shape[2]:
         return A, B, C
     xp = namespace(A)
     return (

@@ -372,7 +372,8 @@ class FiveLinkBiped(HybridSystem):
             ]
         )
         unit = jnp.ones_like(slope)
-        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        half = slope / 2
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - half, -1 + half])
         return desired, direction
 
     def transitions(self):

@@ -235,7 +235,8 @@ class HopperPair(VerticalHopper):
         def reset(t, q, u):
             whole = _whole(down, q)
             if not lifts:
-                whole[2 * i + 1] = self.retention * whole[2 * i + 1]
+                v = 2 * i + 1
+                whole[v] = self.retention * whole[v]
             return _part(after, whole)
 
         what = "liftoff" if lifts else "touchdown"

@@ -97,8 +97,11 @@ class RimlessWheel(HybridSystem):
 
     def draw(self, chart, t, q):
         """With spokes of 1 m, of which up to 24 are drawn."""
-        angles = q["th"] + 2 * self.alpha * (jnp.arange(24) % self.spokes)
-        hub = jnp.stack([jnp.sin(q["th"]), jnp.cos(q["th"])])
+        turned = jnp.arange(24) % self.spokes
+        angles = q["th"] + 2 * self.alpha * turned
+        x = jnp.sin(q["th"])
+        y = jnp.cos(q["th"])
+        hub = jnp.stack([x, y])
         tips = hub - jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
         spokes = jnp.stack([jnp.broadcast_to(hub, tips.shape), tips], axis=1).reshape(
             -1, 2
@@ -223,7 +226,8 @@ class CompassGait(HybridSystem):
         gravity = self.g * (mH * length + m * a + m * length)
         weight = m * self.g * b * jnp.sin(n)
         torque_n = -d * vs**2 - weight + u[0]
-        torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
+        pull = gravity * jnp.sin(s)
+        torque_s = d * vn**2 + pull - u[0]
         # The inverse of [[A, B], [B, D]].
         A = m * b**2
         B = -coupling * c

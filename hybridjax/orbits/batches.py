@@ -379,7 +379,12 @@ def _of_one_width(parts):
     def fill(x):
         return (0, 0), (0, width - x.shape[1])
 
-    return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
+    padded = []
+    for x in parts:
+        if x.ndim == 2:
+            x = np.pad(x, fill(x), constant_values=-1)
+        padded.append(x)
+    return padded
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:

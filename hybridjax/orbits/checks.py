@@ -307,7 +307,9 @@ def check_jumps(cycle: LimitCycle) -> None:
     t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
     events = path.t[path.event >= 0]
     if path.event[-1] < 0:  # the cycle may begin where the field jumps
-        t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
+        t = np.concatenate([t, t[1:2]])
+        chart = np.concatenate([chart, chart[1:2]])
+        q = np.concatenate([q, q[1:2]])
         t[-1] += period
     scale = np.asarray(cycle.settings.scale)
     for a in charts:

@@ -239,7 +239,8 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
         zero = TOGETHER * period * abs(event.rate[0])
         was_positive = event.level[0] > zero
         falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
-        predicate = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u)
+        member = s.member(g)
+        predicate = kernels.enabled(s, member, times[1:], states[1:].T, u)
         holds = predicate.all()
         if g not in events and was_positive and falls and holds:
             found.add(g)

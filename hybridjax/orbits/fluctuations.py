@@ -168,7 +168,8 @@ def _noisy(
     d = flow.q.shape[-1]
 
     # One turn without fluctuations at its beginning.
-    (turn, noise), (begin, *_) = _around(pieces, xp.zeros((n, n)))
+    none = xp.zeros((n, n))
+    (turn, noise), (begin, *_) = _around(pieces, none)
     valid = xp.append(map.valid, xp.ones(n - d, bool))
     turn = xp.where(valid[:, None], turn, 0.0)
     field = flow.field[0, 0]

@@ -154,7 +154,8 @@ def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
     a = int(lane.chart[0])
     u = np.zeros((s.nu, 1))
     q = lane.q[: s.dims[a]]
-    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    rows = kernels.field(s, a, lane.t, q, u)
+    rate = rows[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
             f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
@@ -172,7 +173,8 @@ def _settled(map: ReturnMap, settle: float, period: float | None) -> ReturnMap:
     end = np.asarray(lanes.t) + wait
     lanes = _go(map, "settling", lanes, toward(end, -1, end))
     if period is not None:
-        lanes = lanes._replace(t=real(np.asarray(lanes.t) - wait))
+        begin = np.asarray(lanes.t) - wait
+        lanes = lanes._replace(t=real(begin))
     return dataclasses.replace(map, anchor=lanes)
 
 
@@ -182,7 +184,8 @@ def _patience(map: ReturnMap, lanes: Lanes) -> float:
     lane = to_host(lanes)
     a = int(lane.chart[0])
     t = float(lane.t[0])
-    near = sizes_near(s, a, t, lane.q[:, 0], None)
+    state = lane.q[:, 0]
+    near = sizes_near(s, a, t, state, None)
     return _PATIENCE * max(near.time, slow_time(s, t, near.points))
 
 
@@ -193,7 +196,8 @@ def _time_of_motion(map: ReturnMap, lanes: Lanes) -> float:
     a = int(lane.chart[0])
     q = lane.q[: s.dims[a]]
     u = np.zeros((s.nu, 1))
-    rates = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    rows = kernels.field(s, a, lane.t, q, u)
+    rates = rows[:, 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         times = np.abs(q[:, 0] / rates)
     return float(np.nanmin(times, initial=np.inf))
@@ -230,7 +234,8 @@ def _on_section(
     lanes = map.anchor
     a = int(np.asarray(lanes.chart)[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
-    f, level, rate = jax.device_get(_at_anchor(dataclasses.replace(map, base=section)))
+    with_section = dataclasses.replace(map, base=section)
+    f, level, rate = jax.device_get(_at_anchor(with_section))
     f = f[: s.dims[a]]
     if not f.any():
         raise ComputationError(
@@ -239,7 +244,8 @@ def _on_section(
         )
     place = str(section)
     advice = ""
-    on_section = rate < 0 and abs(level) <= -SAME * time * rate  # up to rounding
+    rounding = -SAME * time * rate
+    on_section = rate < 0 and abs(level) <= rounding  # up to rounding
     if isinstance(section, AtEvent):
         on_section = is_after
     if section is None:
@@ -261,7 +267,8 @@ def _on_section(
         if is_default(section) and _misses(moved) and not last:
             say("a section where the flow has led")
             # (A search that is given up may end at an event.)
-            end = np.asarray(moved.lanes.t) + _ONWARD * _patience(map, moved.lanes)
+            longest = _ONWARD * _patience(map, moved.lanes)
+            end = np.asarray(moved.lanes.t) + longest
             onward = _go(map, "settling", moved.lanes, toward(end, -1, end))
             later = dataclasses.replace(at_guess, anchor=onward)
             return _on_section(later, None, False, time, max_period, last=True)
@@ -272,8 +279,10 @@ def _on_section(
 
 def _across(map: ReturnMap, a: int, q: np.ndarray, f: np.ndarray) -> Crossing:
     """The plane through a state of chart a that is orthogonal to the field there, in sizes."""
-    sizes = np.asarray(map.scale)[a, : len(q)]
-    normal = f / sizes**2 / np.linalg.norm(f / sizes)
+    scale = np.asarray(map.scale)[a, : len(q)]
+    sizes = scale
+    length = np.linalg.norm(f / sizes)
+    normal = f / sizes**2 / length
     plane = _Plane(real(q), real(normal))
     return Crossing(plane, "rising", charts=(map.structure.names[a],))
 
@@ -305,9 +314,11 @@ def _next_crossing(
     begin = float(np.asarray(lanes.t)[0])
     for _ in range(_LOOKS):
         no_time = np.full(1, np.inf)
-        target = toward(no_time, -1, np.asarray(lanes.t) + wait)
+        last = np.asarray(lanes.t) + wait
+        target = toward(no_time, -1, last)
         moved = _moved(map, lanes, to_section(target, section, map.event))
-        waited = float(np.asarray(moved.lanes.t)[0]) - begin
+        end = float(np.asarray(moved.lanes.t)[0])
+        waited = end - begin
         if not _misses(moved) or max_period is not None:
             break
         # (The states may have become slower than they were at the guess, or drift away.)
@@ -324,7 +335,8 @@ def _next_crossing(
     if _misses(moved):
         _require_motion(map, moved.lanes)
         s = map.structure
-        doubts = begins_beyond(s, to_host(map.anchor), np.zeros((s.nu, 1)))
+        no_input = np.zeros((s.nu, 1))
+        doubts = begins_beyond(s, to_host(map.anchor), no_input)
         causes = [f"One cause may be that {x.text} " for x in doubts]
         late = "".join(causes) or late
     return moved, late
@@ -344,10 +356,12 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     code = np.asarray(tape.code)[:, 0]
     follows = np.asarray(tape.at_once)[:, 0]
     # (A section at an event that another one follows at once is refused.)
-    happens = (code >= 0) & ~np.append(follows[1:], False)
+    is_followed = np.append(follows[1:], False)
+    happens = (code >= 0) & ~is_followed
     if not happens.any():
         return None
-    counts = np.bincount(code[code >= 0], minlength=len(s.transitions))
+    happened = code[code >= 0]
+    counts = np.bincount(happened, minlength=len(s.transitions))
     g = min(np.unique(code[happens]).tolist(), key=lambda g: counts[g])
     row = np.flatnonzero(happens & (code == g))[-1]
     a = int(tape.chart[row, 0])
@@ -377,8 +391,10 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         signal: Any = plane.signal
         point = np.asarray(signal.point)
         normal = np.asarray(signal.normal)
-        before = normal @ (moves.q[:n] - point[:, None])
-        after = normal @ (ends[:n] - point[:, None])
+        from_point = moves.q[:n] - point[:, None]
+        before = normal @ from_point
+        to_point = ends[:n] - point[:, None]
+        after = normal @ to_point
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)
         # (It meets the plane where the piece begins, with the move before and that after.)
         meets[begins[k] - 1 : begins[k] + 1] = False
@@ -400,7 +416,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     rows = kernels.field(s, a, t, lane.q[:n], u)
     field = rows[..., 0]
     scale = np.asarray(map.scale)[a, :n]
-    sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
+    magnitude = np.abs(lane.q[:n, 0])
+    sizes = np.maximum(magnitude, scale)
     rate = field[:, 0] / sizes
     by_state = field[:, 2 : 2 + n]
     jacobian = by_state * sizes / sizes[:, None]
@@ -410,7 +427,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
         return
     # (A state that drifts at a constant rate is near none.)
     drift = rate - jacobian @ distance
-    if np.abs(drift).max() > 0.1 * np.abs(rate).max():
+    largest = np.abs(rate).max()
+    if np.abs(drift).max() > 0.1 * largest:
         return
     beyond = []
     guards = s.guards(a)
@@ -426,7 +444,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
-    known = np.abs(lane.q[:n, 0]) > _REST * scale
+    magnitude = np.abs(lane.q[:n, 0])
+    known = magnitude > _REST * scale
     place = np.where(known, lane.q[:n, 0], 0.0)
     place = signal_values(s.states(a), place)
     raise ComputationError(

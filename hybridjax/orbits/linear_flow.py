@@ -271,7 +271,8 @@ class LinearFlow(eqx.Module):
         own = xp.pad(xp.eye(d), [(0, 0), (nu, 0)])
         begin = own[..., None] + 0 * kick[0]
         through = xp.asarray(self.through, dtype=waves.dtype)
-        end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
+        one_over_wave = 1 / last[:, 0]
+        end, x = scan(advance, begin, (through, kick, one_over_wave))
 
         # The delays of events.
         free, _ = self.forward
@@ -499,14 +500,7 @@ def _linear_flow(
         return np.moveaxis(x, (-1, -3, -2), (0, 1, 2))
 
     states = lay(states)
-    # Ends of pieces: by direction and piece.
-    direction = np.repeat(np.arange(directions), P)
-    u = kernels.unpushed(of, 1 + d + direction)
-    events = np.tile(pieces.event, directions)
-    times_of_ends = pieces.time[:, -1].T.ravel()
-    states_at_ends = states[:, :, -1].reshape(-1, d)
-    jumps = _jumps(of, events, times_of_ends, u, states_at_ends)
-    jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
+    jumps = _jumps_at_ends(of, pieces, states[:, :, -1])
     flow = LinearFlow(
         t=lay(times),
         length=pieces.length.T,
@@ -523,6 +517,19 @@ def _linear_flow(
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, flow)
     flow = jax.tree_util.tree_map(lambda x: x[0], flow)
     return dataclasses.replace(flow, chart=chart, event=pieces.event)
+
+
+def _jumps_at_ends(
+    of: Structure, pieces: _Pieces, states: Inexact[np.ndarray, "directions P d"]
+) -> Jumps:
+    """The jumps at the ends of pieces, by direction and piece, from the states before them."""
+    directions, P, d = states.shape
+    direction = np.repeat(np.arange(directions), P)
+    u = kernels.unpushed(of, 1 + d + direction)
+    events = np.tile(pieces.event, directions)
+    times = pieces.time[:, -1].T.ravel()
+    jumps = _jumps(of, events, times, u, states.reshape(-1, d))
+    return Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
 
 
 def _step_at(moves: Moves, pieces: _Pieces) -> Int[np.ndarray, "P K"]:

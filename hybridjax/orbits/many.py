@@ -167,7 +167,8 @@ class Solver:
             self._take(number)
         for _ in range(_SEARCHES + 1 - len(self.routes)):
             known = np.flatnonzero(self.found.path >= 0)
-            if not len(self.pending) or len(known) < _WORTH * len(self.found.path):
+            are_few = len(known) < _WORTH * len(self.found.path)
+            if not len(self.pending) or are_few:
                 return
             distance, near = self.nearest(self.pending, known)
             first = np.argmin(distance)
@@ -199,7 +200,8 @@ class Solver:
         expected = float(route.map.expected)
         q = np.repeat(route.map.anchor.q.T, len(rows), axis=0)
         grown = many.expected[rows] / expected
-        ends = many.t[rows, None] + route.first.ends * grown[:, None]
+        since = route.first.ends * grown[:, None]
+        ends = many.t[rows, None] + since
         for _ in range(_ROUNDS):
             attempt = many.attempt(route, rows, q, ends)
             self._keep(number, attempt)

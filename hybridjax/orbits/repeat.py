@@ -295,7 +295,8 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
 def _newton(map: ReturnMap, factors, residual, q):
     """The Jacobian of the residual, the Newton step, its size relative to the tolerance, and that
     of the residual in sizes of the states."""
-    product = jnp.where(map.valid[:, None], monodromy(factors), 0.0)
+    whole = monodromy(factors)
+    product = jnp.where(map.valid[:, None], whole, 0.0)
     unit = jnp.eye(len(q))
     jacobian = product - unit - map.held(q)[1]
     sizes = map.sizes
@@ -303,7 +304,8 @@ def _newton(map: ReturnMap, factors, residual, q):
     step = -solve_by_columns(scaled, residual / sizes)
     tolerance = ATOL + RTOL * jnp.abs(q / sizes)
     excess = jnp.max(jnp.abs(step) / tolerance)
-    return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
+    distance = jnp.max(jnp.abs(residual) / sizes)
+    return jacobian, step * sizes, excess, distance
 
 
 def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
@@ -327,7 +329,9 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         )
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
-        closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
+        is_small = excess <= enough
+        stays_small = (excess <= 1) & (before.excess <= 1)
+        closed = is_small | stays_small
         # (Where multipliers are zero, the state converges before the times of events do.)
         closed = closed & (passage.last <= _LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
@@ -399,7 +403,8 @@ def _solved_jvp(primals, tangents):
         _, step, *_ = maps.each(_newton, factors, moved, q)
         return by_q + step, by_passage
 
-    by_q, by_passages = jax.lax.scan(along, jnp.zeros_like(q), length=2)
+    start = jnp.zeros_like(q)
+    by_q, by_passages = jax.lax.scan(along, start, length=2)
     by_passage = jax.tree_util.tree_map(lambda x: x[-1], by_passages)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
     return found, nothing._replace(q=by_q, passage=by_passage)
@@ -481,7 +486,9 @@ def factors_across(
     def first(x):
         return xp.moveaxis(x, lanes, 0)
 
-    factors = across(first(passage.rates), first(sizes), first(passage.factors))
+    rates = first(passage.rates)
+    size = first(sizes)
+    factors = across(rates, size, first(passage.factors))
     return xp.moveaxis(factors, 0, lanes)
 
 
@@ -562,4 +569,5 @@ def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
     difference = xp.abs(other.q - q)
     apart = xp.max(difference / route.map.sizes, axis=-1)
     same = xp.isfinite(apart) & (apart <= _APART)
-    return same & check.periodic & (other.error <= _ROUGH) & ~other.left
+    is_rough = other.error <= _ROUGH
+    return same & check.periodic & is_rough & ~other.left

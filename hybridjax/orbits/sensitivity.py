@@ -89,7 +89,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     f0 = flow.field[0, 0]
     clocked = map.base is None
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
-    starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
+    constant = xp.ones((*flow.t.shape, 1))
+    starts, late, total = (x[..., 0] for x in flow.driven(constant))
     both = map.valid[:, None] & map.valid
     whole = xp.where(both, total[:, 1:], 0.0)
     closed, Z = loop(map, whole, f0)

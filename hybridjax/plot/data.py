@@ -1,5 +1,7 @@
 """Figures of data: experiments, recordings, impulse responses, and the validation of a model."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
@@ -67,28 +69,27 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
     phase = np.arange(N) / N
-    with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
+    height = 0.5 + 1.4 * len(names)
+    with panels(ax, len(names), 3, width=PAGE, height=height) as axes:
         for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
             average, spread, last = axes[i]
             average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(axis_of(name))
-            spread.plot(
-                at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True
-            )
+
+            dots: Any = {"color": COLORS["gray"], "rasterized": True}
+            spread.plot(at[thin] / N, x[thin], ",", **dots)
             std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(phase, sign * std, color=CYCLE[0])
             spread.set_ylabel(axis_of(name, deviation=True))
+
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
-                f, power = input_spectrum(data)
-                floor = 1e-12 * power[:, i].max()
-                shown = np.maximum(power[:, i], floor)
-                last.semilogy(f, shown, color=CYCLE[1])
-                last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
+                _draw_spectrum(last, data, i)
             else:
-                last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
+                at_most_spread = x[at == np.argmax(std)]
+                last.plot(at_most_spread, lw=0.5, color=CYCLE[1])
                 last.set_xlabel("cycle")
                 last.sharey(spread)
                 last.tick_params(labelleft=False)
@@ -96,6 +97,16 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             panel.set_xlabel("phase (cycles)")
         letters(axes)
     return Plot(axes)
+
+
+def _draw_spectrum(ax: Axes, data: SectionData, i: int) -> None:
+    """Draw the power spectrum of input i, without the part below rounding."""
+    f, power = input_spectrum(data)
+    floor = 1e-12 * power[:, i].max()
+    shown = np.maximum(power[:, i], floor)
+    ax.semilogy(f, shown, color=CYCLE[1])
+    label = with_unit("power", square(data.inputs[i]))
+    ax.set(xlabel="f (1/period)", ylabel=label)
 
 
 def _powers_of_ten(ax: Axes) -> None:

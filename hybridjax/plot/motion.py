@@ -423,7 +423,8 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
     points = []
     for scene in scenes:
-        points.append(np.array([_NOWHERE[:2], *scene.points.values()]).T)
+        places_of_scene = [_NOWHERE[:2], *scene.points.values()]
+        points.append(np.array(places_of_scene).T)
     parts: list[Part] = [(dots, dots.set_data, points)]
     is_simple = len(scenes[0].lines) <= 4
     colors = itertools.cycle(CYCLE[: 3 if is_simple else 1])

@@ -97,7 +97,9 @@ def cycle(
             panel.plot(*line, color=shade, label=s.names[a], **look)
         t, *curve = orbit(x, y)
         points = np.stack(curve, axis=1)
-        center = (np.nanmin(points, axis=0) + np.nanmax(points, axis=0)) / 2
+        lowest = np.nanmin(points, axis=0)
+        highest = np.nanmax(points, axis=0)
+        center = (lowest + highest) / 2
         _arrow(panel, orbit, t, points)
         panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
@@ -168,9 +170,12 @@ def by_chart(
 ) -> dict[int, Float[np.ndarray, "2 p"]]:
     """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
-    is_jump = (np.diff(t) == 0) | (np.diff(chart) != 0)
+    same_time = np.diff(t) == 0
+    other_chart = np.diff(chart) != 0
+    is_jump = same_time | other_chart
     cuts = np.flatnonzero(is_jump) + 1
-    curve = np.insert(trajectory(x, y)[1:], cuts, np.nan, axis=1)
+    values = trajectory(x, y)[1:]
+    curve = np.insert(values, cuts, np.nan, axis=1)
     chart = np.insert(chart, cuts, chart[cuts])
     curves = {}
     for a in np.unique(chart).tolist():
@@ -263,7 +268,8 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
         last = point + _BAR * along
         bars += [first, last, (np.nan, np.nan)]
         if i % step == 0:  # at the end of the bar that is outside of the loop
-            outwards = np.sign(along / unit @ ((point - center) / unit)) or 1.0
+            from_center = (point - center) / unit
+            outwards = np.sign(along / unit @ from_center) or 1.0
             x, y = point + 2 * _BAR * outwards * along
             ax.text(x, y, str(i), **_NUMBER)
     label = f"sections ({placed.n_sections})"
@@ -283,7 +289,8 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
     for a in np.unique(charts).tolist():
         mask = charts == a
         q = states[: s.dims[a], mask]
-        at = times[mask], q, np.zeros((s.nu, 1))
+        no_input = np.zeros((s.nu, 1))
+        at = times[mask], q, no_input
         flow = kernels.field(s, a, *at)[:, 0]
         values = kernels.outputs(s, a, items, *at)
         points[mask], by_time, *by_state = values.transpose(1, 2, 0)

@@ -144,7 +144,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         paired = self.compare(true)
         order = [int(np.argmin(abs(self.multipliers - z))) for z in paired.estimated]
         low, high = self.interval(level)[order].T
-        return (low <= np.abs(paired.true)) & (np.abs(paired.true) <= high)
+        modulus = np.abs(paired.true)
+        return (low <= modulus) & (modulus <= high)
 
     def compare(self, other: Truth) -> MultiplierComparison:
         """Pair the multipliers with true ones, or with those of another fit. There is no test: see
@@ -183,15 +184,18 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         """
         blocks = self._blocks
         wider = np.sqrt(blocks / (blocks - 1))
-        reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
+        quantile = stats.t.ppf((1 + level) / 2, blocks - 1)
+        reach = wider * quantile
         values = self.plain if plain else self.multipliers
         draws = self.plain_draws if plain else self.draws
         is_real = values.imag == 0
         center = np.where(is_real, values.real, np.abs(values))
         drawn = np.where(is_real, draws.real, _moduli(values, draws))
         half = reach * drawn.std(axis=0)
-        ends = np.abs(np.stack([center - half, center + half], axis=1))
-        low = np.where(half < np.abs(center), ends.min(axis=1), 0.0)
+        pair = np.stack([center - half, center + half], axis=1)
+        ends = np.abs(pair)
+        is_one_sided = half < np.abs(center)
+        low = np.where(is_one_sided, ends.min(axis=1), 0.0)
         return np.stack([low, ends.max(axis=1)], axis=1)
 
     def __repr__(self) -> str:
@@ -214,7 +218,8 @@ def _moduli(
     for k in np.flatnonzero(values.imag > 0):
         distance = np.abs(values - values[k].conj())
         twin = int(np.argmin(distance))
-        common = np.sqrt(moduli[:, k] * moduli[:, twin])
+        square = moduli[:, k] * moduli[:, twin]
+        common = np.sqrt(square)
         moduli[:, [k, twin]] = common[:, None]
     return moduli
 
@@ -227,7 +232,8 @@ def _beside(values: Complex[np.ndarray, " d"], draws: Draws) -> Draws:
         return draws
     ordered = np.empty_like(draws)
     for row, drawn in enumerate(draws):
-        _, columns = linear_sum_assignment(np.abs(values[:, None] - drawn))
+        distances = np.abs(values[:, None] - drawn)
+        _, columns = linear_sum_assignment(distances)
         ordered[row] = drawn[columns]
     return ordered
 
@@ -324,7 +330,8 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     moments = _moments(data, order)
     K = len(moments.records)
     _, counts = np.unique(moments.records, return_counts=True)
-    block = max(_SHORTEST_BLOCK, round(_BLOCK * K ** (1 / 3)))
+    by_length = round(_BLOCK * K ** (1 / 3))
+    block = max(_SHORTEST_BLOCK, by_length)
     are_short = np.median(counts) < _SHORTEST_BLOCK * block
     if are_short and len(counts) >= _SHORTEST_BLOCK:
         # (Many short records are drawn as wholes.)
@@ -385,13 +392,15 @@ def _moments(data: SectionData, order: int) -> _Moments:
     **Raises:** `DefinitionError` for too few cycles, or signals, for so many.
     """
     N = data.n_sections
-    size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
+    outputs = np.concatenate([x.y for x in data.records])
+    size = np.nanstd(outputs, axis=0)
     if order > _EACH * len(size):
         raise DefinitionError(
             f"`order` must be at most {_EACH * len(size)}, the size of a state."
         )
     rows = _rows(data)
-    names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
+    pairs = rows[:, :2]
+    names, cycle = np.unique(pairs, axis=0, return_inverse=True)
     K = len(names)
     needed = 2 * (_EACH * order + 2)
     if K < needed:
@@ -412,7 +421,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
     state = values(0, _EACH)
     after = values(-N, _EACH)
     instruments = values(2 * _EACH - 1, _EACH + 1)
-    known = np.isfinite(np.hstack([state, after, instruments])).all(axis=1)
+    columns = np.hstack([state, after, instruments])
+    known = np.isfinite(columns).all(axis=1)
     most = min(_EACH * (order + 1), instruments.shape[1])
     moments = _Moments(
         state=np.zeros((N, K, order, order)),
@@ -423,7 +433,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
         records=names[:, 0],
     )
     for n in range(N):
-        at = np.flatnonzero(known & (rows[:, 2] == n))
+        in_section = rows[:, 2] == n
+        at = np.flatnonzero(known & in_section)
         if len(at) <= most + 1:
             raise DefinitionError(
                 f"section {n} was seen in {len(at)} cycles only: record longer."
@@ -468,8 +479,10 @@ def _principal(
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
-    size = np.maximum(s[:count], 1e-9 * s[0])  # below: rounding
-    onto = axes[:count].T / size * np.sqrt(len(x))
+    rounding = 1e-9 * s[0]
+    size = np.maximum(s[:count], rounding)  # below: rounding
+    scaled = axes[:count].T / size
+    onto = scaled * np.sqrt(len(x))
     other_deviation = other - other.mean(axis=0)
     return (x - mean) @ onto, other_deviation @ onto
 
@@ -545,9 +558,12 @@ def _corrected(
 
 def _positive(covariance: Float[np.ndarray, "B N d d"]) -> Float[np.ndarray, "B N d d"]:
     """Return the nearest covariances of full rank: estimates may have negative variances."""
-    values, axes = np.linalg.eigh((covariance + covariance.mT) / 2)
-    least = _LEAST_VARIANCE * np.abs(values[..., -1:])
-    return (axes * np.maximum(values, least)[..., None, :]) @ axes.mT
+    symmetric = (covariance + covariance.mT) / 2
+    values, axes = np.linalg.eigh(symmetric)
+    largest = np.abs(values[..., -1:])
+    least = _LEAST_VARIANCE * largest
+    positive_values = np.maximum(values, least)[..., None, :]
+    return (axes * positive_values) @ axes.mT
 
 
 def _resampled(
@@ -559,11 +575,13 @@ def _resampled(
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
         chosen = rng.choice(names, len(names))
-        return (records[:, None] == chosen).sum(axis=1).astype(float)
+        is_drawn = records[:, None] == chosen
+        return is_drawn.sum(axis=1).astype(float)
     weights = np.zeros(len(records))
     for record, count in zip(names, counts, strict=True):
         length = min(block, count)
-        starts = rng.integers(0, count - length + 1, -(-count // length))
+        number = -(-count // length)
+        starts = rng.integers(0, count - length + 1, number)
         rows = starts[:, None] + np.arange(length)
         drawn = rows.ravel()[:count]
         cycles = np.flatnonzero(records == record)

@@ -307,7 +307,8 @@ class Delayed(NamedTuple):
         D = jnp.concatenate([0 * even, even], axis=2)
         names = *model.inputs, *(f"{x} before" for x in model.inputs)
         over_both = A[1::2] @ A[::2]
-        model = LDTP(over_both, B, C[::2], D, dims[::2], names, model.outputs)
+        C_of_both = C[::2]
+        model = LDTP(over_both, B, C_of_both, D, dims[::2], names, model.outputs)
         return cls(model, lag, names[: len(names) // 2])
 
     def htf(

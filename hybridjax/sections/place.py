@@ -6,6 +6,7 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import quick_jit
@@ -150,16 +151,13 @@ def place_along(
     raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
     # The flow from section to section, with the times of the sections.
     is_clock = np.isfinite(bound.time)
+    by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     late = 0.0
     if is_clock[0]:
         shift = bound.time[0] - raw.time[0]
         late = np.rint(shift / cycle.period)
-    ends = len(flows[0][1].time)
-    k = np.arange(N + 1)[-ends:]
-    by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
-    later = (late + k // N) * longer[:, None]
-    moved_times = by_time[:, k % N] + later
-    times = is_clock[k % N] * moved_times
+    last = np.arange(N + 1)[-len(flows[0][1].time) :]
+    times = _moved_times(is_clock, by_time, longer, late, last)
     variation, tangents, along = follow(flows[0], by_bound.levels, times, True)
     t, chart, q, u = variation.points(tangents, variation.first[-N:])
 
@@ -172,6 +170,27 @@ def place_along(
     rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
     moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
     return moved, along, variation.jacobians(tangents, placed.across)[-N:]
+
+
+def _moved_times(
+    is_clock: Bool[np.ndarray, " N"],
+    by_time: Float[np.ndarray, "P N"],
+    longer: Float[np.ndarray, " P"],
+    late: float,
+    ends: Int[np.ndarray, " k"],
+) -> Float[np.ndarray, "P k"]:
+    """Tangents of the times of sections in P directions; zero for sections of the state.
+
+    **Arguments:** `by_time`: tangents of the times in the first period. `longer`: tangents of the
+    period. `late`: periods by which all sections are later. `ends`: the sections, of which section
+    N is section 0 one period later.
+    """
+    N = len(is_clock)
+    section = ends % N
+    periods = late + ends // N
+    later = periods * longer[:, None]
+    moved = by_time[:, section] + later
+    return is_clock[section] * moved
 
 
 def _observed(

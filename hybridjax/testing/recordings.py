@@ -248,7 +248,8 @@ def simulate_beats(
         u = (1 - part) * begin + part * end
         half_way = phase + (w + at(phase) * u) * h / 2
         z = at(half_way)  # the middle of the step
-        move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        drawn = jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        move: Any = (w + z * u) * h + drawn
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):
             share = (1 - phase[trial]) / move[trial]

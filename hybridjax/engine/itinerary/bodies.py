@@ -146,7 +146,8 @@ class Bodies:
             branches.append(ft.partial(self._step, motion, row))
         if does & {JUMP, LEVEL}:
             branches.append(ft.partial(self._end, motion, row))
-        return chosen(row.ends_leg.astype(int), branches, course, flags, (now, due))
+        which = row.ends_leg.astype(int)
+        return chosen(which, branches, course, flags, (now, due))
 
     # Stages, and numbers of rows.
 
@@ -179,7 +180,8 @@ class Bodies:
         guard = s.transitions[g].guard
         assert isinstance(guard, Scheduled)
         tick = guard.nearest(course.ends[row.leg])
-        return course._replace(ends=course.ends.at[row.leg].set(tick)), flags
+        ends = course.ends.at[row.leg].set(tick)
+        return course._replace(ends=ends), flags
 
     def _time(self, row: Row, s: Structure, _, course: Course, flags: Flags):
         """The arrival at a time that is known."""
@@ -230,7 +232,8 @@ class Bodies:
 
     def _step(self, motion: Motion, row: Row, course, flags: Flags, _):
         """A part of the leg, or a Newton step on a watched function."""
-        course, _ = motion.apply(self._lane(self._departed, row), course, None)
+        departed = self._lane(self._departed, row)
+        course, _ = motion.apply(departed, course, None)
         moving, error = self._advanced(motion, row, course)
         course, _ = motion.apply(_after_step, moving, None)
         flags = flags._replace(error=jnp.maximum(flags.error, error))
@@ -251,8 +254,10 @@ class Bodies:
             by_state = jnp.eye(C - 1, d)
             unit = jnp.concatenate([by_time, by_state])
             delay = delay.at[0].set(1.0)
-        dims = jnp.asarray([s.dims[a] for a in self.form.charts])
-        unit = jnp.where(jnp.arange(d) < dims[row.chart], unit, 0.0)
+        counts = [s.dims[a] for a in self.form.charts]
+        dims = jnp.asarray(counts)
+        is_used = jnp.arange(d) < dims[row.chart]
+        unit = jnp.where(is_used, unit, 0.0)
         begins = row.piece < self.form.pieces
         columns = jnp.where(begins, unit, course.y[1:])
         h = row.fraction * (course.ends[row.leg] - course.begin)
@@ -287,14 +292,16 @@ class Bodies:
         allowed = settings.rtol * larger
         allowed = allowed + settings.atol * scale
         # (Numbers that a chart does not use have no error.)
-        relative = jnp.where(error == 0, 0.0, jnp.abs(error) / allowed)
+        part = jnp.abs(error) / allowed
+        relative = jnp.where(error == 0, 0.0, part)
         error = still(jnp.max(relative, axis=-1, initial=0.0))
         return motion.join(course, y), error
 
     def _advanced_by(self, solver: steps.Solver, motion: Motion, row: Row, course):
         """The state and its columns after a step of one of the solvers, and the error."""
         charts = [a for a in self.form.charts if self.solver(a) == solver]
-        places = [charts.index(a) if a in charts else 0 for a in self.form.charts]
+        all_charts = self.form.charts
+        places = [charts.index(a) if a in charts else 0 for a in all_charts]
         place = jnp.asarray(places)[row.chart]
         if steps.is_implicit(solver):
             stages = [self._lane(self._implicit_step, solver, a) for a in charts]
@@ -337,16 +344,19 @@ class Bodies:
         """The event, or the arrival on a level, with which a leg ends."""
         now, due = seen
         course, _ = self._in_chart(motion, row, self._aimed, course)
-        course, _ = motion.apply(self._lane(self._shifted), course, None)
+        shifted = self._lane(self._shifted)
+        course, _ = motion.apply(shifted, course, None)
         flags = self._without_tick(motion, row, course, flags)
         kinds = self.form.kinds
         stages = [self._lane(self._reset, kind, row) for kind in kinds]
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
         jumping = Jumping(due, flags.entry, disabled=jnp.zeros_like(flags.left))
-        course, (_, jumping) = choose(motion, row.kind, stages, course, (now, jumping))
+        found = (now, jumping)
+        course, (_, jumping) = choose(motion, row.kind, stages, course, found)
         ended = self._lane(self._ended, row)
-        course, (flags, *_) = motion.apply(ended, course, (flags, now, jumping))
+        seen_there = (flags, now, jumping)
+        course, (flags, *_) = motion.apply(ended, course, seen_there)
         return course, flags
 
     def _aimed(self, a: int, row: Row, s: Structure, constants, course: Course, notes):
@@ -422,7 +432,8 @@ class Bodies:
         pending = (now.value > 0) | jumping.due
         pending = pending & (jnp.arange(self.form.watched) != row.target)
         entry = entered(s, a, b, constants.levels, row, t, q, pending)
-        disabled = ~s.enabled(member, t, q, jnp.zeros(s.nu))
+        no_input = jnp.zeros(s.nu)
+        disabled = ~s.enabled(member, t, q, no_input)
         return now, jumping._replace(entry=entry, disabled=disabled)
 
     def _ended(self, row: Row, s: Structure, _, course: Course, notes):
@@ -482,7 +493,9 @@ def _with_predicates(
     enabled_at_zero = jnp.asarray(now.enabled_at_zero)
     for place, g in predicates:
         values = before.value[place], now.value[place]
-        slopes = h * before.rate[place], h * now.rate[place]
+        slope_before = h * before.rate[place]
+        slope_after = h * now.rate[place]
+        slopes = slope_before, slope_after
         zero = root_near_end(*values, *slopes)
         # (NaN where nothing is known of the time before.)
         x = jnp.clip(jnp.nan_to_num(zero, nan=1.0), 0.0, 1.0)
@@ -500,7 +513,8 @@ def _padded(
 ) -> Float[Array, "*C d"]:
     """`x` with zeros for numbers that a chart does not use."""
     more = like.shape[-1] - x.shape[-1]
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, more)]) if more else x
+    kept = [(0, 0)] * (x.ndim - 1)
+    return jnp.pad(x, kept + [(0, more)]) if more else x
 
 
 def _after_step(_, moving, notes):
@@ -516,7 +530,8 @@ def _arrived(row: Row, course: Course, flags: Flags, late):
         last=jnp.maximum(flags.last, jnp.abs(still(late))),
         left=flags.left | still(t < course.begin),
     )
-    return course._replace(begin=t, ends=course.ends.at[row.leg].set(t)), flags
+    ends = course.ends.at[row.leg].set(t)
+    return course._replace(begin=t, ends=ends), flags
 
 
 def _has_tick(a: int, row: Row, s: Structure, _, left, passed):

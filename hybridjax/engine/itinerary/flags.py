@@ -90,7 +90,8 @@ def watched(
     """The watched functions of chart a: its guards, and the level of the row's section."""
     from ..kernels import watched_at
 
-    return watched_at(a, s.guard_kinds(a), s, levels, t, q, u, row.section)
+    kinds = s.guard_kinds(a)
+    return watched_at(a, kinds, s, levels, t, q, u, row.section)
 
 
 def count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
@@ -111,7 +112,8 @@ def noted(
     lost = row.at_once & ~row.scheduled
     if due.size:
         lost = lost & ~due[_fired(form, s, row)]
-    left = flags.left | is_new | lost | _has_left(row, flags.before, now)
+    has_left = _has_left(row, flags.before, now)
+    left = flags.left | is_new | lost | has_left
     # (Where a reset puts the state on a guard, rounding gives this guard a sign. It does not fall
     # through its zero there, as it did not on the recorded trajectory.)
     zero = SAME_TIME * duration * jnp.abs(now.rate)
@@ -129,7 +131,9 @@ def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:
     begins = jnp.isinf(flags.before.value)
     falls = now.rate < 0
     beyond = now.value < -SAME_TIME * duration * jnp.abs(now.rate)
-    crossed = (falls & ~entry.known) | (entry.armed & (falls | beyond))
+    is_new = falls & ~entry.known
+    was_to_fall = entry.armed & (falls | beyond)
+    crossed = is_new | was_to_fall
     return begins & (now.value < 0) & crossed & now.enabled
 
 
@@ -167,7 +171,8 @@ def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     other = begins & compared & ~as_recorded
     unknown = within & ~jnp.isfinite(now.value)
     returns = within & dips(before, now, signs)
-    falls = within & (before.value > 0) & ~(now.value > 0)
+    was_positive = before.value > 0
+    falls = within & was_positive & ~(now.value > 0)
     enabled = before.enabled | now.enabled | now.enabled_at_zero
     happens = falls & enabled
     left = (other | unknown | returns | happens).any()
@@ -221,7 +226,8 @@ def entered(
         return Entry.unknown(width)
 
     def values(chart, q):
-        functions = watched(s, chart, levels, row, t, q, jnp.zeros(s.nu))
+        no_input = jnp.zeros(s.nu)
+        functions = watched(s, chart, levels, row, t, q, no_input)
         return functions[: len(s.guards(chart))]
 
     own = values(a, q)

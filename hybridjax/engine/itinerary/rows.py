@@ -123,12 +123,14 @@ class Form(NamedTuple):
     @property
     def charts(self) -> tuple[int, ...]:
         """The charts in which rows begin."""
-        return tuple(sorted({x.chart for x in self.bodies if x.way.does == STEP}))
+        begun = {x.chart for x in self.bodies if x.way.does == STEP}
+        return tuple(sorted(begun))
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
         """The kinds of jumps."""
-        return tuple(sorted({x.kind for x in self.bodies if x.does == JUMP}))
+        jumps = {x.kind for x in self.bodies if x.does == JUMP}
+        return tuple(sorted(jumps))
 
 
 class Itinerary(NamedTuple):
@@ -216,10 +218,12 @@ class _Leg(NamedTuple):
 
     def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
         """Beginnings of steps, and the end, with so many steps for each recorded one."""
-        if self.at_once or self.times[-1] == self.times[0]:
+        lasts_no_time = self.times[-1] == self.times[0]
+        if self.at_once or lasts_no_time:
             return self.times[-1:]
         moves = len(self.times) - 1
-        count = max(1, int(np.ceil(moves * density - 1e-9)))
+        number = np.ceil(moves * density - 1e-9)
+        count = max(1, int(number))
         place = np.linspace(0, moves, count + 1)
         return np.interp(place, np.arange(moves + 1), self.times)
 
@@ -300,7 +304,8 @@ def _written(
         _end(s, table, k, leg, before, goes_on, is_last)
     last_times = np.array([leg.times[-1] for leg in legs])
     ends = last_times - legs[0].times[0]
-    no_more = np.repeat(ends[-1:], -len(ends) % _LEGS)
+    missing = -len(ends) % _LEGS
+    no_more = np.repeat(ends[-1:], missing)
     form, rows, used = _finished(table)
     armed = np.array(begun.armed).reshape(len(begun.charts), len(s.transitions))
     return Itinerary(
@@ -333,7 +338,8 @@ class _Pieces:
         self.charts.append(leg.chart)
         earlier = self._legs[:k]
         self.events.append(sum(before.code >= 0 for before in earlier))
-        self.armed.append(_armed(self._s, leg.chart, t, leg.signs(t)))
+        signs = leg.signs(t)
+        self.armed.append(_armed(self._s, leg.chart, t, signs))
         return len(self.charts) - 1
 
 
@@ -352,7 +358,8 @@ def _rows_of_leg(
     leg, on a section.
     """
     if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
-        table.add(Body(SCHEDULE, leg.chart, (leg.code,)), k, leg.unknown)
+        schedule = Body(SCHEDULE, leg.chart, (leg.code,))
+        table.add(schedule, k, leg.unknown)
     step = Body(STEP, leg.chart)
     fractions = _fractions(times)
     if -1 in begins and not len(fractions):
@@ -401,7 +408,8 @@ def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
     """Durations of the steps of a leg, as parts of its own."""
     if len(times) < 2:
         return np.zeros(0)
-    return np.diff(times) / (times[-1] - times[0])
+    whole = times[-1] - times[0]
+    return np.diff(times) / whole
 
 
 def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
@@ -443,7 +451,8 @@ def _end(
         if is_last:
             # (The next row tests what has happened in a step. Here none would follow.)
             table.add(Body(STEP, a), k, signs, section=leg.section)
-        table.add(Body(TIME), k, leg.unknown, target=len(s.guards(a)))
+        level = len(s.guards(a))
+        table.add(Body(TIME), k, leg.unknown, target=level)
     else:
         jump, place = _jump(s, leg.code, leg.at_once)
         target = -1
@@ -476,11 +485,15 @@ def _legs(
 ) -> list[_Leg]:
     """The legs of a recorded turn, or of a walk to sections."""
     moves = recorded_moves(*turn)
-    index = np.zeros(len(moves.h), np.int32) if to is None else to[moves.lane]
+    if to is None:
+        index = np.zeros(len(moves.h), np.int32)
+    else:
+        index = to[moves.lane]
     h = np.where(moves.at_once, 0.0, moves.h)
     before = _before_events(turn[1])
     begins = _signs(s, levels, moves.t, moves.chart, moves.q, index)
-    ends = _signs(s, levels, moves.t + h, moves.chart, before, index)
+    ends_of_moves = moves.t + h
+    ends = _signs(s, levels, ends_of_moves, moves.chart, before, index)
     is_last = moves.code >= 0
     is_last[-1] = True
     if to is not None:
@@ -526,7 +539,8 @@ def _signs(s: Structure, levels, t, chart, q, index) -> Int[np.ndarray, "M G"]:
         no_input = np.zeros((s.nu, 1))
         rows = kernels.watched(s, a, levels, t[here], state, no_input, index[here])
         value = np.nan_to_num(rows[:, 0], posinf=np.inf, neginf=-np.inf)
-        finite = np.where(np.isfinite(value), np.abs(value), 0.0)
+        magnitude = np.abs(value)
+        finite = np.where(np.isfinite(value), magnitude, 0.0)
         largest = finite.max(axis=1, keepdims=True)
         known = np.abs(value) > _NEAR_ZERO * largest
         sign = np.where(known, np.sign(value), 0)

@@ -124,7 +124,8 @@ def implicit_step(
     def rates_at(t, y):
         return rates(s, a, t, y.T, inputs).T
 
-    point = (t[None], y[0][:, None], h[None])
+    state = y[0][:, None]
+    point = (t[None], state, h[None])
     begin = jax.lax.stop_gradient(point)
     near, _, J = increments(method, lanes, *begin, small=_NEAR)
     equations = StageEquations.at(method, lanes, *begin, near)
@@ -137,7 +138,8 @@ def implicit_step(
         along = jax.vmap(rates_at)(t + c * h, stages)
         change = equations.solve(h * along - w)
         w = w + change
-    left = jnp.max(jnp.abs(change[..., :1]), axis=0)
+    change_of_state = jnp.abs(change[..., :1])
+    left = jnp.max(change_of_state, axis=0)
     of_state = jax.lax.stop_gradient((w[..., :1], left))
     _, error = errors(method, *of_state, J, begin[2])
     end = y + jnp.tensordot(b, w, 1).T

@@ -171,7 +171,8 @@ def _fill(
     for j in range(weight.shape[3]):
         w = weight[..., j]
         x = state[None, :, None, :, None, j]
-        np.multiply((by_Y * w)[:, None], x, out=blocks["Y"][..., j])
+        weighted = (by_Y * w)[:, None]
+        np.multiply(weighted, x, out=blocks["Y"][..., j])
         blocks["B"][:, j, ..., j] = after * w
         if gains:
             blocks["K"][..., j] = (after * w)[:, None] * outputs[
@@ -216,4 +217,5 @@ def states_at(
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
     """Return the product with a real matrix, (a, *rest)."""
     parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
-    return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
+    product = (matrix @ parts).view(complex)
+    return product.reshape(len(matrix), *x.shape[1:])

@@ -129,8 +129,10 @@ class Linearization(NamedTuple):
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
-        along = np.where(size > 0, along / positive(size), 0.0)
-        rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
+        divided = along / positive(size)
+        along = np.where(size > 0, divided, 0.0)
+        unexplained = self.square.sum() - along @ along
+        rest = np.sqrt(max(unexplained, 0.0))
         scaled = size[:, None] * vectors.T
         jacobian = np.pad(scaled, ((0, 1), (0, 0)))
         return np.append(along, rest), jacobian
@@ -182,7 +184,8 @@ def linearize(
             out.square[n, fit.outputs] = np.linalg.trace(fit.products)
             out.gradient[fit.outputs] += fit.gradient
             out.curvature[fit.outputs] += fit.curvature
-            out.dof[n, fit.outputs] = round(fit.dof) - fit.root.shape[1]
+            columns = fit.root.shape[1]
+            out.dof[n, fit.outputs] = round(fit.dof) - columns
     return out
 
 
@@ -217,7 +220,8 @@ def each_fit(
     sections = range(problem.records.n_sections)
 
     def section(k: int, n: int) -> list[Any]:
-        pairs = zip(solution.fits[n], regress(k, parts[k], n), strict=True)
+        regressions = regress(k, parts[k], n)
+        pairs = zip(solution.fits[n], regressions, strict=True)
         return [work(k, parts[k], n, *pair) for pair in pairs]
 
     results = []

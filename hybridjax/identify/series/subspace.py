@@ -61,8 +61,10 @@ def subspace_model(
     # The effect of the past of each section on its outputs.
     rules = []
     for section in sections:
-        rows = np.concatenate([section.u * direct, section.past(past)], axis=1)
-        rules.append(_regress(rows, section.y)[section.u.shape[1] :])
+        known = [section.u * direct, section.past(past)]
+        rows = np.concatenate(known, axis=1)
+        rule = _regress(rows, section.y)
+        rules.append(rule[section.u.shape[1] :])
     rows_of_outputs = -(-most // ny) + 1
     longest = min(past, N, default_horizon(0))
     horizon = max(rows_of_outputs, longest)
@@ -82,7 +84,8 @@ def subspace_model(
             raise DefinitionError(
                 f"the data show {len(size)} dimensions of section {n}, not {d}: lower `dims`."
             )
-        size = np.maximum(size[:d], _SHRINKAGE * size[0])
+        smallest = _SHRINKAGE * size[0]
+        size = np.maximum(size[:d], smallest)
         scale = size / np.sqrt(len(section.y))
         to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
@@ -118,14 +121,16 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
             continue
         past = section.past(length)[later]
         y = section.y[later]
-        r, u = np.split(section.u[later], [nr], axis=1)
+        inputs = section.u[later]
+        r, u = np.split(inputs, [nr], axis=1)
         rows = np.concatenate([past, r], axis=1)
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
         gain = _log_size(past, y, floor) - _log_size(rows, y, floor)
         correction = (ny - nr + 1) / 2
         degrees = len(y) - rows.shape[1] - correction
         statistic += max(degrees, 0.0) * gain
-        left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
+        unexplained = u - rows @ _regress(rows, u)
+        left += float((unexplained**2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
     half = max(statistic, 0.0) / 2
@@ -145,7 +150,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
 def _log_size(rows: np.ndarray, y: np.ndarray, floor: np.ndarray) -> float:
     """Return the log determinant of the errors of a regression."""
     error = y - rows @ _regress(rows, y)
-    return float(np.linalg.slogdet(error.T @ error + floor)[1])
+    gram = error.T @ error + floor
+    return float(np.linalg.slogdet(gram)[1])
 
 
 def without_drift(grid: CycleGrid) -> CycleGrid:
@@ -163,7 +169,8 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
                 no_columns, no_columns, grid.drift, weight[:, :, n]
             )
             z = x[:, :, n]
-            out[:, :, n] = regression.reduced(z).reshape(z.shape)
+            reduced = regression.reduced(z)
+            out[:, :, n] = reduced.reshape(z.shape)
         return out
 
     all_sampled = np.asarray(grid.sampled.all(axis=3))
@@ -180,7 +187,8 @@ def _sections(
     """Return the samples of more signals, the inputs and the outputs at each section."""
     grid = without_drift(records.whole())
     ny = len(records.outputs)
-    z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
+    scaled = grid.y / records.scale
+    z = np.concatenate([*more, grid.u, scaled], axis=3)
     sampled = np.asarray(grid.sampled.all(axis=3))
     return [_Section(z, sampled, n, ny) for n in range(records.n_sections)]
 
@@ -211,7 +219,8 @@ class _Section:
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
-    size = positive(np.sqrt(np.square(rows).sum(axis=0)))
+    square = np.square(rows).sum(axis=0)
+    size = positive(np.sqrt(square))
     rows = rows / size
     gram = rows.T @ rows
     shrunk = gram + _SHRINKAGE * np.eye(len(size))
@@ -240,7 +249,8 @@ def _from_states(
             np.concatenate([rows, error], axis=1),
             section.past(past, 1) @ to_state[(n + 1) % N],
         )
-        A, B, K = np.split(later.T, [d, d + nu], axis=1)
+        ends = [d, d + nu]
+        A, B, K = np.split(later.T, ends, axis=1)
         blocks.append(
             (A, B, output[:d].T, output[d:].T, K if innovations else K[:, :0])
         )

@@ -239,7 +239,8 @@ def _improbable(intervals: Intervals, white: Whitening, errors: Columns) -> floa
     **Arguments:** `errors`: derivatives by the rates, residuals, and derivatives by what was
     fitted.
     """
-    rest, _, power = without_rates(intervals, errors[:, 0], errors[:, 1:])
+    others = errors[:, 1:]
+    rest, _, power = without_rates(intervals, errors[:, 0], others)
     y = rest[:, 0]
     x = rest[:, 1:]
     curvatures, axes = np.linalg.eigh(x.T @ x)
