@@ -204,7 +204,8 @@ def excited_classes(
     size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
-    relative = power / scale[:, :, None] / scale[:, None]
+    by_column = power / scale[:, :, None]
+    relative = by_column / scale[:, None]
     least = np.linalg.eigvalsh(relative)[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
     if whole.any():
@@ -239,8 +240,10 @@ def solve(
     classes = excited_classes(sums, r, threshold)
     estimates = _solve_classes(sums, classes, (y, u, r), how)
     every = (classes[:, None] + P * np.arange(N)) / P
-    nearest = np.abs((every + N / 2) % N - N / 2)
-    f = np.unique(np.round(P * nearest).astype(int)) / P
+    shifted = (every + N / 2) % N
+    nearest = np.abs(shifted - N / 2)
+    bins = np.round(P * nearest).astype(int)
+    f = np.unique(bins) / P
     lines = Lines.of(f, N)
 
     def entries(x):

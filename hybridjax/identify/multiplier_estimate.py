@@ -124,7 +124,8 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     truth = multipliers_from(true)
     if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
-    rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
+    distances = np.abs(values[:, None] - truth)
+    rows, columns = linear_sum_assignment(distances)
     paired_values = values[rows]
     paired_truth = truth[columns]
     order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
@@ -189,7 +190,8 @@ class MultiplierFit(Fit):
         if not np.isfinite(self.covariance).all():
             return modulus, np.full(len(modulus), np.inf)
         along = self.multipliers / positive(modulus)
-        outward = np.stack([along.real, along.imag], axis=1)[:, :, None]
+        parts = np.stack([along.real, along.imag], axis=1)
+        outward = parts[:, :, None]
         with np.errstate(all="ignore"):
             variance = outward.mT @ self.multiplier_covariances @ outward
         return modulus, np.sqrt(variance[:, 0, 0])

@@ -416,7 +416,8 @@ def noise_ratios(
     cost, dof = varpro.cost_of(groups, c)
     level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / dof)
     whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
-    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2 / level
+    singular_values = np.linalg.svd(whitened, compute_uv=False)
+    values = singular_values[::-1] ** 2 / level
     if exact:
         values = values / _ROUNDING_VARIES
     return values, tails * float(np.sqrt(2 / dof))

@@ -238,7 +238,8 @@ def _fit_one(
         raise DefinitionError(
             f"{name} holds NaN or infinity: leave these frequencies out."
         )
-    rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
+    power = np.mean(np.abs(h) ** 2)
+    rms = float(np.sqrt(power))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
     exponents = 1 + np.arange(zeros + 1)

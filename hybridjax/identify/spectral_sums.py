@@ -169,7 +169,8 @@ def _sums_of_part(
     products = X[:, :, None].conj() * X[:, None]
     Y, noise = _outputs(data, windows, experiment, line, harmonics)
     size = np.abs(U)
-    phase = np.divide(U.conj(), size, out=np.zeros_like(U), where=size > 0)
+    none = np.zeros_like(U)
+    phase = np.divide(U.conj(), size, out=none, where=size > 0)
     turned = phase[:, :, None, None] * Y[:, None]
     tested = (0, 0)
     if first or len(lines) < len(line):  # lines were measured several times
@@ -255,7 +256,8 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
             continue
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
         spectra = np.zeros((_REDRAWS, len(size)), complex)
-        spectra[:, lines] = size[lines] * np.exp(1j * angle)
+        turns = np.exp(1j * angle)
+        spectra[:, lines] = size[lines] * turns
         waves = np.fft.irfft(spectra, len(signal), axis=1)
         draws = np.abs(waves).max(axis=1)
         tested += 1

@@ -149,12 +149,14 @@ class Validation(Showable, eqx.Module):
     @property
     def white(self) -> bool:
         """True if the residuals of all outputs may be white."""
-        return bool(np.min(self.whiteness) >= self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return bool(np.min(self.whiteness) >= threshold)
 
     @property
     def independent(self) -> bool:
         """True if the residuals of all outputs may be independent of the inputs."""
-        return bool(np.min(self.independence) >= self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return bool(np.min(self.independence) >= threshold)
 
     @property
     def unexplained(self) -> tuple[str, ...]:
@@ -295,7 +297,8 @@ def validate(
         roots = list(model.spread(grid))
     if isinstance(tested, LDTP):
         # Outputs in units of their size, so that none is neglected.
-        S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
+        of_section = np.diag(prepared.scale**2)
+        S = np.tile(of_section, (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):

@@ -155,8 +155,10 @@ def late_columns(
     for j in range(len(c) + 1):
         rows = group.weighted(c, delay**j * group.data)
         columns.append(without(q, rows).ravel())
-    taken = (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
-    left = (2 - taken) / np.abs(chi(group.period_delay, c)) ** 2
+    by_row = (q**2).sum(axis=1)
+    taken = by_row.reshape(2, -1).sum(axis=0)
+    gain = np.abs(chi(group.period_delay, c)) ** 2
+    left = (2 - taken) / gain
     return np.stack(columns, axis=1), left
 
 

@@ -144,7 +144,8 @@ def neighbor_correlation(
     products = later * earlier.conj()
     neighbors = np.real(products).mean()
     square = (np.abs(error) ** 2).mean()
-    rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
+    power = (np.abs(values) ** 2).mean()
+    rounding = np.finfo(float).eps * power
     return float(neighbors / np.maximum(square, rounding))
 
 

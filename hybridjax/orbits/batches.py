@@ -224,7 +224,8 @@ class Tiles(NamedTuple):
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
         anchor, period, turn, codes, together = self._turn(rows, anchor, period)
-        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
+        scale = np.asarray(self.map.settings.scale)
+        sizes = scale[anchor.chart[:, 0]]
         ratio = turn.jacobian * sizes[:, None, :]
         jacobian = ratio / sizes[:, :, None]
         step = newton_steps(jacobian, turn.residual / sizes)

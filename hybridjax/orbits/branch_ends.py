@@ -134,7 +134,8 @@ def _is_slow(row, field, sizes, period: float) -> bool:
     slope = row[2 : 2 + len(field)]
     fastest = np.maximum(np.abs(field), sizes / period)
     possible = abs(row[1]) + np.abs(slope) @ fastest
-    return bool(abs(row[1] + slope @ field) < _SLOW * possible)
+    rate = row[1] + slope @ field
+    return bool(abs(rate) < _SLOW * possible)
 
 
 def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
@@ -191,7 +192,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 def _has_minimum(level: np.ndarray, near: float) -> bool:
     """True if a guard has a minimum close to zero within a stay, after which it grows again."""
     inside = level[1:-1]
-    lowest = (inside < level[:-2]) & (inside <= level[2:])
+    below_last = inside < level[:-2]
+    lowest = below_last & (inside <= level[2:])
     return bool(np.any(lowest & (np.abs(inside) <= near)))
 
 

@@ -69,7 +69,8 @@ class BranchPoint(NamedTuple):
     @property
     def critical(self) -> Complex[np.ndarray, " c"]:
         """The multipliers on the unit circle."""
-        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < SAME]
+        off_circle = np.abs(np.abs(self.multipliers) - 1)
+        return self.multipliers[off_circle < SAME]
 
 
 class BranchEnd(NamedTuple):

@@ -245,7 +245,8 @@ def _predicate(s: Structure, g: int) -> Callable:
     u = np.zeros((s.nu, 1))
 
     def predicate(t, q):
-        holds = kernels.enabled(s, s.member(g), t, q, u).astype(float)
+        rows = kernels.enabled(s, s.member(g), t, q, u)
+        holds = rows.astype(float)
         derivatives = np.zeros((1 + len(q), len(t)))
         return np.concatenate([holds[None], derivatives])[None]
 
@@ -356,7 +357,8 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     values, gradients = map.outputs(cycle.anchor.q[:, 0], names)
     changes = gradients @ monodromy(cycle.factors) - gradients
     changes = np.abs(changes * map.sizes).max(axis=1)
-    kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
+    largest = np.abs(gradients * map.sizes).max(axis=1)
+    kept = changes <= SAME * largest
     conserved = np.flatnonzero(kept).tolist()
     return {names[k]: float(values[k]) for k in conserved}
 

@@ -100,7 +100,8 @@ def groups_on(
     **Arguments:** `scale`: sizes of the states by chart.
     """
     times = path.t[rows]
-    starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
+    steps = np.diff(times, prepend=-np.inf)
+    starts = np.flatnonzero(steps > TOGETHER * period)
     groups: list[SimultaneousEvents | None] = []
     for first, after in itertools.pairwise([*starts, len(rows)]):
         group = rows[first:after].tolist()
@@ -190,7 +191,8 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     by_reset = expanded[:, 1:, 0]
     direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
-    size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
+    by_rows = np.abs(by_q) @ np.abs(by_reset)
+    size = np.abs(direct) + by_rows
     if is_scheduled:  # (its time is the same in all neighbors)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
@@ -250,7 +252,8 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     """True if scheduled event g happens at t."""
     schedule = cast(Scheduled, s.transitions[g].guard)
-    return abs(float(schedule.nearest(np.asarray(t))) - t) <= within
+    nearest = schedule.nearest(np.asarray(t))
+    return abs(float(nearest) - t) <= within
 
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:
@@ -339,7 +342,8 @@ def check_begin(map: ReturnMap) -> None:
     due &= falls_within(guards, rates, TOGETHER * float(map.expected))
     if base is not None:
         # (Events that follow at once have been armed by the event that led to the anchor.)
-        due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)
+        armed = np.asarray(map.anchor.armed)[:, 0]
+        due |= armed & (guards < 0)
         due[map.event] = False
     if due.any():
         raise ComputationError(about_begin(map, int(np.argmax(due))))

@@ -99,7 +99,8 @@ class Point:
     @property
     def scaled(self) -> Float[np.ndarray, "d n"]:
         """Derivatives of the residual, all in sizes."""
-        return self.turn.jacobian * self.size / self.size[:-1, None]
+        by_column = self.turn.jacobian * self.size
+        return by_column / self.size[:-1, None]
 
     @ft.cached_property
     def multipliers(self) -> Complex[np.ndarray, " d"]:
@@ -168,7 +169,8 @@ class Curve:
         )
         if isinstance(point, Result):
             return point
-        astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
+        off = point.z - last.z - ahead
+        astray = np.linalg.norm(off / last.size)
         return point if astray <= 0.5 * length else Result.NOT_CONVERGED
 
     def between(self, a: Point, b: Point, where: float) -> Point | Result:

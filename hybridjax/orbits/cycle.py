@@ -282,7 +282,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
-        return bool(np.sum(inside) == len(inside) - len(self.conserved))
+        free = len(inside) - len(self.conserved)
+        return bool(np.sum(inside) == free)
 
     @property
     def state(self) -> dict[str, float]:

@@ -136,7 +136,8 @@ class Coupling(Showable, eqx.Module):
     @property
     def _slope(self) -> "Coupling":
         c = to_host(self.coefficients)
-        return Coupling(2j * np.pi * np.arange(len(c)) * c)
+        rates = 2j * np.pi * np.arange(len(c))
+        return Coupling(rates * c)
 
     def _zeros(self) -> tuple[Locked, ...]:
         """Zeros in one cycle, with the slopes there."""
@@ -237,7 +238,8 @@ class Responses(Showable, eqx.Module):
         xp = namespace(self.period)
         jumps = self.flow.jumps
         s = self.structure
-        after = xp.roll(self._covector(mode)[:, 0], -1, axis=0)
+        last_covector = self._covector(mode)[:, 0]
+        after = xp.roll(last_covector, -1, axis=0)
         weight = xp.einsum("pi,piu->pu", after, jumps.by_input)
         place = xp.argsort(self.flow.event < 0, stable=True)
         phases = (self.flow.turn + self.flow.length) / self.period
@@ -355,7 +357,8 @@ class Responses(Showable, eqx.Module):
             name if name is None else [name]
         )
         by_input = self.flow.by_input[..., columns[0]]
-        return name, namespace(by_input).sum(self._covector(None) * by_input, axis=-1)
+        products = self._covector(None) * by_input
+        return name, namespace(by_input).sum(products, axis=-1)
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
         if mode is None:
@@ -488,7 +491,8 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     back = f[:, None] * along
     closed = monodromy - xp.eye(len(f)) + back
     if on_host(f):
-        smallest = svdvals(closed * size / size[:, None])[-1]
+        scaled = closed * size / size[:, None]
+        smallest = svdvals(scaled)[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
                 "the cycle has no defined phase: its multiplier 1 is double, as in a family of "

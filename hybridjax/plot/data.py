@@ -266,7 +266,8 @@ def validation(
     N = validation.n_sections
     ny = len(validation.outputs)
     shown = slice(max(len(validation.measured) - cycles * N, 0), None)
-    time = (validation.first_section + np.arange(len(validation.measured)))[shown] / N
+    sections = validation.first_section + np.arange(len(validation.measured))
+    time = sections[shown] / N
     limit = float(special.ndtri(0.995))
     with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
         for i, name in enumerate(validation.outputs):

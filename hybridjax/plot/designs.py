@@ -52,7 +52,8 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
         f = np.unique(plan.frequencies)
-        H = np.abs(np.asarray(model.htf(f, 0).H)[0])
+        response = np.asarray(model.htf(f, 0).H)[0]
+        H = np.abs(response)
         for k, name in enumerate(model.outputs):
             for i, _ in enumerate(model.inputs):
                 modulus = H[:, k, i]

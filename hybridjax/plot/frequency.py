@@ -558,7 +558,8 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
     """Return the phase in degrees where it is known, NaN elsewhere; whole turns are chosen as in
     the reference, a pair of frequencies and phases."""
     phase = np.full(len(f), np.nan)
-    phase[known] = np.degrees(np.unwrap(np.angle(values[known])))
+    angles = np.unwrap(np.angle(values[known]))
+    phase[known] = np.degrees(angles)
     if reference is not None and known.any() and len(reference[0]):
         off = np.interp(f[known], *reference) - phase[known]
         turns = np.median(off) / 360

@@ -244,7 +244,8 @@ def _zoom(
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    order = np.lexsort((-np.imag(true), -np.abs(true)))
+    by_modulus = -np.abs(true)
+    order = np.lexsort((-np.imag(true), by_modulus))
     leading = complex(true[order[0]])
     reaches = [1e-12]
     for z in series.values():

@@ -208,7 +208,8 @@ class _Line(NamedTuple):
     def states(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, "n L"]:
         """Return the states on the line with these values of the coordinate."""
         cycle = np.asarray(self.returns.fixed_point)
-        return cycle[:, None] + np.outer(self.direction, values - self.fixed)
+        since = values - self.fixed
+        return cycle[:, None] + np.outer(self.direction, since)
 
     def next(self, states: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
         """Return the states after one period, NaN if the section is not reached."""
@@ -247,7 +248,8 @@ def _jacobian(
 def _largest_real(cycle: LimitCycle) -> float:
     """**Raises:** `DefinitionError` for a cycle without a real multiplier."""
     multipliers = cycle.multipliers
-    is_real = np.abs(np.imag(multipliers)) <= _REAL * np.abs(multipliers)
+    modulus = np.abs(multipliers)
+    is_real = np.abs(np.imag(multipliers)) <= _REAL * modulus
     if not is_real.any():
         raise DefinitionError(
             "return_map: the cycle has no real multiplier. Deviations turn from period to period, "

@@ -189,7 +189,8 @@ class LDTPFit(WithCost, MultiplierFit):
         """Iterate over sections: roots of the covariance of the predictions by errors of the fit,
         in units of the noise."""
         part = SeriesPart.of(grid, self._scale)
-        S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
+        units = np.outer(self._scale, self._scale)
+        S = cast(Predictor, self.predictor).S / units
         path = SeriesProblem(
             parts=[part],
             S=S,

@@ -216,6 +216,7 @@ def states_at(
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
     """Return the product with a real matrix, (a, *rest)."""
-    parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
+    values = np.ascontiguousarray(x).view(float)
+    parts = values.reshape(len(x), -1)
     product = (matrix @ parts).view(complex)
     return product.reshape(len(matrix), *x.shape[1:])
