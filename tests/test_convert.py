@@ -110,7 +110,12 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     pytest.importorskip("xarray")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
-    one = dataset.H.sel(frequency=0.4, harmonic=-1, input="w", output="y")
+    one = dataset.H.sel(
+        frequency=0.4,
+        harmonic=-1,
+        input="w",
+        output="y",
+    )
     expected = complex(H[-1][-1, 0, 1])
     assert one.item() == expected
     assert dataset.input_unit.sel(input="u").item() == "N"

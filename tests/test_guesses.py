@@ -45,7 +45,13 @@ def names():
     known = dict(
         hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
     )
-    known |= dict(sections=sections, model=model, design=design, whole=whole, rec=made)
+    known |= dict(
+        sections=sections,
+        model=model,
+        design=design,
+        whole=whole,
+        rec=made,
+    )
     known |= dict(
         fit=hj.fit_multipliers(est, order=2),
         ser=hj.fit_series(data, order=2),

@@ -279,7 +279,8 @@ class Data:
 @pytest.mark.parametrize("cls", [Pair, Data])
 def test_named_tuples_and_dataclasses_are_checked(cls):
     assert type(cls(1).first) is float
-    assert pickle.loads(pickle.dumps(cls(1))) == cls(1)
+    copied = pickle.loads(pickle.dumps(cls(1)))
+    assert copied == cls(1)
     with pytest.raises(
         hj.errors.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"
     ):

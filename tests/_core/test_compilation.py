@@ -126,7 +126,8 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
         constants = {"k": jnp.asarray(k)}
         run = kernel(point, plain, (2,), (constants,), lanes)
         values = run(x, y)
-        expected_values = k * 3 * np.sin(x) ** 2 + y
+        waves = k * 3 * np.sin(x) ** 2
+        expected_values = waves + y
         assert_allclose(values, expected_values, rtol=1e-15)
     assert len(compilation._kernels) == before + 1
     some = np.array([False, True, False, True])

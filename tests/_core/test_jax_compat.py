@@ -220,7 +220,8 @@ def test_suddenness(how):
 def test_smooth_operations():
     smooth = program_of(lambda x: jnp.sum(x * jnp.sin(x) - 1.0), X)
     for equation in smooth.eqns:
-        assert jax_compat.suddenness(equation, [True] * len(equation.invars)) == []
+        varies = [True] * len(equation.invars)
+        assert jax_compat.suddenness(equation, varies) == []
 
 
 # LAPACK -----------------------------------------------------------------------------------------
@@ -357,7 +358,8 @@ def test_a_branch_on_some_lanes_stays_a_branch_under_vmap():
         return jax.lax.cond(some, lambda: jnp.ones(()), lambda: jnp.zeros(()))
 
     masks = jnp.array([[False, True], [False, False]])
-    assert "select_n" not in str(jax.make_jaxpr(jax.vmap(function))(masks))
+    program = jax.make_jaxpr(jax.vmap(function))(masks)
+    assert "select_n" not in str(program)
     assert jax.vmap(function)(masks).tolist() == [1.0, 1.0]
     found = jax.vmap(function)(masks[1:])
     assert found.tolist() == [0.0]

@@ -39,11 +39,13 @@ def looped(x, y):
 def test_vectorized_replaces_everything():
     assert left(looped, 0.3, 0.7)
     assert not left(vectorized(looped), 0.3, 0.7)
-    assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
+    found = vectorized(looped)(0.3, 0.7)
+    assert_allclose(found, looped(0.3, 0.7), rtol=1e-13)
 
 
 def test_other_types_and_requested_accuracies_stay():
-    assert left(vectorized(jnp.sin), jnp.float16(1)) == {"sin"}
+    operations = left(vectorized(jnp.sin), jnp.float16(1))
+    assert operations == {"sin"}
     exact = ft.partial(jax.lax.sin, accuracy=jax.lax.AccuracyMode.HIGHEST)
     assert left(vectorized(exact), 1.0) == {"sin"}
 
@@ -107,7 +109,8 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
 
 def test_off_away_from_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert left(vectorized(looped), 0.3, 0.7) == left(looped, 0.3, 0.7)
+    operations = left(vectorized(looped), 0.3, 0.7)
+    assert operations == left(looped, 0.3, 0.7)
 
 
 def test_vectors_of_several_functions_are_put_together_row_by_row():

@@ -44,7 +44,8 @@ def arguments(name):
     of_all_sizes = sizes * RNG.choice([-1, 1], 20000)
     small = RNG.uniform(-10, 10, 20000)
     large = RNG.uniform(-1e6, 1e6, 9000)
-    near_multiples = np.arange(-20000, 20000, 7) * (math.pi / 4)
+    multiples = np.arange(-20000, 20000, 7)
+    near_multiples = multiples * (math.pi / 4)
     return np.concatenate([of_all_sizes, small, large, near_multiples])
 
 
@@ -77,7 +78,8 @@ def test_hardest_arguments():
     for number in k:
         multiple = int(number) * PI / 2
         x.append(float(multiple))
-        remainder.append(float(Fraction(x[-1]) - multiple))
+        exact = Fraction(x[-1]) - multiple
+        remainder.append(float(exact))
     x = np.array(x)
     remainder = np.array(remainder)
     assert np.min(np.abs(remainder)) < 1e-18

@@ -119,7 +119,8 @@ def test_nothing_is_written_through_a_link_to_a_folder(full):
 
 def test_a_list_with_names_outside_touches_nothing_there(full):
     away = full.parent / "away" / "file"
-    (full / LIST).write_text(json.dumps(["../away/file", str(away)]))
+    places = ["../away/file", str(away)]
+    (full / LIST).write_text(json.dumps(places))
     write(full, RESULTS)
     assert away.read_text() == "away"
 

@@ -21,7 +21,8 @@ def model():
     across = np.sin(angle)
     push = np.stack([along, across], axis=1)
     x = np.ones((8, 2))
-    v = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    sine = np.sin(angle)
+    v = np.stack([sine, np.cos(angle)], axis=1)
     C = np.stack([x, v], axis=1)
     B = push[:, :, None]
     return hj.linear.LDTP(A, B, C, inputs="u", outputs=("x", "v"))
@@ -50,7 +51,8 @@ def expected_htf(model, design, noise, harmonics=None):
     """Return the exact HTFs at the lines of a design, with the variance of their estimates."""
     htf = model.htf(design.frequencies, harmonics)
     of_unit_noise = design.expected_variance()[:, None, :]
-    of_outputs = np.square(list(noise.values()))[:, None]
+    squares = np.square(list(noise.values()))
+    of_outputs = squares[:, None]
     variance = np.broadcast_to(of_unit_noise * of_outputs, htf.H.shape)
     return dataclasses.replace(htf, variance=variance)
 

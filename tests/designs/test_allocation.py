@@ -45,7 +45,8 @@ def test_several_limits(linear, quadratic):
     cost = rng.uniform(0.2, 2, (linear, 14))
 
     def value(p):
-        return np.trace(np.linalg.inv(slopes * p @ slopes.T))
+        information = slopes * p @ slopes.T
+        return np.trace(np.linalg.inv(information))
 
     within = {"type": "ineq", "fun": lambda p: 1 - np.append(cost @ p, curved @ p @ p)}
     other = minimize(

@@ -58,7 +58,8 @@ def two_charts():
     """Charts with one and with two states, two inputs, and an output that depends on both."""
 
     def up(t, q, u):
-        x = 0.6 * q[0] + u[0] + 0.3 * q[0] * u[1]
+        product = 0.3 * q[0] * u[1]
+        x = 0.6 * q[0] + u[0] + product
         y = 0.5 * q[0] ** 2 + u[1]
         return x, y
 
@@ -104,7 +105,8 @@ def quadratic():
 
 @pytest.fixture(scope="module")
 def two():
-    cycle = hj.find_limit_cycle(two_charts(), hj.Guess("one", (0.0,), time=0.75))
+    guess = hj.Guess("one", (0.0,), time=0.75)
+    cycle = hj.find_limit_cycle(two_charts(), guess)
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, ("x", "z"))
 
@@ -133,7 +135,8 @@ def test_the_even_part_of_the_hopper(hopper_cycle):
         even_power = np.mean(even**2)
         left.append(np.sqrt(wrong_power / even_power))
     assert left[0] < 1e-3
-    assert left[1] / left[0] == pytest.approx(4, rel=0.1)
+    ratio = left[1] / left[0]
+    assert ratio == pytest.approx(4, rel=0.1)
 
 
 @pytest.mark.slow
@@ -251,8 +254,10 @@ def test_designs_within_a_distortion(hopper_cycle):
     at_limit = [name for name, share in found if share > 0.99]
     assert len(at_limit) > 0
     assert plan.limited == tuple(at_limit)
-    assert max(shares(plan.rms).values()) == pytest.approx(1)
-    assert max(shares(plan.usual_rms).values()) == pytest.approx(1)
+    largest = max(shares(plan.rms).values())
+    assert largest == pytest.approx(1)
+    largest_usual = max(shares(plan.usual_rms).values())
+    assert largest_usual == pytest.approx(1)
     assert plan.saved > 1.2
     assert 1 <= plan.certificate < 1.1
     assert f"With the {' and '.join(plan.limited)} limited, one cycle" in plan.advice
@@ -267,7 +272,8 @@ def test_designs_within_a_distortion(hopper_cycle):
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
     outputs = quadratic.second_order(plan.design.signals())
-    rms = np.sqrt(np.mean(outputs**2, axis=(0, 1)))
+    squares = np.mean(outputs**2, axis=(0, 1))
+    rms = np.sqrt(squares)
     expected = [plan.rms[f"distortion of {name}"] for name in OUTPUTS]
     assert_allclose(rms, expected, rtol=0.1)
 
@@ -316,7 +322,8 @@ def test_without_distortion(quadratic):
 
 def test_bad_distortions(quadratic):
     cycle, sections, model = quadratic
-    twice = hj.linear.LDTP(model.A, 2 * model.B, model.C, outputs="x")
+    doubled = 2 * model.B
+    twice = hj.linear.LDTP(model.A, doubled, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
         (sections, "differ in H_0 .to x, by 50%"),

@@ -138,8 +138,22 @@ def with_angle(angle):
             [[1.0, -0.1], [0.0, 1.0]],
         ]
     )
-    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])
-    C = np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])
+    B = np.array(
+        [
+            [1, 0.2],
+            [0.5, -1],
+            [0.3, 0.1],
+            [1, 1],
+        ]
+    )
+    C = np.array(
+        [
+            [1, 0.4],
+            [0.2, 1],
+            [1, -1],
+            [0.5, 0.5],
+        ]
+    )
     return hj.linear.LDTP(A, B[:, :, None], C[:, None])
 
 
@@ -187,7 +201,8 @@ def test_limits_hold_for_each_of_several_models(three):
     rms = []
     for model in three:
         data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
-        rms.append(np.sqrt(np.mean(data.y**2)))
+        square = np.mean(data.y**2)
+        rms.append(np.sqrt(square))
     assert max(rms) == pytest.approx(0.1, rel=1e-2)
 
 
@@ -197,7 +212,8 @@ def test_several_models_that_do_not_fit_together(three):
         hj.errors.DefinitionError, match="model 1 and model 0 have different n_sections"
     ):
         hj.optimal_design([three[0], hj.testing.synthetic_ldtp()], usual)
-    unstable = dataclasses.replace(three[1], A=1.1 * three[1].A)
+    larger = 1.1 * three[1].A
+    unstable = dataclasses.replace(three[1], A=larger)
     with pytest.raises(hj.errors.DefinitionError, match="model 1 is unstable"):
         hj.optimal_design([three[0], unstable], usual)
     with pytest.raises(hj.errors.DefinitionError, match="not an empty list"):

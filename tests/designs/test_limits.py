@@ -38,7 +38,8 @@ def test_rates(optimal_two):
     """The change from one section to the next, also from the last one to the first."""
     plan = optimal_two(limit=Limits(rms=RMS, rate={"u0": 0.03}))
     signals = plan.design.signals(33)
-    change = np.diff(signals, axis=1)[:, : 6 * 32]
+    changes = np.diff(signals, axis=1)
+    change = changes[:, : 6 * 32]
     square = change[..., 0] ** 2
     measured = np.sqrt(np.mean(square))
     assert measured == pytest.approx(0.03, rel=1e-3)

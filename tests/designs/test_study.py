@@ -49,7 +49,8 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
 
     plan = hj.optimal_design(model, first, noise=NOISE)
     error = end.standard_errors[-1, 0]
-    strides_of_first = plan.usual_criterion * plan.usual.cycles(0) / error**2
+    usual_cycles = plan.usual.cycles(0)
+    strides_of_first = plan.usual_criterion * usual_cycles / error**2
     assert strides_of_first > 4 * end.cycles[-1]
     # The bound of as many strides, all of them with the best design for the true model.
     bound_of_plan = np.linalg.norm(plan.standard_errors)
@@ -66,7 +67,8 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     cycles = [study.design.cycles(0) for study in studies[:-1]]
     assert_array_equal(studies[-1].cycles, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
-        assert after.cycles[-1] <= 3 * before.cycles[-1]
+        allowed = 3 * before.cycles[-1]
+        assert after.cycles[-1] <= allowed
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
@@ -117,7 +119,9 @@ def test_repeated_windows_count(model, first):
     twice = study.add(noisy, repeats=2)
     both = 2 * first.cycles(0)
     assert once.cycles[0] == twice.cycles[0] == both
-    assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
+    of_once = once.noise["x"]
+    of_twice = twice.noise["x"]
+    assert of_once == pytest.approx(of_twice, rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
 
@@ -186,7 +190,8 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     assert error > 0.95 * np.linalg.norm(plan.usual_standard_errors)
     asked = 1.2 * error
     assert hj.designs.SequentialDesign(first, 2, asked).add(data).done
-    half = hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data)
+    study_of_half = hj.designs.SequentialDesign(first, 2, 0.4 * error)
+    half = study_of_half.add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
     assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
     assert (
@@ -210,7 +215,8 @@ def test_an_unstable_estimate_repeats_the_first_design(model, first):
 
 def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     """Return two outputs of rms one, the second with a transient, larger in the first cycle."""
-    cycle = np.repeat(np.arange(before + P * repeats), N)
+    cycles = np.arange(before + P * repeats)
+    cycle = np.repeat(cycles, N)
     n = np.arange(len(cycle))
     angle = 2 * np.pi * n / (N * P)
     wave = np.sqrt(2) * np.cos(angle)

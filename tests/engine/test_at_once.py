@@ -88,7 +88,8 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
 
     def charged(time):
         """x on the cycle while on."""
-        return 1 + (at_tick(duty) - 1) * np.exp(-time)
+        above = at_tick(duty) - 1
+        return 1 + above * np.exp(-time)
 
     if chart == "on":
         exact = charged(time)
@@ -148,7 +149,8 @@ def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_befor
     state, result = found(0.93)
     above = at_tick(0.93) - 1
     exact = 1 + above * np.exp(-0.9)
-    assert result != hj.errors.Result.OK or state == pytest.approx(exact, abs=1e-10)
+    is_near = state == pytest.approx(exact, abs=1e-10)
+    assert result != hj.errors.Result.OK or is_near
 
 
 def test_schedules_whose_order_is_not_defined():
@@ -290,7 +292,8 @@ def test_derivatives_across_an_event_at_once():
     cycle = hj.find_limit_cycle(system, hj.Guess("calm", (0.5,), time=0.5))
     start = float(cycle.anchor.q[0, 0])
     low = np.exp(-0.5 * 0.7) * start
-    expected = np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2
+    low_after = np.exp(-0.5 * 0.7) * 0.4
+    expected = low_after * (1 + low) ** 2
     assert_allclose(cycle.state["x"], expected, rtol=1e-11)
     multiplier = 0.8 * (1 + low) * np.exp(-0.7)
     assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
@@ -298,13 +301,16 @@ def test_derivatives_across_an_event_at_once():
     assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
 
     def at(rate):
-        return hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]
+        kicked = hj.find_limit_cycle(Kicked(rate), cycle)
+        return kicked.anchor.q[0, 0]
 
     later = float(at(0.7 + 1e-5))
     earlier = float(at(0.7 - 1e-5))
     by_steps = (later - earlier) / 2e-5
-    assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
-    measured = jax.jit(jax.grad(at))(jnp.asarray(0.7))
+    slope = jax.grad(at)(jnp.asarray(0.7))
+    assert_allclose(slope, by_steps, rtol=1e-7)
+    program = jax.jit(jax.grad(at))
+    measured = program(jnp.asarray(0.7))
     assert_allclose(measured, by_steps, rtol=1e-7)
 
 
@@ -474,7 +480,8 @@ def test_experiments_do_not_miss_an_event_at_once_on_a_section(with_another_sect
     decay = np.exp(-0.7)
     off = pushes[0] / 0.7 * (1 - decay)
     after = data.y[0, 20 * N :: N, 0]
-    assert_allclose(after[:3], [0.0, off, off * decay], atol=1e-8)
+    expected = [0.0, off, off * decay]
+    assert_allclose(after[:3], expected, atol=1e-8)
     response = hj.experiments.response_function(cycle, sections, ["x"])
     order = hj.errors.Result.EVENT_ORDER
     found = response(u[:, 18 * N :])
@@ -492,7 +499,8 @@ def test_experiments_do_not_miss_an_event_at_once_on_a_section(with_another_sect
 
 
 def test_a_section_at_an_event_that_another_one_follows_at_once_is_refused():
-    cycle = hj.find_limit_cycle(Kicked(), hj.Guess("calm", (0.5,), time=0.5))
+    guess = hj.Guess("calm", (0.5,), time=0.5)
+    cycle = hj.find_limit_cycle(Kicked(), guess)
     for call in (hj.linearize, hj.experiments.response_function):
         with pytest.raises(
             hj.errors.ComputationError,

@@ -25,14 +25,16 @@ STEP = 1e-6
 def flow(s, t, q, u, end):
     """(t, q) at the end, the lanes at the start, the target and the tape."""
     charts = np.zeros(1, np.int32)
-    lanes = start_lanes(s, np.array([t]), charts, q[:, None])
+    times = np.array([t])
+    lanes = start_lanes(s, times, charts, q[:, None])
     target = until(np.array([end]))
     sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
     options = Options(True, tangents=True)
     done = move(s, lanes, u[:, None], target, settings, options=options)
     moved = done.moved.lanes
-    after = np.concatenate([moved.t, moved.q[:, 0]])
+    state = moved.q[:, 0]
+    after = np.concatenate([moved.t, state])
     return after, lanes, target, done
 
 

@@ -53,7 +53,8 @@ def test_harmonic_transfer_functions_compile_nothing():
         loop = model.feedback(np.eye(2)).inverse()
         size = np.ones(exact.H.shape)
         more = {"n_sections": SECTIONS, **ports}
-        variance_dof = hj.linear.VarianceDof(np.full(len(f), 4.0), size)
+        dof = np.full(len(f), 4.0)
+        variance_dof = hj.linear.VarianceDof(dof, size)
         htf = hj.linear.HTF(
             f,
             exact.H,

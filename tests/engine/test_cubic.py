@@ -30,7 +30,8 @@ def cubic(v0, v1, d0, d1):
 
 def real_roots(coefficients):
     roots = np.roots(np.trim_zeros(coefficients, "f"))
-    return np.sort(roots[np.abs(roots.imag) < 1e-9].real)
+    is_real = np.abs(roots.imag) < 1e-9
+    return np.sort(roots[is_real].real)
 
 
 def first_fall(coefficients, armed):
@@ -55,7 +56,12 @@ def first_fall(coefficients, armed):
 
 
 @settings(max_examples=200)
-@given(v0=number, v1=number, d0=number, d1=number)
+@given(
+    v0=number,
+    v1=number,
+    d0=number,
+    d1=number,
+)
 def test_first_crossing_is_a_root(v0, v1, d0, d1):
     armed = v0 > 0
     assume(abs(v0) > 1e-2 and abs(v1) > 1e-2)
@@ -109,6 +115,7 @@ def test_halfway_a_cubic_is_met_exactly():
     ends = np.array([0.0, length])
     values = np.polyval(coefficients, ends)
     rates = np.polyval(slopes, ends)
-    state, rate = halfway_cubic(*values, *rates, np.array(length))
+    times = np.array(length)
+    state, rate = halfway_cubic(*values, *rates, times)
     assert_allclose(state, np.polyval(coefficients, length / 2), rtol=1e-14)
     assert_allclose(rate, np.polyval(slopes, length / 2), rtol=1e-13)

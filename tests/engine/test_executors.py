@@ -86,8 +86,10 @@ def agree(system, chart, state, u, begin, duration):
         assert_allclose(ours.t, theirs.t, rtol=1e-12)
         assert_allclose(ours.q / size, theirs.q / size, atol=1e-9)
     moved = host.tape.code[:, 0] != IDLE
-    assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
-    assert_allclose(whole.tape.before[moved], host.tape.before[moved], atol=1e-7)
+    found_times = whole.tape.t[moved]
+    assert_allclose(found_times, host.tape.t[moved], rtol=1e-9)
+    found_states = whole.tape.before[moved]
+    assert_allclose(found_states, host.tape.before[moved], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
@@ -129,7 +131,8 @@ def wrong_moves(map, expected):
     gap = 1e-6 * third * map.scale[expected.chart].T
     yield expected._replace(q=expected.q + gap)
     is_first = expected.order + expected.lane == 0
-    yield expected._replace(t=expected.t - 1e-6 * map.expected * is_first)
+    sooner = 1e-6 * map.expected * is_first
+    yield expected._replace(t=expected.t - sooner)
     is_event = expected.code >= 0
     if is_event[:-1].any():
         is_first_event = is_event & (np.cumsum(is_event) == 1)
@@ -169,7 +172,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     s = map.structure
     sources = [s.chart_index(transition.source) for transition in s.transitions]
     for pieces in (again.pieces, turn.pieces):
-        of_other_charts = np.array(sources, int)[:, None] != pieces.chart
+        source_column = np.array(sources, int)[:, None]
+        of_other_charts = source_column != pieces.chart
         pieces.armed[of_other_charts] = False
     assert_array_equal(again.pieces.armed, turn.pieces.armed)
     assert_array_equal(again.pieces.chart, turn.pieces.chart)

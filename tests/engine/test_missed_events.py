@@ -78,9 +78,11 @@ def test_no_event_of_200_polynomials_is_missed_or_invented():
     tolerance = np.tile([1e-3, 1e-6, 1e-9, 1e-12], L // 4)
     flows = [draw(rng, x) for x in tolerance]
     s = Structure(chain())
-    q = np.stack([start(p) for p, _ in flows], axis=1)
+    starts = [start(p) for p, _ in flows]
+    q = np.stack(starts, axis=1)
     zeros = jnp.zeros(L, jnp.int32)
-    lanes = start_lanes(s, jnp.zeros(L), zeros, jnp.asarray(q))
+    states = jnp.asarray(q)
+    lanes = start_lanes(s, jnp.zeros(L), zeros, states)
     # Each polynomial has a tolerance of its own.
     settings = eqx.tree_at(
         lambda settings: (settings.rtol, settings.atol),
@@ -185,17 +187,23 @@ def test_the_state_halfway_has_its_order(method, order):
     lengths = np.array([0.4, 0.2])
     start = np.full((1, 2), begin)
     end = step(np.zeros(2), start, lengths)
-    state = begin / (1 - begin * np.sin(lengths / 2))
+    wave = begin * np.sin(lengths / 2)
+    state = begin / (1 - wave)
     rate = state**2 * np.cos(lengths / 2)
-    state_error = np.abs(np.asarray(end.middle)[0] - state)
-    rate_error = np.abs(np.asarray(end.rate)[0] - rate)
+    found_state = np.asarray(end.middle)[0]
+    state_error = np.abs(found_state - state)
+    found_rate = np.asarray(end.rate)[0]
+    rate_error = np.abs(found_rate - rate)
     # The default method misses the conditions of order 5 by a little: order 4 in the end.
     least = order - 1 if method is VERNER76 else order
-    assert state_error[0] / state_error[1] > 2 ** (least + 0.5)
-    assert rate_error[0] / rate_error[1] > 2 ** (least - 0.5)
+    state_ratio = state_error[0] / state_error[1]
+    assert state_ratio > 2 ** (least + 0.5)
+    rate_ratio = rate_error[0] / rate_error[1]
+    assert rate_ratio > 2 ** (least - 0.5)
     if order > 3:
         cubic, _ = halfway_cubic(begin, end.q, end.f0, end.f1, lengths)
-        cubic_error = np.abs(cubic[0, 0] - state[0])
+        found_cubic = cubic[0, 0]
+        cubic_error = np.abs(found_cubic - state[0])
         assert state_error[0] < 0.2 * cubic_error
 
 
@@ -231,4 +239,5 @@ def test_an_event_just_before_a_blow_up_is_found(begin):
     system = toy({"a": square}, [reset])
     path = hj.simulate(system, "a", (1.0,), 9.5, time=begin)
     spikes = np.array([event.time for event in path.events]) - begin
-    assert_allclose(spikes, np.arange(1, 10) * (1 - 1e-11), rtol=1e-9)
+    expected = np.arange(1, 10) * (1 - 1e-11)
+    assert_allclose(spikes, expected, rtol=1e-9)

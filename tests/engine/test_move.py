@@ -26,11 +26,13 @@ def flow(system, chart, q, u, t, end):
     """State after the flow of one lane from time t to `end`, and its result."""
     s = Structure(system)
     padded = jnp.zeros((s.d, 1))
-    q = padded.at[: q.shape[0], 0].set(q)
+    rows = q.shape[0]
+    q = padded.at[:rows, 0].set(q)
     index = jnp.full(1, s.chart_index(chart), jnp.int32)
     lanes = start_lanes(s, t[None], index, q)
     target = until(end[None])
-    moved = move(s, lanes, u[:, None], target, tight(s)).moved
+    inputs = u[:, None]
+    moved = move(s, lanes, inputs, target, tight(s)).moved
     return moved.lanes.q[:, 0], moved.result[0]
 
 
@@ -44,10 +46,12 @@ def ball(x):
 def ball_exact(x):
     y0, v0, g, e, u, end = x
     g = g - u
-    speed = jnp.sqrt(v0**2 + 2 * g * y0)
+    square = v0**2 + 2 * g * y0
+    speed = jnp.sqrt(square)
     first = (v0 + speed) / g
     rest = end - first
-    height = e * speed * rest - g * rest**2 / 2
+    thrown = e * speed * rest
+    height = thrown - g * rest**2 / 2
     velocity = e * speed - g * rest
     return jnp.stack([height, velocity])
 
@@ -81,7 +85,8 @@ def test_lanes_fail_one_by_one():
     moved = move(s, lanes, u, until(end), tight(s)).moved
     bad = hj.errors.Result.BAD_INPUT
     zeno = hj.errors.Result.ZENO
-    assert moved.result.tolist() == [hj.errors.Result.OK, bad, zeno, bad]
+    codes = [hj.errors.Result.OK, bad, zeno, bad]
+    assert moved.result.tolist() == codes
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
     expected = jax.jit(ball_exact)(x)
     assert_allclose(moved.lanes.q[:, 0], expected, rtol=1e-12)
@@ -131,7 +136,8 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
         return state[0]
 
     def exact(x, a):
-        return (1 + (2 - (x + 1) / a) / 2) ** 2
+        part = (2 - (x + 1) / a) / 2
+        return (1 + part) ** 2
 
     x = jnp.array([-0.5, 0.2])
     a = 1.3

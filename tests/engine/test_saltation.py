@@ -59,7 +59,8 @@ def test_a_bounce_is_that_of_the_closed_form():
     v = -3.0
     e = RESTITUTION
     bounce = jump_of("bounce", v)
-    np.testing.assert_allclose(bounce.delay_by_state, [[-1 / v, 0.0]])
+    expected_delay = [[-1 / v, 0.0]]
+    np.testing.assert_allclose(bounce.delay_by_state, expected_delay)
     by_height = -(1 + e) * G / v
     expected = [[[-e, 0.0], [by_height, -e]]]
     np.testing.assert_allclose(bounce.saltation, expected)

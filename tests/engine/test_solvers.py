@@ -32,7 +32,8 @@ FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
 
 # One mode decays in 3 s, one in 0.3 ms.
 def rates(t, q, u):
-    rate = STIFF[1] @ q + force(t) + u[0]
+    own = STIFF[1] @ q
+    rate = own + force(t) + u[0]
     return (q[1], rate)
 
 
@@ -84,7 +85,8 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
     h = 0.4
     radau = as_method(hj.systems.Radau())
     start = 1.0 + excited
-    step = take_step(radau, field, jnp.zeros(4), start, jnp.array([h]))
+    length = jnp.array([h])
+    step = take_step(radau, field, jnp.zeros(4), start, length)
     transient = excited * np.exp(-rate * h)
     expected = np.cos(h) + transient
     error = np.abs(np.asarray(step.q) - expected)
@@ -93,7 +95,8 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
 
 
 def a_rates(t, q, u):
-    return (1.0 + 0 * q[0], -2e3 * q[1])
+    decay = -2e3 * q[1]
+    return (1.0 + 0 * q[0], decay)
 
 
 RAMP = toy({"a": Field(("x", "v"), a_rates)})
@@ -128,10 +131,12 @@ def test_estimates_are_of_the_size_of_errors(solver):
     def field(t, q):
         x, y = q
         apart = y - jnp.cos(t)
-        return jnp.stack([-(x**2), -30 * apart - jnp.sin(t)])
+        stiff_rate = -30 * apart - jnp.sin(t)
+        return jnp.stack([-(x**2), stiff_rate])
 
     start = jnp.ones((2, 1))
-    step = take_step(method, field, jnp.zeros(1), start, jnp.array([h]))
+    length = jnp.array([h])
+    step = take_step(method, field, jnp.zeros(1), start, length)
     exact = [1 / (1 + h), np.cos(h)]
     found = np.asarray(step.q[:, 0])
     error = np.abs(found - exact).max()
@@ -143,7 +148,8 @@ def test_estimates_are_of_the_size_of_errors(solver):
 def test_inverses_of_many_matrices():
     matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
     matrix[0, 0] = 0.0  # pivots are needed
-    found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
+    inverses = jax.jit(inverse)(matrix)
+    found = np.moveaxis(inverses, -1, 0)
     expected = np.linalg.inv(np.moveaxis(matrix, -1, 0))
     assert_allclose(found, expected, atol=1e-12)
 
@@ -159,7 +165,8 @@ def test_derivatives_of_implicit_steps(solver):
 
     def end(x):
         def field(t, q, x=x):
-            fast = -50.0 * (q[0] - jnp.sin(q[1] + x))
+            distance = q[0] - jnp.sin(q[1] + x)
+            fast = -50.0 * distance
             slow = q[0] * q[1] + x
             return jnp.stack([fast, slow])
 
@@ -174,7 +181,8 @@ def test_derivatives_of_implicit_steps(solver):
         d * jnp.arange(-2.0, 3.0)
     )
     first = jax.jit(jax.jacfwd(end))(0.0)
-    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
+    curvature = jax.jacfwd(jax.jacfwd(end))
+    second = jax.jit(curvature)(0.0)
     combined = lowest - 8 * low + 8 * high - highest
     by_differences = combined / (12 * d)
     assert_allclose(first, by_differences, rtol=1e-6)

@@ -49,7 +49,8 @@ def stay(heat, rate, x, z, end):
         return heat + part * np.exp(-t) + (z - heat - part) * np.exp(-rate * t) - end  # noqa: E731
 
     t = brentq(sensor, 1e-2, 10.0, xtol=1e-15, rtol=1e-15)
-    return t, heat + (x - heat) * np.exp(-t)
+    above = (x - heat) * np.exp(-t)
+    return t, heat + above
 
 
 def exact(fast=1e4, slow=5.0):

@@ -25,7 +25,8 @@ SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
 
 def sizes(length, time):
     """By which the hopper's states are multiplied."""
-    return length * jnp.array([1.0, 1 / time, 1.0, 1 / time])
+    ratios = jnp.array([1.0, 1 / time, 1.0, 1 / time])
+    return length * ratios
 
 
 def begin(system, length, time):
@@ -46,7 +47,8 @@ def flow(length, time, scale, tangents):
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
     options = Options(True, tangents=tangents)
-    moved, tape = move(Structure(system), lanes, u, end, settings, options=options)
+    structure = Structure(system)
+    moved, tape = move(structure, lanes, u, end, settings, options=options)
     states = moved.lanes.q.T / sizes(length, time)
     return tape.h / time, tape.code, states, moved.result
 
@@ -88,7 +90,8 @@ def test_an_oscillator_at_zero():
 
 def test_a_weight_at_rest_up_to_rounding():
     def spring(t, q, u):
-        return q[1], 9.81 - 100.3 * (q[0] - 0.1)
+        spring = 100.3 * (q[0] - 0.1)
+        return q[1], 9.81 - spring
 
     rest = 0.1 + 9.81 / 100.3
     found = simulate_rates(spring, (rest, 0.0))
@@ -111,5 +114,6 @@ def test_a_chain_of_integrators_from_zero():
     found = simulate_rates(integrators, (0.0, 0.0, 0.0, 0.0, 0.0))
     t = 10.0
     bent = np.cos(t) - 1 + t**2 / 2
-    expected = [bent, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
+    slope = t - np.sin(t)
+    expected = [bent, slope, 1 - np.cos(t), np.sin(t)]
     assert_allclose(found.after[-1][1:], expected, rtol=1e-9)

@@ -108,7 +108,8 @@ def require_undisturbed(design, experiment, P):
 def require_phases(design, channel, phases):
     """A channel has each line in as many phases as it takes; two are a quarter period apart."""
     for j, count in phases.items():
-        here = design.phase[(design.line == j) & (design.channel == channel)]
+        is_here = (design.line == j) & (design.channel == channel)
+        here = design.phase[is_here]
         assert len(here) == count
         if count == 2:
             cosine = np.cos(here[0] - here[1])
@@ -155,7 +156,9 @@ def test_signals_are_sums_of_cosines():
         rate = 2 * np.pi * design.line[k] / (P * N)
         angle = rate * n + design.phase[k]
         wave = design.amplitude[k] * np.cos(angle)
-        expected[design.experiment[k], :, design.channel[k]] += wave
+        experiment = design.experiment[k]
+        channel = design.channel[k]
+        expected[experiment, :, channel] += wave
     assert_allclose(design.signals(9), expected, atol=1e-14)
     one_round = expected[:, : P * N]
     assert_allclose(design.signals(), one_round, atol=1e-14)

@@ -28,14 +28,17 @@ def require_color(x, std, memory):
     std = np.broadcast_to(std, (N, x.shape[2]))
     cycles = x.reshape(len(x), -1, *std.shape)
     require_mean((cycles**2).mean(axis=1), std**2)
-    require_mean(x[:, 0] ** 2, std[0] ** 2)
+    square = x[:, 0] ** 2
+    require_mean(square, std[0] ** 2)
 
     normal = x / np.resize(std, x.shape[1:])
     for lag in (1, 3, N, 4 * N):
         later = normal[:, lag:]
         earlier = normal[:, :-lag]
         products = later * earlier
-        expected = np.exp(-lag / (N * memory)) if memory else 0.0
+        expected = 0.0
+        if memory:
+            expected = np.exp(-lag / (N * memory))
         require_mean(products.mean(axis=1), expected)
     # Different signals have no correlation.
     first = normal[:, :, 0]
@@ -49,7 +52,8 @@ def require_color(x, std, memory):
 def test_process_noise_has_the_color_that_it_says(std, memory):
     noise = ProcessNoise(std, seed=1, memory=memory)
     x = noise.draw((COUNT, N * CYCLES, 2), N)
-    require_color(x, np.broadcast_to(std, N)[:, None], memory)
+    std_of_sections = np.broadcast_to(std, N)[:, None]
+    require_color(x, std_of_sections, memory)
 
 
 @pytest.fixture(scope="module")

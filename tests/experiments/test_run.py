@@ -82,9 +82,11 @@ def test_records_agree_with_scipy(family, design):
             section = ("clock", apex[0] + turn)
         else:
             section = ("angle", angle - 2 * np.pi * turn)
-        point = hopper_scipy.flow(point, section, data.u[3, n, 0])
+        push = data.u[3, n, 0]
+        point = hopper_scipy.flow(point, section, push)
     found = np.array(deviations)
-    error = np.abs(found - data.y[3, :40])
+    simulated = data.y[3, :40]
+    error = np.abs(found - simulated)
     scale = np.ptp(cycle, axis=0)
     assert np.max(error / scale) < 1e-8
 
@@ -101,7 +103,8 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     others = np.arange(80) != 17
     assert_allclose(broken.y[others], data.y[others], atol=1e-9)
     after = broken.failed_at[17] + 1
-    assert np.all(np.isfinite(broken.y[17, :after]))
+    known = broken.y[17, :after]
+    assert np.all(np.isfinite(known))
     assert np.all(np.isnan(broken.y[17, after:]))
     estimate = hj.estimate_htf(broken)
     lost = design.frequency[design.experiment == 17]
@@ -312,7 +315,8 @@ class Restarted(hj.HybridSystem):
 
     def charts(self):
         def rates(t, q, u):
-            return (q[1] + u[0], *q[2:], 0.0)
+            first = q[1] + u[0]
+            return (first, *q[2:], 0.0)
 
         return {"run": Field(tuple("abcdef"), rates)}
 
@@ -343,7 +347,8 @@ def test_no_event_is_missed_between_sections_a_period_apart():
     assert cycle.event_sequence == (0, 0, 0, 1)
     rng = np.random.default_rng(0)
     u = 1e-3 * rng.normal(size=(10, 20, 1))
-    data = hj.run_experiments(cycle, hj.ClockPhase(1), u, ("a",), discard=0)
+    section = hj.ClockPhase(1)
+    data = hj.run_experiments(cycle, section, u, ("a",), discard=0)
     assert data.ok.all(), data.summary()
 
 

@@ -42,7 +42,8 @@ def test_experiments_start_in_their_periodic_response(run, start, least, most):
     change = np.abs(data.y[:, :n] - data.y[:, n:])
     assert least <= change.max() < most
     with no_compilation(after=lambda: run(DESIGN, start=start)):
-        run(hj.multisine(4, 3, (0, 1.2), 0.05, seed=2), start=start)
+        design = hj.multisine(4, 3, (0, 1.2), 0.05, seed=2)
+        run(design, start=start)
 
 
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
@@ -99,7 +100,8 @@ def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, 
     y = np.stack([loop.simulate(experiment) for experiment in reference])
     tolerance = 1e-3 * np.abs(y).max()
     assert_allclose(data.y, y, rtol=0, atol=tolerance)
-    u = reference - np.stack([controller.simulate(output) for output in y])
+    feedback = np.stack([controller.simulate(output) for output in y])
+    u = reference - feedback
     tolerance = 1e-3 * np.abs(u).max()
     expected = np.dstack([u, reference])
     assert_allclose(data.u, expected, rtol=0, atol=tolerance)

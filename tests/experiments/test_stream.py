@@ -109,7 +109,8 @@ def test_batches_are_alike_and_keep_all_workers_busy():
                 assert number * size < 1.2 * S
     whole = hj.scale.Execution(256, 8)
     assert divide(1000, whole) == hj.scale.Execution(256, 4)
-    assert divide(80, hj.scale.Execution(workers=2)) == hj.scale.Execution(40, 2)
+    halves = divide(80, hj.scale.Execution(workers=2))
+    assert halves == hj.scale.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(made, whole):
@@ -126,7 +127,9 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert made.dataset.y.dims == ("experiment", "sample", "output")
     stored = made.dataset.y.sel(output="v")
     assert_array_equal(stored, whole.y[..., 1])
-    assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
+    found = hj.estimate_htf(made).H
+    expected = hj.estimate_htf(whole).H
+    assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):

@@ -17,8 +17,10 @@ class Charge(hj.Chart):
     def field(self, t, q, u):
         o = self.oscillator
         x, v = q
-        damping = o.p * o.q * (1 - x**2) * v
-        return v, damping - o.w**2 * x + u[0]
+        negative = o.p * o.q * (1 - x**2)
+        damping = negative * v
+        spring = o.w**2 * x
+        return v, damping - spring + u[0]
 
 
 class Oscillator(hj.HybridSystem):

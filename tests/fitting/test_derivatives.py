@@ -49,7 +49,8 @@ def test_htfs(hopper_htf, seen_in_htf):
     assert_allclose(by_forces, -scaled, atol=1e-9 * size)
     by_length = S[:, HOPPER.index("l0")]
     assert_allclose(by_length, 0, atol=1e-9 * size)
-    by_both = S[:, HOPPER.index("a")] + S[:, HOPPER.index("g")]
+    by_gravity = S[:, HOPPER.index("g")]
+    by_both = S[:, HOPPER.index("a")] + by_gravity
     assert np.abs(by_both).max() < 1e-9 * size
 
 

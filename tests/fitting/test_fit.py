@@ -30,7 +30,8 @@ def test_a_fit_that_stops_where_cycles_end_has_not_converged():
     """Steps toward 3 are rejected beyond 1, where there is no cycle, until they are tiny."""
 
     def evaluate(problem, x, guess):
-        return np.where(x < 1, x - 3, np.inf), np.eye(1), guess
+        residual = np.where(x < 1, x - 3, np.inf)
+        return residual, np.eye(1), guess
 
     *_, steps, converged = problem.descend(None, np.zeros(1), None, evaluate)
     assert steps < problem.MAX_STEPS
@@ -54,7 +55,8 @@ def test_the_unit_of_residuals_does_not_count():
 
 def test_errors_that_no_residual_shows_are_unknown():
     juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
-    fit = hj.fit_model(juggler, hj.fitting.ObservedCycle(impact, times=[0.15]), "A")
+    cycle = hj.fitting.ObservedCycle(impact, times=[0.15])
+    fit = hj.fit_model(juggler, cycle, "A")
     assert fit.result == hj.errors.Result.OK
     assert np.isnan(fit.standard_errors).all()
     with pytest.raises(hj.errors.DefinitionError, match="no residual is left"):
@@ -97,7 +99,8 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
             where, "x", [[0.1], [-2.0]], times=[begin, begin + gap]
         )
         rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
-    assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
+    first_values = rough[0].values
+    assert first_values == pytest.approx(rough[1].values, rel=1e-6)
     assert rough[0].result == 0
     assert "mu reaches its bound 0 within its error" in repr(rough[0])
     with pytest.raises(
@@ -109,11 +112,13 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
 @pytest.mark.slow
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
-    fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
+    data = observed(oscillation)
+    fit = hj.fit_model(wrong, data, ("p", "q", "w"), guess=oscillation)
     assert fit.result == hj.errors.Result.OK
     assert fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
-    assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
+    product = fit.system.p * fit.system.q
+    assert product == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p / fit.system.q == pytest.approx(
         0.6 / 2.1, rel=1e-6
     )  # it did not move
@@ -134,7 +139,8 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 @pytest.mark.slow
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
-    fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
+    rough_guess = Oscillator(w=1.02)
+    fit = hj.fit_model(rough_guess, data, ("p", "q", "w"), guess=oscillation)
     assert fit.weighted
     assert fit.dof == 7
     assert fit.result == hj.errors.Result.OK
@@ -158,7 +164,8 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     assert fit.standard_errors[2] == pytest.approx(errors[1], rel=0.02)
     with pytest.raises(hj.errors.DefinitionError, match="the other values lack 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
-    unseen = eqx.tree_at(lambda o: o.measured[1], data, np.nan * data.measured[1])
+    no_values = np.nan * data.measured[1]
+    unseen = eqx.tree_at(lambda o: o.measured[1], data, no_values)
     with pytest.raises(hj.errors.ComputationError, match="residuals are not finite"):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
@@ -194,7 +201,8 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     )
     assert len(several.guesses) == 2
     assert several.cost == min(g.cost for g in several.guesses)
-    assert np.ptp([g.values[0] for g in several.guesses]) > 0
+    reached = [g.values[0] for g in several.guesses]
+    assert np.ptp(reached) > 0
     one = hj.fit_model(
         oscillation.system, observed(oscillation), free, guess=oscillation, guesses=2
     )
@@ -217,11 +225,20 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
     hopper_cycle, hopper_htf
 ):
     rng = np.random.default_rng(0)
-    u = 0.05 * rng.normal(size=(2, 8 * SECTIONS.n_sections, 1))
+    pushes = rng.normal(size=(2, 8 * SECTIONS.n_sections, 1))
+    u = 0.05 * pushes
     data = hj.run_experiments(
         hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0
     )
-    wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
+    wrong = hj.models.VerticalHopper(
+        m=1.1,
+        M=1.8,
+        k=11.0,
+        b=4.2,
+        l0=2.2,
+        a=18.0,
+        g=2.2,
+    )
     true = np.array([getattr(hopper_cycle.system, name) for name in HOPPER])
     observed = (
         hj.fitting.ObservedHTF(hopper_htf, SECTIONS),
@@ -241,7 +258,8 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
 def fitted(hopper_cycle):
     """A fit of a stiffness and both delays, which begins near the cycle of another stiffness."""
     lines = np.arange(1, 33) / 16 + 0.01
-    htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
+    delayed = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081))
+    htf = delayed.htf(lines)
     data = hj.fitting.ObservedHTF(
         htf, SECTIONS, delay=(0.0625, 0.0625)
     )  # (together a whole section)

@@ -32,7 +32,9 @@ class Trigger(hj.HybridSystem):
         return 2.2
 
     def charts(self):
-        return {"high": Ramp(12.0, self.tau), "low": Ramp(-12.0, self.tau)}
+        high = Ramp(12.0, self.tau)
+        low = Ramp(-12.0, self.tau)
+        return {"high": high, "low": low}
 
     def transitions(self):
         def top(t, q, u):

@@ -51,7 +51,8 @@ def test_directions_are_said_in_words(rows, words):
 )
 def test_the_basis_spans_what_is_not_seen(rows):
     rows = np.array(rows, float)
-    assume(np.linalg.svd(rows, compute_uv=False)[-1] > 1e-3)
+    sizes = np.linalg.svd(rows, compute_uv=False)
+    assume(sizes[-1] > 1e-3)
     S = blind(rows)
     found = diagnose(tuple("abcde"), S)
     assert found.unseen.shape == rows.shape

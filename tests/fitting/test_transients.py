@@ -14,7 +14,8 @@ from hybridjax.errors import ComputationError, DefinitionError
 
 def ball(**numbers):
     def fall(t, q, u, p):
-        drag = p.drag * jnp.abs(q[1]) * q[1]
+        size = jnp.abs(q[1])
+        drag = p.drag * size * q[1]
         return q[1], -p.g - drag
 
     def bounce(t, q, u, p):
@@ -34,7 +35,8 @@ def drop(height):
     """Heights at TIMES and times of two bounces, by scipy."""
 
     def fall(t, q):
-        drag = TRUE["drag"] * abs(q[1]) * q[1]
+        size = abs(q[1])
+        drag = TRUE["drag"] * size * q[1]
         return q[1], -9.81 - drag
 
     def ground(t, q):
@@ -44,14 +46,20 @@ def drop(height):
     ground.direction = -1
     t, q, heights, bounces = 0.0, np.array([height, 0.0]), [], []
     while t < TIMES[-1]:
-        options = dict(rtol=1e-12, atol=1e-14, method="DOP853", dense_output=True)
+        options = dict(
+            rtol=1e-12,
+            atol=1e-14,
+            method="DOP853",
+            dense_output=True,
+        )
         found = solve_ivp(fall, (t, 1.5), q, events=ground, **options)
         is_later = TIMES > t
         has_come = TIMES <= found.t[-1]
         own = TIMES[is_later & has_come]
         heights.append(found.sol(own)[0])
         t = found.t[-1]
-        speed = -TRUE["e"] * found.y[1, -1]
+        before = found.y[1, -1]
+        speed = -TRUE["e"] * before
         q = np.array([0.0, speed])
         bounces.append(t)
     return np.concatenate(heights), bounces[:2]
@@ -106,7 +114,8 @@ def test_prints_have_the_digits_that_errors_leave():
 def test_standard_errors_are_those_of_many_draws():
     errors = []
     for seed in range(60):
-        fit = hj.fit_model(ball(), observed(1.0, seed), ("e", "drag"))
+        data = observed(1.0, seed)
+        fit = hj.fit_model(ball(), data, ("e", "drag"))
         size = fit.standard_errors[:2]
         true = tuple(TRUE.values())
         errors.append((fit.values[:2] - true) / size)

@@ -160,7 +160,8 @@ def engine(
         many = jax.tree_util.tree_map(
             lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill
         )
-        moved = _flow(plan, many, jnp.asarray(stops), jnp.asarray(accuracy))
+        times = jnp.asarray(stops)
+        moved = _flow(plan, many, times, jnp.asarray(accuracy))
         moved = jax.tree_util.tree_map(np.asarray, moved)
         for i in range(len(piece)):
             result, count, events, t, chart, q = jax.tree_util.tree_map(

@@ -99,7 +99,8 @@ def arrow(rng, n: int, after: int, /, spread=0.3, **given) -> dict[str, Any]:
 
 def start(rng, n: int, limit=25.0, size=1.2) -> Start:
     t = rng.uniform(0.0, 5.0)
-    return Start(t, rng.normal(0.0, size, n), rng.normal(size=2), t + limit)
+    state = rng.normal(0.0, size, n)
+    return Start(t, state, rng.normal(size=2), t + limit)
 
 
 def unit(n: int, k: int = 0) -> np.ndarray:
@@ -135,7 +136,8 @@ STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {}
 
 def structure(*arrows, dims):
     """List a function that draws systems of this plan."""
-    plan = Plan(dims, tuple(Arrow(*a) for a in arrows))
+    all_arrows = tuple(Arrow(*a) for a in arrows)
+    plan = Plan(dims, all_arrows)
     return lambda function: STRUCTURES.setdefault(function.__name__, (plan, function))[
         1
     ]
@@ -151,7 +153,8 @@ def kicks(rng) -> Sample:
     for x in arrows:
         if rng.random() < 0.5:
             along = x["n"] @ x["r"]
-            x |= {"R": np.eye(3), "r": x["r"] - x["n"] * along}
+            kept = x["r"] - x["n"] * along
+            x |= {"R": np.eye(3), "r": kept}
     return Sample([swinging(rng, 3)], arrows, start(rng, 3))
 
 
@@ -185,7 +188,8 @@ def hop(rng) -> Sample:
     land = arrow(rng, 4, 2, n=unit(4, 2), R=upper, r=rng.normal(0.0, 0.1, 2))
     land |= {"c": 0.0, "m": np.zeros(2)}
     left = np.eye(4)[:, :2]
-    lift = arrow(rng, 2, 4, R=left, V=np.zeros((4, 2)))
+    none = np.zeros((4, 2))
+    lift = arrow(rng, 2, 4, R=left, V=none)
     if rng.random() < 0.5:  # start right on the guard of touchdown
         lift["r"][2] = 0.0
     return Sample([air, ground], [land, lift], start(rng, 4))
@@ -199,10 +203,21 @@ def ladder(rng) -> Sample:
     for n, after, level in ((1, 3, 1.0), (3, 5, -1.0), (5, 1, 1.0)):
         back = np.zeros((after, n))
         back[0, 0] = rng.uniform(-0.5, 0.5)
-        back[1:, :] = rng.normal(0.0, 0.5, (after - 1, n))
+        spread = rng.normal(0.0, 0.5, (after - 1, n))
+        back[1:, :] = spread
         c = -level * rng.uniform(0.5, 1.5)
         offset = rng.normal(0.0, 0.3, after)
-        arrows.append(arrow(rng, n, after, n=unit(n), c=c, R=back, r=offset))
+        arrows.append(
+            arrow(
+                rng,
+                n,
+                after,
+                n=unit(n),
+                c=c,
+                R=back,
+                r=offset,
+            )
+        )
     return Sample(charts, arrows, start(rng, 1, size=0.3))
 
 

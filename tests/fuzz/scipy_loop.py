@@ -52,7 +52,8 @@ def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Ru
     chart = 0
     excluded = None
     while len(found) < events and t < limit:
-        stay = _Stay(plan, sample, chart, t, np.asarray(q, float), u)
+        state = np.asarray(q, float)
+        stay = _Stay(plan, sample, chart, t, state, u)
         t, q, code, reason = stay.follow(limit, rtol, atol)
         excluded = excluded or reason
         if code is None:
@@ -91,7 +92,8 @@ class _Stay:
     def field(self, t, q):
         x = self.x
         linear = x["A"] @ q + x["b"]
-        smooth = linear + x["B"] @ self.u - x["cube"] * q**3
+        cubic = x["cube"] * q**3
+        smooth = linear + x["B"] @ self.u - cubic
         swing = x["S"] @ np.sin(q)
         bounded = swing + x["T"] @ np.tanh(q)
         phase = x["w"] * t + x["p"]
@@ -116,7 +118,8 @@ class _Stay:
         symmetric = x["Q"] + x["Q"].T
         slope = x["n"] + 0.5 * symmetric @ q
         phase = x["w"] * t + x["p"]
-        wave = x["a"] * x["w"] * np.cos(phase)
+        slope_of_wave = x["a"] * x["w"]
+        wave = slope_of_wave * np.cos(phase)
         rate = slope @ self.field(t, q) + wave
         return rate if self.plan.arrows[g].kind == "falling" else -rate
 
@@ -198,7 +201,8 @@ class _Stay:
 
         values = self.guard(g, t, q)
         t, v = self.with_minima(value, t, values)
-        rates = np.abs(np.diff(v) / np.diff(t))
+        steps = np.diff(v) / np.diff(t)
+        rates = np.abs(steps)
         self.fastest[g] = max(self.fastest[g], rates.max())
         found = []
         for k in range(1, len(t)):

@@ -64,7 +64,8 @@ class Piece(hj.Chart):
     def field(self, t, q, u):
         x = self.x
         linear = x["A"] @ q + x["b"]
-        smooth = linear + x["B"] @ u - x["cube"] * q**3
+        cubic = x["cube"] * q**3
+        smooth = linear + x["B"] @ u - cubic
         swing = x["S"] @ jnp.sin(q)
         bounded = swing + x["T"] @ jnp.tanh(q)
         phase = x["w"] * t + x["p"]
@@ -100,7 +101,8 @@ class Random(hj.HybridSystem):
             bent = 0.5 * q @ (x["Q"] @ q)
             curved = x["n"] @ q + bent + x["c"]
             phase = x["w"] * t + x["p"]
-            return curved + x["m"] @ u + x["a"] * jnp.sin(phase)
+            wave = x["a"] * jnp.sin(phase)
+            return curved + x["m"] @ u + wave
 
         def enabled(t, q, u):
             return x["k"] @ q + x["k0"] > 0

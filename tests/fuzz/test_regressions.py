@@ -72,7 +72,8 @@ def two_pieces(x, first, second):
 
 
 def test_a_guard_that_a_new_input_makes_positive_is_armed():
-    assert two_pieces(-0.5, 0.0, 1.6) == (hj.errors.Result.OK, 1)
+    found = two_pieces(-0.5, 0.0, 1.6)
+    assert found == (hj.errors.Result.OK, 1)
 
 
 @pytest.mark.parametrize("size, time", [(1e4, 0.0), (1.0, 3e3)])

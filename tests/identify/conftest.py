@@ -30,7 +30,8 @@ def small():
 def exact(reference):
     """The hopper's HTFs from the independent computation: 620 frequencies, all harmonics."""
     data = reference("htf_exact_isochron")
-    H = data["H"].transpose(1, 0, 2)[..., None]
+    by_harmonic = data["H"].transpose(1, 0, 2)
+    H = by_harmonic[..., None]
     return hj.linear.HTF(
         data["f"], H, tuple(range(-16, 16)), 32, "u", ("yM", "vM"), "exact"
     )

@@ -20,9 +20,12 @@ def plant():
     """A system with two multipliers, whose coordinates change from section to section."""
     rng = np.random.default_rng(1)
     root = np.diag(np.array(MULTIPLIERS) ** (1 / N))
-    T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
+    draws = rng.normal(size=(N, 2, 2))
+    T = draws + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 1, 2))
+    return hj.linear.LDTP(A, B, C)
 
 
 def recorded(plant, noise=0.1, cycles=300, drift=0.0):
@@ -32,7 +35,8 @@ def recorded(plant, noise=0.1, cycles=300, drift=0.0):
     y = clean + noise * rng.normal(size=u.shape)
     line = np.linspace(-1, 1, len(y))
     slow = drift * line**3
-    return hj.experiments.SectionSeries(u, y + slow[:, None], n_sections=N)
+    drifting = y + slow[:, None]
+    return hj.experiments.SectionSeries(u, drifting, n_sections=N)
 
 
 def uncertain(plant):
@@ -70,7 +74,8 @@ def test_fits_of_multipliers_are_fits(fits):
     for name, fit in fits.items():
         assert isinstance(fit, hj.identify.Fit), name
         found = np.sort(fit.multipliers.real)
-        assert np.abs(found - np.sort(MULTIPLIERS)).max() < 0.02
+        apart = np.abs(found - np.sort(MULTIPLIERS))
+        assert apart.max() < 0.02
         assert fit.covariance.shape == (2, 2) and fit.dof > 100, name
         assert fit.findings == (), f"{name}: {fit.findings}"
         low, high = fit.interval(0.99).T
@@ -123,7 +128,8 @@ def test_an_order_that_is_too_high_is_a_finding(plant):
     assert "support 2 multipliers, not 3" in fit.findings[0].text
     assert causes(fit) == {"order"}
     assert "order" in causes(hj.fit_series(recorded(plant), 3, check=False))
-    assert causes(hj.fit_ldtp(recorded(plant, noise=0.3), 3)) == {"order"}
+    low_order = hj.fit_ldtp(recorded(plant, noise=0.3), 3)
+    assert causes(low_order) == {"order"}
     with pytest.raises(
         hj.errors.DefinitionError, match="support 2 multipliers.*check=False"
     ):

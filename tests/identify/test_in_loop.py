@@ -23,9 +23,12 @@ def plant():
     s = np.sin(0.225)
     rotation = np.array([[c, -s], [s, c]])
     turn = 0.8 ** (1 / N) * rotation
-    T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
+    draws = rng.normal(size=(N, 2, 2))
+    T = draws + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 1, 2))
+    return hj.linear.LDTP(A, B, C)
 
 
 GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
@@ -35,7 +38,8 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     """u = r - K y, y = P u + d, with process noise and noise of sensor and controller."""
     A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
     S, n = r.shape
-    w, e, c = noise * rng.normal(size=(3, S, n))
+    draws = rng.normal(size=(3, S, n))
+    w, e, c = noise * draws
     x = np.zeros((S, A.shape[1]))
     u = np.zeros((S, n))
     y = np.zeros((S, n))
@@ -53,7 +57,8 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
         y[:, i] = last
         drive = u[:, i] + w[:, i]
         carried = x @ A[k].T
-        forced = drive[:, None] * B[k, :, 0]
+        gain = B[k, :, 0]
+        forced = drive[:, None] * gain
         x = carried + forced
     return u, y
 
@@ -98,7 +103,8 @@ def test_plant_and_controller_of_exact_data(plant):
     assert not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
-    np.testing.assert_allclose(loop.closed.H, exact.htf(f).H, atol=1e-9)
+    expected = exact.htf(f).H
+    np.testing.assert_allclose(loop.closed.H, expected, atol=1e-9)
     # u = r - K y
     around = controller().htf(f) @ exact.htf(f)
     entered = -np.array(around.H)
@@ -206,7 +212,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         hj.errors.DefinitionError, match="the reference determines 2 multipliers, not 3"
     ):
         hj.fit_series(series(plant, 0, noise=0.7), 3, references="r")
-    assert best_order(series(plant, 0), ("r",), 4) == (2, "")
+    order = best_order(series(plant, 0), ("r",), 4)
+    assert order == (2, "")
     assert (
         "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
     )
@@ -216,7 +223,8 @@ def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     rng = np.random.default_rng(1)
     moduli = np.array([0.8, 0.5, 0.3])
     root = np.diag(moduli ** (1 / N))
-    T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
+    draws = rng.normal(size=(N, 3, 3))
+    T = draws + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(
         hj.linear.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0
@@ -253,7 +261,8 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
 def test_whether_outputs_answer_at_once_is_found(plant):
     for waits, through in ((False, 0.0), (True, 0.0), (True, 1.0)):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
-        noise = 0.1 * np.random.default_rng(0).normal(size=data.y.shape)
+        white = np.random.default_rng(0).normal(size=data.y.shape)
+        noise = 0.1 * white
         moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
         fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
         has_direct = bool(np.asarray(fit.model.D).any())

@@ -40,14 +40,17 @@ def noisy(model, noise, cycles, seed):
     n = model.n_sections * cycles
     before = 20 * model.n_sections
     u, w = (rng.normal(size=(n + before, len(x.inputs))) for x in (model, noise))
-    y = np.asarray(model.simulate(u) + noise.simulate(w))
+    clean = model.simulate(u)
+    y = np.asarray(clean + noise.simulate(w))
     about = dict(n_sections=model.n_sections, outputs=model.outputs)
-    return hj.experiments.SectionSeries(u[before:], y[before:], **about)
+    recorded_u = u[before:]
+    return hj.experiments.SectionSeries(recorded_u, y[before:], **about)
 
 
 def with_gaps(whole, share, seed):
     rng = np.random.default_rng(seed)
-    whole.y[rng.random(whole.y.shape) < share] = np.nan
+    is_gap = rng.random(whole.y.shape) < share
+    whole.y[is_gap] = np.nan
     return whole
 
 
@@ -72,7 +75,8 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
     """A missing output's error is the mean given the other's."""
     part = SeriesPart.of(CycleGrid.from_records(gappy), ONE)
     model = in_innovation_form(small)
-    path = SeriesProblem([part], COVARIANCES, True, False, 0).path(model, part)
+    problem = SeriesProblem([part], COVARIANCES, True, False, 0)
+    path = problem.path(model, part)
     for r, one in enumerate(gappy):
         x = np.zeros(model.dims[r])
         for t, (u, y) in enumerate(zip(one.u, one.y, strict=True)):
@@ -81,7 +85,8 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
             seen = np.isfinite(e)
             S = COVARIANCES[n]
             of_seen = S[np.ix_(seen, seen)]
-            mean = S[:, seen] @ np.linalg.solve(of_seen, e[seen])
+            weighted = np.linalg.solve(of_seen, e[seen])
+            mean = S[:, seen] @ weighted
             np.testing.assert_allclose(
                 path.error[n][r, cycle], np.where(seen, e, 0.0), atol=1e-11
             )
@@ -144,7 +149,8 @@ def test_too_few_dimensions_are_named(small):
             (2, "depend on the inputs"),
             (small.dims + 1, spare),
         ):
-            fit = hj.fit_ldtp(record(small, 4 * 300, 0, noise), dims)
+            data = record(small, 4 * 300, 0, noise)
+            fit = hj.fit_ldtp(data, dims)
             assert doubt in repr(fit.findings)
             assert bool(doubt) == bool(fit.findings)
 
@@ -253,7 +259,8 @@ def test_errors_are_as_large_as_said(small):
 
 def test_the_spectrum_of_noise(small):
     """White: its variance, everywhere. Else, by Parseval, the sum over all lines that end there."""
-    assert noise_spectrum(driven(small, 0.3), []).shape == (4, 0, 2)
+    none = noise_spectrum(driven(small, 0.3), [])
+    assert none.shape == (4, 0, 2)
     f = np.array([0.1, 0.3])
     N = 4
     white = hj.linear.LDTP(
@@ -309,5 +316,6 @@ def test_a_controller_at_the_section_of_its_measurement_is_no_lack_of_dimensions
     data = hj.experiments.SectionSeries(u, y, n_sections=2)
     fit = hj.fit_ldtp(data, 2, noise="innovations")
     assert {finding.cause for finding in fit.findings} == {"feedback"}
-    multiplier = turn[0, 0] + 1j * turn[0, 1]
+    imaginary = 1j * turn[0, 1]
+    multiplier = turn[0, 0] + imaginary
     assert fit.contains(multiplier).all()

@@ -20,7 +20,8 @@ SHAPES = [((2, 3, 1, 2), 2, 1, 6), ((1, 3, 2), 1, 2, 5), ((2,), 1, 1, 9)]
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_any_system_is_identified_exactly(shape, seed):
     dims, ny, nu, periods = shape
-    model = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    blocks = blocks_at_random(seed, dims, ny, nu)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     N = len(dims)
     top = N * periods // 2 / periods
     design = hj.multisine(N, periods, (0, top), 1.0, seed, lines="two-phase", inputs=nu)

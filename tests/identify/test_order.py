@@ -42,7 +42,8 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance[1:], rng)
         if few:
-            factors = rng.gamma(3.0, 1 / 3, variance[1:].shape)
+            shape = variance[1:].shape
+            factors = rng.gamma(3.0, 1 / 3, shape)
             rough = variance[1:] * factors
             data = with_variance(htf, data.H, rough, np.full(80, 3.0))
         try:
@@ -74,7 +75,13 @@ def test_a_weak_multiplier_that_was_left_out_is_named(size):
     """A pair of modulus 0.7, and a multiplier of 0.4 that the input excites by `size` as much."""
     real = 0.7 * np.cos(0.9)
     imaginary = 0.7 * np.sin(0.9)
-    A = np.array([[real, imaginary, 0], [-imaginary, real, 0], [0, 0, 0.4]])
+    A = np.array(
+        [
+            [real, imaginary, 0],
+            [-imaginary, real, 0],
+            [0, 0, 0.4],
+        ]
+    )
     named = 0
     for seed in range(6):
         rng = np.random.default_rng(seed)

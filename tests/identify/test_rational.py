@@ -29,7 +29,8 @@ def test_no_start_finds_a_better_fit(exact):
     h = np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
-        fitted = rational(f, x[2:], [1, *x[:2]], 32)
+        denominator = [1, *x[:2]]
+        fitted = rational(f, x[2:], denominator, 32)
         e = (h - fitted) / np.linalg.norm(h)
         return np.concatenate([e.real, e.imag])
 
@@ -76,5 +77,6 @@ def test_a_rational_function_is_found_exactly():
     more = hj.identify.fit_rational(
         hj.linear.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3
     )
-    distances = np.abs(more.poles[0] - poles[:, None])
+    shift = more.poles[0] - poles[:, None]
+    distances = np.abs(shift)
     assert np.all(distances.min(axis=1) < 1e-4)

@@ -18,7 +18,9 @@ LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 def model():
     rng = np.random.default_rng(0)
     A = 0.6 * rng.normal(size=(N, 2, 2))
-    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 2, 2))
+    return hj.linear.LDTP(A, B, C)
 
 
 def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
@@ -37,7 +39,8 @@ def inside(model, count, repeats, variance, runs=40, **more):
         estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
         exact = model.htf(estimate.frequencies, 0)[0]
         error = np.abs(estimate[0] - exact)
-        hits.append((error <= estimate.confidence_radius()[0])[::3])
+        is_inside = error <= estimate.confidence_radius()[0]
+        hits.append(is_inside[::3])
     return np.sum(hits), np.size(hits)
 
 
@@ -65,13 +68,15 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     rng = np.random.default_rng(R)
     runs = 20_000
     phases = 2 * np.pi * rng.random((R, runs))
-    parts = np.sqrt(0.5) * rng.normal(size=(R, runs, 2))
+    draws = rng.normal(size=(R, runs, 2))
+    parts = np.sqrt(0.5) * draws
     bias = constant * np.exp(1j * phases)
     error = bias + noise * parts @ [1, 1j]
     shares = np.full((R, 1), 1 / R)
     if constant == 0:
         # Of experiments of different strengths; Gaussian errors know nothing of it.
-        shares = rng.dirichlet(np.full(R, 3.0))[:, None]
+        concentration = np.full(R, 3.0)
+        shares = rng.dirichlet(concentration)[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
     residuals = np.sqrt(shares) * (error - mean)
@@ -86,7 +91,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
         quantile = quantiles[0, :, 0, 0]
         inside = np.abs(mean) ** 2 <= quantile * variance
         if constant == 0:
-            assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
+            count = int(inside.sum())
+            assert stats.binomtest(count, runs, level).pvalue > 1e-3
         elif R > 3 and level == 0.95:
             assert 0.935 < inside.mean() < 0.965
     if R == 2:
@@ -133,7 +139,8 @@ def test_sums_of_parts_are_those_of_the_whole(model):
     one = hj.estimate_htf(data, repeats=2)
     many = hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance"):
-        np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
+        of_many = getattr(many, name)
+        np.testing.assert_allclose(of_many, getattr(one, name), rtol=1e-9)
     np.testing.assert_array_equal(many.variance_dof.dof, one.variance_dof.dof)
     np.testing.assert_allclose(
         many.variance_dof.roundness, one.variance_dof.roundness, rtol=1e-9
@@ -148,7 +155,8 @@ def test_a_failed_realization_leaves_the_others(model):
         data.u, data.y, n_sections=N, periods=P, result=result
     )
     estimate = hj.estimate_htf(data)
-    lost = np.isin(estimate.frequencies, LINES.frequency[LINES.experiment == 0])
+    of_first = LINES.frequency[LINES.experiment == 0]
+    lost = np.isin(estimate.frequencies, of_first)
     of_lost = np.mean(estimate.variance[:, lost])
     of_others = np.mean(estimate.variance[:, ~lost])
     ratio = of_lost / of_others
@@ -207,7 +215,8 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
     misfit = np.mean(weight * squares) * 300 / 299
     _, deviation = estimated_noise(dof / (dof - 1), misfit)
     weights = weight.sum(axis=1)
-    actual = np.mean(estimate**2) / np.mean(1 / weights)
+    expected = np.mean(1 / weights)
+    actual = np.mean(estimate**2) / expected
     assert actual == pytest.approx(
         deviation**2, rel=0.12
     )  # (freedom / (freedom - 2) at most)
@@ -216,8 +225,10 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
 def test_fits_know_of_estimated_variances(model):
     exact = model.htf(np.arange(1, 32) / 16)
     H = np.asarray(exact.H)
-    drawn = np.random.default_rng(0).normal(size=(2, *H.shape))
-    variance = 0.1 * np.random.default_rng(1).gamma(4, size=H.shape)
+    rng = np.random.default_rng(0)
+    drawn = rng.normal(size=(2, *H.shape))
+    shapes = np.random.default_rng(1).gamma(4, size=H.shape)
+    variance = 0.1 * shapes
     fits = [
         hj.fit_ldtp(
             hj.linear.HTF(

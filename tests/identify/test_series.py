@@ -80,7 +80,8 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
         x0 = rng.normal(size=model.dims[section])
         length = 60 * N + 1 + k
         whole = record(model, length, seed + k, first_section=section, x0=x0)
-        whole.y[rng.random(whole.y.shape) < 0.02] = np.nan
+        is_gap = rng.random(whole.y.shape) < 0.02
+        whole.y[is_gap] = np.nan
         whole.u[25 * N + 2, 0] = np.nan
         records.append(whole)
     fit = hj.fit_series(records, model)
@@ -116,7 +117,8 @@ def test_outputs_that_depend_on_later_inputs(small):
         hj.experiments.SectionSeries(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
     )
     response = small.impulse_response(22)
-    expected = np.roll(response, -2, axis=0)[:, 2:]
+    ahead_response = np.roll(response, -2, axis=0)
+    expected = ahead_response[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
     ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[
         ..., None, None
@@ -137,7 +139,8 @@ def test_regions_cover(small):
     distances = []
     noise = []
     for seed in range(runs):
-        fit = hj.fit_series(record(small, 4 * 120, seed, 0.3), 2)
+        data = record(small, 4 * 120, seed, 0.3)
+        fit = hj.fit_series(data, 2)
         hits += fit.contains(true).all()
         errors.append(fit.compare(true).error ** 2)
         variances.append(fit.standard_errors**2)
@@ -184,7 +187,8 @@ def test_the_covariance_of_the_gradient_with_process_noise():
     runs = 12
     for seed in range(runs):
         clean = record(model, N * cycles, seed)
-        problem = problem_of(with_outputs(clean, clean.y + noise()), 1, 12)
+        noisy = with_outputs(clean, clean.y + noise())
+        problem = problem_of(noisy, 1, 12)
         solution = linearize(problem, np.array([-true]))
         draws = (
             np.stack([noise() for _ in range(50)]).reshape(-1, cycles, N)
@@ -272,7 +276,8 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         for data, guess in cases:
             with pytest.warns(FindingWarning, match="Drift: outputs may drift"):
                 multipliers = fit(data, guess).multipliers
-            assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
+            apart = np.abs(multipliers - small.multipliers[0])
+            assert apart.max() > 0.1
     first = mock.Mock(wraps=subspace_model)
     monkeypatch.setattr("hybridjax.identify.joint.fit.subspace_model", first)
     for data in (
@@ -289,7 +294,8 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     with pytest.raises(
         hj.errors.DefinitionError, match="not 2.*outputs may drift: `with_drift"
     ):
-        hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
+        drifting = moved(3 * slow.repeat(4), seed=0)
+        hj.fit_series(drifting, 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
     found = (len(begun.u), begun.drift, with_drift([begun]))
     assert found == (4000, 20, [])
@@ -412,7 +418,8 @@ def test_inputs_have_units_of_their_own(unit):
         for v in (u, u * units)
     ]
     htfs = [fit.htf([0.3]).H for fit in fits]
-    np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
+    in_units = htfs[1] * units
+    np.testing.assert_allclose(in_units, htfs[0], rtol=1e-6)
     found = [fit.model.multipliers for fit in fits]
     np.testing.assert_allclose(*found, rtol=1e-6)
     design = hj.multisine(4, 8, lines="odd", inputs=2, division="disjoint")
@@ -447,7 +454,8 @@ def test_a_multiplier_that_changes_along_the_data_is_named():
             for i in range(160):
                 # Two sections in a period.
                 factor = z if i % 2 else 1.0
-                x[i + 1] = factor * x[i] + u[i, 0]
+                carried = factor * x[i]
+                x[i + 1] = carried + u[i, 0]
             noise = 0.1 * rng.normal(size=(160, 1))
             y = x[:160, None] + noise
             each.append(hj.experiments.SectionSeries(u, y, n_sections=2))

@@ -32,10 +32,12 @@ def test_random_systems(shape, seed):
     blocks = blocks_at_random(seed, dims, ny, nu, gain=0.95)
     model = hj.linear.LDTP.from_blocks(*blocks)
     N = len(dims)
-    f = np.linspace(0.01, N / 2 - 0.01, 12 * N)
+    last = N / 2 - 0.01
+    f = np.linspace(0.01, last, 12 * N)
     htf = model.htf(f)
     fit = hj.fit_multipliers(htf, model)
     true = model.multipliers
-    assert_allclose(fit.coefficients, np.poly(true).real[1:], atol=1e-8)
+    exact = np.poly(true).real[1:]
+    assert_allclose(fit.coefficients, exact, atol=1e-8)
     assert fit.htf(htf.frequencies).error(htf).max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)

@@ -127,12 +127,14 @@ def test_the_spectrum_of_errors_is_found(small):
     chi = np.polyval(polynomial, delay)
     white = np.array([3e-3, 1e-2])
     colored = np.array([1e-2, 2e-3])
-    true = white + colored / np.abs(chi[:, None]) ** 2
+    gain = np.abs(chi[:, None]) ** 2
+    true = white + colored / gain
     guessed = np.linspace(1e-3, 4e-3, 160).reshape(80, 2, 1)
     supposed = weights_of(guessed, np.ones(2))
     supposed = np.broadcast_to(supposed, htf.H.shape)
     rng = np.random.default_rng(0)
-    lines = rng.uniform(0.1, 2, (80, 1, htf.H.shape[3]))
+    inputs = htf.H.shape[3]
+    lines = rng.uniform(0.1, 2, (80, 1, inputs))
     by_line = true[..., None] * lines
     variance = np.broadcast_to(by_line, htf.H.shape)
     found = []
@@ -141,7 +143,8 @@ def test_the_spectrum_of_errors_is_found(small):
             noisy(htf, variance, np.random.default_rng(seed)), supposed, 13
         )
         found.append(error_spectrum(groups, c, f, lines, 2))
-    np.testing.assert_allclose(np.mean(found, axis=0), variance[0], rtol=0.06)
+    mean = np.mean(found, axis=0)
+    np.testing.assert_allclose(mean, variance[0], rtol=0.06)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,8 @@ def test_the_true_model_leaves_white_noise(small):
     for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
         rng = np.random.default_rng(seed)
-        data.y[rng.random(data.y.shape) < 0.02] = np.nan
+        is_gap = rng.random(data.y.shape) < 0.02
+        data.y[is_gap] = np.nan
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
         other = record(small, 4 * 60, 100 + seed, 0.3)
@@ -32,8 +33,10 @@ def test_the_true_model_leaves_white_noise(small):
     by_seed = np.reshape(p, (30, 2, 2))
     for test in by_seed.transpose(1, 2, 0).reshape(4, 30):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
-    assert covered(int((np.array(p) > 0.05).sum()), 120)
-    np.testing.assert_allclose(np.mean(np.square(correlations)), 1, atol=0.15)
+    accepted = int((np.array(p) > 0.05).sum())
+    assert covered(accepted, 120)
+    mean_square = np.mean(np.square(correlations))
+    np.testing.assert_allclose(mean_square, 1, atol=0.15)
     for test in np.swapaxes(of_fits, 0, 1):
         assert covered(int((test > 0.05).sum()), 120)
 
@@ -108,7 +111,12 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     slow = np.cos(np.pi * 3 * cycle)
     by_section = np.cos(np.arange(4 * 150) % 4)
     wave = 9 * slow * by_section + 7
-    about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
+    about = dict(
+        n_sections=4,
+        first_section=1,
+        outputs=plain.outputs,
+        drift=50,
+    )
     drift = wave[:, None] * [1.0, -2.0]
     records = (
         hj.experiments.SectionSeries(plain.u, plain.y + k * drift, **about)
@@ -140,7 +148,8 @@ def test_records_shorter_than_the_lags(small):
     with pytest.raises(
         hj.errors.DefinitionError, match="0.75 cycles without gaps are too few"
     ):
-        hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
+        halves = [whole.part(0, 3), whole.part(3, 6)]
+        hj.validate(small, halves)
     with pytest.raises(hj.errors.DefinitionError, match="^u is zero or missing"):
         hj.validate(
             small,

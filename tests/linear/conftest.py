@@ -12,7 +12,8 @@ def blocks_at_random(seed, dims, ny, nu, gain=0.7):
     A = [gain * a / np.linalg.norm(a, 2) for a in A]
     B = [rng.normal(size=(d, nu)) for d in after]
     C = [rng.normal(size=(ny, d)) for d in dims]
-    return A, B, C, [rng.normal(size=(ny, nu)) for _ in dims]
+    D = [rng.normal(size=(ny, nu)) for _ in dims]
+    return A, B, C, D
 
 
 def simulate_blocks(blocks, u, x0, start=0):

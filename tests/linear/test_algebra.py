@@ -47,7 +47,8 @@ def lifted(ldtp, z):
         x = A[k] @ x + B[k] @ u
     y = np.concatenate(outputs)
     shift = z[:, None, None] * np.eye(n)
-    resolvent = np.linalg.inv(shift - x[:, :n])
+    of_state = x[:, :n]
+    resolvent = np.linalg.inv(shift - of_state)
     by_state = y[:, :n] @ resolvent @ x[:, n:]
     return by_state + y[:, n:]
 
@@ -55,7 +56,8 @@ def lifted(ldtp, z):
 @pytest.fixture(scope="module")
 def pair():
     plant = system(0, (3, 2, 4, 1))
-    return plant, system(1, (1, 2, 1, 3), OUT, IN, 0.1)
+    controller = system(1, (1, 2, 1, 3), OUT, IN, 0.1)
+    return plant, controller
 
 
 def test_systems_against_lifted_ones(pair):
@@ -117,7 +119,8 @@ def test_variances_are_those_of_draws(operation, pair):
 
     def draws(htf):
         parts = rng.normal(size=(200, *htf.H.shape, 2))
-        noise = size / np.sqrt(2) * (parts @ [1, 1j])
+        draws = parts @ [1, 1j]
+        noise = size / np.sqrt(2) * draws
         return np.asarray(htf.H) + noise
 
     def with_variance(htf):
@@ -158,10 +161,12 @@ def test_what_does_not_fit_is_refused(pair):
         system(2, (2, 2, 2, 2), through=0).inverse()
     with refused("answers itself at section 2"):
         inverse = np.linalg.inv(P.D[2])
-        eqx.tree_at(lambda x: x.D, K, K.D.at[2].set(-inverse)).feedback(P)
+        blocking = K.D.at[2].set(-inverse)
+        eqx.tree_at(lambda x: x.D, K, blocking).feedback(P)
     with refused(r"of shape \(2 inputs, 2 outputs\) or of shape \(4 sections"):
         P.feedback(np.eye(3))
     with refused("do not hold f = 1.3"):
         P.htf([0.3, 0.7]).inverse()
     with refused("needs all 4 harmonics"):
-        P.htf(F, (0, 1)) @ K.htf(F, (0, 1))
+        of_plant = P.htf(F, (0, 1))
+        of_plant @ K.htf(F, (0, 1))

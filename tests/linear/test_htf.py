@@ -36,7 +36,8 @@ def test_three_ways_agree(seed, shape, f):
     # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
     omega = 2 * np.pi * f / N
     h = np.asarray(ldtp.impulse_response(120))
-    delays = np.exp(-1j * omega * np.arange(120))
+    times = np.arange(120)
+    delays = np.exp(-1j * omega * times)
     G = np.einsum("nrij,r->nij", h, delays)
     fourier = np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N) / N
     expected = np.einsum("mn,nij->mij", fourier, G)
@@ -48,10 +49,13 @@ def test_three_ways_agree(seed, shape, f):
     channel = seed % nu
     n = np.arange((transient + periods) * N)
     u = np.zeros((len(n), nu))
-    u[:, channel] = np.cos(omega * n + 0.3)
-    _, y = simulate_blocks(blocks, u, np.zeros(dims[0]))
+    wave = np.cos(omega * n + 0.3)
+    u[:, channel] = wave
+    rest = np.zeros(dims[0])
+    _, y = simulate_blocks(blocks, u, rest)
     Y = np.fft.fft(y[transient * N :], axis=0)
-    U = np.fft.fft(u[transient * N :, channel])
+    steady = u[transient * N :, channel]
+    U = np.fft.fft(steady)
     line = round(f * periods)
     lines = (line + m * periods) % (periods * N)
     assert_allclose(H[:, :, channel], Y[lines] / U[line], rtol=0, atol=1e-12)
@@ -63,13 +67,15 @@ def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
     N = len(dims)
     periods = 4
-    ldtp = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    blocks = blocks_at_random(seed, dims, ny, nu)
+    ldtp = hj.linear.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(periods * N, nu))
     start = ldtp.periodic_state(u, periods)
     expected = ldtp.simulate(u, start)
     # Negative frequencies follow by symmetry.
-    f = np.arange(periods * N // 2 + 1) / periods
+    lines = np.arange(periods * N // 2 + 1)
+    f = lines / periods
     assert_allclose(ldtp.htf(f).predict(u), expected, rtol=0, atol=1e-11)
 
 
@@ -112,7 +118,8 @@ def test_a_multiplier_on_the_unit_circle_is_named():
     B = np.ones((2, 1))
     C = np.ones((1, 2))
     ldtp = hj.linear.LDTP.from_blocks([turn] * 3, [B] * 3, [C] * 3)
-    resonance = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
+    angle = np.arctan2(0.8, 0.6)
+    resonance = 3 * angle / (2 * np.pi)
     beside = ldtp.htf([0.1, resonance + 1e-6])
     assert np.all(np.isfinite(beside.H))
     with pytest.raises(

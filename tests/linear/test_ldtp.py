@@ -43,7 +43,8 @@ def test_periodic_state_of_an_unstable_system():
     # A^20 has the entries 1e20 and 1e-20; the stable part must not drown.
     A = np.array([[10.0, 0.0], [3.0, 0.1]])
     B = np.ones((2, 1))
-    ldtp = hj.linear.LDTP.from_blocks([A], [B], [np.eye(2)])
+    C = np.eye(2)
+    ldtp = hj.linear.LDTP.from_blocks([A], [B], [C])
     rng = np.random.default_rng(0)
     u = rng.normal(size=(20, 1))
     # One linear system for the states of all periods: x[k+1] = A x[k] + B u[k], cyclically.

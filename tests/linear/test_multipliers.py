@@ -17,9 +17,12 @@ RTOL = 1e-12
 
 def basis_at_random(rng, d):
     """A matrix with condition number at most 9."""
-    left, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    right, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    logarithms = rng.uniform(-np.log(3), np.log(3), d)
+    draws = rng.normal(size=(d, d))
+    left, _ = np.linalg.qr(draws)
+    others = rng.normal(size=(d, d))
+    right, _ = np.linalg.qr(others)
+    widest = np.log(3)
+    logarithms = rng.uniform(-widest, widest, d)
     sizes = np.exp(logarithms)
     return left * sizes @ right
 
@@ -76,7 +79,8 @@ def relative_error(found, multipliers):
 
 def assert_conjugate_and_sorted(found):
     moduli = np.abs(found)
-    assert np.all(np.diff(moduli) <= 1e-15 * np.abs(found[:-1]))
+    steps = np.diff(moduli)
+    assert np.all(steps <= 1e-15 * np.abs(found[:-1]))
     values = list(found)
     for value in values:
         assert np.conj(value) in values
@@ -98,7 +102,8 @@ def assert_conjugate_and_sorted(found):
 )
 def test_widely_spread_multipliers_keep_their_digits(multipliers, sections=32):
     rng = np.random.default_rng(sections)
-    found = product_eigenvalues(chain(rng, multipliers, np.zeros(sections, int)), RTOL)
+    factors = chain(rng, multipliers, np.zeros(sections, int))
+    found = product_eigenvalues(factors, RTOL)
     assert relative_error(found, multipliers) < 1e-11
     assert_conjugate_and_sorted(found)
 
@@ -129,7 +134,8 @@ def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
         product = factor @ product
     expected, vectors = np.linalg.eig(product)
     # Backward error of the product, magnified by the sensitivity of its eigenvalues.
-    size = np.prod([np.linalg.norm(factor, 2) for factor in factors])
+    norms = [np.linalg.norm(factor, 2) for factor in factors]
+    size = np.prod(norms)
     condition = np.linalg.cond(vectors)
     bound = 1e-14 * d * sections * size * condition
     assert largest_difference(found, expected, relative=False) <= bound
@@ -184,7 +190,8 @@ def test_hopper(hopper, reference):
     assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
     ranks = [hopper.rank(n) for n in range(32)]
     assert ranks == list(data["rank_monodromy"])
-    assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
+    expected = data["monodromy"][7]
+    assert_allclose(hopper.monodromy(7), expected, rtol=0, atol=1e-14)
 
 
 def test_the_synthetic_system(synthetic):

@@ -22,8 +22,10 @@ def an_htf(**more):
 @pytest.fixture(scope="module")
 def htf():
     rng = np.random.default_rng(1)
-    size = rng.uniform(1, 2, (3, len(F), 2, 1))
-    variance_dof = hj.linear.VarianceDof(np.full(len(F), 4.0), size)
+    shape = (3, len(F), 2, 1)
+    size = rng.uniform(1, 2, shape)
+    dof = np.full(len(F), 4.0)
+    variance_dof = hj.linear.VarianceDof(dof, size)
     return an_htf(variance=2 * size, noise_variance=size, variance_dof=variance_dof)
 
 

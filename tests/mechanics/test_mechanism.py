@@ -22,7 +22,9 @@ def double_pendulum():
     """Two equal masses on two equal rods, by absolute angles from straight down."""
 
     def positions(q):
-        directions = jnp.stack([jnp.sin(q), -jnp.cos(q)], axis=1)
+        x = jnp.sin(q)
+        y = -jnp.cos(q)
+        directions = jnp.stack([x, y], axis=1)
         return L * jnp.cumsum(directions, axis=0)
 
     def kinetic(q, v):
@@ -71,7 +73,8 @@ def test_a_double_pendulum_moves_as_textbooks_say():
     squares = jnp.array([v[1] ** 2, -(v[0] ** 2)])
     centrifugal = m * L**2 * s * squares
     masses = jnp.array([2, 1])
-    weight = m * G * L * masses * jnp.sin(q)
+    moments = m * G * L * masses
+    weight = moments * jnp.sin(q)
     assert_allclose(bias, centrifugal + weight, rtol=1e-12)
     expected = np.linalg.solve(expected_mass, f - centrifugal - weight)
     assert_allclose(acceleration, expected, rtol=1e-12)
@@ -104,7 +107,8 @@ def test_a_contact_that_holds_is_a_rod():
     gravity = G * np.cos(angle)
     tension = M * (gravity + L * rate**2)
     assert_allclose(found.force * L, [-tension], rtol=1e-13)
-    tangent = jnp.array([np.cos(angle), np.sin(angle)])
+    direction = [np.cos(angle), np.sin(angle)]
+    tangent = jnp.array(direction)
     expected = L * acceleration[0]
     assert_allclose(found.acceleration @ tangent, expected, rtol=1e-12)
 
@@ -125,10 +129,12 @@ def test_impacts(restitution):
 
     after = impact(restitution)
     J = L * np.cos(q)[None]
-    assert_allclose(J @ after.velocity, -restitution * (J @ v), atol=1e-14)
+    rate_before = J @ v
+    assert_allclose(J @ after.velocity, -restitution * rate_before, atol=1e-14)
     momentum = pendulum.mass(q) @ (after.velocity - v)
     assert_allclose(momentum, J.T @ after.impulse, rtol=1e-12)
-    lost = pendulum.energy(q, v) - pendulum.energy(q, after.velocity)
+    after_impact = pendulum.energy(q, after.velocity)
+    lost = pendulum.energy(q, v) - after_impact
     if restitution == 1:
         assert abs(lost) < 1e-12
     else:
@@ -149,7 +155,8 @@ def worn(t, q, u):
 
 
 def test_a_singular_mass_matrix_ends_the_trajectory_with_its_cause():
-    system = toy({"move": Field(("x", "y", "vx", "vy"), worn)})
+    chart = Field(("x", "y", "vx", "vy"), worn)
+    system = toy({"move": chart})
     found = hj.simulate(system, "move", (0.0, 0.0, 1.5, 0.0), 5.0, throw=False)
     assert found.result == hj.errors.Result.FIELD_NOT_FINITE
     assert_allclose(found.t[-1], 2 / 3, rtol=1e-6)

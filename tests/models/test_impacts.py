@@ -34,7 +34,8 @@ def test_the_cycle_and_its_multipliers(n):
     events = cycle.trajectory().events
     times, masses = zip(*truth["impacts"], strict=True)
     assert_allclose([event.time for event in events], times)
-    assert [event.name for event in events] == [f"impact {i}" for i in masses]
+    names = [event.name for event in events]
+    assert names == [f"impact {i}" for i in masses]
 
 
 def test_events_that_coincide_neither_graze_nor_accumulate():
@@ -43,7 +44,8 @@ def test_events_that_coincide_neither_graze_nor_accumulate():
     pace = np.array([[0.0], [np.inf], [0.0], [0.0]])
     event = np.ones(1, bool)
     for moved in [1.0, 0.0] * 9:
-        pace, zeno = keep_pace(pace, np.array([moved]), event, ~event, 2.0, 2)
+        times = np.array([moved])
+        pace, zeno = keep_pace(pace, times, event, ~event, 2.0, 2)
         assert not zeno
 
 

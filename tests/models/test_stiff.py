@@ -83,7 +83,9 @@ def test_the_hopper_on_a_compliant_ground():
     expected = state / np.array(list(cycle.scale.values()))
     assert_allclose(found, expected, atol=1e-11)
     z = -0.24885118328047069434 + 0.69922500780850327787j
-    assert_allclose(cycle.multipliers[:2], [z, z.conjugate()], atol=1e-12)
+    pair = [z, z.conjugate()]
+    assert_allclose(cycle.multipliers[:2], pair, atol=1e-12)
     assert cycle.multipliers[2] == pytest.approx(1.6159409134125691e-4, abs=1e-14)
     model = hj.linearize(cycle, hj.ClockPhase(16))
-    assert_allclose(model.multipliers[:2], [z, z.conjugate()], atol=1e-10)
+    pair_of_model = [z, z.conjugate()]
+    assert_allclose(model.multipliers[:2], pair_of_model, atol=1e-10)

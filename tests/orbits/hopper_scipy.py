@@ -32,7 +32,8 @@ def _field(t, q, u):
 
 
 def plane(point):
-    return (point[1] - 1.9) / 0.3, point[2] / 1.9
+    x = (point[1] - 1.9) / 0.3
+    return x, point[2] / 1.9
 
 
 def _level(section, t, q):
@@ -41,7 +42,8 @@ def _level(section, t, q):
     if kind == "clock":
         return value - t
     x, y = plane((t, *q))
-    return y * np.cos(value) - x * np.sin(value)
+    along = y * np.cos(value)
+    return along - x * np.sin(value)
 
 
 def _guard(t, q):
@@ -96,14 +98,16 @@ def flow(point, section, u=0.0, retention=1.0):
         before = path.t[-2]
         end = path.t[-1]
         if end > before:
-            last = solve(before, path.y[:, -2], u, end)
+            begin = path.y[:, -2]
+            last = solve(before, begin, u, end)
             watched = level if at_section else guard
             start = last.y[:, -1]
             t, q = _polish(watched, end, start, u)
         if at_section:
             return np.array([t, *q])
         if len(q) == 4:  # touchdown
-            q = np.array([q[0], retention * q[1]])
+            speed = retention * q[1]
+            q = np.array([q[0], speed])
         else:  # liftoff
             q = np.array([q[0], q[1], 0.0, 0.0])
 
@@ -116,7 +120,8 @@ def onto(section, point, names):
         point[0] = value
     elif "vM" not in names:
         height = point[1] - 1.9
-        point[2] = 1.9 * np.tan(value) * height / 0.3
+        slope = 1.9 * np.tan(value)
+        point[2] = slope * height / 0.3
     else:
         assert "yM" not in names
         ratio = point[2] / 1.9
@@ -140,7 +145,8 @@ def jacobian(point, here, there, names, names_after, retention=1.0, e=2e-4):
 
     def derivative(value):
         once = value(e) - value(-e)
-        twice = value(2 * e) - value(-2 * e)
+        ahead = value(2 * e)
+        twice = ahead - value(-2 * e)
         return (8 * once - twice) / (12 * e)
 
     columns = []

@@ -15,7 +15,8 @@ class Swing(hj.Chart):
     def field(self, t, q, u):
         x, v = q
         stiffness = 0.25 + 0.2 * jnp.cos(t)
-        return v, -0.05 * v - stiffness * x - x**3
+        force = stiffness * x
+        return v, -0.05 * v - force - x**3
 
 
 class Pumped(hj.HybridSystem):
@@ -36,7 +37,8 @@ def test_a_search_for_two_periods_leaves_the_rest_to_which_newtons_method_leads(
     def rates(t, q):
         x, v = q
         stiffness = 0.25 + 0.2 * np.cos(t)
-        return v, -0.05 * v - stiffness * x - x**3
+        force = stiffness * x
+        return v, -0.05 * v - force - x**3
 
     end = solve_ivp(rates, (0, 400 * np.pi), (0.15, 0.05), rtol=1e-9, atol=1e-12)
     found = np.abs(cycle.anchor.q[:, 0])
@@ -88,7 +90,8 @@ class Membrane(hj.Chart):
 
     def field(self, t, q, u):
         v, w = q
-        rise = 0.04 * v**2 + 5 * v + 150 - w
+        own = 0.04 * v**2 + 5 * v
+        rise = own + 150 - w
         recovery = 0.02 * (0.2 * v - w)
         return rise, recovery
 

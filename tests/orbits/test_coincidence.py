@@ -117,7 +117,12 @@ def test_derivatives_of_both_orders():
     assert not found.commute
     exact = {
         ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),
-        ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
+        ("y", "x second"): np.array(
+            [
+                [-4 / 3, -8 / 3],
+                [-2.0, -3.0],
+            ]
+        ),
     }
     assert set(found.orders) == set(exact)
     for order, derivative in zip(found.orders, found.derivatives, strict=True):
@@ -154,7 +159,8 @@ def test_an_event_that_coincides_with_a_schedule():
     with pytest.raises(
         hj.errors.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
     ):
-        hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
+        guess = hj.Guess("a", (0.5,), 0.3)
+        hj.find_limit_cycle(ticked(height), guess)
 
 
 class Filled(hj.HybridSystem):
@@ -246,4 +252,5 @@ def test_two_schedules_for_one_time():
     with pytest.raises(
         hj.errors.DefinitionError, match="'tick' and 'tock' are scheduled for the same"
     ):
-        hj.find_limit_cycle(ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))
+        guess = hj.Guess("a", (0.5,), 0.3)
+        hj.find_limit_cycle(ticked(other=0.5), guess)

@@ -41,7 +41,8 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     impact_speed = g * float(juggler.T) / 2
     paddle_speed = (1 - a) * impact_speed / (1 + a)
     fold = paddle_speed / (2 * np.pi)  # the paddle just reaches the speed: s = 0
-    factor = 2 * (1 + a**2) / (1 + a) ** 2
+    square = (1 + a) ** 2
+    factor = 2 * (1 + a**2) / square
     s = factor * g
     weight = s / (2 * np.pi) ** 2
     flip = np.hypot(paddle_speed / (2 * np.pi), weight)
@@ -63,7 +64,8 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     for k in at:
         cycle = branch[k]
         (impact,) = cycle.trajectory().events
-        acceleration = -((2 * np.pi) ** 2) * impact.before["y"]
+        rate = 2 * np.pi
+        acceleration = -(rate**2) * impact.before["y"]
         by_table = (1 + a) ** 2 * acceleration / g
         trace = 1 + a**2 + by_table
         assert_allclose(np.sum(cycle.multipliers).real, trace, rtol=1e-9)
@@ -98,7 +100,8 @@ def test_a_branch_is_drawn_in_pieces_of_one_stability(by_amplitude):
     fold, flip = (point.index for point in branch.points)
     drawn = [line.get_xdata() for line in lines]
     assert_array_equal(drawn[0], branch.values[: fold + 1])
-    assert_array_equal(drawn[1], branch.values[fold : flip + 1])
+    between = branch.values[fold : flip + 1]
+    assert_array_equal(drawn[1], between)
     assert_array_equal(drawn[2], branch.values[flip:])
 
 
@@ -148,7 +151,8 @@ def test_derivatives_of_a_turn_by_a_clock_are_differences(system, parameter):
     cycle = hj.find_limit_cycle(system())
     curve = Curve(cycle, parameter, 1.0)
     point = np.append(curve.map.anchor.q, curve.value)
-    derivative = curve.turn(curve.map, point).jacobian[:, -1]
+    turn = curve.turn(curve.map, point)
+    derivative = turn.jacobian[:, -1]
 
     h = 1e-5 * curve.value
     step = np.zeros(len(point))
@@ -213,7 +217,8 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     assert not branch.points
     assert branch.values[-1] == 30.0
     assert float(branch[-1].anchor.t[0]) != 0.5
-    again = hj.find_limit_cycle(branch[-1].system, branch[-1])
+    last = branch[-1]
+    again = hj.find_limit_cycle(last.system, last)
     assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
 
 
@@ -228,15 +233,18 @@ class Maps(hj.HybridSystem):
 
     def charts(self):
         def rates(t, q, u):
-            return 0.0 * jnp.sin(2 * jnp.pi * t) * q
+            wave = jnp.sin(2 * jnp.pi * t)
+            return 0.0 * wave * q
 
         return {"a": Field(tuple("abcdef"), rates)}
 
     def transitions(self):
         def step(t, q, u):
-            r = self.growth.r + jnp.array([0.0, 0.0, 0.0, 0.01])
+            change = jnp.array([0.0, 0.0, 0.0, 0.01])
+            r = self.growth.r + change
             others = q[jnp.array([0, 1, 4, 5])]
-            return *(r * q[:4] * (1 - others)), q[2], q[3]
+            growth = r * q[:4] * (1 - others)
+            return *growth, q[2], q[3]
 
         return [
             hj.Transition("step", "a", "a", hj.systems.Scheduled(1.0, 0.5), reset=step)
@@ -286,7 +294,8 @@ class IntegrateAndFire(hj.HybridSystem):
 
     def charts(self):
         def leak(t, q, u):
-            wave = jnp.sin(2 * jnp.pi * t / self.T)
+            phase = 2 * jnp.pi * t / self.T
+            wave = jnp.sin(phase)
             return 1.5 - q + self.a * wave
 
         return {"leak": Field(("v",), leak)}
@@ -327,7 +336,8 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
 
     # The potential between two spikes of the last cycle, in closed form.
     def steady(t):
-        wave = np.sin(rate * t) - rate * np.cos(rate * t)
+        sine = np.sin(rate * t)
+        wave = sine - rate * np.cos(rate * t)
         return 1.5 + begin.value * wave / (1 + rate**2)
 
     (spike,) = branch[0].trajectory().events
@@ -352,7 +362,8 @@ class Boost(hj.HybridSystem):
             return -q[0] / (self.R * 1e-4), 1e5
 
         def off(t, q, u):
-            current = (q[1] - q[0] / self.R) / 1e-4
+            load = q[0] / self.R
+            current = (q[1] - load) / 1e-4
             voltage = (10.0 - q[0]) / 1e-4
             return current, voltage
 
@@ -393,10 +404,23 @@ class Boost(hj.HybridSystem):
 def _least_current(R):
     """Of the cycle in continuous conduction, by exponentials of matrices beside a constant 1."""
     load = 1 / (R * 1e-4)
-    on = np.array([[-load, 0, 0], [0, 0, 1e5], [0, 0, 0]])
-    off = np.array([[-load, 1e4, 0], [-1e4, 0, 1e5], [0, 0, 0]])
+    on = np.array(
+        [
+            [-load, 0, 0],
+            [0, 0, 1e5],
+            [0, 0, 0],
+        ]
+    )
+    off = np.array(
+        [
+            [-load, 1e4, 0],
+            [-1e4, 0, 1e5],
+            [0, 0, 0],
+        ]
+    )
     turn = expm(off * 10e-6) @ expm(on * 10e-6)
-    back = np.eye(2) - turn[:2, :2]
+    unit = np.eye(2)
+    back = unit - turn[:2, :2]
     return np.linalg.solve(back, turn[:2, 2])[1]
 
 
@@ -425,7 +449,9 @@ class Brusselator(hj.HybridSystem):
         def rates(t, q, u):
             x, y = q
             square = x**2 * y
-            return 1 - (self.b + 1) * x + square, self.b * x - square
+            first = 1 - (self.b + 1) * x + square
+            second = self.b * x - square
+            return first, second
 
         return {"all": Field(("x", "y"), rates)}
 

@@ -106,7 +106,8 @@ def test_van_der_pol(mu):
     """In reversed time, mu -> -mu, the cycle is the same and its multiplier the reciprocal."""
     amplitude, period, multiplier = VANDERPOL[abs(mu)]
     cycle = vanderpol(mu, (2.0, 0.0) if mu < 0 else None)
-    assert_allclose(cycle.anchor.q[:, 0], [amplitude, 0.0], atol=1e-9)
+    at_rest = [amplitude, 0.0]
+    assert_allclose(cycle.anchor.q[:, 0], at_rest, atol=1e-9)
     assert_allclose(cycle.period, period, atol=1e-9)
     assert_allclose(cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0)
     assert not cycle.clocked
@@ -131,7 +132,8 @@ def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
     event = hj.Transition("spike", "a", "a", spike, "rising", again)
     guess = hj.Guess("a", (9e4,))
     section = hj.AtEvent("spike")
-    cycle = hj.find_limit_cycle(toy({"a": square}, [event]), guess, section=section)
+    system = toy({"a": square}, [event])
+    cycle = hj.find_limit_cycle(system, guess, section=section)
     expected = np.arctan(1e5) + np.pi / 4
     assert_allclose(cycle.period, expected, rtol=1e-9)
 
@@ -203,7 +205,8 @@ def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
     system = toy({"cells": cells}, spikes)
     guess = hj.Guess("cells", (0, 0.5))
     cycle = hj.find_limit_cycle(system, guess)
-    root = np.sqrt(0.1**2 + 4 * 1.3 * 0.3)
+    product = 4 * 1.3 * 0.3
+    root = np.sqrt(0.1**2 + product)
     half = np.log(2 * 1.3 / (root - 0.1))
     assert_allclose(cycle.period, 2 * half, rtol=1e-10)
 
@@ -297,9 +300,11 @@ def test_scheduled_events():
     placed = hj.sections.place_sections(cycle, hj.ClockPhase(10))
     on = np.arange(10) < 3
     assert_array_equal(placed.lanes.chart, np.where(on, 0, 1))
-    assert_allclose(placed.lanes.q[0, 0], system.exact(), rtol=1e-11)
+    height = placed.lanes.q[0, 0]
+    assert_allclose(height, system.exact(), rtol=1e-11)
     ldtp = hj.linearize(cycle, placed)
-    assert_allclose(ldtp.A[:, 0, 0], np.exp(-0.1), rtol=1e-11)
+    decay = np.exp(-0.1)
+    assert_allclose(ldtp.A[:, 0, 0], decay, rtol=1e-11)
     expected_push = on * (1 - np.exp(-0.1))
     assert_allclose(ldtp.B[:, 0, 0], expected_push, atol=1e-12)
 

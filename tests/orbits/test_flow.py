@@ -53,7 +53,8 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
     assert second.count == 2
     assert np.isnan(second.event_times[2:]).all()
 
-    apex = hj.flow(ball(), DROP, hj.Crossing("v", "falling"), within=3.0)
+    top = hj.Crossing("v", "falling")
+    apex = hj.flow(ball(), DROP, top, within=3.0)
     assert_allclose(apex.t, FIRST * 1.7, rtol=1e-12)
     assert_allclose(apex.state[0], 0.49, rtol=1e-12)
 
@@ -97,7 +98,8 @@ def test_what_goes_on_from_a_flow():
     @jax.jit
     def program(height):
         begin = hj.Guess("main", jnp.stack([height, 0.0]))
-        return hj.flow(ball(), hj.flow(ball(), begin, 2.0), 2.1)
+        first = hj.flow(ball(), begin, 2.0)
+        return hj.flow(ball(), first, 2.1)
 
     assert program(0.1).result == Result.ZENO
     assert program(1.0).result == Result.OK
@@ -130,16 +132,19 @@ def test_an_event_that_another_has_caused_at_once_happens_after_a_break():
     start = hj.Guess("main", (1.0, 5.0))
     whole = hj.flow(system, start, 1.5)
     assert [event.name for event in whole.events] == ["first", "second"]
-    broken = hj.flow(system, hj.flow(system, start, "first", within=2.0), 1.5)
+    first = hj.flow(system, start, "first", within=2.0)
+    broken = hj.flow(system, first, 1.5)
     assert_allclose(broken.state, whole.state, rtol=1e-12)
     assert_allclose(broken.state, (2.5, 9.5), rtol=1e-12)
 
 
 def test_states_at_times_between():
     times = np.array([0.2, FIRST + 0.1, 1.0])
-    charts, states = hj.flow(ball(), DROP, 1.0).at(times)
+    fall = hj.flow(ball(), DROP, 1.0)
+    charts, states = fall.at(times)
     since = times - np.where(times > FIRST, FIRST, 0.0)
-    speed = np.where(times > FIRST, 0.7 * 9.81 * FIRST, 0.0)
+    rebound = 0.7 * 9.81 * FIRST
+    speed = np.where(times > FIRST, rebound, 0.0)
     begin = np.where(times > FIRST, 0.0, 1.0)
     assert_allclose(
         states[:, 0], begin + speed * since - 9.81 * since**2 / 2, rtol=1e-12
@@ -152,7 +157,8 @@ def test_a_sample_at_an_event_is_the_state_after_it():
     found = hj.flow(ball(), DROP, 1.0)
     first = found.event_times[:1]
     _, states = found.at(first)
-    assert_allclose(states[0, 1], 0.7 * 9.81 * FIRST, rtol=1e-12)
+    rebound = 0.7 * 9.81 * FIRST
+    assert_allclose(states[0, 1], rebound, rtol=1e-12)
 
 
 class Thermostat(hj.HybridSystem):
@@ -183,7 +189,8 @@ class Thermostat(hj.HybridSystem):
 
 
 def test_samples_are_those_of_their_charts():
-    found = hj.flow(Thermostat(), hj.Guess("on", (18.0,)), 0.7)
+    start = hj.Guess("on", (18.0,))
+    found = hj.flow(Thermostat(), start, 0.7)
     hot = np.log(12 / 8)
     cold = hot + np.log(22 / 18)
     assert_allclose(found.event_times[:2], [hot, cold], rtol=1e-11)
@@ -207,8 +214,10 @@ def third_bounce(height, g, e):
 
 def third_bounce_exactly(height, g, e):
     first = jnp.sqrt(2 * height / g)
-    speed = -(e**2) * jnp.sqrt(2 * height * g)
-    third = first * (1 + 2 * e + 2 * e**2)
+    fall = jnp.sqrt(2 * height * g)
+    speed = -(e**2) * fall
+    bounces = 1 + 2 * e + 2 * e**2
+    third = first * bounces
     second = first * (1 + 2 * e)
     return jnp.stack([third, speed, second])
 
@@ -283,7 +292,8 @@ def test_derivatives_at_a_state_of_rest():
     true = solve_ivp(
         rates, (0, 7), np.eye(2).ravel(), method="DOP853", rtol=1e-12, atol=1e-14
     )
-    own = jax.jit(jax.jacfwd(end))(jnp.zeros(2))
+    slope = jax.jit(jax.jacfwd(end))
+    own = slope(jnp.zeros(2))
     expected = true.y[:, -1].reshape(2, 2)
     assert_allclose(own, expected, rtol=1e-9)
 
@@ -307,12 +317,20 @@ def test_derivatives_where_states_are_small_for_a_moment():
 @pytest.mark.slow
 def test_many_flows_one_of_which_fails():
     """A ball that comes to rest before the end has NaN, and the others are untouched."""
-    states = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
-    found = hj.flow(ball(), hj.Guess("main", states), 0.9, throw=False)
+    states = jnp.array(
+        [
+            [1.0, 0.0],
+            [1e-6, 0.0],
+            [2.0, 1.0],
+        ]
+    )
+    guesses = hj.Guess("main", states)
+    found = hj.flow(ball(), guesses, 0.9, throw=False)
     assert found.result.tolist() == [Result.OK, Result.ZENO, Result.OK]
     assert np.isnan(found.state[1]).all()
     for k in (0, 2):
-        alone = hj.flow(ball(), hj.Guess("main", states[k]), 0.9)
+        guess = hj.Guess("main", states[k])
+        alone = hj.flow(ball(), guess, 0.9)
         assert_allclose(found.state[k], alone.state, rtol=1e-11)
         assert_allclose(found.event_times[k], alone.event_times, rtol=1e-11)
     with pytest.raises(ComputationError, match="1 of 3 flows .* start 1: events accum"):
@@ -331,16 +349,24 @@ def test_many_flows_one_of_which_fails():
 @pytest.mark.slow
 def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
     """They share the parameters. What uses the flow that failed has no derivative."""
-    starts = jnp.array([[1.0, 0.0], [1e-6, 0.0], [2.0, 1.0]])
+    starts = jnp.array(
+        [
+            [1.0, 0.0],
+            [1e-6, 0.0],
+            [2.0, 1.0],
+        ]
+    )
     times = jnp.array([0.4, 0.8])
 
     def of_batch(g):
-        found = hj.flow(ball(g=g), hj.Guess("main", starts), 0.9, throw=False)
+        guesses = hj.Guess("main", starts)
+        found = hj.flow(ball(g=g), guesses, 0.9, throw=False)
         return found.result, found.state[:, 0], found.at(times)[1][:, :, 0].sum(axis=1)
 
     def of_each(g):
         def one(start):
-            found = hj.flow(ball(g=g), hj.Guess("main", start), 0.9)
+            guess = hj.Guess("main", start)
+            found = hj.flow(ball(g=g), guess, 0.9)
             return found.result, found.state[0], found.at(times)[1][:, 0].sum()
 
         return jax.vmap(one)(starts)
@@ -366,7 +392,8 @@ def test_flows_without_events_one_of_which_blows_up():
         return (p.a * q[0] ** 2,)
 
     tower = hj.HybridSystem.from_functions(("x",), grows, parameters={"a": 1.0})
-    starts = hj.Guess("main", jnp.array([[0.5], [2.0]]))
+    heights = jnp.array([[0.5], [2.0]])
+    starts = hj.Guess("main", heights)
 
     def total(a):
         found = hj.flow(tower.replace(a=a), starts, 1.0, throw=False)
@@ -418,7 +445,8 @@ def test_a_guard_that_is_touched():
         assert np.isnan(jax.grad(end)(a))
         assert np.isnan(jax.jacfwd(end)(a))
         with pytest.raises(ComputationError, match="tangentially"):
-            hj.flow(Wall(), hj.Guess("swing", (-a, 0.0)), 4.0)
+            begin = hj.Guess("swing", (-a, 0.0))
+            hj.flow(Wall(), begin, 4.0)
 
     def exact(a):
         hit = jnp.pi - jnp.arccos(1 / a)
@@ -466,7 +494,14 @@ def test_steps_after_events_are_not_tried_with_the_length_of_the_first_one():
     events = [("bounce", lambda t, q, u, p: q[0], bounce)]
     dragged = hj.HybridSystem.from_functions(("y", "v"), fall, events, inputs=())
     few = hj.orbits.Settings(rtol=1e-10, max_steps=40)
-    found = hj.flow(dragged, DROP, events=10, within=20.0, settings=few, max_steps=40)
+    found = hj.flow(
+        dragged,
+        DROP,
+        events=10,
+        within=20.0,
+        settings=few,
+        max_steps=40,
+    )
     assert found.count == 10
 
 
@@ -552,11 +587,13 @@ def test_states_between_of_a_system_that_has_changed(monkeypatch):
 
     stone = hj.HybridSystem.from_functions(("y", "v"), fall)
     found = hj.flow(stone, DROP, 1.0)
-    assert_allclose(found.at([1.0])[1][0], found.state)
+    sampled = found.at([1.0])[1][0]
+    assert_allclose(sampled, found.state)
     monkeypatch.setitem(globals(), "GRAVITY", 1.62)
     with pytest.raises(DefinitionError, match="has changed since this flow was comp"):
         found.at([1.0])
-    assert_allclose(hj.flow(stone, DROP, 1.0).state, (1 - 0.81, -1.62))
+    end = hj.flow(stone, DROP, 1.0).state
+    assert_allclose(end, (1 - 0.81, -1.62))
 
 
 class Pair(hj.HybridSystem):
@@ -577,11 +614,13 @@ class Pair(hj.HybridSystem):
     def transitions(self):
         def left(t, q, u):
             push = self.push * q[1]
-            return q[0], -0.5 * q[1], q[2], q[3] + push
+            second = q[3] + push
+            return q[0], -0.5 * q[1], q[2], second
 
         def right(t, q, u):
             push = self.push * q[3]
-            return q[0], q[1] + push, q[2], -0.5 * q[3]
+            first = q[1] + push
+            return q[0], first, q[2], -0.5 * q[3]
 
         return [
             hj.Transition("left", "air", "air", lambda t, q, u: q[0], reset=left),
@@ -593,7 +632,8 @@ def test_events_that_coincide():
     """They have a derivative if their orders lead to the same, and are refused otherwise."""
     together = hj.Guess("air", (1.0, 0.0, 1.0, 0.0))
     found = hj.flow(Pair(), together, 2.0)
-    assert_allclose(found.state[:2], found.state[2:], rtol=1e-12)
+    left = found.state[:2]
+    assert_allclose(left, found.state[2:], rtol=1e-12)
     with pytest.raises(ComputationError, match="coincide.* depend on the order"):
         hj.flow(Pair(push=0.3), together, 2.0)
     # (Programs do not compare the orders.)
@@ -656,7 +696,8 @@ def test_events_at_the_start_and_at_the_end():
     start = hj.Guess("main", (0.0, -1.0))
     rolls = hj.flow(ball(), start, 1.0)
     assert [x.cause for x in rolls.findings] == ["on a guard"]
-    thrown = hj.flow(ball(), hj.Guess("main", (0.0, 1.0)), 0.1)
+    up = hj.Guess("main", (0.0, 1.0))
+    thrown = hj.flow(ball(), up, 0.1)
     assert thrown.findings == ()
 
 
@@ -698,7 +739,8 @@ def test_a_longest_duration_that_is_far_too_long():
     """The advice helps."""
     with pytest.raises(ComputationError, match=r"duration \(1e\+09\).* shorter"):
         hj.flow(ball(), DROP, "bounce", within=1e9)
-    assert_allclose(hj.flow(ball(), DROP, "bounce", within=1e3).t, FIRST, rtol=1e-12)
+    first = hj.flow(ball(), DROP, "bounce", within=1e3)
+    assert_allclose(first.t, FIRST, rtol=1e-12)
 
 
 def test_ends_that_are_not_reached():

@@ -21,16 +21,19 @@ def paddle(t):
 
 
 def slope(t):
-    return 0.3 * np.pi * np.cos(2 * np.pi * t)
+    phase = 2 * np.pi * t
+    return 0.3 * np.pi * np.cos(phase)
 
 
 def bend(t):
-    return -0.6 * np.pi**2 * np.sin(2 * np.pi * t)
+    phase = 2 * np.pi * t
+    return -0.6 * np.pi**2 * np.sin(phase)
 
 
 @pytest.fixture(scope="module")
 def juggler():
-    return hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
+    guess = hj.Guess("fall", (0.2, 4.5), time=0.1)
+    return hj.find_limit_cycle(Juggler(), guess)
 
 
 def _at_impact(cycle):
@@ -72,7 +75,8 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     odd = 2 * omega * np.sin(2 * angle)
     double = even + odd
     size = 0.4**2 + 4 * omega**2
-    variance = strength**2 / 2 * (1 / 0.4 + double / size)
+    sum_of_rates = 1 / 0.4 + double / size
+    variance = strength**2 / 2 * sum_of_rates
     # At equal phases d angle = alpha dr / r, so that deviations have one direction.
     x = np.cos(angle) - alpha * np.sin(angle)
     y = np.sin(angle) + alpha * np.cos(angle)
@@ -96,7 +100,8 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
 def test_states_may_have_no_correlation():
     cycle = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0))
     noisy = cycle.fluctuations({"u": 0.2})
-    assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
+    expected = 0.1 * np.eye(2)
+    assert_allclose(noisy.covariance([0.3])[0], expected, rtol=0, atol=1e-12)
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
@@ -131,7 +136,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     assert_allclose(noisy.covariance([0.0], 2)[0], expected, rtol=1e-11)
 
     # A duration is the difference of two times.
-    times = [C[0, 0], (step @ C)[0, 0], (step @ step @ C)[0, 0]]
+    once = step @ C
+    times = [C[0, 0], once[0, 0], (step @ step @ C)[0, 0]]
     expected = 2 * (times[0] - times[1])
     assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
     expected = 2 * times[1] - times[0] - times[2]
@@ -171,7 +177,8 @@ def test_a_million_simulated_bounces_scatter_as_computed(juggler):
         products = later * earlier
         covariance = products.mean(axis=0)  # of each of the independent jugglers
         standard_error = covariance.std(ddof=1) / np.sqrt(jugglers)
-        error = covariance.mean() - noisy.durations(lag)[0, 0]
+        computed = noisy.durations(lag)[0, 0]
+        error = covariance.mean() - computed
         assert abs(error) < 3 * standard_error, f"lag {lag}"
 
 
@@ -221,7 +228,8 @@ class _Follower(hj.HybridSystem):
 
 
 def test_noise_without_an_effect_gives_zero():
-    cycle = hj.find_limit_cycle(_Follower(), hj.Guess("sub", (0.5, 1.0)))
+    guess = hj.Guess("sub", (0.5, 1.0))
+    cycle = hj.find_limit_cycle(_Follower(), guess)
     follower = np.array([[0, 0], [0, 0.2**2 / 2]])  # w' = -w + noise, unless v matters
     for strength, expected in (({"u": 0.2}, follower), ({"idle": 0.2}, 0 * follower)):
         noisy = cycle.fluctuations(white=strength)

@@ -99,7 +99,8 @@ def compiled(monkeypatch):
 
 def amplitude(drive):
     """Of the free motion, in closed form."""
-    return drive / np.hypot(1 - 1.3**2, 0.4 * 1.3)
+    impedance = np.hypot(1 - 1.3**2, 0.4 * 1.3)
+    return drive / impedance
 
 
 def damping_of_a_turn():
@@ -169,7 +170,8 @@ def test_gradients_inside_of_programs_are_differences():
     h = 1e-4
     gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
-        change = value(*(at + step)) - value(*(at - step))
+        higher = value(*(at + step))
+        change = higher - value(*(at - step))
         difference = change / (2 * h)
         assert_allclose(slope, difference, rtol=1e-6)
     jacobian = jax.jacfwd(state, argnums=(0, 1, 2))
@@ -186,7 +188,8 @@ def test_repeated_gradients_outside_of_programs_are_those_of_the_search(monkeypa
     def coefficient(drive, damping):
         cycle = hj.find_limit_cycle(Rebound(drive=drive, damping=damping), known)
         model = hj.linearize(cycle, family, ("x",))
-        return model.characteristic_polynomial()[1] + model.B[0, 0, 0]
+        coefficients = model.characteristic_polynomial()
+        return coefficients[1] + model.B[0, 0, 0]
 
     gradient = jax.grad(coefficient, argnums=(0, 1))
     drives = 2.0, 2.001, 0.5
@@ -216,7 +219,8 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     for i in (0, 7, 20, 63, int(np.argmin(charts))):
         alone = hj.find_limit_cycle(cycles[i].system)
         found = cycles.multipliers[i][: len(alone.multipliers)]
-        assert np.allclose(np.sort(found), np.sort(alone.multipliers), atol=1e-8)
+        expected = np.sort(alone.multipliers)
+        assert np.allclose(np.sort(found), expected, atol=1e-8)
 
 
 def test_programs_of_many_systems_factorize_nothing(free):
@@ -255,7 +259,8 @@ def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     path = cycle.trajectory()
     after = np.flatnonzero(path.event == 0)[0]
     # In closed form, the charge with which a pulse of 0.35 begins.
-    rise = np.exp(-0.65) * (1 - np.exp(-0.35))
+    later = 1 - np.exp(-0.35)
+    rise = np.exp(-0.65) * later
     begin = rise / (1 - np.exp(-1.0))
     error = abs(path.after[after, 0] - begin)
     assert error < 1e-10
@@ -349,7 +354,8 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
     up = hj.find_limit_cycle(Thrower(speed=0.1, pull=2.0))
     assert_allclose(down.period, 1, rtol=1e-12)
     # The height is reached at 0.1 t + t^2 = 1.2.
-    expected = 1 - 0.05 + np.sqrt(0.05**2 + 1.2)
+    root = np.sqrt(0.05**2 + 1.2)
+    expected = 1 - 0.05 + root
     assert_allclose(up.period, expected, rtol=1e-9)
 
     @jax.jit
@@ -408,7 +414,8 @@ class Detuned(Free):
     def field(self, t, q, u):
         x, v = q
         s = self.system
-        push = s.drive * jnp.cos((s.rate + s.detuned) * t)
+        rate = s.rate + s.detuned
+        push = s.drive * jnp.cos(rate * t)
         return v, -x - s.damping * v + push
 
 
@@ -444,7 +451,8 @@ def test_a_lane_without_a_cycle_has_no_derivative(free):
     """In reverse mode. The others keep theirs: that of x(0) in closed form."""
 
     def begin(drive):
-        return hj.find_limit_cycle(Rebound(drive=drive), free).anchor.q[0, 0]
+        rebound = hj.find_limit_cycle(Rebound(drive=drive), free)
+        return rebound.anchor.q[0, 0]
 
     drives = jnp.array([0.3, jnp.nan, 0.4])
     values = jax.vmap(jax.grad(begin))(drives)
@@ -541,7 +549,8 @@ def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     """Not at the ends of a step, but at the zero of the guard within."""
     cycle = hj.find_limit_cycle(Window(), hj.Guess("follows", (0.5,)))
     sizes = np.linspace(0.5, 1.1, 13)
-    ripple = 1 / np.sqrt(1 + 4 * np.pi**2)
+    square = 1 + 4 * np.pi**2
+    ripple = 1 / np.sqrt(square)
     has_no_event = sizes * (1 + ripple) < 1
     result = jax.jit(
         jax.vmap(lambda size: hj.find_limit_cycle(Window(size), cycle).result)

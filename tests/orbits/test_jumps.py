@@ -27,7 +27,8 @@ class Turning(hj.Chart):
     def field(self, t, q, u):
         x, v = q
         damping = (1 - x**2) * v
-        return v, damping - x + self.further(x) + u[0]
+        force = damping - x + self.further(x)
+        return v, force + u[0]
 
 
 class Turns(hj.HybridSystem):

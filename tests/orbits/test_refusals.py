@@ -38,7 +38,8 @@ BEAT = kicked(schedule=1.0)
 @pytest.mark.parametrize("size", [1e300, 1e100])
 def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
     cycle = hj.find_limit_cycle(BEAT, hj.Guess("a", (size,)))
-    expected = np.exp(-0.9) / (1 - np.exp(-1))
+    passed = 1 - np.exp(-1)
+    expected = np.exp(-0.9) / passed
     assert_allclose(cycle.state["x"], expected, rtol=1e-12)
 
 
@@ -100,7 +101,8 @@ def test_outputs_of_a_call_have_the_period_of_the_clock():
         with pytest.raises(
             hj.errors.DefinitionError, match="output 'z' does not have the period 1"
         ):
-            hj.linearize(cycle, hj.ClockPhase(4), hj.Output("z", value))
+            output = hj.Output("z", value)
+            hj.linearize(cycle, hj.ClockPhase(4), output)
 
 
 def test_a_ball_does_not_fall_through_the_floor():
@@ -138,7 +140,8 @@ def test_a_guess_that_is_far_too_large_in_one_state_leads_to_the_same_accuracy(
 ):
     """States were small beside the guess, and errors relative to that: 1e-3 in multipliers."""
     system = hj.models.VerticalHopper()
-    far = hj.find_limit_cycle(system, hj.Guess("stance", (2e6, 1.9e6), 0.5))
+    guess = hj.Guess("stance", (2e6, 1.9e6), 0.5)
+    far = hj.find_limit_cycle(system, guess)
     assert_allclose(far.multipliers, hopper_cycle.multipliers, rtol=1e-9)
 
 
@@ -148,7 +151,9 @@ def test_failed_cycles_of_a_sweep_have_no_period():
     def make(mu):
         def field(t, q, u):
             rate = mu - q[0] ** 2 - q[1] ** 2
-            return rate * q[0] + q[1], rate * q[1] - q[0]
+            x_rate = rate * q[0] + q[1]
+            y_rate = rate * q[1] - q[0]
+            return x_rate, y_rate
 
         return {"a": Field(("x", "v"), field)}, ()
 
@@ -166,7 +171,8 @@ def oscillator(force):
 
     def field(t, q, u):
         damping = (1 - q[0] ** 2) * q[1]
-        return q[1], damping - q[0] + force(t, q)
+        acceleration = damping - q[0] + force(t, q)
+        return q[1], acceleration
 
     return toy({"a": Field(("x", "v"), field)})
 
@@ -191,7 +197,8 @@ def test_a_field_in_float32_is_named(force):
     with pytest.raises(
         hj.errors.DefinitionError, match="field of chart 'a' is computed in float32"
     ):
-        hj.find_limit_cycle(oscillator(force), hj.Guess("a", (2.0, 0.0)))
+        guess = hj.Guess("a", (2.0, 0.0))
+        hj.find_limit_cycle(oscillator(force), guess)
 
 
 def test_constants_in_float32_are_exact():

@@ -30,7 +30,8 @@ class StuartLandau(hj.HybridSystem):
     def field(self, t, q, u):
         square = q[0] ** 2 + q[1] ** 2
         z = self.growth(square)
-        x = z[0] * q[0] - z[1] * q[1] + u[0]
+        turned = z[0] * q[0] - z[1] * q[1]
+        x = turned + u[0]
         y = z[1] * q[0] + z[0] * q[1]
         return x, y
 
@@ -78,7 +79,8 @@ class Driven(hj.HybridSystem):
 
     def field(self, t, q, u):
         wave = jnp.cos(2 * jnp.pi * t)
-        return self.force * wave - q[0], 1e12 * q[0] - q[1]
+        fast = 1e12 * q[0] - q[1]
+        return self.force * wave - q[0], fast
 
     def period(self):
         return 1.0
@@ -93,8 +95,10 @@ class Square(hj.HybridSystem):
     WALLS = (("right", 0, 1), ("top", 1, 1), ("left", 0, -1), ("bottom", 1, -1))
 
     def rates(self, q):
-        x = self.a * q[0] - self.omega * q[1]
-        y = self.omega * q[0] + self.a * q[1]
+        grown = self.a * q[0]
+        x = grown - self.omega * q[1]
+        grown = self.a * q[1]
+        y = self.omega * q[0] + grown
         return x, y
 
     def charts(self):
@@ -208,9 +212,12 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
         return (-q[0],)
 
     turned = hj.Transition("tick", "line", "line", tick, reset=tick_reset)
-    system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
-    responses = hj.find_limit_cycle(system, hj.Guess("line", (0.1,))).responses()
-    assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
+    chart = FieldChart(field, ("x",))
+    system = toy({"line": chart}, [turned], period=1.0)
+    cycle = hj.find_limit_cycle(system, hj.Guess("line", (0.1,)))
+    responses = cycle.responses()
+    expected = [-0.3 + 1j * np.pi]
+    assert_allclose(responses.exponents, expected, rtol=1e-12)
     before_tick = np.where(PHASES < 0.5, PHASES, PHASES - 1)
     turn = np.exp(1j * np.pi * before_tick)
     of_tick = responses.amplitude(0, [0.0])["x"]
@@ -225,7 +232,8 @@ def test_the_closed_form_of_a_response_has_its_derivative():
 
     def response(mu):
         cycle = hj.find_limit_cycle(StuartLandau(mu=mu), near)
-        return cycle.responses(modes=0).phase(jnp.asarray(PHASES), "radians")["x"]
+        phases = jnp.asarray(PHASES)
+        return cycle.responses(modes=0).phase(phases, "radians")["x"]
 
     angle = 2 * np.pi * PHASES
     wave = np.sin(angle) - 0.4 * np.cos(angle)
@@ -277,7 +285,12 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     with pytest.raises(hj.errors.DefinitionError, match="acts at events alone"):
         leaky.curve("u")
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
-    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    system = Neuron(
+        current=1.0,
+        leak=0.0,
+        square=1.0,
+        low=-2.0,
+    )
     cycle = hj.find_limit_cycle(system)
     begin = np.arctan(-2.0)
     quadratic = cycle.responses()
@@ -310,7 +323,8 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
     periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
-    assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
+    slope = np.diff(periods)[0] / 0.02
+    assert_allclose(slope, a.period, rtol=1e-3)
 
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
@@ -392,7 +406,8 @@ def test_htfs_at_many_frequencies_come_from_fewer():
     f = np.linspace(0.013, 9.987, 620)
     some = [0, 7, 311, 619]
     many = cycle.htf(f, (-1, 0, 1)).H
-    few = cycle.htf(f[some], (-1, 0, 1)).H
+    response = cycle.htf(f[some], (-1, 0, 1))
+    few = response.H
     tolerance = 1e-12 * np.abs(few).max()
     assert_allclose(many[:, some], few, rtol=0, atol=tolerance)
 
@@ -430,7 +445,12 @@ def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_t
 @pytest.mark.slow
 def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_path):
     rng = np.random.default_rng(0)
-    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    system = Neuron(
+        current=1.0,
+        leak=0.0,
+        square=1.0,
+        low=-2.0,
+    )
     f, angle = rng.uniform(0.1, 0.9, (2, 12))
 
     def current(t):
@@ -490,9 +510,11 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     def central(h):
         return (numbers(h) - numbers(-h)) / (2 * h)
 
-    difference = (4 * central(step / 2) - central(step)) / 3
+    half_step = central(step / 2)
+    difference = (4 * half_step - central(step)) / 3
     name = cycle.structure.charts[0].states[0]
-    part = float(cycle.anchor.t[0]) / float(cycle.period)
+    period = float(cycle.period)
+    part = float(cycle.anchor.t[0]) / period
     begin = part * change.period
     exact = [
         [change.period],
@@ -534,7 +556,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         impulse = responses.impulses(section)[0].weight["u"]
         later = change.durations[0]
         pushed = push[output][0]
-        return jnp.abs(jnp.stack([pushed, htf, noisy, shape, impulse, later]))
+        values = [pushed, htf, noisy, shape, impulse, later]
+        return jnp.abs(jnp.stack(values))
 
     forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
 
@@ -543,7 +566,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         return change / (2 * h)
 
     h = 1e-3 * begin
-    difference = (4 * central(h / 2) - central(h)) / 3
+    of_half_step = central(h / 2)
+    difference = (4 * of_half_step - central(h)) / 3
     assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
     assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 

@@ -13,9 +13,16 @@ from ..toys import Field, toy
 
 def decaying(rates):
     """A forced linear system whose modes, mixed with each other, decay at these rates."""
-    modes = np.array([[1.0, 0.4, 0.2], [-0.3, 1.0, 0.5], [0.1, -0.6, 1.0]])
+    modes = np.array(
+        [
+            [1.0, 0.4, 0.2],
+            [-0.3, 1.0, 0.5],
+            [0.1, -0.6, 1.0],
+        ]
+    )
     decay = np.diag(-np.array(rates))
-    A = jnp.asarray(modes @ decay @ np.linalg.inv(modes))
+    inverse = np.linalg.inv(modes)
+    A = jnp.asarray(modes @ decay @ inverse)
     force = jnp.array([1.0, 2.0, 3.0])
 
     def field(t, q, u):
@@ -49,14 +56,16 @@ def test_multipliers_beside_a_reset_to_zero_do_not_depend_on_units():
     def field(t, q, u):
         x, y = q
         wave = small * jnp.cos(2 * jnp.pi * t)
-        return wave - x / 2, x / small * large - y
+        fast = x / small * large - y
+        return wave - x / 2, fast
 
     def reset(t, q, u):
         return (q[0], 0.0)
 
     schedule = hj.systems.Scheduled(1.0, 0.5)
     tick = hj.Transition("tick", "a", "a", schedule, reset=reset)
-    system = toy({"a": Field(("x", "y"), field)}, [tick], period=1.0)
+    chart = Field(("x", "y"), field)
+    system = toy({"a": chart}, [tick], period=1.0)
     guess = hj.Guess("a", (small, large))
     cycle = hj.find_limit_cycle(system, guess)
     assert_allclose(cycle.multipliers, [np.exp(-0.5)], rtol=1e-12)

@@ -48,7 +48,8 @@ def relaxation_in(length, time):
         still = (((x + length) - x) - length - rounding) / time
         return v, force + u[0], -nothing / time, still
 
-    system = toy({"all": Field(("x", "v", "nothing", "rounding"), field)})
+    chart = Field(("x", "v", "nothing", "rounding"), field)
+    system = toy({"all": chart})
     guess = hj.Guess("all", (2.0 * length, 0.0, 0.0, 0.0))
     return hj.find_limit_cycle(system, guess)
 
@@ -95,7 +96,8 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     cycle = relaxation_in(length, time)
     assert cycle.result == hj.errors.Result.OK
     assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
-    assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
+    leading = cycle.multipliers[:2]
+    assert_allclose(leading, relaxation.multipliers[:2], rtol=1e-9)
 
 
 def test_states_that_rest_stop_nothing(relaxation):

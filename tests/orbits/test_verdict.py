@@ -149,7 +149,9 @@ def test_the_rhythm_of_two_cells_is_that_of_the_closed_form():
 def ghost_beside(cycle):
     """The cycle as if it rested at x = 1, beyond the threshold."""
     found = cycle.anchor
-    anchor = found._replace(chart=jnp.zeros_like(found.chart), q=jnp.ones_like(found.q))
+    chart = jnp.zeros_like(found.chart)
+    ones = jnp.ones_like(found.q)
+    anchor = found._replace(chart=chart, q=ones)
     return dataclasses.replace(cycle, anchor=anchor)
 
 
@@ -221,12 +223,16 @@ class Switched(hj.HybridSystem):
 
 
 def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard():
-    cycle = hj.find_limit_cycle(Switched(), hj.Guess("up", (0.0,), time=0.0))
+    guess = hj.Guess("up", (0.0,), time=0.0)
+    cycle = hj.find_limit_cycle(Switched(), guess)
     half = np.exp(-0.5)
     since = np.exp(-0.25)
-    at_switch = 1 - (1 - cycle.anchor.q[0, 0]) * since
-    assert at_switch == pytest.approx((1 - half) / (1 + half), abs=1e-12)
-    assert cycle.multipliers == pytest.approx([np.exp(-1)], abs=1e-12)
+    below = 1 - cycle.anchor.q[0, 0]
+    at_switch = 1 - below * since
+    exact = (1 - half) / (1 + half)
+    assert at_switch == pytest.approx(exact, abs=1e-12)
+    expected_multipliers = [np.exp(-1)]
+    assert cycle.multipliers == pytest.approx(expected_multipliers, abs=1e-12)
 
 
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():

@@ -210,7 +210,12 @@ def test_a_walker_in_mujoco():
     outputs = ("x_rate", "pitch")
     cycle = hj.plants.find_cycle(plant, hj.ClockPhase(8), outputs, cycles=40)
     returns = cycle.perturbed_returns(coordinates(plant))
-    design = hj.multisine(n_sections=8, periods=16, amplitude=0.1, lines="odd")
+    design = hj.multisine(
+        n_sections=8,
+        periods=16,
+        amplitude=0.1,
+        lines="odd",
+    )
     data = cycle.run_experiments(design, discard=24)
     fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
     assert fit.contains(returns.multipliers[:2]).all()

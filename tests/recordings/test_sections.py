@@ -19,7 +19,13 @@ from .conftest import MULTIPLIER
 from .mishaps import mishandle, misjudged
 
 
-CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(1, 1))
+CIRCLE = hj.KinematicPhase(
+    8,
+    position="x",
+    velocity="v",
+    center=(0, 0),
+    scale=(1, 1),
+)
 
 
 def sample(recording, phase=CIRCLE, **options):
