@@ -44,7 +44,9 @@ def bomb(path):
 
 def overlapping(path):
     """Many entries of the archive's directory that stand for the same data."""
-    pack(path, [("time.npy", npy((2**19,), bytes(2**22)))])
+    shape = (2**19,)
+    zeros = bytes(2**22)
+    pack(path, [("time.npy", npy(shape, zeros))])
     with zipfile.ZipFile(path, "a") as archive:
         entry = archive.infolist()[0]
         for k in range(200):

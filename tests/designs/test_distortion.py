@@ -64,10 +64,14 @@ def two_charts():
         return x, y
 
     def down(t, q, u):
-        return (0.5 * q[0] - q[1] + 0.2 * u[0] * u[1] + 0.4 * q[1] ** 2,)
+        linear = 0.5 * q[0] - q[1]
+        product = 0.2 * u[0] * u[1]
+        return (linear + product + 0.4 * q[1] ** 2,)
 
     def shown(t, q, u):
-        return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
+        by_input = q[0] * u[0]
+        square = 2 * u[1] ** 2
+        return q[0] + u[1] + by_input + square + 0.5 * u[0] * u[1]
 
     def one_rates(t, q, u):
         return (0.0 * q[0],)

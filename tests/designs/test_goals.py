@@ -154,7 +154,9 @@ def with_angle(angle):
             [0.5, 0.5],
         ]
     )
-    return hj.linear.LDTP(A, B[:, :, None], C[:, None])
+    by_input = B[:, :, None]
+    by_state = C[:, None]
+    return hj.linear.LDTP(A, by_input, by_state)
 
 
 def variance(model, design):

@@ -253,7 +253,10 @@ def test_noise_is_no_transient():
     difference of two cycles contains twice."""
     noise = np.array([0.01, 0.01])
     level = 2 * 0.01**2
-    size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
+    spread = np.sqrt(2 / (N * S))
+    power = 6 * level * spread
+    response = 0.8 * (1 - 0.8**P)
+    size = np.sqrt(power) / response
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)
         with pytest.raises(hj.errors.DefinitionError, match="transient is left"):

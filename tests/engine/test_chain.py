@@ -53,7 +53,8 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     # x holds the time, the states (padded) and the inputs at the start.
     x = np.zeros(1 + s.d + s.nu)
     x[0] = sample.start.t
-    x[1 : 1 + len(sample.start.q)] = sample.start.q
+    used = slice(1, 1 + len(sample.start.q))
+    x[used] = sample.start.q
     end = sample.start.t + 3.0
 
     def run(x):

@@ -181,7 +181,9 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
     scale = map.scale[turn.pieces.chart].T
-    assert_allclose(again.pieces.q / scale, turn.pieces.q / scale, rtol=0, atol=1e-8)
+    found = again.pieces.q / scale
+    usual = turn.pieces.q / scale
+    assert_allclose(found, usual, rtol=0, atol=1e-8)
     assert_allclose(again.period, turn.period, rtol=3e-10)
     size = np.abs(turn.factors).max(axis=0)
     assert_allclose(again.factors / size, turn.factors / size, rtol=0, atol=1e-6)

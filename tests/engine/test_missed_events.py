@@ -216,7 +216,9 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
     assert high[0] > 2.2
     armed = np.array([True])
     assert first_crossing(*ends, armed, margin).near[0]
-    assert not first_crossing(*ends, armed, np.array([0.9])).near[0]
+    above = np.array([0.9])
+    crossing = first_crossing(*ends, armed, above)
+    assert not crossing.near[0]
 
 
 @pytest.mark.parametrize("begin", [0.0, 10.0])

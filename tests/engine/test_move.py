@@ -39,7 +39,8 @@ def flow(system, chart, q, u, t, end):
 def ball(x):
     """(y, v) of a bouncing ball; x = (y0, v0, gravity, restitution, input, duration)."""
     system = hj.models.BouncingBall(g=x[2], restitution=x[3])
-    end = flow(system, "fall", x[:2], x[4:5], jnp.zeros(()), x[5])
+    zero = jnp.zeros(())
+    end = flow(system, "fall", x[:2], x[4:5], zero, x[5])
     return end[0]
 
 

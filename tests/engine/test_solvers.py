@@ -186,7 +186,9 @@ def test_derivatives_of_implicit_steps(solver):
     combined = lowest - 8 * low + 8 * high - highest
     by_differences = combined / (12 * d)
     assert_allclose(first, by_differences, rtol=1e-6)
-    twice = (16 * (low + high) - 30 * middle - lowest - highest) / (12 * d**2)
+    near = 16 * (low + high)
+    curved = near - 30 * middle - lowest - highest
+    twice = curved / (12 * d**2)
     assert_allclose(second, twice, rtol=1e-5)
 
 
@@ -211,7 +213,9 @@ def test_linearization_of_a_stiff_system(damped):
     B = model.B[0]
     size = np.array([damped.scale["y"], damped.scale["v"]])
     ratio = size / size[:, None]
-    assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
+    found = A * ratio
+    exact = exactly[:2, :2] * ratio
+    assert_allclose(found, exact, atol=1e-9)
     expected = exactly[:2, 2] / size
     assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)
 
@@ -224,7 +228,9 @@ def test_linearization_of_a_stiff_system_inside_of_a_program(damped):
     def matrices():
         cycle = hj.find_limit_cycle(damped.system, damped)
         model = hj.linearize(cycle, phases, ("y",))
-        return model.A[:, :2, :2], model.B[:, :2]
+        A = model.A[:, :2, :2]
+        B = model.B[:, :2]
+        return A, B
 
     outside = hj.linearize(damped, phases, ("y",))
     A, B = matrices()

@@ -50,7 +50,8 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     # All lines that disturb j disturb each other: so many experiments are needed at least.
     crowds = []
     for j in phases:
-        crowds.append(sum(phases[i] for i in phases if disturb(i, j, P)))
+        others = [phases[i] for i in phases if disturb(i, j, P)]
+        crowds.append(sum(others))
     needed = nu * max(crowds)
 
     smallest = hj.multisine(**arguments, seed=seed)

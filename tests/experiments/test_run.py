@@ -252,7 +252,8 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
     expected = hj.experiments.simulate_experiments(model, design).y
     assert_allclose(data.y, expected, atol=1e-9)
     scales = hj.experiments.response_function(resting, family, "x").stepping.scales
-    sizes = [float(resting.period), *(resting.scale[name] for name in "xv"), 1.0]
+    of_states = [resting.scale[name] for name in "xv"]
+    sizes = [float(resting.period), *of_states, 1.0]
     assert_array_equal(scales, np.tile(sizes, (4, 1)))
 
 
@@ -311,7 +312,8 @@ class Restarted(hj.HybridSystem):
 
     def start(self):
         p = self.polynomial()
-        return (p(0.0), *(p.deriv(k)(0.0) for k in range(1, 6)))
+        derivatives = [p.deriv(k)(0.0) for k in range(1, 6)]
+        return (p(0.0), *derivatives)
 
     def charts(self):
         def rates(t, q, u):

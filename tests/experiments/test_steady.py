@@ -39,7 +39,9 @@ def run(placed):
 def test_experiments_start_in_their_periodic_response(run, start, least, most):
     data = run(DESIGN, start=start)
     n = DESIGN.signals().shape[1]
-    change = np.abs(data.y[:, :n] - data.y[:, n:])
+    first = data.y[:, :n]
+    second = data.y[:, n:]
+    change = np.abs(first - second)
     assert least <= change.max() < most
     with no_compilation(after=lambda: run(DESIGN, start=start)):
         design = hj.multisine(4, 3, (0, 1.2), 0.05, seed=2)

@@ -181,7 +181,8 @@ def test_other_experiments_are_refused(made, arguments):
     )
     names = ("cycle", "sections", "design", "outputs")
     for change, difference in cases:
-        call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
+        call = dict(zip(names, arguments, strict=True))
+        call |= dict(chunk=5) | BATCH | change
         with pytest.raises(
             hj.errors.DefinitionError, match=f"holds other results: .*{difference}"
         ):

@@ -33,7 +33,8 @@ def test_a_fit_that_stops_where_cycles_end_has_not_converged():
         residual = np.where(x < 1, x - 3, np.inf)
         return residual, np.eye(1), guess
 
-    *_, steps, converged = problem.descend(None, np.zeros(1), None, evaluate)
+    start = np.zeros(1)
+    *_, steps, converged = problem.descend(None, start, None, evaluate)
     assert steps < problem.MAX_STEPS
     assert not converged
 
@@ -79,7 +80,8 @@ def test_errors_that_no_residual_shows_are_unknown():
 @pytest.mark.slow
 def test_times_of_autonomous_cycles_count_from_any_moment():
     where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
-    cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
+    systems = [hj.models.VanDerPol(mu=mu) for mu in (1.1, 1.101)]
+    cycles = [hj.find_limit_cycle(system) for system in systems]
     (gap,), (other,) = (
         np.diff(hj.sections.place_sections(x, where).lanes.t) for x in cycles
     )
@@ -98,7 +100,9 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
         data = hj.fitting.ObservedCycle(
             where, "x", [[0.1], [-2.0]], times=[begin, begin + gap]
         )
-        rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
+        oscillator = hj.models.VanDerPol()
+        bounds = {"mu": (0.0, np.inf)}
+        rough.append(hj.fit_model(oscillator, data, bounds))
     first_values = rough[0].values
     assert first_values == pytest.approx(rough[1].values, rel=1e-6)
     assert rough[0].result == 0

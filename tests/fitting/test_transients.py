@@ -44,7 +44,10 @@ def drop(height):
 
     ground.terminal = True
     ground.direction = -1
-    t, q, heights, bounces = 0.0, np.array([height, 0.0]), [], []
+    t = 0.0
+    q = np.array([height, 0.0])
+    heights = []
+    bounces = []
     while t < TIMES[-1]:
         options = dict(
             rtol=1e-12,

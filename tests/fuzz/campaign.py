@@ -121,7 +121,9 @@ def truth(plan: Plan, sample: Sample) -> Run:
 
 def stop(run: Run, sample: Sample) -> float:
     """When hybridjax may stop: at the limit, or a little after the last event."""
-    return sample.start.limit if len(run.events) < EVENTS else run.t + 1e-3
+    if len(run.events) < EVENTS:
+        return sample.start.limit
+    return run.t + 1e-3
 
 
 def order(run: Run) -> list[int]:
@@ -139,7 +141,10 @@ def difference(a: Run, b: Run, end: bool) -> tuple[float, float]:
     times = [relative(x.t, y.t) for x, y in pairs]
     states = [relative(x.after, y.after) for x, y in pairs]
     if end:
-        states.append(relative(a.q, b.q) if a.chart == b.chart else np.inf)
+        if a.chart == b.chart:
+            states.append(relative(a.q, b.q))
+        else:
+            states.append(np.inf)
     return max(times, default=0.0), max(states, default=0.0)
 
 
@@ -172,7 +177,8 @@ def engine(
                 for at, code, b, after in zip(*events, strict=True)
             ]
             state = q[: plan.dims[chart]]
-            run = Run(events[:count], float(t), int(chart), state)
+            happened = events[:count]
+            run = Run(happened, float(t), int(chart), state)
             out.append((hj.errors.Result(int(result)), run))
     return out
 
@@ -183,7 +189,8 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
         t, q, u, _ = sample.start
         s = Structure(Random(plan, sample.charts, sample.arrows))
         padded = jnp.zeros((s.d, 1))
-        q = padded.at[: plan.dims[0], 0].set(q)
+        d = plan.dims[0]
+        q = padded.at[:d, 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
         charts = jnp.zeros(1, jnp.int32)
         lanes = start_lanes(s, t[None], charts, q)

@@ -76,7 +76,9 @@ def drifting(rng, n: int, direction: float) -> dict[str, Any]:
 
 def arrow(rng, n: int, after: int, /, spread=0.3, **given) -> dict[str, Any]:
     """A flat guard near zero, and a reset that turns and stretches the state and moves it."""
-    turn = np.linalg.qr(rng.normal(size=(max(n, after),) * 2))[0][:after, :n]
+    larger = max(n, after)
+    turn, _ = np.linalg.qr(rng.normal(size=(larger, larger)))
+    turn = turn[:after, :n]
     normal = rng.normal(size=n)
     numbers = {
         "n": normal / np.linalg.norm(normal),
@@ -118,7 +120,8 @@ def wave(rng, size, rate) -> dict[str, Any]:
 
 def beside(rng, x, sign: float) -> dict[str, Any]:
     """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
-    gap = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5)
+    side = rng.choice([-1.0, 1.0])
+    gap = side * 10 ** rng.uniform(-5.5, -1.5)
     bend = rng.normal(0.0, 3.0)
     # sign * (n.q + c + gap + bend * (n.q + c)^2)
     n = x["n"]
@@ -254,7 +257,8 @@ def switch(rng) -> Sample:
         ),
         arrow(rng, 2, 2),
     ]
-    return Sample([swinging(rng, 2), swinging(rng, 2)], arrows, start(rng, 2))
+    charts = [swinging(rng, 2), swinging(rng, 2)]
+    return Sample(charts, arrows, start(rng, 2))
 
 
 @structure(
@@ -308,4 +312,6 @@ def draw(name: str, number: int, seed: int = 0) -> Sample:
     """System `number` of a structure."""
     # (So that "dips:28" stays the system that failed once.)
     place = 2 + list(STRUCTURES).index(name)
-    return STRUCTURES[name][1](np.random.default_rng([seed, place, number]))
+    rng = np.random.default_rng([seed, place, number])
+    _, draw_sample = STRUCTURES[name]
+    return draw_sample(rng)

@@ -59,7 +59,9 @@ def test_a_guard_that_the_input_makes_negative_is_not_armed():
 def two_pieces(x, first, second):
     """One second at one input, and one at another."""
     s = Structure(THRESHOLD)
-    lanes = start_lanes(s, jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.full((1, 1), x))
+    none = jnp.zeros(1, jnp.int32)
+    state = jnp.full((1, 1), x)
+    lanes = start_lanes(s, jnp.zeros(1), none, state)
     h = None
     for end, u in ((1.0, first), (2.0, second)):
         moved = move(

@@ -79,7 +79,9 @@ def test_fits_of_multipliers_are_fits(fits):
         assert fit.covariance.shape == (2, 2) and fit.dof > 100, name
         assert fit.findings == (), f"{name}: {fit.findings}"
         low, high = fit.interval(0.99).T
-        assert (low < fit.multipliers.real).all() and (high > MULTIPLIERS).all(), name
+        covers_low = (low < fit.multipliers.real).all()
+        covers_high = (high > MULTIPLIERS).all()
+        assert covers_low and covers_high, name
     for name in ("series", "ldtp of series"):
         np.testing.assert_allclose(fits[name].noise, 0.1, rtol=0.1)
     assert fits["multipliers"].noise is None
@@ -146,7 +148,9 @@ def test_a_controller_is_a_finding(plant):
     rng = np.random.default_rng(0)
     x = np.zeros(2)
     signals = []
-    A, B, C = (np.asarray(m) for m in (plant.A, plant.B, plant.C))
+    A = np.asarray(plant.A)
+    B = np.asarray(plant.B)
+    C = np.asarray(plant.C)
     for k in range(N * 500):
         n = k % N
         y = C[n] @ x + rng.normal(size=1)

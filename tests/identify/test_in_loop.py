@@ -36,7 +36,9 @@ GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
 
 def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     """u = r - K y, y = P u + d, with process noise and noise of sensor and controller."""
-    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    A = np.asarray(model.A)
+    B = np.asarray(model.B)
+    C = np.asarray(model.C)
     S, n = r.shape
     draws = rng.normal(size=(3, S, n))
     w, e, c = noise * draws
@@ -77,7 +79,11 @@ def experiments(model, seed, count, noise=0.0, discard=30, together=False):
         N, 8, frequencies=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
     )
     z = design.realizations(count, seed).signals(8 + discard)
-    r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
+    if together:
+        r = z.sum(axis=2)
+        d = 0 * z[..., 0]
+    else:
+        r, d = np.moveaxis(z, 2, 0)
     rng = np.random.default_rng(seed)
     u, y = run(model, r, d, rng, noise)
     inputs = np.concatenate(

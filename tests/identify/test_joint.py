@@ -193,13 +193,16 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     below = stats.chi2(2 * draws).cdf(square)
     assert 1e-3 < below < 1 - 1e-3
     cost = sum(fit.cost for fit in fits)
-    assert 1e-3 < stats.chi2(sum(fit.dof for fit in fits)).cdf(cost) < 1 - 1e-3
-    hits = sum(int(fit.contains(model.multipliers).all()) for fit in fits)
+    dof = sum(fit.dof for fit in fits)
+    assert 1e-3 < stats.chi2(dof).cdf(cost) < 1 - 1e-3
+    inside = [fit.contains(model.multipliers).all() for fit in fits]
+    hits = sum(int(x) for x in inside)
     assert stats.binomtest(hits, draws, 0.95).pvalue > 1e-3
     H = np.array([fit.htf(F).H for fit in fits])
     variances = [fit.htf(F).variance for fit in fits]
     variance = np.mean(variances, axis=0)
-    square = np.mean(np.abs(H - np.asarray(exact.H)) ** 2, axis=0)
+    apart = np.abs(H - np.asarray(exact.H))
+    square = np.mean(apart**2, axis=0)
     assert abs(np.mean(square / variance) - 1) < 0.1
     # Without variances, the residuals give them.
     draw = noisy(exact, exact.variance, np.random.default_rng(4))

@@ -81,7 +81,9 @@ def test_predictions_are_those_of_the_recursion_sample_by_sample(small, gappy):
         x = np.zeros(model.dims[r])
         for t, (u, y) in enumerate(zip(one.u, one.y, strict=True)):
             cycle, n = divmod(r + t, 4)
-            e = y - model.C[n] @ x - model.D[n] @ u
+            by_state = model.C[n] @ x
+            at_once = model.D[n] @ u
+            e = y - by_state - at_once
             seen = np.isfinite(e)
             S = COVARIANCES[n]
             of_seen = S[np.ix_(seen, seen)]
@@ -308,7 +310,8 @@ def test_a_controller_at_the_section_of_its_measurement_is_no_lack_of_dimensions
     y = np.zeros((1200, 2))
     for i in range(1200):
         y[i] = x + 0.1 * rng.normal(size=2)
-        u[i] = rng.normal() - 0.3 * y[i, 0] - 0.2 * y[i, 1]
+        answer = 0.3 * y[i, 0]
+        u[i] = rng.normal() - answer - 0.2 * y[i, 1]
         A = turn if i % 2 else np.eye(2)
         push = [u[i, 0], 0.3 * u[i, 0]]
         x = A @ x + push

@@ -68,7 +68,8 @@ def failed(data, experiments):
     """The same data, as if these experiments had failed at sample 50."""
     y = data.y.copy()
     result = data.result.copy()
-    y[experiments, 50:], result[experiments] = np.nan, hj.errors.Result.BLOW_UP
+    y[experiments, 50:] = np.nan
+    result[experiments] = hj.errors.Result.BLOW_UP
     return dataclasses.replace(data, y=y, result=result)
 
 
@@ -102,7 +103,9 @@ def test_half_integers_need_two_phases():
     data = record([(1.5, 0.3), (0.25, 0.0)])
     measured = hj.estimate_htf(data).frequencies
     assert_array_equal(measured, [0.25])
-    opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
+    first = [(1.5, 0.3)]
+    second = [(1.5, 0.3 + np.pi)]
+    opposite = record(first, second)
     with pytest.raises(
         hj.errors.DefinitionError, match="multiples of 1/2 with two phases"
     ):

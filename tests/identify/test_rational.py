@@ -16,7 +16,8 @@ def test_the_bias_on_exact_data(exact, multipliers):
 
 
 def rational(f, numerator, denominator, sections):
-    w = np.exp(-2j * np.pi * np.asarray(f) / sections)
+    angles = -2j * np.pi * np.asarray(f)
+    w = np.exp(angles / sections)
     top = sum(b * w ** (1 + r) for r, b in enumerate(numerator))
     bottom = sum(a * w**r for r, a in enumerate(denominator))
     return top / bottom

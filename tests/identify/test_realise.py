@@ -73,7 +73,10 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     rng = np.random.default_rng(0)
     size = 1e-4 * np.abs(exact.H).max()
     variance = np.full(exact.H.shape, size**2)
-    error = rng.normal(size=exact.H.shape) + 1j * rng.normal(size=exact.H.shape)
+    shape = exact.H.shape
+    real = rng.normal(size=shape)
+    imaginary = rng.normal(size=shape)
+    error = real + 1j * imaginary
     H = exact.H + np.sqrt(variance / 2) * error
     model = realized_htf(dataclasses.replace(exact, H=H, variance=variance), order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)

@@ -101,7 +101,8 @@ def test_inputs_before_the_start_act_through_all_lags():
     A = decay + chain
     B = np.array([[1.0], [1], [0], [0], [0]])
     C = np.array([[1.0, 0, 0, 0, 1]])
-    model = hj.linear.LDTP.from_blocks(*([x] * 4 for x in (A, B, C, np.zeros((1, 1)))))
+    blocks = [[x] * 4 for x in (A, B, C, np.zeros((1, 1)))]
+    model = hj.linear.LDTP.from_blocks(*blocks)
     data = [record(model, 240, k, first_section=k, x0=np.ones(5)) for k in range(1, 4)]
     rough = total_least_squares(late_outputs(problem_of(data, 1, 4), 1))
     fit = hj.fit_series(data, 1)
@@ -146,7 +147,8 @@ def test_regions_cover(small):
         variances.append(fit.standard_errors**2)
         noise.append(fit.noise)
         htf = fit.htf(f, (-1, 0, 1))
-        distances.append(np.abs(htf.H - exact.H) ** 2 / htf.variance)
+        square = np.abs(htf.H - exact.H) ** 2
+        distances.append(square / htf.variance)
     assert covered(hits, runs)
     rms = np.sqrt(np.mean(errors, axis=0))
     estimated = np.sqrt(np.mean(variances, axis=0))
@@ -243,9 +245,11 @@ def test_an_order_that_is_too_low_is_noticed(small):
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert fit.findings[0].text in " ".join(repr(fit).split())
+        printed = " ".join(repr(fit).split())
+        assert fit.findings[0].text in printed
         assert "too low" in fit._repr_html_()
-        bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
+        curved = 0.1 * data.y**2 / data.y.std()
+        bent = with_outputs(data, data.y + curved)
         assert not hj.fit_series(bent, 2).findings
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
     data = hj.experiments.simulate_experiments(small, design)
@@ -401,7 +405,9 @@ def test_absolute_outputs_are_refused(small):
     ):
         with pytest.raises(hj.errors.DefinitionError, match="subtract the limit cycle"):
             door(*arguments)
-    assert hj.estimate_htf(good).error(small.htf([0.25, 1.0])).max() < 1e-9
+    estimated = hj.estimate_htf(good)
+    error = estimated.error(small.htf([0.25, 1.0]))
+    assert error.max() < 1e-9
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e9])

@@ -129,7 +129,9 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
         for printed in (ldtp, htf, s.htf([0.3])):
             repr(printed)
         x0 = s.periodic_state(u, 2)
-        return ldtp.simulate(u, x0[:3]), htf.error(s.htf(f, harmonics))
+        outputs = ldtp.simulate(u, x0[:3])
+        error = htf.error(s.htf(f, harmonics))
+        return outputs, error
 
     rng = np.random.default_rng(2)
     u = rng.normal(size=(12, 2))

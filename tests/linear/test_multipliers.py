@@ -72,7 +72,9 @@ def largest_difference(found, true, relative):
 def relative_error(found, multipliers):
     true = []
     for m in multipliers:
-        true += [m, np.conj(m)] if np.iscomplex(m) else [m]
+        true.append(m)
+        if np.iscomplex(m):
+            true.append(np.conj(m))
     assert len(found) == len(true)
     return largest_difference(found, np.array(true), relative=True)
 

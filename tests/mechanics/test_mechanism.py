@@ -95,7 +95,9 @@ def test_a_contact_that_holds_is_a_rod():
         return jnp.sum(q**2) / 2
 
     pendulum = free_ball().along(position)
-    acceleration = jax.jit(pendulum.acceleration)(jnp.array([angle]), jnp.array([rate]))
+    q = jnp.array([angle])
+    v = jnp.array([rate])
+    acceleration = jax.jit(pendulum.acceleration)(q, v)
     assert_allclose(acceleration, [-G / L * np.sin(angle)], rtol=1e-13)
 
     @jax.jit

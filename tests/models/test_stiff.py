@@ -50,7 +50,10 @@ def test_relaxation_oscillations(name):
     cycle = hj.find_limit_cycle(make(), section=section)
     assert float(cycle.period) == pytest.approx(period, rel=1e-9)
     t, x = cycle.trajectory()(next(iter(cycle.state)))
-    at_top = cycle.state["x"] if "x" in cycle.state else _top(cycle, t[np.argmax(x)])
+    if "x" in cycle.state:
+        at_top = cycle.state["x"]
+    else:
+        at_top = _top(cycle, t[np.argmax(x)])
     assert at_top == pytest.approx(top, rel=1e-9)
     assert cycle.log_multipliers == pytest.approx([logarithm], rel=1e-6)
     assert cycle.stable

@@ -47,7 +47,9 @@ def _level(section, t, q):
 
 
 def _guard(t, q):
-    return _leg(t, q[0], 0.0) + 2.0 if len(q) == 2 else q[2]
+    if len(q) == 2:
+        return _leg(t, q[0], 0.0) + 2.0
+    return q[2]
 
 
 def _polish(function, t, q, u):

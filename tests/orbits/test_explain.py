@@ -33,11 +33,15 @@ class Balls(hj.HybridSystem):
                 return q[2 * k] - table
 
             def reset(t, q, u):
-                v = -retention * q[2 * k + 1] + (1 + retention) * A * w * jnp.cos(w * t)
+                kept = -retention * q[2 * k + 1]
+                table_speed = A * w * jnp.cos(w * t)
+                v = kept + (1 + retention) * table_speed
                 table_height = A * jnp.sin(w * t)
                 height = q[2 - 2 * k] - table_height  # of the other ball
-                q = jnp.asarray(q).at[2 * k + 1].set(v)
-                return q.at[2 * k + 1].add(self.coupling * height)
+                place = 2 * k + 1
+                q = jnp.asarray(q).at[place].set(v)
+                change = self.coupling * height
+                return q.at[2 * k + 1].add(change)
 
             return hj.Transition(f"impact{k}", "air", "air", guard, reset=reset)
 
@@ -121,7 +125,8 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     orbit = cycle.trajectory(2.0)
     is_late = orbit.t > both.time - 1e-6
     is_impact = (orbit.event >= 0) & is_late
-    y, v = orbit.before[np.flatnonzero(is_impact)[0], :2]
+    row = np.flatnonzero(is_impact)[0]
+    y, v = orbit.before[row, :2]
     height = y - v * half - 9.81 * half**2 / 2
     ball = [height, v + 9.81 * half]
     start = np.array([*ball, *ball])

@@ -88,7 +88,9 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     expected_later = decay * variance * y**2
     assert_allclose(later[:, 1, 1], expected_later, rtol=1e-11)
 
-    diffusion = strength**2 * (1 + alpha**2) / (2 * mu) / omega**2
+    shear = 1 + alpha**2
+    relative = strength**2 * shear / (2 * mu)
+    diffusion = relative / omega**2
     assert_allclose(noisy.diffusion, diffusion, rtol=1e-11)
     # Periods are correlated, and over many of them their variance is that of the diffusion.
     alone = noisy.durations()[0, 0]
@@ -129,7 +131,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     C = solve_discrete_lyapunov(step, noise)
 
     since = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
-    now = np.array([[-(v - G * since), 1.0, since], [G, 0.0, 1.0]])
+    speed_there = v - G * since
+    now = np.array([[-speed_there, 1.0, since], [G, 0.0, 1.0]])
     expected = now @ C @ now.T
     assert_allclose(noisy.covariance([0.0])[0], expected, rtol=1e-11)
     expected = now @ step @ step @ C @ now.T

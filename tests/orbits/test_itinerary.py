@@ -168,7 +168,8 @@ def test_gradients_inside_of_programs_are_differences():
     value = jax.jit(state)
     at = np.array([2.0, 0.4, 1.3])
     h = 1e-4
-    gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
+    of_state = jax.grad(state, argnums=(0, 1, 2))
+    gradient = jax.jit(of_state)(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
         higher = value(*(at + step))
         change = higher - value(*(at - step))

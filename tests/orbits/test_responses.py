@@ -322,7 +322,8 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     measured = np.reshape(a.durations, (4, 2)).sum(1)
     assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
-    periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
+    squares = [Square(a=x) for x in (0.19, 0.21)]
+    periods = [hj.find_limit_cycle(square, cycle).period for square in squares]
     slope = np.diff(periods)[0] / 0.02
     assert_allclose(slope, a.period, rtol=1e-3)
 
@@ -357,7 +358,8 @@ def test_phase_responses_are_differences_of_asymptotic_phases(name):
 
         def central(h):
             to = [cycle.asymptotic_phase(s.names[a], q + x * push) for x in (h, -h)]  # noqa: B023
-            apart = (to[0] - to[1] + 0.5) % 1.0 - 0.5
+            half_turn_on = to[0] - to[1] + 0.5
+            apart = half_turn_on % 1.0 - 0.5
             return apart / (2 * h)
 
         fourth_order = (4 * central(0.5) - central(1.0)) / 3
@@ -549,9 +551,15 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         H = cycle.htf(0.3, 1, output).H
         htf = H[0, 0, 0, 0]
         noise = cycle.fluctuations({output: 0.1})
-        noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
+        if guess.clocked:
+            noisy = noise.covariance(at)[0, 0, 0]
+        else:
+            noisy = noise.diffusion
         change = cycle.sensitivity(name)
-        shape = change.shape(at)[output][0] if guess.clocked else change.period
+        if guess.clocked:
+            shape = change.shape(at)[output][0]
+        else:
+            shape = change.period
         section = 0 if guess.clocked else None
         impulse = responses.impulses(section)[0].weight["u"]
         later = change.durations[0]
@@ -559,7 +567,7 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         values = [pushed, htf, noisy, shape, impulse, later]
         return jnp.abs(jnp.stack(values))
 
-    forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
+    _, forward = jax.jvp(result, (begin,), (jnp.ones(()),))
 
     def central(h):
         change = result(begin + h) - result(begin - h)

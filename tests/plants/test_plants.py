@@ -134,7 +134,8 @@ class Travelling(Circle):
         return (*self.q, self.distance)
 
     def set_state(self, q):
-        self.distance = float(q[2]) if len(q) > 2 else self.distance
+        if len(q) > 2:
+            self.distance = float(q[2])
         return super().set_state(q[:2]) | {"distance": self.distance}
 
     def step(self, u, duration):
@@ -259,7 +260,8 @@ class Rounded(Circle):
         return (*self.q, self.side)
 
     def set_state(self, q):
-        self.side = float(q[2]) if len(q) > 2 else self.side
+        if len(q) > 2:
+            self.side = float(q[2])
         return super().set_state(q[:2]) | {"side": self.side}
 
     def step(self, u, duration):

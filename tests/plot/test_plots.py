@@ -154,7 +154,8 @@ def test_bode_in_hertz_and_decibels(estimate):
     assert "dB" in upper.get_ylabel()
     upper, lower, gain = drawn(unit="rad/s", period=0.5)
     assert_allclose(gain.get_xdata(), 4 * np.pi * f)
-    assert_allclose(gain.get_ydata(), np.abs(estimate[0][:, 1, 0]))
+    modulus = np.abs(estimate[0][:, 1, 0])
+    assert_allclose(gain.get_ydata(), modulus)
     assert (upper.get_xscale(), upper.get_yscale()) == ("linear", "log")
     with pytest.raises(hj.errors.DefinitionError, match="needs the `period`"):
         drawn(unit="Hz")
@@ -351,7 +352,8 @@ def test_bands_hold_the_values(estimate):
 
 @pytest.fixture(scope="module")
 def found(hopper):
-    u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
+    rng_of_input = np.random.default_rng(0)
+    u = 0.02 * rng_of_input.normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
     rng = np.random.default_rng(1)
     size = 0.1 * y.std(axis=0)
@@ -409,13 +411,16 @@ def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())
     blue = [0, 0x72, 0xB2]
-    distance = np.abs(picture[..., :3] - blue).sum(axis=2)
+    apart = np.abs(picture[..., :3] - blue)
+    distance = apart.sum(axis=2)
     is_blue = distance < 60
     for end in (value - half_width, value + half_width):
         place = plot.ax.transData.transform((end, 0)).round()
         column, height = place.astype(int)
         row = len(picture) - height
-        cap = is_blue[row - 8 : row + 8, column - 2 : column + 3]
+        rows = slice(row - 8, row + 8)
+        columns = slice(column - 2, column + 3)
+        cap = is_blue[rows, columns]
         pixels_high = cap.any(axis=1).sum()
         assert pixels_high > 6, "the line itself is one or two pixels high"
 

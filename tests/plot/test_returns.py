@@ -102,7 +102,8 @@ def test_states_that_do_not_return_are_gaps():
     lost = 1 / np.sqrt(1 - np.exp(-2))
     assert_array_equal(np.isfinite(after), np.abs(x) < lost)
     kept = x[np.abs(x) < lost]
-    exact = kept / np.sqrt(kept**2 + (1 - kept**2) * np.exp(2))
+    square = kept**2
+    exact = kept / np.sqrt(square + (1 - square) * np.exp(2))
     assert_allclose(after[np.abs(x) < lost], exact, atol=1e-9)
 
 

@@ -45,7 +45,8 @@ def rhythm():
     z' = (2 pi i + a (1 - |z|^2)) z + f by Runge-Kutta's method, f linear between samples. It turns
     with the clock of a drive: its angle is pulled towards 2 pi t at the same rate.
     """
-    force = hj.experiments.random_input(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
+    inputs = hj.experiments.random_input(STRIDES, RATE, 8, rms=0.02, seed=0)
+    force = inputs[:, 0]
     steps = 2  # from one sample to the next
     h = 1 / RATE / steps
     sampled = np.arange(len(force)) / RATE
@@ -55,7 +56,8 @@ def rhythm():
 
     def field(w, f, turn):
         """Of w = z exp(-2 pi i t), with turn = exp(-2 pi i t)."""
-        pull = -1j * DECAY * 2 * np.angle(w) * w
+        turned = 2 * np.angle(w) * w
+        pull = -1j * DECAY * turned
         growth = DECAY * (1 - abs(w) ** 2) * w
         return growth + pull + f * turn
 

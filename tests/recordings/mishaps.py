@@ -204,7 +204,8 @@ def late(samples, only=None):
 def other_clock(x, s):
     start = s.trial.time[0]
     since = s.trial.time - start
-    return np.interp(start + since * (1 - 0.005), s.trial.time, x)
+    later = start + since * (1 - 0.005)
+    return np.interp(later, s.trial.time, x)
 
 
 def misjudged(lost=0.0, doubled=0.0, off=0.0):

@@ -110,7 +110,8 @@ def test_a_rate_that_wanders_is_no_memory():
     events = []
     for k in range(2500):
         response = CURVE[int(200 * phase)]
-        rate = max(10 + walk[k], 2.0) + response * force[k]
+        own = max(10 + walk[k], 2.0)
+        rate = own + response * force[k]
         jitter = 0.05 * np.sqrt(0.1) * rng.normal()
         step = max(rate, 0.0) * 0.01 + jitter
         phase = max(phase + step, 0.0)
@@ -238,7 +239,8 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
     push = 0.4 * slow_noise(rng, trials=4, samples=n + 1, highest=0.05e-3 / period)
     size = 0.5 * np.sqrt(0.05)
     kicks = size * rng.normal(size=(4, n))
-    middle = (push[:, 1:] + push[:, :-1]) / 2
+    ends = push[:, 1:] + push[:, :-1]
+    middle = ends / 2
     spikes = spikes_of_izhikevich(10 + middle, kicks, adapts)
     time = np.arange(n + 1) * 0.05e-3
     trials = [

@@ -132,9 +132,12 @@ def test_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
-        file["time"], file["x"], file["daq/f"] = SLOW, X, F
+        file["time"] = SLOW
+        file["x"] = X
+        file["daq/f"] = F
         file["daq/time"] = 1000 * FAST
-        file["daq/time"].attrs["units"], file["daq/f"].attrs["units"] = "ms", "N"
+        file["daq/time"].attrs["units"] = "ms"
+        file["daq/f"].attrs["units"] = "N"
         file["note"] = "left leg"
     found = check_two_rates(path, f="daq/f")
     assert found.unit("daq/f") == "N"
@@ -200,7 +203,8 @@ def test_excel(tmp_path):
         ["ms", None],
         *zip(1000 * SLOW, X, strict=True),
     ):
-        book.active.append([float(v) if isinstance(v, np.floating) else v for v in row])
+        plain = [float(v) if isinstance(v, np.floating) else v for v in row]
+        book.active.append(plain)
     book.active["B8"] = None
     book.create_sheet("notes")
     book.save(path)
@@ -254,7 +258,9 @@ def write_c3d(
 ):
     file = pytest.importorskip("ezc3d").c3d()
     points = np.ones((4, 2, len(SLOW)))
-    points[0, 0], points[1, 0], points[2, 1, 3] = X, 2 * X, np.nan
+    points[0, 0] = X
+    points[1, 0] = 2 * X
+    points[2, 1, 3] = np.nan
     file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
     file["parameters"]["POINT"]["LABELS"]["value"] = ("LASI", "LKnee")
     file["parameters"]["POINT"]["UNITS"]["value"] = ("mm",)
@@ -266,7 +272,8 @@ def write_c3d(
     file["parameters"]["ANALOG"]["LABELS"]["value"] = ("Fz1",)
     file["parameters"]["ANALOG"]["UNITS"]["value"] = ("N",)
     no_samples = np.zeros(10)
-    file["data"]["analogs"] = np.append(F, no_samples)[None, None]
+    force = np.append(F, no_samples)
+    file["data"]["analogs"] = force[None, None]
     for at, context, label in events:
         file.add_event([0, at], context, label)
     file.write(str(path))
@@ -284,7 +291,8 @@ def test_c3d(tmp_path):
     np.testing.assert_allclose(f[:190], F, atol=1e-6)
     units = [found.unit(x) for x in ("LASI.y", "LKnee.x", "Fz1")]
     assert units == ["mm", "deg", "N"]
-    assert len(samples(found, "LKnee.z")[0]) == len(SLOW) - 1
+    times, _ = samples(found, "LKnee.z")
+    assert len(times) == len(SLOW) - 1
     np.testing.assert_allclose(
         found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7
     )
@@ -337,7 +345,8 @@ def write_bag(path, version):
     image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
     messages = []
     for t, x in zip(SLOW, X, strict=True):
-        stamp = time(5 + int(t), round(t % 1 * 1e9))
+        seconds = 5 + int(t)
+        stamp = time(seconds, round(t % 1 * 1e9))
         head = header(stamp=stamp, frame_id="", **seq)
         body = point(x, 2 * x, 0.0)
         messages.append((t, "/body", stamped(head, body)))
@@ -422,7 +431,9 @@ def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
     refused("declares arrays of 1048576 bytes or more", tmp_path / "x.mat")
     monkeypatch.setattr(limits, "RECORDED", 100)
-    parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
+    slow = hj.Recording(SLOW, {"x": X})
+    fast = hj.Recording(FAST, {"f": F})
+    parts = [slow, fast]
     with pytest.raises(
         hj.errors.DefinitionError, match="2 signals at 191 times are too many"
     ):
