@@ -83,7 +83,8 @@ def frames(
 # White, that of bodies, and each of the palette in four shades, as at the borders of lines.
 _INKS = np.array([to_rgb(color) for color in COLORS.values()])
 _SHADES = (1 + np.arange(1, 5)[:, None, None] / 4 * (_INKS - 1)).reshape(-1, 3)
-_PALETTE = 255 * np.vstack([np.ones(3), to_rgb(BODY), _SHADES])
+_WHITE = np.ones(3)
+_PALETTE = 255 * np.vstack([_WHITE, to_rgb(BODY), _SHADES])
 
 
 def gif(images: Sequence[Image.Image], interval: float) -> bytes:

@@ -521,7 +521,8 @@ def _values(
 
 def _frequency_limits(ax: Axes, f) -> None:
     spacing = f[1] - f[0] if len(f) > 1 else 1.0
-    ax.set_xlim(min(0.0, f[0]), f[-1] + spacing)
+    first = min(0.0, f[0])
+    ax.set_xlim(first, f[-1] + spacing)
 
 
 def _name(m: int) -> str:

@@ -196,7 +196,8 @@ class _Line(NamedTuple):
         **Raises:** `DefinitionError` for a range that does not hold the cycle.
         """
         if range is None:
-            return self.fixed - _REACH * self.scale, self.fixed + _REACH * self.scale
+            reach = _REACH * self.scale
+            return self.fixed - reach, self.fixed + reach
         low, high = range
         if not low < self.fixed < high:
             raise DefinitionError(
