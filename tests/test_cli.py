@@ -59,7 +59,8 @@ def test_reproduce_writes_its_results(results):
         exact, estimate = (
             hj.load(results / f"{x}_{family}.npz") for x in ("exact", "estimate")
         )
-        assert exact.harmonics == estimate.harmonics == tuple(range(-16, 16))
+        every_harmonic = tuple(range(-16, 16))
+        assert exact.harmonics == estimate.harmonics == every_harmonic
         model, fit = (
             hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
         )
@@ -147,7 +148,8 @@ def protocols(monkeypatch):
 
 def test_the_short_form_has_other_sizes_and_failures_are_said(protocols, capsys):
     for options, sizes in {"": (80, 84, 64), "--quick": (20, 36, 16)}.items():
-        assert main(["reproduce", "--out", "x", *options.split()]) == 0
+        arguments = ["reproduce", "--out", "x", *options.split()]
+        assert main(arguments) == 0
         protocol = protocols.pop()
         assert (protocol.experiments, protocol.cycles, protocol.keep) == sizes
     assert main(["reproduce", "--out", "x", "--seed", "1"]) == 1

@@ -60,7 +60,8 @@ def test_scipy(model):
     lti = convert.to_lti(model)
     assert system.dt == 2.0
     for name in "ABCD":
-        assert_array_equal(getattr(system, name), getattr(lti, name)[0])
+        of_lti = getattr(lti, name)[0]
+        assert_array_equal(getattr(system, name), of_lti)
 
 
 def test_python_control_gets_the_lifted_system(model):
@@ -81,7 +82,8 @@ def test_python_control_gets_frequency_responses(model):
     data = convert.to_control(H, period=2.0)
     assert isinstance(data, control.FrequencyResponseData)
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
-    assert_allclose(data.omega, 2 * np.pi * f / 2.0)
+    omega = 2 * np.pi * f / 2.0
+    assert_allclose(data.omega, omega)
     of_harmonic = data(1j * data.omega)
     response = np.asarray(H[-1])[:, 0]
     assert_array_equal(of_harmonic[1], response.T)
@@ -179,7 +181,8 @@ def test_section_data(wave):
         wave, crossing, inputs="f", outputs="x", n_sections=8
     )
     dataset = convert.to_xarray(data)
-    assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
+    values_of_x = data.records[0].y[:, 0]
+    assert_array_equal(dataset.x.values, values_of_x)
     average = dataset.average_cycle.sel(signal="x")
     assert_array_equal(average.values, data.cycle_outputs[:, 0])
     with pytest.raises(hj.errors.DefinitionError, match="that `to_xarray` made of a"):
@@ -197,7 +200,8 @@ def test_a_table_of_a_recording_is_read_back():
     frame = recording().to_pandas()
     first = frame[frame["trial"] == 0].drop(columns="trial")
     again = hj.Recording.from_frame(first, units={"a": "N"})
-    assert_array_equal(again.trials[0].values, recording().trials[0].values)
+    values = again.trials[0].values
+    assert_array_equal(values, recording().trials[0].values)
 
 
 def test_a_table_of_an_htf_has_a_row_for_each_value(model):
@@ -207,7 +211,8 @@ def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     frequency = H.frequencies[1].item()
     row = table.loc[-1, frequency, "y", "w"]
     value = complex(H[-1][1, 0, 1])
-    assert tuple(row) == (value.real, value.imag, np.abs(value))
+    expected = (value.real, value.imag, np.abs(value))
+    assert tuple(row) == expected
     assert np.asarray(H).tobytes() == H.H.tobytes()
 
 

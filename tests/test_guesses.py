@@ -399,7 +399,8 @@ def test_tables_of_words_have_owners_that_exist():
     for owners in ATTRIBUTES:
         assert set(owners.split()) <= classes
     for owners in KEYWORDS:
-        assert set(owners.split()) <= {*PLACES, *hj.__all__}
+        known = {*PLACES, *hj.__all__}
+        assert set(owners.split()) <= known
     for namespace in NAMES:
         assert namespace == "" or namespace in hj.__all__
 
@@ -521,7 +522,8 @@ def test_an_error_in_a_field_has_the_hint_that_fits():
 
     misspelt = error_of(lambda t, q, u, p: -p.dampin * q[0])
     assert misspelt.endswith("A System has no `dampin`: use `damping`.")
-    assert "write `p.k`" in error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    error = error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    assert "write `p.k`" in error
     assert "write `y, v = q`" in error_of(lambda t, q, u, p: -q["x"])
     assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
     assert "from_functions` take (t, q, u, p)" in error_of(lambda t, q, p: -q)
@@ -584,7 +586,8 @@ def test_every_fit_does_what_fits_do(names, name):
     low, high = fit.interval(0.9).T
     assert_allclose((low + high) / 2, values)
     assert (high - low > 3 * errors).all()
-    assert np.all(fit.contains(names["cycle"], level=1 - 1e-9))
+    is_inside = fit.contains(names["cycle"], level=1 - 1e-9)
+    assert np.all(is_inside)
     assert fit.compare(names["cycle"]).p_value > 1e-9
     assert "p " in repr(fit.compare(names["cycle"]))
     assert "true" in repr(fit.compare(names["cycle"]))
@@ -592,7 +595,8 @@ def test_every_fit_does_what_fits_do(names, name):
     assert fit.compare(fit).p_value > 0.99
     assert len(fit.to_pandas()) == len(values)
     assert fit.plot().axes.size
-    assert hj.validate(fit, names["data"]).fit.min() > 90
+    validation = hj.validate(fit, names["data"])
+    assert validation.fit.min() > 90
 
 
 @pytest.mark.parametrize("name", FITS)
@@ -609,8 +613,10 @@ def test_every_fit_comes_back_from_a_file(names, name):
         assert other.to_pandas().equals(fit.to_pandas())
     if name == "ldtp":
         f = np.array([0.1, 0.7])
-        assert_array_equal(back.htf(f).H, fit.htf(f).H)
-        assert_array_equal(back.htf(f).variance, fit.htf(f).variance)
+        stored = back.htf(f).H
+        assert_array_equal(stored, fit.htf(f).H)
+        variance = back.htf(f).variance
+        assert_array_equal(variance, fit.htf(f).variance)
     if name == "phys":
         assert type(back).__name__ == "ParameterEstimate"
         assert back.names == ("k", "b")
@@ -659,7 +665,8 @@ def test_a_fit_of_some_harmonics_says_so_where_it_is_validated(names):
     assert not whole.findings
     assert whole.independent
     # As the fit to the series explains the same data.
-    assert_allclose(whole.fit, hj.validate(names["ser"], data).fit, atol=0.3)
+    expected = hj.validate(names["ser"], data).fit
+    assert_allclose(whole.fit, expected, atol=0.3)
 
 
 def test_tables_hold_the_numbers(names):
@@ -667,8 +674,10 @@ def test_tables_hold_the_numbers(names):
     table = data.to_pandas()
     of_cycle = (table.experiment == 3) & (table.cycle == 5)
     row = table[of_cycle & (table.section == 2)]
-    assert row.vM.item() == data.y[3, 42, 1]
-    assert_array_equal(data["u"], data.u[:, :, 0])
+    expected = data.y[3, 42, 1]
+    assert row.vM.item() == expected
+    inputs = data.u[:, :, 0]
+    assert_array_equal(data["u"], inputs)
     states = names["traj"].to_pandas()
     assert set(states.chart) == {"flight", "stance"}
     assert states[states.chart == "stance"].ym.isna().all()
@@ -729,8 +738,10 @@ def test_a_result_of_several_steps_compares_as_its_fit(names):
     """Not as a truth without errors."""
     fit = names["fit"]
     result = names["result"]
-    assert fit.compare(result).p_value == fit.compare(result.fit).p_value
-    assert fit.compare(result).p_value > fit.compare(result.multipliers).p_value
+    by_result = fit.compare(result).p_value
+    assert by_result == fit.compare(result.fit).p_value
+    by_multipliers = fit.compare(result.multipliers).p_value
+    assert fit.compare(result).p_value > by_multipliers
     assert "other fit" in repr(fit.compare(result))
 
 

@@ -103,7 +103,8 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     backs = [trip(folder, thing) for thing in things]
     assert all(map(same, things, backs))
     assert type(backs[-1].periods) is int
-    assert backs[-1].summary() == things[-1].summary()
+    summary = things[-1].summary()
+    assert backs[-1].summary() == summary
     assert {p.name for p in folder.iterdir()} == {"thing.npz"}
     xarray = pytest.importorskip("xarray")
     for thing in things:
@@ -247,7 +248,8 @@ def test_where_nothing_can_be_written_or_read(folder, things):
     ):
         with pytest.raises(hj.errors.HybridJaxError, match=problem):
             hj.load(folder / f"{name}.npz")
-    assert not [p for p in folder.iterdir() if p.name.startswith(".")]
+    hidden = [p for p in folder.iterdir() if p.name.startswith(".")]
+    assert not hidden
 
 
 def test_traced_and_batched_objects(folder, ldtp):

@@ -84,7 +84,8 @@ def test_no_class_has_the_name_of_another():
     classes = {
         x.rpartition(".")[2] for x, thing in all_members() if isinstance(thing, type)
     }
-    assert {name for name in classes if named[name] > 1} == set()
+    repeated = {name for name in classes if named[name] > 1}
+    assert repeated == set()
 
 
 def test_types_that_functions_return_can_be_imported():

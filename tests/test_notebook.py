@@ -38,7 +38,8 @@ def test_the_executed_notebook_has_the_code_of_its_source(name):
         for c in notebook["cells"]
         if c["cell_type"] == "code"
     ]
-    assert code == cells((NOTEBOOKS / f"{name}.py").read_text())
+    script = (NOTEBOOKS / f"{name}.py").read_text()
+    assert code == cells(script)
     printed = json.dumps([c.get("outputs") for c in notebook["cells"]])
     assert "Traceback" not in printed
     assert "Warning" not in printed
@@ -134,7 +135,8 @@ def in_the_loop(found):
 
 
 def simulator(found):
-    assert found.fit.contains(found.returns.multipliers[:2]).all()
+    leading = found.returns.multipliers[:2]
+    assert found.fit.contains(leading).all()
 
 
 @pytest.mark.slow

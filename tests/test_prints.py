@@ -113,7 +113,8 @@ def test_definitions_print_as_they_are_written():
     for text in written:
         name = text.partition("(")[0]
         place = place_of(name).rpartition(".")[0]
-        assert repr(eval(f"{place}.{text}")) == text
+        made = eval(f"{place}.{text}")
+        assert repr(made) == text
     key = jax.random.key(0)
     network = eqx.nn.MLP(2, 1, 8, 1, key=key)
 

@@ -65,7 +65,8 @@ def read_section(tmp_path_factory):
                 session.run(text)
             elif language == "bash":
                 command = text.replace("\\\n", "")
-                assert main(shlex.split(command)[1:]) in (None, 0)
+                arguments = shlex.split(command)[1:]
+                assert main(arguments) in (None, 0)
         return session.module
 
     with pytest.MonkeyPatch.context() as patch:
@@ -110,7 +111,8 @@ def test_links_lead_somewhere():
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if "://" not in link:
-                assert (page.parent / link).exists(), f"{page.name} links to {link}"
+                target = page.parent / link
+                assert target.exists(), f"{page.name} links to {link}"
 
 
 def test_files_that_documents_name_are_there():

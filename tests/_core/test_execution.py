@@ -80,7 +80,8 @@ def test_the_libraries_of_numpy_and_scipy_use_one_thread():
         pytest.skip("NumPy has another BLAS here")
     before = [x.get() for x in libraries]
     with one_blas_thread():
-        assert [x.get() for x in libraries] == [1] * len(libraries)
+        numbers = [x.get() for x in libraries]
+        assert numbers == [1] * len(libraries)
     assert [x.get() for x in libraries] == before
 
 

@@ -131,7 +131,8 @@ def test_names_of_functions(name):
 
 
 def test_names_of_other_functions():
-    assert jax_compat.function_of(only_equation(jax.lax.atan2, 1.0, 2.0)) == "arctan2"
+    angle = only_equation(jax.lax.atan2, 1.0, 2.0)
+    assert jax_compat.function_of(angle) == "arctan2"
     joined = only_equation(lambda x: jax.lax.concatenate([x, x], 0), X)
     assert jax_compat.function_of(joined) == "vector"
     assert jax_compat.function_of(only_equation(jax.lax.exp, 1.0)) == ""
@@ -360,6 +361,7 @@ def test_a_branch_on_some_lanes_stays_a_branch_under_vmap():
     masks = jnp.array([[False, True], [False, False]])
     program = jax.make_jaxpr(jax.vmap(function))(masks)
     assert "select_n" not in str(program)
-    assert jax.vmap(function)(masks).tolist() == [1.0, 1.0]
+    found_values = jax.vmap(function)(masks)
+    assert found_values.tolist() == [1.0, 1.0]
     found = jax.vmap(function)(masks[1:])
     assert found.tolist() == [0.0]

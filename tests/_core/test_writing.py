@@ -72,7 +72,8 @@ def test_later_results_take_the_place_of_earlier_ones(full):
     assert "figures/old.png" not in after
     for name, text in MINE.items():
         assert after[name] == text
-    assert set(json.loads(after[LIST])) == set(RESULTS)
+    listed = json.loads(after[LIST])
+    assert set(listed) == set(RESULTS)
 
 
 def link_to_away(folder):
@@ -177,7 +178,8 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
         writer(folder / name)
     assert (tmp_path / "away").read_text() == "mine"
     assert (folder / name).is_symlink()
-    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    hidden = [path for path in folder.iterdir() if path.name.startswith(".")]
+    assert not hidden
     (folder / name).unlink()
     os.mkfifo(folder / name)
     with pytest.raises(hj.errors.DefinitionError, match="is a link or a device"):

@@ -193,7 +193,8 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     study_of_half = hj.designs.SequentialDesign(first, 2, 0.4 * error)
     half = study_of_half.add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
-    assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
+    study_asked = hj.designs.SequentialDesign(first, 2, asked)
+    assert not study_asked.add(data).done
     assert (
         hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.cycles
         > half.plan.cycles

@@ -133,7 +133,8 @@ def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
     is_found = result(jnp.asarray(duties)) == hj.errors.Result.OK
-    assert_array_equal(is_found, [*[False] * len(BESIDE_FULL), False, True])
+    not_found = [False] * len(BESIDE_FULL)
+    assert_array_equal(is_found, [*not_found, False, True])
 
 
 def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_before():
@@ -363,7 +364,8 @@ def test_a_guard_that_both_charts_have_happens_once():
         period=2.0,
     )
     path = hj.simulate(system, "day", (-0.5,), 3.3)
-    assert [e.name for e in path.events] == ["by day", "dusk", "dawn", "dusk"]
+    names = [e.name for e in path.events]
+    assert names == ["by day", "dusk", "dawn", "dusk"]
 
 
 def test_a_turn_cannot_begin_between_events_at_once():

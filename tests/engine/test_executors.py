@@ -186,7 +186,9 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     assert_allclose(found, usual, rtol=0, atol=1e-8)
     assert_allclose(again.period, turn.period, rtol=3e-10)
     size = np.abs(turn.factors).max(axis=0)
-    assert_allclose(again.factors / size, turn.factors / size, rtol=0, atol=1e-6)
+    factors = again.factors / size
+    usual_factors = turn.factors / size
+    assert_allclose(factors, usual_factors, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("PaddleJuggler",)))

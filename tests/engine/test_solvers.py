@@ -117,7 +117,8 @@ def test_a_landing_is_as_stiff_as_its_chart():
     stride = Stride(one, 0.9975 * one, 1e7 * one)
     no_input = np.zeros((s.nu, 1))
     moved = move(s, lanes, no_input, target, settings, stride)
-    assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
+    states = moved.moved.lanes.q
+    assert_allclose(states, [[1.0], [0.0]], atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +200,8 @@ def damped():
 
 
 def test_a_stiff_cycle_with_default_settings(damped):
-    assert_allclose(list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13)
+    state = list(damped.state.values())
+    assert_allclose(state, exact(), rtol=1e-9, atol=1e-13)
     assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
     assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
 
@@ -217,7 +219,8 @@ def test_linearization_of_a_stiff_system(damped):
     exact = exactly[:2, :2] * ratio
     assert_allclose(found, exact, atol=1e-9)
     expected = exactly[:2, 2] / size
-    assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)
+    by_input = B[:, 0] / size
+    assert_allclose(by_input, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_linearization_of_a_stiff_system_inside_of_a_program(damped):

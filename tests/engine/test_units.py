@@ -116,4 +116,5 @@ def test_a_chain_of_integrators_from_zero():
     bent = np.cos(t) - 1 + t**2 / 2
     slope = t - np.sin(t)
     expected = [bent, slope, 1 - np.cos(t), np.sin(t)]
-    assert_allclose(found.after[-1][1:], expected, rtol=1e-9)
+    end = found.after[-1][1:]
+    assert_allclose(end, expected, rtol=1e-9)

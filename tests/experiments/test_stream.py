@@ -69,7 +69,8 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
     parts = list(hj.run_experiments(*arguments, **BATCH, chunk=5))
-    assert [len(part.u) for part in parts] == [5, 5, 2]
+    lengths = [len(part.u) for part in parts]
+    assert lengths == [5, 5, 2]
     assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
     expected = hj.estimate_htf(whole)
@@ -118,8 +119,10 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert made.experiments == COUNT
     assert made.missing() == []
     assert_array_equal(records(made), whole.y)
-    assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
-    assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    inputs = np.concatenate([part.u for part in made])
+    assert_array_equal(inputs, whole.u)
+    errors = np.concatenate([part.error for part in made])
+    assert_array_equal(errors, whole.error)
     assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
     assert made[0].outputs[0].unit == "m"
     assert made.summary() == whole.summary() == "12/12 ok"

@@ -36,7 +36,8 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     monkeypatch.setattr(beside, "evaluate", no_search)
     fit = hj.fit_model(start, data, ("k", "b"))
     assert fit.result == hj.errors.Result.OK
-    np.testing.assert_allclose(fit.values, [TRUE.k, TRUE.b], rtol=1e-8)
+    true = [TRUE.k, TRUE.b]
+    np.testing.assert_allclose(fit.values, true, rtol=1e-8)
     np.testing.assert_allclose(fit.values, expected.values, rtol=1e-8)
     # (The Jacobian, by relative changes of the parameters.)
     found, known = (x.identifiability.sensitivity for x in (fit, expected))

@@ -91,7 +91,8 @@ def test_parameters_and_starts_of_two_drops_are_those_of_scipy():
     )
     expected = (*TRUE.values(), 1.0, 0.0, 1.5, 0.0)
     assert_allclose(fit.values, expected, atol=1e-6)
-    assert len(fit.residuals) == 2 * (len(TIMES) - 1)
+    measured = 2 * (len(TIMES) - 1)
+    assert len(fit.residuals) == measured
     assert fit.cycle is None
     assert_allclose(float(fit.system.e), TRUE["e"], atol=1e-6)
 

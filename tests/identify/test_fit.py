@@ -110,7 +110,8 @@ def test_intervals_of_moduli():
 def causes(fit):
     assert all(isinstance(finding, Finding) for finding in fit.findings)
     for finding in fit.findings:
-        assert finding.text in " ".join(repr(fit).split()), "it is printed"
+        printed = " ".join(repr(fit).split())
+        assert finding.text in printed, "it is printed"
         assert finding.text.split("`")[0][:40] in fit._repr_html_(), (
             "and shown in notebooks"
         )
@@ -118,18 +119,21 @@ def causes(fit):
 
 
 def test_an_order_that_is_too_low_is_a_finding(plant):
-    assert causes(hj.fit_multipliers(uncertain(plant), 1)) == {"order"}
+    few_multipliers = hj.fit_multipliers(uncertain(plant), 1)
+    assert causes(few_multipliers) == {"order"}
     # (A missing multiplier may look like drift, too.)
     found = causes(hj.fit_series(recorded(plant), 1))
     assert found in ({"order"}, {"drift"})
-    assert causes(hj.fit_ldtp(recorded(plant), 1)) == {"left over"}
+    few_states = hj.fit_ldtp(recorded(plant), 1)
+    assert causes(few_states) == {"left over"}
 
 
 def test_an_order_that_is_too_high_is_a_finding(plant):
     fit = hj.fit_multipliers(uncertain(plant), 3, check=False)
     assert "support 2 multipliers, not 3" in fit.findings[0].text
     assert causes(fit) == {"order"}
-    assert "order" in causes(hj.fit_series(recorded(plant), 3, check=False))
+    high_order = hj.fit_series(recorded(plant), 3, check=False)
+    assert "order" in causes(high_order)
     low_order = hj.fit_ldtp(recorded(plant, noise=0.3), 3)
     assert causes(low_order) == {"order"}
     with pytest.raises(

@@ -309,7 +309,8 @@ def test_a_plant_that_is_stable_in_its_loop_only():
         hj.fit_series(data, 1, references="r"),
     ):
         assert fit.contains(plant.multipliers, 0.999).all()
-        assert abs(fit.multipliers[0] - 1.2**N) < 0.1
+        error = abs(fit.multipliers[0] - 1.2**N)
+        assert error < 0.1
 
 
 def test_residuals_tell_of_the_loop(plant):

@@ -71,7 +71,8 @@ def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
     entries = by_section.sum()
     assert coordinates.size == entries - (dims**2).sum()
     found = transfer(coordinates.model, F, exact.harmonics)
-    np.testing.assert_allclose(found, model.htf(F).H, rtol=1e-9, atol=1e-9)
+    expected = model.htf(F).H
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
     J = np.concatenate(
         [
             s.reshape(len(s), -1)
@@ -115,7 +116,8 @@ def test_derivatives_are_those_of_jax(model, errors):
         [s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2
     )
     true = np.asarray(true)[np.array(harmonics)]
-    np.testing.assert_allclose(np.tensordot(step, slopes, 1), true, atol=1e-11)
+    along = np.tensordot(step, slopes, 1)
+    np.testing.assert_allclose(along, true, atol=1e-11)
     c, by_step = characteristic_slopes(coordinates)
     np.testing.assert_allclose(
         c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12
@@ -158,7 +160,8 @@ def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=20, seed=0))
     for dims, named in ((2, True), (model.dims, False)):
-        assert ("too few dimensions" in repr(hj.fit_ldtp(htf, dims).findings)) == named
+        findings = repr(hj.fit_ldtp(htf, dims).findings)
+        assert ("too few dimensions" in findings) == named
 
 
 def test_undetermined_responses_have_infinite_variance():
@@ -203,7 +206,8 @@ def test_errors_are_as_small_as_the_bound(model, exact):
     variance = np.mean(variances, axis=0)
     apart = np.abs(H - np.asarray(exact.H))
     square = np.mean(apart**2, axis=0)
-    assert abs(np.mean(square / variance) - 1) < 0.1
+    ratio = np.mean(square / variance)
+    assert abs(ratio - 1) < 0.1
     # Without variances, the residuals give them.
     draw = noisy(exact, exact.variance, np.random.default_rng(4))
     fit = hj.fit_ldtp(with_values(draw, draw.H), initial=model)

@@ -109,7 +109,8 @@ def test_the_gradient_is_that_of_the_cost(small, gappy, free, drift):
     ahead, back = (problem.cost(coordinates.moved(h * step)) for h in (1e-6, -1e-6))
     gradient = problem.linearize(coordinates).gradient
     by_differences = (ahead - back) / 2e-6
-    assert by_differences == pytest.approx(-2 * gradient @ step, rel=1e-5)
+    slope = -2 * gradient @ step
+    assert by_differences == pytest.approx(slope, rel=1e-5)
 
 
 @pytest.mark.parametrize("start", ("free", "cycle"))
@@ -124,7 +125,8 @@ def test_series_without_noise_are_met_exactly(small, start):
     f = np.array([0.1, 0.4])
     error = fit.htf(f).error(small.htf(f))
     assert error.max() < 1e-9
-    assert fit.unknowns == local_coordinates(PeriodicModel.of(small, ONE), True).size
+    coordinates = local_coordinates(PeriodicModel.of(small, ONE), True)
+    assert fit.unknowns == coordinates.size
 
 
 def test_a_drift_is_found_where_samples_are_missing(small):
@@ -277,7 +279,8 @@ def test_the_spectrum_of_noise(small):
     for row, m in zip(found, (-1, 1), strict=True):
         H = [noise.htf(f + m - k, (k,)).H[0] for k in range(-2, 2)]
         power = np.abs(H) ** 2
-        np.testing.assert_allclose(row, power.sum(axis=(0, 3)), rtol=1e-9)
+        total = power.sum(axis=(0, 3))
+        np.testing.assert_allclose(row, total, rtol=1e-9)
 
 
 @pytest.mark.parametrize("size, cause", [(0.0, None), (0.5, "process noise")])

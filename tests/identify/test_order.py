@@ -27,7 +27,8 @@ def test_two_multipliers_are_two(size, small, variance):
     np.testing.assert_allclose(ratio, 1.0, atol=0.2)
     blind = hj.select_order(with_variance(htf, data.H, None), 4)
     for x in (found, blind):
-        assert (x.by_rank, x.by_mdl, x.order) == (2, 2, 2)
+        orders = (x.by_rank, x.by_mdl, x.order)
+        assert orders == (2, 2, 2)
     assert "by rank: 2" in repr(found)
     assert len(repr(found).splitlines()) == 7
 

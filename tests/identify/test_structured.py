@@ -39,5 +39,6 @@ def test_random_systems(shape, seed):
     true = model.multipliers
     exact = np.poly(true).real[1:]
     assert_allclose(fit.coefficients, exact, atol=1e-8)
-    assert fit.htf(htf.frequencies).error(htf).max() < 1e-8
+    error = fit.htf(htf.frequencies).error(htf)
+    assert error.max() < 1e-8
     assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)

@@ -78,7 +78,8 @@ def test_prediction_is_the_periodic_response(seed, shape):
     # Negative frequencies follow by symmetry.
     lines = np.arange(periods * N // 2 + 1)
     f = lines / periods
-    assert_allclose(ldtp.htf(f).predict(u), expected, rtol=0, atol=1e-11)
+    predicted = ldtp.htf(f).predict(u)
+    assert_allclose(predicted, expected, rtol=0, atol=1e-11)
 
 
 def test_derivatives_by_matrices_and_frequencies(synthetic):

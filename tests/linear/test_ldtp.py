@@ -52,7 +52,8 @@ def test_periodic_state_of_an_unstable_system():
     states = np.linalg.solve(
         np.eye(40) - np.kron(next_period, A), np.kron(next_period, B) @ u[:, 0]
     )
-    assert_allclose(ldtp.periodic_state(u, 20), states[:2], rtol=1e-12)
+    periodic = ldtp.periodic_state(u, 20)
+    assert_allclose(periodic, states[:2], rtol=1e-12)
 
 
 def test_jit_vmap_and_gradients(synthetic):
@@ -63,7 +64,8 @@ def test_jit_vmap_and_gradients(synthetic):
     )
     inputs = np.stack([u, 2 * u])
     many = jax.vmap(synthetic.simulate)(inputs)
-    assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
+    expected = np.stack([plain, 2 * plain])
+    assert_allclose(many, expected, atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
     direct = batch.D.at[1].set(0.0)
     batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, direct)
@@ -91,7 +93,8 @@ def test_jit_and_vmap(synthetic):
     assert_allclose(compiled, plain, atol=1e-14)
     inputs = np.stack([u, 2 * u])
     two_inputs = jax.vmap(synthetic.simulate)(inputs)
-    assert_allclose(two_inputs, np.stack([plain, 2 * plain]), atol=1e-13)
+    expected = np.stack([plain, 2 * plain])
+    assert_allclose(two_inputs, expected, atol=1e-13)
 
     # The second system of a batch has no feedthrough.
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)

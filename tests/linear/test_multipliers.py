@@ -82,7 +82,8 @@ def relative_error(found, multipliers):
 def assert_conjugate_and_sorted(found):
     moduli = np.abs(found)
     steps = np.diff(moduli)
-    assert np.all(steps <= 1e-15 * np.abs(found[:-1]))
+    rounding = 1e-15 * np.abs(found[:-1])
+    assert np.all(steps <= rounding)
     values = list(found)
     for value in values:
         assert np.conj(value) in values
@@ -197,7 +198,8 @@ def test_hopper(hopper, reference):
 
 
 def test_the_synthetic_system(synthetic):
-    assert list(synthetic.dims) == [3, 2, 3, 2, 3, 2]
+    dims = list(synthetic.dims)
+    assert dims == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
     assert_allclose(synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13)
 

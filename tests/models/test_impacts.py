@@ -25,7 +25,8 @@ LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
 def test_the_cycle_and_its_multipliers(n):
     cycle = hj.find_limit_cycle(hj.models.BouncingChain(n=n))
     truth = TRUTH[str(n)]
-    assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
+    state = list(cycle.state.values())
+    assert_allclose(state, truth["state"], atol=1e-12)
     multipliers = np.array(truth["multipliers"]) @ [1, 1j]
     differences = np.abs(multipliers[:, None] - cycle.multipliers)
     assert differences.min(axis=0).max() < 1e-12, "each that was found is a true one"

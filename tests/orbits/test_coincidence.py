@@ -237,7 +237,8 @@ def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
     """x would be full 1e-10 before the tick: beside the cycle, the clock may empty it instead."""
     guess = hj.Guess("up", (0.4,), time=0.5)
     found = results_of_all_searches(Filled, guess, 0.9 - 1e-10)
-    assert found == dict.fromkeys(found, int(hj.errors.Result.SIMULTANEOUS))
+    together = int(hj.errors.Result.SIMULTANEOUS)
+    assert found == dict.fromkeys(found, together)
     early = hj.find_limit_cycle(Filled(0.9 - 1e-7), guess)
     assert early.event_sequence == (0, 2)
 
@@ -245,7 +246,8 @@ def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
 def test_clocks_that_tick_together_are_accepted_by_all_searches():
     guess = hj.Guess("a", (1.0,), time=0.9)
     found = results_of_all_searches(Clocks, guess, 0.9)
-    assert found == dict.fromkeys(found, int(hj.errors.Result.OK))
+    ok = int(hj.errors.Result.OK)
+    assert found == dict.fromkeys(found, ok)
 
 
 def test_two_schedules_for_one_time():

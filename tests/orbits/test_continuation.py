@@ -54,7 +54,8 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     assert_allclose(at_fold.value, fold, rtol=1e-11)
     assert_allclose(at_flip.value, flip, rtol=1e-11)
     assert_allclose(at_fold.multipliers, [1, a**2], atol=2e-6)
-    assert_allclose(at_flip.multipliers, [-1, -(a**2)], rtol=1e-9)
+    expected = [-1, -(a**2)]
+    assert_allclose(at_flip.multipliers, expected, rtol=1e-9)
     for end in branch.ends:
         assert end.message == "end of the parameter range"
 
@@ -99,7 +100,8 @@ def test_a_branch_is_drawn_in_pieces_of_one_stability(by_amplitude):
     assert styles == ["--", "-", "--"], "unstable, stable, unstable"
     fold, flip = (point.index for point in branch.points)
     drawn = [line.get_xdata() for line in lines]
-    assert_array_equal(drawn[0], branch.values[: fold + 1])
+    before_fold = branch.values[: fold + 1]
+    assert_array_equal(drawn[0], before_fold)
     between = branch.values[fold : flip + 1]
     assert_array_equal(drawn[1], between)
     assert_array_equal(drawn[2], branch.values[flip:])
@@ -134,7 +136,8 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
         g = float(end.system.g)
         T = float(end.system.T)
         (bounce,) = end.trajectory().events
-        assert_allclose(bounce.after["v"], g * T / 2, rtol=1e-9)
+        speed = g * T / 2
+        assert_allclose(bounce.after["v"], speed, rtol=1e-9)
         stiffness = (2 * np.pi / T) ** 2
         acceleration = -stiffness * bounce.before["y"]
         by_table = (1 + a) ** 2 * acceleration / g
@@ -216,7 +219,8 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     assert branch.ends[1].message == "end of the parameter range"
     assert not branch.points
     assert branch.values[-1] == 30.0
-    assert float(branch[-1].anchor.t[0]) != 0.5
+    time = float(branch[-1].anchor.t[0])
+    assert time != 0.5
     last = branch[-1]
     again = hj.find_limit_cycle(last.system, last)
     assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)

@@ -29,7 +29,8 @@ def vanderpol(mu, guess=None, section=FALL, **options):
 def test_the_hopper_and_its_events(reference, hopper_cycle):
     data = reference("limit_cycle")
     half = data["state_clock_half"]
-    assert_allclose(hopper_cycle.anchor.q[:2, 0], half, atol=1e-10)
+    state = hopper_cycle.anchor.q[:2, 0]
+    assert_allclose(state, half, atol=1e-10)
     assert hopper_cycle.result == hj.errors.Result.OK
     assert hopper_cycle.stable
     assert hopper_cycle.period == 1.0
@@ -64,7 +65,8 @@ def test_a_cycle_can_be_donated(hopper_cycle):
 
 def test_the_lossy_hopper(lossy_cycle):
     state = [1.87978886663710, 1.75832736962547]
-    assert_allclose(lossy_cycle.anchor.q[:2, 0], state, atol=1e-10)
+    found = lossy_cycle.anchor.q[:2, 0]
+    assert_allclose(found, state, atol=1e-10)
     multiplier = -0.317897006349938 + 0.694628822735891j
     assert_allclose(lossy_cycle.multipliers[0], multiplier, atol=1e-9)
     events = [e.time % 1 for e in lossy_cycle.trajectory().events]
@@ -96,7 +98,8 @@ def test_the_two_legged_bar():
         -0.0243713338437363,
         -0.268770117871700,
     ]
-    assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
+    after = list(events[3].after.values())
+    assert_allclose(after, landed, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +112,8 @@ def test_van_der_pol(mu):
     at_rest = [amplitude, 0.0]
     assert_allclose(cycle.anchor.q[:, 0], at_rest, atol=1e-9)
     assert_allclose(cycle.period, period, atol=1e-9)
-    assert_allclose(cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0)
+    expected = [multiplier ** np.sign(mu)]
+    assert_allclose(cycle.multipliers, expected, rtol=1e-7, atol=0)
     assert not cycle.clocked
     assert cycle.event_sequence == ()
     assert cycle.stable == (mu > 0)

@@ -60,7 +60,8 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
 
     # One goes on where the other has ended.
     third = hj.flow(ball(), second, "bounce", within=3.0)
-    assert_allclose(third.t, FIRST * (1 + 1.4 + 0.98), rtol=1e-12)
+    expected = FIRST * (1 + 1.4 + 0.98)
+    assert_allclose(third.t, expected, rtol=1e-12)
     assert third.count == 1
 
 
@@ -87,7 +88,8 @@ def test_what_goes_on_from_a_flow():
     onward = hj.flow(mass, first, 2.0)
     assert_allclose(onward.state, [np.sin(2.0)], rtol=1e-11)
     constant = hj.flow(mass, first, 2.0, input=3.0)
-    assert_allclose(constant.state, [np.sin(1.0) + 3.0], rtol=1e-11)
+    expected = [np.sin(1.0) + 3.0]
+    assert_allclose(constant.state, expected, rtol=1e-11)
 
     rests = hj.flow(ball(), DROP, 5.0, throw=False)
     with pytest.raises(DefinitionError, match=r"`start` failed \(events accum"):
@@ -267,7 +269,8 @@ def test_derivatives_by_the_end_the_section_the_input_and_times_between():
     # x = t + t^2, or t + u t^2 / 2.
     assert_allclose(jax.grad(by_end)(3.0), 7.0, rtol=1e-12)
     assert_allclose(jax.grad(by_input)(2.0), 4.5, rtol=1e-12)
-    assert_allclose(jax.grad(by_section)(12.0), 1 / 7.0, rtol=1e-11)
+    slope = jax.grad(by_section)(12.0)
+    assert_allclose(slope, 1 / 7.0, rtol=1e-11)
     assert_allclose(jax.grad(by_time)(1.5), 4.0, rtol=1e-12)
 
 
@@ -328,7 +331,8 @@ def test_many_flows_one_of_which_fails():
     )
     guesses = hj.Guess("main", states)
     found = hj.flow(ball(), guesses, 0.9, throw=False)
-    assert found.result.tolist() == [Result.OK, Result.ZENO, Result.OK]
+    codes = [Result.OK, Result.ZENO, Result.OK]
+    assert found.result.tolist() == codes
     assert np.isnan(found.state[1]).all()
     for k in (0, 2):
         guess = hj.Guess("main", states[k])
@@ -696,7 +700,8 @@ def test_events_at_the_start_and_at_the_end():
     for end in (FIRST, FIRST * (1 - 1e-15), FIRST * (1 + 1e-15)):
         ends = hj.flow(ball(), DROP, end)
         assert [x.cause for x in ends.findings] == ["ends at an event"]
-    assert hj.flow(ball(), DROP, FIRST * 0.999).findings == ()
+    shortly_before = hj.flow(ball(), DROP, FIRST * 0.999)
+    assert shortly_before.findings == ()
     start = hj.Guess("main", (0.0, -1.0))
     rolls = hj.flow(ball(), start, 1.0)
     assert [x.cause for x in rolls.findings] == ["on a guard"]
@@ -780,7 +785,8 @@ def test_no_end_later_than_within(end, time):
     found = hj.flow(ball(), DROP, **end, within=early, throw=False)
     assert found.result == Result.SECTION_MISSED
     assert np.isnan(found.t)
-    assert_allclose(hj.flow(ball(), DROP, **end, within=time).t, time, rtol=1e-12)
+    ended = hj.flow(ball(), DROP, **end, within=time)
+    assert_allclose(ended.t, time, rtol=1e-12)
     starts = hj.Guess("main", jnp.array([DROP.state]))
     for within, code in ((early, Result.SECTION_MISSED), (time, Result.OK)):
         program = hj.flow(ball(), starts, **end, within=within, throw=False)

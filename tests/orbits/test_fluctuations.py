@@ -103,7 +103,8 @@ def test_states_may_have_no_correlation():
     cycle = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0))
     noisy = cycle.fluctuations({"u": 0.2})
     expected = 0.1 * np.eye(2)
-    assert_allclose(noisy.covariance([0.3])[0], expected, rtol=0, atol=1e-12)
+    computed = noisy.covariance([0.3])[0]
+    assert_allclose(computed, expected, rtol=0, atol=1e-12)
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
@@ -136,7 +137,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     expected = now @ C @ now.T
     assert_allclose(noisy.covariance([0.0])[0], expected, rtol=1e-11)
     expected = now @ step @ step @ C @ now.T
-    assert_allclose(noisy.covariance([0.0], 2)[0], expected, rtol=1e-11)
+    computed_later = noisy.covariance([0.0], 2)[0]
+    assert_allclose(computed_later, expected, rtol=1e-11)
 
     # A duration is the difference of two times.
     once = step @ C
@@ -144,7 +146,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     expected = 2 * (times[0] - times[1])
     assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
     expected = 2 * times[1] - times[0] - times[2]
-    assert_allclose(noisy.durations(1)[0, 0], expected, rtol=1e-11)
+    found = noisy.durations(1)[0, 0]
+    assert_allclose(found, expected, rtol=1e-11)
 
 
 def test_a_million_simulated_bounces_scatter_as_computed(juggler):

@@ -369,10 +369,12 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
         cycle = hj.find_limit_cycle(Thrower(speed=speed, pull=2.0), up)
         return cycle.period, cycle.result
 
-    assert_allclose(below(-0.4), (1, hj.errors.Result.OK))
+    expected_below = (1, hj.errors.Result.OK)
+    assert_allclose(below(-0.4), expected_below)
     assert below(1.0)[1] == hj.errors.Result.EVENT_ORDER
     rise = -0.025 + np.sqrt(0.025**2 + 1.2)
-    assert_allclose(above(0.05), (1 + rise, hj.errors.Result.OK))
+    expected_above = (1 + rise, hj.errors.Result.OK)
+    assert_allclose(above(0.05), expected_above)
     assert above(-0.05)[1] == hj.errors.Result.EVENT_ORDER
 
 

@@ -163,7 +163,8 @@ def test_failed_cycles_of_a_sweep_have_no_period():
     systems = [Toys(make, [mu]) for mu in (1.0, -1.0)]
     found = hj.orbits.find_limit_cycles(systems, cycle)
     assert_array_equal(found.ok, [True, False])
-    assert_allclose(found.period, [2 * np.pi, np.nan], rtol=1e-8)
+    expected = [2 * np.pi, np.nan]
+    assert_allclose(found.period, expected, rtol=1e-8)
 
 
 def oscillator(force):

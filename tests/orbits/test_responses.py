@@ -307,7 +307,8 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
     assert_allclose(change.period, -1 / 5, rtol=1e-11)
     assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
-    assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
+    by_speed = change.shape([0.0])["v"]
+    assert_allclose(by_speed, [1.0], rtol=1e-11)
 
 
 @pytest.mark.core
@@ -391,7 +392,8 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         1.085149865188 - 0.060008477233j,
         0.333649918824 + 0.129840711721j,
     ]
-    assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
+    computed = htf.H[:, 0, 0, 0]
+    assert_allclose(computed, published, rtol=0, atol=1e-11)
     assert "continuous time" in str(htf)
     assert htf[1].shape == (1, 1, 1)
     ldtp = hj.linearize(cycle, hj.ClockPhase(64), "x")

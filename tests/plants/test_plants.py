@@ -99,7 +99,8 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     expected_x = np.cos(motion.t)
     error = np.abs(motion.after[:, 0] - expected_x).max()
     assert error < 1e-9
-    assert len(hj.plot.animate(motion, "x", "y").times) > 4
+    film = hj.plot.animate(motion, "x", "y")
+    assert len(film.times) > 4
 
     class Falls(Circle):
         def step(self, u, duration):
@@ -244,7 +245,8 @@ def test_errors_contain_stairs_of_steps_that_a_plant_divides():
         off = returns.multipliers[0] - (a + b * d)
         ratios.append(abs(off) / returns.standard_errors[0])
     # (The rms of 16 numbers of Student's distribution with 21 degrees of freedom.)
-    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+    rms = np.sqrt(np.mean(np.square(ratios)))
+    assert 0.5 < rms < 1.5
 
 
 class Rounded(Circle):
@@ -322,7 +324,8 @@ def test_an_unstable_cycle_is_found_from_a_guess():
     error = abs(cycle.cycle_outputs[0, 0] - 1)
     assert error < 1e-8
     returns = cycle.perturbed_returns()
-    assert returns.contains(math.exp(0.4 * math.pi)).all()
+    multiplier = math.exp(0.4 * math.pi)
+    assert returns.contains(multiplier).all()
     assert len(returns.multipliers) == 1
 
 
@@ -376,7 +379,8 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
     # (The last two have half of the first input and none, which test the size of the inputs.)
-    assert seeds == [*range(1, 10), 9, 10, 1, 1]
+    expected = [*range(1, 10), 9, 10, 1, 1]
+    assert seeds == expected
     assert np.array_equal(data.y, whole.y)
     assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(
@@ -384,9 +388,11 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
     )
     monkeypatch.setattr(circle.drive.plant, "rate", 0.4)  # around the same cycle
     other = circle.run_experiments(u, **options)
-    assert np.abs(other.y - data.y).max() > 1e-3
+    apart = np.abs(other.y - data.y)
+    assert apart.max() > 1e-3
     hj.save(tmp_path / "data.npz", data)
-    assert np.array_equal(hj.load(tmp_path / "data.npz").y, data.y)
+    stored = hj.load(tmp_path / "data.npz")
+    assert np.array_equal(stored.y, data.y)
 
 
 def test_what_does_not_fit_is_refused(circle):

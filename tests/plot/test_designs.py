@@ -32,7 +32,8 @@ def test_the_spectrum_of_a_design(plan):
     usual, optimal = below.get_lines()
     power = np.square(optimal.get_ydata()) / 2
     assert_allclose(power.sum(), plan.power.sum())
-    assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
+    amplitude = np.sqrt(2 * plan.usual_power)
+    assert_allclose(usual.get_ydata(), amplitude)
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
     assert plan.usual_name == "equal amplitudes"
     legend = [text.get_text() for text in below.get_legend().get_texts()]

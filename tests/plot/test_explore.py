@@ -25,11 +25,13 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     assert explorer.message.startswith("The cycle is lost at slope = 0.0")
     found = float(explorer.cycle.system.slope)
     assert explorer.message.endswith(f"The picture is that at slope = {found:.4g}.")
-    assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("0.88")}
+    colors = {ax.get_facecolor() for ax in explorer.figure.axes}
+    assert colors == {to_rgba("0.88")}
     assert 0.001 < float(explorer.cycle.system.slope) <= 0.1
     explorer.move({"slope": 0.1})
     assert explorer.message == ""
-    assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("white")}
+    new_colors = {ax.get_facecolor() for ax in explorer.figure.axes}
+    assert new_colors == {to_rgba("white")}
     assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
 
 

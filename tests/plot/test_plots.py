@@ -147,7 +147,8 @@ def test_bode_in_hertz_and_decibels(estimate):
     modulus = np.abs(estimate[0][:, 1, 0])
     decibels = 20 * np.log10(modulus)
     assert_allclose(gain.get_ydata(), decibels)
-    assert_allclose(lower.get_lines()[0].get_xdata(), f / 0.5)
+    hertz = lower.get_lines()[0].get_xdata()
+    assert_allclose(hertz, f / 0.5)
     assert (upper.get_xscale(), lower.get_xscale()) == ("log", "log")
     assert upper.get_yscale() == "linear"
     assert "(Hz)" in lower.get_xlabel()
@@ -173,7 +174,8 @@ def test_the_period_of_a_cycle_is_in_its_own_unit(estimate):
 
     drawn = hj.plot.bode(estimate, unit="Hz", period=cycle("ms"))
     line = drawn.axes[0, 0].get_lines()[0]
-    assert_allclose(line.get_xdata(), np.asarray(estimate.frequencies) * 50)
+    frequencies = np.asarray(estimate.frequencies)
+    assert_allclose(line.get_xdata(), frequencies * 50)
     with pytest.raises(hj.errors.DefinitionError, match="'strides', is none of s,"):
         hj.plot.bode(estimate, unit="Hz", period=cycle("strides"))
 
@@ -283,7 +285,8 @@ def test_poles_and_zeros(rational):
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
         poles = labeled(ax)["poles, isochron"].get_xydata()
-        assert_array_equal(poles[:, 1], rational.poles[i].imag)
+        imaginary = rational.poles[i].imag
+        assert_array_equal(poles[:, 1], imaginary)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
     with pytest.raises(hj.errors.DefinitionError, match="one or more fits"):
@@ -300,7 +303,8 @@ def test_experiment(hopper):
         r"$\delta$ vM",
     ]
     y = figure.axes[2].get_lines()[0]
-    assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
+    last = data.y[-1, :, 1]
+    assert_array_equal(y.get_ydata(), last)
     assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.errors.DefinitionError, match="no experiment 99"):
@@ -316,7 +320,8 @@ def test_saved_in_several_formats(tmp_path):
     assert "<svg" in svg.read_text()
     expected = [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
     assert [p.name for p in (png, pdf, svg)] == expected
-    assert plot.save(str(tmp_path / "v1.0")) == (tmp_path / "v1.0.png",)
+    files = plot.save(str(tmp_path / "v1.0"))
+    assert files == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.errors.DefinitionError, match="x.bmp': formats are png"):
@@ -367,9 +372,12 @@ def test_validation_draws_signals_and_correlations(found):
     figure = found.plot(cycles=2).figure
     upper, lower = np.reshape(figure.axes, (2, 3))
     simulated, measured = lower[0].get_lines()
-    assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
-    assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
-    assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    simulated_end = found.simulated[-64:, 1]
+    assert_array_equal(simulated.get_ydata(), simulated_end)
+    measured_end = found.measured[-64:, 1]
+    assert_array_equal(measured.get_ydata(), measured_end)
+    cycles = 38 + np.arange(64) / 32
+    assert_allclose(measured.get_xdata(), cycles)
     assert lower[0].get_ylabel() == r"$\delta$ vM"
     title = f"fit {found.fit[0]:.3g} %\n"
     assert upper[0].get_title("right") == title
@@ -433,7 +441,8 @@ def test_regions_are_drawn_around_estimates(hopper):
     border = estimate.ellipse(0)
     (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
     ellipses = [line for line in inset.get_lines() if len(line.get_xdata()) == 100]
-    assert_array_equal(ellipses[0].get_xydata() @ [1, 1j], border)
+    drawn = ellipses[0].get_xydata() @ [1, 1j]
+    assert_array_equal(drawn, border)
     (left, right) = inset.get_xlim()
     (low, high) = inset.get_ylim()
     assert left < border.real.min()

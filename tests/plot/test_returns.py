@@ -47,7 +47,8 @@ def test_the_logistic_map_and_its_cobweb():
     plot = hj.plot.return_map(cycle, range=(0.3, 0.95), start=0.4, iterates=6)
     lines = lines_of(plot)
     x, after = lines["return map"]
-    assert (x[0], x[-1]) == (0.3, 0.95)
+    ends = (x[0], x[-1])
+    assert ends == (0.3, 0.95)
     assert_allclose(after, r * x * (1 - x), atol=1e-12)
     assert "slope -0.8: multiplier" in lines  # 2 - r
     near, tangent = lines["slope -0.8: multiplier"]
@@ -58,7 +59,8 @@ def test_the_logistic_map_and_its_cobweb():
         last = iterates[-1]
         iterates.append(r * last * (1 - last))
     corners_x, corners_y = lines["from 0.4"]
-    assert_allclose(corners_x, np.repeat(iterates, 2)[:-1], atol=1e-12)
+    expected_x = np.repeat(iterates, 2)[:-1]
+    assert_allclose(corners_x, expected_x, atol=1e-12)
     twice = np.repeat(iterates[1:], 2)
     assert_allclose(corners_y[1:], twice, atol=1e-12)
     (fixed,), _ = lines["cycle"]
@@ -100,11 +102,13 @@ def test_states_that_do_not_return_are_gaps():
     plot = hj.plot.return_map(cycle, range=(-1.5, 1.5), start=0.9)
     x, after = lines_of(plot)["return map"]
     lost = 1 / np.sqrt(1 - np.exp(-2))
-    assert_array_equal(np.isfinite(after), np.abs(x) < lost)
+    returns = np.abs(x) < lost
+    assert_array_equal(np.isfinite(after), returns)
     kept = x[np.abs(x) < lost]
     square = kept**2
     exact = kept / np.sqrt(square + (1 - square) * np.exp(2))
-    assert_allclose(after[np.abs(x) < lost], exact, atol=1e-9)
+    inner = after[np.abs(x) < lost]
+    assert_allclose(inner, exact, atol=1e-9)
 
 
 def test_wrong_coordinates_ranges_and_cycles_are_refused():

@@ -62,7 +62,8 @@ def test_a_rhythm_without_noise_is_found_exactly():
 
 def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     low, high = found.interval(X, 0.99)
-    assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
+    is_inside = (low <= CURVE) & (CURVE <= high)
+    assert np.mean(is_inside) > 0.9
     assert 3 < found.detail < 10
     assert abs(found.jitter - 0.05) < 0.01
     assert found.p_flat < 1e-3
@@ -76,7 +77,8 @@ def test_the_band_holds_the_curve_and_forecasts_gain_from_it(found):
     np.testing.assert_allclose(line, found.values / 1000)
     path = drawn.collections[0].get_paths()[0]
     heights = path.vertices[:, 1]
-    assert heights.min() == pytest.approx(band.min() / 1000)
+    lowest = band.min() / 1000
+    assert heights.min() == pytest.approx(lowest)
     other = [PhaseCurve(X, CURVE, Signal("u", unit)) for unit in ("nA", "pA")]
     with pytest.raises(hj.errors.DefinitionError, match="different units: nA and pA"):
         hj.plot.phase_response(other[0], model=other[1])
@@ -95,7 +97,8 @@ def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
     # The averaged curve varies less, most at the end of the cycle.
     smoothed = found.with_jitter(X)
     assert np.ptp(smoothed) < np.ptp(found(X))
-    np.testing.assert_allclose(found.with_jitter([0.0]), found([0.0]))
+    smoothed_there = found.with_jitter([0.0])
+    np.testing.assert_allclose(smoothed_there, found([0.0]))
     assert "free of jitter" in repr(found)
 
 
@@ -143,11 +146,13 @@ def test_slopes_are_derivatives(noisy):
         ahead = a + 1e-5 * np.eye(5)[k]
         moved = forecast(intervals, table, ahead, rates)
         difference = (moved.duration - base.duration) / 1e-5
-        np.testing.assert_allclose(base.slopes[:, k], difference, atol=0.02 * 0.1)
+        slope = base.slopes[:, k]
+        np.testing.assert_allclose(slope, difference, atol=0.02 * 0.1)
     difference = (
         forecast(intervals, table, a, rates + 1e-5).duration - base.duration
     ) / 1e-5
-    np.testing.assert_allclose(base.slopes[:, -1], difference, atol=5e-4)
+    slope = base.slopes[:, -1]
+    np.testing.assert_allclose(slope, difference, atol=5e-4)
 
 
 def test_intervals_of_all_lengths_are_no_missed_events():
@@ -191,7 +196,8 @@ def test_of_a_slow_input_the_band_is_wide_and_holds_the_curve(seed):
     found = hj.recordings.phase_response(slow, BEAT, input="u")
     low, high = found.interval(X)
     assert np.isfinite(found.errors).all()
-    assert np.mean((low <= CURVE) & (CURVE <= high)) > 0.9
+    is_inside = (low <= CURVE) & (CURVE <= high)
+    assert np.mean(is_inside) > 0.9
     assert "slow input" in [x.cause for x in found.findings]
 
 

@@ -175,7 +175,8 @@ def test_feather(tmp_path):
     found = hj.read_recording(tmp_path / "x.feather", signals="x")
     np.testing.assert_array_equal(samples(found, "x")[1], X)
     assert found.unit("x") == "m"
-    assert found.trials[0].events["go"] == [SLOW[7]]
+    events = found.trials[0].events["go"]
+    assert events == [SLOW[7]]
     refused(
         "no signal 'z'; it has ",
         tmp_path / "x.feather",
@@ -384,7 +385,8 @@ def test_bags(tmp_path, version):
     np.testing.assert_allclose(
         samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12
     )
-    np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
+    counted = samples(found, "count.data")
+    np.testing.assert_allclose(counted, [SLOW, SLOW], atol=1e-12)
     texts = [finding.text for finding in found.findings]
     assert any("times of count are those of arrival" in text for text in texts)
     assert "image.data.0" not in hj.read_recording(path).signals
@@ -529,7 +531,8 @@ def test_columns_take_time_in_proportion_to_their_number(tmp_path):
         parts = [hj.Recording(SLOW, signals), single]
         hj.Recording.join([hj.Recording.beside(parts)] * 2)
         counts.append(Name.compared)
-    assert counts[1] < 3 * max(counts[0], 1)
+    allowed = 3 * max(counts[0], 1)
+    assert counts[1] < allowed
     groups = "/".join("g" * (limits.NESTED + 1))
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["time"], file[f"{groups}/x"] = SLOW, X
@@ -604,7 +607,8 @@ def test_texts_in_tables(tmp_path):
     found = hj.read_recording(path)
     assert found.signals == ("Öffnung",)
     assert found.units == ("°",)
-    assert np.flatnonzero(np.isnan(found["Öffnung"])) == [4]
+    missing = np.flatnonzero(np.isnan(found["Öffnung"]))
+    assert missing == [4]
     assert "text were left out: 'phase'" in repr(found)
     assert not hj.read_recording(path, signals="Öffnung").findings
     refused("'phase' holds 'stance'", path, signals="phase")

@@ -63,7 +63,8 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
         "--inputs u --references r --outputs x,v --crossing clock:rising --sections 16"
     )
     with pytest.warns(FindingWarning):
-        assert not main(["identify", trial, *options.split(), "--out", out])
+        arguments = ["identify", trial, *options.split(), "--out", out]
+        assert not main(arguments)
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert summary["references"] == ["r"]
     assert "u" in summary["inputs"]

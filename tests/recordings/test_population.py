@@ -56,7 +56,8 @@ def test_equal_errors_give_the_t_interval():
     found = (row["low"][0], row["high"][0])
     assert found == pytest.approx(interval)
     left = y.var(ddof=1) - 0.09
-    assert row["spread"][0] == pytest.approx(np.sqrt(left))
+    expected = np.sqrt(left)
+    assert row["spread"][0] == pytest.approx(expected)
 
 
 def test_an_outlier_among_subjects_is_named():
@@ -110,9 +111,11 @@ def test_the_bcg_trials():
     ]
     errors = np.sqrt(v)
     row = study(np.array(y), errors).mean("gain")
-    assert row["estimate"][0] == pytest.approx(-0.7145, abs=2e-4)
+    estimate = row["estimate"][0]
+    assert estimate == pytest.approx(-0.7145, abs=2e-4)
     assert row["standard_error"][0] == pytest.approx(0.1808, abs=2e-4)
-    assert row["spread"][0] ** 2 == pytest.approx(0.3132, abs=2e-4)
+    variance = row["spread"][0] ** 2
+    assert variance == pytest.approx(0.3132, abs=2e-4)
     assert (row["spread_low"][0], row["spread_high"][0]) == pytest.approx(
         (0.346, 1.0543), abs=2e-4
     )
@@ -129,8 +132,10 @@ def test_complete_pairs_give_the_paired_t_test():
     people = Population(table, {"q": y}, {"q": error})
     row = people.difference("q", "a", "b")
     paired = stats.ttest_rel(first, second)
-    assert row["p"][0] == pytest.approx(paired.pvalue, rel=1e-3)
-    assert row["dof"][0] == pytest.approx(N - 1, rel=1e-3)
+    p_value = row["p"][0]
+    assert p_value == pytest.approx(paired.pvalue, rel=1e-3)
+    dof = row["dof"][0]
+    assert dof == pytest.approx(N - 1, rel=1e-3)
 
     wide = 3 * second
     y = np.concatenate([first, wide])
@@ -139,7 +144,8 @@ def test_complete_pairs_give_the_paired_t_test():
     difference = first.mean() - wide.mean()
     expected = abs(difference / welch.statistic)
     assert row["standard_error"][0] == pytest.approx(expected, rel=1e-3)
-    assert row["dof"][0] == pytest.approx(welch.df, rel=0.02)
+    dof_of_groups = row["dof"][0]
+    assert dof_of_groups == pytest.approx(welch.df, rel=0.02)
 
 
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
@@ -207,7 +213,8 @@ def test_moderated_variances_are_closer_to_the_true_ones():
     moderated_error = np.std(np.log(better / true))
     plain_error = np.std(np.log(v / true))
     assert moderated_error < 0.2 * plain_error
-    assert abs(np.log(better / true).mean()) < 0.1
+    bias = abs(np.log(better / true).mean())
+    assert bias < 0.1
     infinite = np.full(400, np.inf)
     np.testing.assert_array_equal(moderated(v, infinite, trend), v)
 
@@ -218,7 +225,8 @@ def test_quantities_of_fits():
     all_fits = [*fits, fit_of([0.5])]
     people = Population.from_fits(all_fits, {"subject": list("abcde")})
     modulus = np.sqrt([0.5, 0.51, 0.52, 0.53])
-    np.testing.assert_allclose(people.values["modulus"], [*modulus, 0.5])
+    found_moduli = people.values["modulus"]
+    np.testing.assert_allclose(found_moduli, [*modulus, 0.5])
     expected = [*1e-2 / (2 * modulus), 1e-2]
     np.testing.assert_allclose(people.errors["modulus"], expected)
     cosines = np.cos(people.values["angle"][:4])
@@ -316,7 +324,8 @@ def test_groups_are_compared_by_the_statistic_of_welch():
     groups = ["a"] * 5 + ["b"] * 7
     test = maps_of(y, 12, group=groups).difference("a", "b", draws=2000)
     assert "2000 random rotations" in test.methods
-    assert test.significant[[0, 5], 2:5].all()
+    inside = test.significant[[0, 5], 2:5]
+    assert inside.all()
     np.testing.assert_array_equal(test.significant, test.p <= 0.05)
     welch = stats.ttest_ind(y[:5], y[5:], equal_var=False)
     np.testing.assert_allclose(test.t, welch.statistic)
@@ -373,7 +382,8 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     y = RNG.normal(size=(15, 6, 8))
     first, second = (maps_of(y, 15).mean(draws=500, seed=1) for _ in range(2))
     np.testing.assert_array_equal(first.reach, second.reach)
-    assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * stats.sem(y)).all()
+    error = stats.sem(y)
+    assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * error).all()
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,8 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     assert found.units == ("N",)
     first = found.trials[0].values[:, 0]
     np.testing.assert_array_equal(first, [1, np.nan, np.nan, 4])
-    np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
+    strikes = found.trials[0].events["strike"]
+    np.testing.assert_array_equal(strikes, [1.0])
     assert found.trials[0].name == "x"
     np.savez(
         tmp_path / "x.npz",
@@ -104,7 +105,8 @@ def test_what_spreadsheets_write(tmp_path, text, encoding):
     )
     assert found.signals == ("F",)
     assert found.units == ("µN",)
-    np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)
+    times = found.trials[0].time
+    np.testing.assert_allclose(times, [0.5, 1.5], rtol=1e-15)
     first = found.trials[0].values[:, 0]
     np.testing.assert_array_equal(first, [1.0, -0.25])
 
@@ -148,7 +150,8 @@ def test_opensim(tmp_path, blanks):
     assert found.signals == ("pelvis_ty", "force_vx")
     assert [x.text for x in found.findings] == ["angles are in degrees."]
     values = found.trials[0].values
-    np.testing.assert_array_equal(values, [[1, 2], [-0.25, 3]])
+    expected = [[1, 2], [-0.25, 3]]
+    np.testing.assert_array_equal(values, expected)
     path.write_text(OPENSIM.replace("nRows=2", "nRows=3"))
     with pytest.raises(FileFormatError, match="2 rows, its header 3"):
         hj.read_recording(path)
@@ -214,12 +217,14 @@ def test_the_unit_of_time(tmp_path):
     columns = {"time (ms)": T, "a": T, "event e": [1.5, 2.5]}
     np.savez(tmp_path / "x.npz", **columns)
     found = hj.read_recording(tmp_path / "x.npz")
-    np.testing.assert_allclose(found.trials[0].time, T / 1000)
+    times = found.trials[0].time
+    np.testing.assert_allclose(times, T / 1000)
     events = found.trials[0].events["e"]
     np.testing.assert_allclose(events, [1.5e-3, 2.5e-3])
     is_event = T == 1
     frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T, "event e": is_event})
-    np.testing.assert_allclose(frame.trials[0].time, T / 1000)
+    times_of_frame = frame.trials[0].time
+    np.testing.assert_allclose(times_of_frame, T / 1000)
     assert (frame.signals, frame.units, frame.trials[0].events["e"]) == (
         ("a",),
         ("N",),

@@ -36,10 +36,12 @@ def sample(recording, phase=CIRCLE, **options):
 def test_a_circle(wave):
     data = sample(wave)
     circle = np.cos(np.pi / 4 * np.arange(8))
-    np.testing.assert_allclose(data.cycle_outputs[:, 0], circle, atol=2e-3)
+    found = data.cycle_outputs[:, 0]
+    np.testing.assert_allclose(found, circle, atol=2e-3)
     (record,) = data.records
     (times,) = data.times
-    np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
+    steps_of_time = np.diff(times)
+    np.testing.assert_allclose(steps_of_time, 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
         (
@@ -105,7 +107,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
         )
         data = sample(thin, inputs="force")
         diagnosis = hj.recordings.diagnose(data, hj.fit_series(data, 1, check=False))
-        assert any(w.cause == "sampling" for w in diagnosis.findings) == few
+        named = any(w.cause == "sampling" for w in diagnosis.findings)
+        assert named == few
 
 
 def test_gaps_are_masked_and_cut(wave):
@@ -318,7 +321,8 @@ def test_the_summary_of_the_command(summary):
     assert abs(found - MULTIPLIER) < 2e-2
     assert summary["held_out_fit_percent"][0] > 80
     assert summary["sampling_rates"] == pytest.approx([64, 64])
-    assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+    units = {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+    assert summary["units"] == units
 
 
 @pytest.mark.slow
@@ -344,12 +348,14 @@ def test_the_page_of_the_command(out, summary):
 
 @pytest.mark.slow
 def test_the_files_of_the_command(out):
-    assert hj.load(out / "fit.npz").contains([MULTIPLIER], 0.999).all()
+    fit = hj.load(out / "fit.npz")
+    assert fit.contains([MULTIPLIER], 0.999).all()
     assert hj.load(out / "htf.npz").variance is not None
     rows = (out / "sections.csv").read_text().splitlines()
     assert rows[0] == "trial,record,cycle,section,time (s),force (N),x (m),v (m/s)"
     assert len(rows) > 16 * 190
-    assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
+    formats = {p.suffix for p in (out / "figures").iterdir()}
+    assert formats == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
 
 

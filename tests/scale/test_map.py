@@ -158,7 +158,8 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert values.max() <= high
         measured = np.histogram(values, 4, (low, high))[0].tolist()
         assert measured == (pytest.approx([12] * 4, abs=2))
-        assert_array_equal(values, SweepPoints.sobol(ranges, 48, seed=3).values[name])
+        expected = SweepPoints.sobol(ranges, 48, seed=3).values[name]
+        assert_array_equal(values, expected)
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
@@ -201,11 +202,14 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
         alone = hj.find_limit_cycle(cycle.system, cycle)
         assert cycle.event_sequence == alone.event_sequence
         assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
-        assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
+        leading = found.multipliers[i, :2]
+        assert_allclose(leading, alone.multipliers, atol=1e-8)
         assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
-    assert len(np.unique(found.anchor.chart[:4])) == 2  # also in other charts
-    assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
+    charts = np.unique(found.anchor.chart[:4])
+    assert len(charts) == 2  # also in other charts
+    others = found.multipliers[:4, 2:]
+    assert_allclose(others, 0.0, atol=1e-9)
 
 
 def test_without_a_clock_and_in_waves(wheel):
@@ -218,7 +222,8 @@ def test_without_a_clock_and_in_waves(wheel):
     assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
     assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
-    assert {found[i].event_sequence for i in range(11)} == {(0,)}
+    sequences = {found[i].event_sequence for i in range(11)}
+    assert sequences == {(0,)}
 
 
 def test_systems_that_are_alike_or_undefined(wheel):
@@ -229,7 +234,8 @@ def test_systems_that_are_alike_or_undefined(wheel):
     assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all()
     assert np.isfinite(found.multipliers[:9]).all()
-    assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
+    words = found.summary().split()
+    assert words[:3] == ["10/11", "found;", "#9:"]
     assert hj.orbits.find_limit_cycles(
         [found[0].system] * 6, wheel, execution=FOUR
     ).ok.all()

@@ -58,7 +58,8 @@ class FallingPast(Chosen):
 
 def test_a_family_of_clock_phases(hopper_cycle):
     placed = hj.sections.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
-    assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
+    phases = placed.lanes.t % 1
+    assert_allclose(phases, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
     assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
 
@@ -70,7 +71,8 @@ def test_a_family_of_levels(vanderpol_cycle):
     own = hj.sections.place_sections(vanderpol_cycle, family)
     listed = hj.sections.place_sections(vanderpol_cycle, one_by_one)
     assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
-    assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
+    observed = own.observe("x")[:, 0]
+    assert_allclose(observed, family.values, atol=1e-12)
     a = hj.linearize(vanderpol_cycle, own, "v")
     b = hj.linearize(vanderpol_cycle, listed, "v")
     assert_allclose(a.A, b.A, atol=1e-12)

@@ -106,8 +106,10 @@ def check_against_differences(ldtp, sections, points, retention, subset):
         J = hopper_scipy.jacobian(points[i], here, there, before, after, retention)
         A = np.asarray(ldtp.A)[i, : len(after), : len(before)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        assert_allclose(A, J[:, :-1], rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
-        assert_allclose(B, J[:, -1], rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
+        by_state = J[:, :-1]
+        assert_allclose(A, by_state, rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
+        by_input = J[:, -1]
+        assert_allclose(B, by_input, rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
 
 
 def test_kinematic_sections_agree_with_scipy(
@@ -120,7 +122,8 @@ def test_kinematic_sections_agree_with_scipy(
     states = np.asarray(placed_kinematic.lanes.q)
     for i, (time, *state) in enumerate(points):
         assert_allclose(times[i], time, rtol=0, atol=1e-10)
-        assert_allclose(states[: len(state), i], state, rtol=0, atol=1e-10)
+        reached = states[: len(state), i]
+        assert_allclose(reached, state, rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
 
 
@@ -164,7 +167,8 @@ def test_a_cycle_that_is_rest():
     """Where the state stands still, only its derivatives say how short steps must be."""
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
     found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
-    assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
+    expected = np.sort(cycle.multipliers)
+    assert_allclose(np.sort(found), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +273,8 @@ def test_a_section_map_waits_for_late_arrivals():
     alone = paddle(state)
     inside = eqx.filter_jit(paddle)(state)
     both = jax.vmap(paddle)(np.stack([state, state]))
-    assert float(alone.t) - begin > 1.5 * float(cycle.period)
+    duration = float(alone.t) - begin
+    assert duration > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):
         assert_allclose(t, path.events[0].time, rtol=1e-9)
 

@@ -215,7 +215,8 @@ def test_outputs_of_any_kind_and_feedthrough(
     assert_array_equal(found, isochron_ldtp.C[:, 1])
     in_flight = np.asarray(ldtp.dims) == 4
     for section in range(32):
-        assert_allclose(ldtp.D[section, :, 0], [0.0, 0.5], atol=1e-15)
+        direct = ldtp.D[section, :, 0]
+        assert_allclose(direct, [0.0, 0.5], atol=1e-15)
         by_foot = 5.0 if in_flight[section] else 0.0
         expected = [-5.0, 0.0, by_foot, 0.0]
         assert_allclose(ldtp.C[section, 1], expected)
@@ -300,7 +301,9 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         ours, theirs = jax.device_get((turn.lanes, flow.lanes))
         here = belongs(structure, theirs.chart)[:-1]
         scale = np.asarray(cycle.settings.scale)[theirs.chart].T
-        assert_allclose(ours.q / scale, theirs.q / scale, rtol=0, atol=1e-12)
+        our_states = ours.q / scale
+        their_states = theirs.q / scale
+        assert_allclose(our_states, their_states, rtol=0, atol=1e-12)
         assert_allclose(ours.t, theirs.t, rtol=1e-12)
         assert_array_equal(ours.chart, theirs.chart)
         assert_array_equal(ours.events, theirs.events)

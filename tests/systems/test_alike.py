@@ -86,7 +86,8 @@ def run(system):
 
 
 def test_kinds_are_found():
-    assert Structure(Circle()).kinds == [(0, 2, 4), (1, 3, 5)]
+    circle = Structure(Circle())
+    assert circle.kinds == [(0, 2, 4), (1, 3, 5)]
     apart = Structure(Circle(apart=True))
     assert apart.kinds == [(g,) for g in range(6)]
     chain = Structure(hj.models.BouncingChain(n=3))
@@ -100,7 +101,9 @@ def test_events_are_those_of_transitions_of_their_own(other):
     one = run(Circle())
     two = run(other)
     assert len(one.events) == 8
-    assert [e.name for e in one.events] == [e.name for e in two.events]
+    names = [e.name for e in one.events]
+    other_names = [e.name for e in two.events]
+    assert names == other_names
     times = [e.time for e in one.events]
     other_times = [e.time for e in two.events]
     assert_allclose(times, other_times)

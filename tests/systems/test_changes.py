@@ -56,7 +56,8 @@ def test_a_constant_of_functions_of_which_a_system_is_made_is_changed(monkeypatc
     start = hj.Guess("main", (1.0,))
     for value in (0.7, 1.3, 0.7):
         monkeypatch.setitem(globals(), "DRAG", value)
-        assert_allclose(hj.flow(slowed, start, 1.0).state, [np.exp(-value)], rtol=1e-9)
+        found = hj.flow(slowed, start, 1.0).state
+        assert_allclose(found, [np.exp(-value)], rtol=1e-9)
         end = hj.simulate(slowed, start, 1.0).after[-1]
         assert_allclose(end, [np.exp(-value)], rtol=1e-7)
 
@@ -157,7 +158,8 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
         monkeypatch.setitem(globals(), "DRAG", drag)
         way = hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force)
         ends.append(way.after[-1, 1])
-    assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
+    expected = ends[0] * 1.3 / 0.7
+    assert_allclose(ends[1], expected, rtol=1e-2)
     for use in (lambda: response(DESIGN.signals(cycles=1)), lambda: next(chunks)):
         with pytest.raises(
             hj.errors.DefinitionError,

@@ -47,7 +47,8 @@ def test_what_has_other_units_is_not_compared():
         hj.errors.DefinitionError, match=r"\('y' \(m\),\) and \('y' \(mm\),\)"
     ):
         small_htf(outputs={"y": "m"}).error(small_htf(outputs={"y": "mm"}))
-    assert small_htf(outputs={"y": "m"}).error(small_htf(outputs="y")) == 0
+    in_meters = small_htf(outputs={"y": "m"})
+    assert in_meters.error(small_htf(outputs="y")) == 0
 
 
 def test_units_that_do_not_fit_are_refused():
