@@ -38,7 +38,8 @@ def saved(path, static):
 
 
 def bomb(path):
-    zeros = npy((2**24,), bytes(2**27))
+    block = bytes(2**27)
+    zeros = npy((2**24,), block)
     pack(path, [("time.npy", zeros)], compression=zipfile.ZIP_DEFLATED, compresslevel=9)
 
 

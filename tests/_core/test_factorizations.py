@@ -65,7 +65,8 @@ def test_values_and_derivatives_are_those_of_lapack(name):
     ids=["qr", "eigh", "svd"],
 )
 def test_other_factorizations_are_left_to_lapack(function):
-    A = definite(samples(4)[0][..., 1])
+    sample = samples(4)[0][..., 1]
+    A = definite(sample)
     lowered = jax.jit(vectorized(function)).lower(A)
     assert "lapack" in lowered.as_text()
 

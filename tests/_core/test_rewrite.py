@@ -123,12 +123,14 @@ def test_vectors_of_several_functions_are_put_together_row_by_row():
 
     t = jnp.asarray(0.7)
     q = jnp.array([0.3, -1.2])
-    program = str(jax.make_jaxpr(vectorized(field))(t, q))
+    jaxpr = jax.make_jaxpr(vectorized(field))(t, q)
+    program = str(jaxpr)
     assert "stack[" not in program.replace("_stack[", "")
     assert program.count("concatenate[") == 1  # with one function behind it
     for new, old in zip(vectorized(field)(t, q), field(t, q), strict=True):
         assert_allclose(new, old, rtol=1e-15)
-    new = jax.jacfwd(vectorized(field))(t, q)[0]
+    slope = jax.jacfwd(vectorized(field))
+    new = slope(t, q)[0]
     old = jax.jacfwd(field)(t, q)[0]
     assert_allclose(new, old, rtol=1e-14)
 
@@ -194,5 +196,6 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
     for (path, a), b in pairs:
         assert a.dtype == b.dtype
         assert a.shape == b.shape
-        atol = tolerance * max(1.0, np.abs(b).max())
+        largest = max(1.0, np.abs(b).max())
+        atol = tolerance * largest
         assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))

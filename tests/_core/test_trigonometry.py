@@ -28,7 +28,8 @@ def compiled(name):
 
 def ulps(value, truth):
     """Distance in units in the last place of the truth."""
-    unit = np.spacing(np.abs(np.asarray(truth, float)))
+    magnitude = np.abs(np.asarray(truth, float))
+    unit = np.spacing(magnitude)
     found = np.asarray(value).astype(np.longdouble)
     distance = np.abs(found - truth)
     return np.asarray(distance / unit, float)

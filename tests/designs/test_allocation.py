@@ -70,7 +70,8 @@ def test_several_limits(linear, quadratic):
     )
     assert value(result.power) == pytest.approx(least)
     poor = allowed.scaled(np.ones(14))
-    excess = certify(criterion(slopes).bound(poor), poor, allowed).excess
+    bound = criterion(slopes).bound(poor)
+    excess = certify(bound, poor, allowed).excess
     lost = value(poor) / other.fun
     assert excess * (1 + 1e-6) > lost
 

@@ -60,7 +60,8 @@ def two_charts():
     def up(t, q, u):
         product = 0.3 * q[0] * u[1]
         x = 0.6 * q[0] + u[0] + product
-        y = 0.5 * q[0] ** 2 + u[1]
+        square = 0.5 * q[0] ** 2
+        y = square + u[1]
         return x, y
 
     def down(t, q, u):
@@ -151,7 +152,8 @@ def test_without_a_clock(vanderpol_cycle):
     design = hj.multisine(4, periods=4, frequencies=(0.0, 2.0))
     u = design.scaled(rms=1e-3).signals()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
-    error = np.abs(even - quadratic.second_order(u)).max()
+    expected = quadratic.second_order(u)
+    error = np.abs(even - expected).max()
     assert error < 1e-4 * np.abs(even).max()
 
 

@@ -19,7 +19,8 @@ def test_peaks_hold_in_every_experiment(optimal_two):
     free = optimal_two()
     plan = optimal_two(limit=Limits(rms={"u1": 0.05}, peak={"u0": 0.1}))
     u = plan.design.signals()
-    peaks = np.abs(u).max(axis=1)[:, 0]
+    largest = np.abs(u).max(axis=1)
+    peaks = largest[:, 0]
     assert_allclose(peaks, 0.1)
     square = u[..., 1] ** 2
     rms = np.sqrt(np.mean(square))
@@ -84,7 +85,8 @@ def test_noise_that_differs_between_harmonics(two, optimal_two):
     seen_at = np.abs(shift - N / 2)
     spectra = [level(seen_at) ** 2 for level in noise.values()]
     spectrum = np.stack(spectra, axis=2)[..., None]
-    variance = spectrum * plan.usual.expected_variance()[:, None, :]
+    usual_variance = plan.usual.expected_variance()[:, None, :]
+    variance = spectrum * usual_variance
     uncertain = dataclasses.replace(htf, source="estimate", variance=variance)
     bound = hj.identify.cramer_rao(two, uncertain)
     total = np.trace(bound.multiplier_covariances[0])

@@ -107,7 +107,8 @@ def test_fits_reach_what_is_promised(model):
     data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
     errors = []
     for seed in range(16):
-        noisy = hj.experiments.add_noise(data, std=list(noise.values()), seed=seed)
+        std = list(noise.values())
+        noisy = hj.experiments.add_noise(data, std=std, seed=seed)
         fit = hj.fit_multipliers(hj.estimate_htf(noisy, HARMONICS), 2)
         errors.append(fit.compare(model.multipliers).error[0])
     rms = np.sqrt(np.mean(np.square(errors)))

@@ -113,7 +113,8 @@ def test_repeated_windows_count(model, first):
     long = hj.experiments.simulate_experiments(
         model, first, discard=32, start="periodic"
     )
-    noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
+    std = list(NOISE.values())
+    noisy = hj.experiments.add_noise(long, std=std, seed=1)
     study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
@@ -221,7 +222,8 @@ def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     n = np.arange(len(cycle))
     angle = 2 * np.pi * n / (N * P)
     wave = np.sqrt(2) * np.cos(angle)
-    transient = size * (0.8**cycle + 3 * (cycle == 0))
+    start = 3 * (cycle == 0)
+    transient = size * (0.8**cycle + start)
     y = np.stack([wave, wave + transient], axis=1)
     rng = np.random.default_rng(seed)
     y = y + noise * rng.normal(size=(S, *y.shape))

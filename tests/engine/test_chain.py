@@ -48,7 +48,8 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     """By the time, the state and the input at the start, through events and schedules; charts'
     fields and guards depend on time, and resets on the input."""
     sample = jax.tree_util.tree_map(np.asarray, draw(name, 1))
-    system = Random(STRUCTURES[name][0], sample.charts, sample.arrows)
+    plan = STRUCTURES[name][0]
+    system = Random(plan, sample.charts, sample.arrows)
     s = Structure(from_host(system))
     # x holds the time, the states (padded) and the inputs at the start.
     x = np.zeros(1 + s.d + s.nu)

@@ -98,8 +98,10 @@ def test_no_event_of_200_polynomials_is_missed_or_invented():
 
     compared = 0
     for k, (p, ends) in enumerate(flows):
-        is_event = np.asarray(tape.code[:, k]) == 0
-        found = np.asarray(tape.t[:, k])[is_event]
+        code = np.asarray(tape.code[:, k])
+        is_event = code == 0
+        times = np.asarray(tape.t[:, k])
+        found = times[is_event]
         truth = list(falls(p, ends))
         # Events within the tolerance of none may be missed.
         sure = [x for x, height in truth if height >= 10 * tolerance[k]]
@@ -150,12 +152,14 @@ def test_a_guard_that_is_faster_than_the_state():
     def rates(t, q, u):
         return (1.0,)
 
-    system = toy({"a": Field(("x",), rates)}, (fall,))
+    chart = Field(("x",), rates)
+    system = toy({"a": chart}, (fall,))
     found = hj.simulate(
         system, "a", (0.0,), 1.0, settings=hj.orbits.Settings(1e-6, 1e-6)
     )
     turns = 2 * np.pi * np.arange(80)
-    truth = (np.pi + np.arcsin(0.3) + turns) / 500
+    first = np.pi + np.arcsin(0.3)
+    truth = (first + turns) / 500
     truth = truth[truth < 1]
     assert_allclose([e.time for e in found.events], truth, atol=1e-9)
 

@@ -330,7 +330,8 @@ def test_every_turn_of_a_fast_guard_is_seen():
     def guard(t, q, u):
         return jnp.sin(61.0 * q[0])
 
-    fast = toy(LINE, [hj.Transition("fall", "line", "line", guard)])
+    fall = hj.Transition("fall", "line", "line", guard)
+    fast = toy(LINE, [fall])
     run = hj.simulate(fast, "line", (0.1,), 3.0)
     odd = 2 * np.arange(1000) + 1
     falls = odd * np.pi / 61.0 - 0.1

@@ -50,7 +50,8 @@ def force(t):
 def exact(a=20.0):
     """The state of the cycle at t = 0."""
     w = 2j * np.pi
-    y = a / (w**2 + 3e3 * w + 1e3)
+    denominator = w**2 + 3e3 * w + 1e3
+    y = a / denominator
     v = w * y
     return np.array([y.imag, v.imag])
 
@@ -109,11 +110,13 @@ def test_a_landing_is_as_stiff_as_its_chart():
     one = np.ones(1)
     none = np.zeros(1, np.int32)
     state = np.array([[0.0], [1e-3]])
-    lanes = to_host(start_lanes(s, np.zeros(1), none, state))
+    begun = start_lanes(s, np.zeros(1), none, state)
+    lanes = to_host(begun)
     target = Target(
         np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.errors.Result.OK
     )
-    settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
+    scale = np.ones((1, 2))
+    settings = Settings(1e-9, 1e-9, 64, scale)
     stride = Stride(one, 0.9975 * one, 1e7 * one)
     no_input = np.zeros((s.nu, 1))
     moved = move(s, lanes, no_input, target, settings, stride)
@@ -151,7 +154,8 @@ def test_inverses_of_many_matrices():
     matrix[0, 0] = 0.0  # pivots are needed
     inverses = jax.jit(inverse)(matrix)
     found = np.moveaxis(inverses, -1, 0)
-    expected = np.linalg.inv(np.moveaxis(matrix, -1, 0))
+    matrices = np.moveaxis(matrix, -1, 0)
+    expected = np.linalg.inv(matrices)
     assert_allclose(found, expected, atol=1e-12)
 
 

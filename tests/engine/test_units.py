@@ -33,7 +33,8 @@ def begin(system, length, time):
     """A lane at the top of a hop, and one on the ground."""
     top = [2.2, 0.0, 0.3, 0.1]
     ground = [2.0, 1.9, 0.0, 0.0]
-    q = np.array([top, ground]) * sizes(length, time)
+    states = np.array([top, ground])
+    q = states * sizes(length, time)
     charts = jnp.array([0, 1], jnp.int32)
     return start_lanes(Structure(system), jnp.zeros(2), charts, q.T)
 

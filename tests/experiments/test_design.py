@@ -164,7 +164,8 @@ def test_signals_are_sums_of_cosines():
     one_round = expected[:, : P * N]
     assert_allclose(design.signals(), one_round, atol=1e-14)
     squares = one_round**2
-    rms = np.sqrt(np.mean(squares, axis=1)).max(axis=1)
+    rms_of_rounds = np.sqrt(np.mean(squares, axis=1))
+    rms = rms_of_rounds.max(axis=1)
     peak = np.abs(one_round).max(axis=(1, 2))
     assert_allclose(design.crest_factors(), peak / rms, rtol=1e-12)
 
@@ -253,7 +254,8 @@ def test_several_inputs(division):
     design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=n_inputs, division=division)
     assert design.experiments == n_inputs * 4
     assert len(design.frequencies) == n_lines
-    acts = np.abs(design.signals()).max(axis=1) > 0
+    peaks = np.abs(design.signals()).max(axis=1)
+    acts = peaks > 0
     if division == "random":
         assert acts.mean() == 1 / 3
     elif division == "orthogonal":

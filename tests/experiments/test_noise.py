@@ -31,7 +31,8 @@ def require_color(x, std, memory):
     square = x[:, 0] ** 2
     require_mean(square, std[0] ** 2)
 
-    normal = x / np.resize(std, x.shape[1:])
+    std_of_each = np.resize(std, x.shape[1:])
+    normal = x / std_of_each
     for lag in (1, 3, N, 4 * N):
         later = normal[:, lag:]
         earlier = normal[:, :-lag]

@@ -27,7 +27,8 @@ def campaign():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sizes = np.linspace(0.005, 0.3, EXPERIMENTS)[:, None, None]
     rng = np.random.default_rng(1)
-    u = sizes * rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
+    draws = rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
+    u = sizes * draws
     return prepare(cycle, FAMILY, u, ("yM", "vM"), RunOptions(discard=0))
 
 
@@ -53,7 +54,8 @@ def test_lanes_that_leave_the_table_say_so(campaign, responses):
     magnitude = np.abs(np.asarray(searched.y))
     sizes = magnitude.max(axis=(0, 1))
     for part, left in along:
-        difference = np.asarray(part.y) - np.asarray(searched.y)
+        searched_y = np.asarray(searched.y)
+        difference = np.asarray(part.y) - searched_y
         error = np.abs(difference) / sizes
         follows = ~np.asarray(left)
         assert 0 < follows.sum() < EXPERIMENTS
@@ -91,6 +93,7 @@ def test_other_inputs_and_parameters_compile_nothing(campaign):
     campaign.run()
     count = len(compilation._by_text)
     other = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))
-    u = jnp.zeros((EXPERIMENTS, 16 * CYCLES, 1)) + 1e-3
+    none = jnp.zeros((EXPERIMENTS, 16 * CYCLES, 1))
+    u = none + 1e-3
     hj.run_experiments(other, FAMILY, u, ("yM", "vM"), discard=0)
     assert len(compilation._by_text) == count

@@ -79,7 +79,8 @@ def test_errors_that_no_residual_shows_are_unknown():
 
 @pytest.mark.slow
 def test_times_of_autonomous_cycles_count_from_any_moment():
-    where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
+    position = hj.Crossing("x", "rising")
+    where = [position, hj.Crossing("v", "rising")]
     systems = [hj.models.VanDerPol(mu=mu) for mu in (1.1, 1.101)]
     cycles = [hj.find_limit_cycle(system) for system in systems]
     (gap,), (other,) = (

@@ -48,7 +48,8 @@ TIMES = np.arange(8.0)
 
 
 def records(**options):
-    y = np.random.default_rng(0).normal(size=(2, 16, 1))
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(2, 16, 1))
     y[:, 0] = options.pop("begin", 0.0)
     return hj.experiments.ExperimentData(
         np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options

@@ -19,7 +19,8 @@ def model(A):
 @settings(max_examples=50)
 @given(st.integers(0, 2**16), st.floats(1e-6, 0.5))
 def test_it_is_bounded_as_stated(seed, smoothing):
-    A = np.random.default_rng(seed).normal(size=(2, 3, 3))
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(2, 3, 3))
     product = A[1] @ A[0]
     values, vectors = np.linalg.eig(product)
     true = np.abs(values).max()
@@ -43,7 +44,8 @@ def test_it_has_a_derivative_where_multipliers_meet(e, mode):
         return hj.fitting.spectral_radius(model(A))
 
     h = 1e-6
-    change = radius(e + h) - radius(e - h)
+    later = radius(e + h)
+    change = later - radius(e - h)
     difference = change / (2 * h)
     slope = float(mode(radius)(e))
     assert slope == pytest.approx(float(difference), rel=1e-5)

@@ -72,7 +72,8 @@ def observed(height, seed=None, **options):
     y, bounces = drop(height)
     y = y[:, None].copy()
     if seed is not None:
-        y += 0.003 * np.random.default_rng(seed).normal(size=y.shape)
+        draws = np.random.default_rng(seed).normal(size=y.shape)
+        y += 0.003 * draws
         options["std"] = 0.003
     y[7] = np.nan  # (a frame without the ball)
     begin = hj.Guess("main", (height + 0.02, 0.1))
@@ -110,7 +111,8 @@ def test_times_of_events_alone_identify_the_restitution():
 def test_prints_have_the_digits_that_errors_leave():
     data = observed(1.0, seed=0)
     assert " known=" not in repr(data)  # (It would list the place of each sample.)
-    table = repr(hj.fit_model(ball(), data, ("e", "drag")))
+    fit_of_ball = hj.fit_model(ball(), data, ("e", "drag"))
+    table = repr(fit_of_ball)
     assert re.search(r"e  +0\.\d{5} +± 0\.00\d\d\n", table)
 
 

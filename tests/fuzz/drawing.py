@@ -121,7 +121,8 @@ def wave(rng, size, rate) -> dict[str, Any]:
 def beside(rng, x, sign: float) -> dict[str, Any]:
     """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
     side = rng.choice([-1.0, 1.0])
-    gap = side * 10 ** rng.uniform(-5.5, -1.5)
+    exponent = rng.uniform(-5.5, -1.5)
+    gap = side * 10**exponent
     bend = rng.normal(0.0, 3.0)
     # sign * (n.q + c + gap + bend * (n.q + c)^2)
     n = x["n"]

@@ -203,7 +203,8 @@ class _Stay:
         t, v = self.with_minima(value, t, values)
         steps = np.diff(v) / np.diff(t)
         rates = np.abs(steps)
-        self.fastest[g] = max(self.fastest[g], rates.max())
+        fastest = rates.max()
+        self.fastest[g] = max(self.fastest[g], fastest)
         found = []
         for k in range(1, len(t)):
             self.armed[g] |= v[k - 1] > LEFT

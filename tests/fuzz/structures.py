@@ -99,7 +99,8 @@ class Random(hj.HybridSystem):
     def _transition(self, g, arrow: Arrow, x):
         def guard(t, q, u):
             bent = 0.5 * q @ (x["Q"] @ q)
-            curved = x["n"] @ q + bent + x["c"]
+            along = x["n"] @ q
+            curved = along + bent + x["c"]
             phase = x["w"] * t + x["p"]
             wave = x["a"] * jnp.sin(phase)
             return curved + x["m"] @ u + wave

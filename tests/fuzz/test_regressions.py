@@ -95,10 +95,12 @@ def across(x, time, duration):
     t = jnp.full(1, time)
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
-    wave = jnp.sin(2 * jnp.pi * (time + hit))
+    angle = 2 * jnp.pi * (time + hit)
+    wave = jnp.sin(angle)
     level = -0.1 * x - 2.1 * hit + 0.1 * wave
     s = Structure(Toys(rounded, [level]))
-    lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
+    none = jnp.zeros(1, jnp.int32)
+    lanes = start_lanes(s, t, none, q)
     no_input = jnp.zeros((1, 1))
     target = until(t + duration)
     moved = move(s, lanes, no_input, target, SETTINGS).moved

@@ -39,7 +39,8 @@ def record(t):
 
 def run(t, u):
     y = np.stack([t.model.simulate(x) for x in u])
-    noise = 1e-3 * np.random.default_rng(2).normal(size=y.shape)
+    draws = np.random.default_rng(2).normal(size=y.shape)
+    noise = 1e-3 * draws
     return hj.experiments.ExperimentData(u, y + noise, n_sections=6, periods=16)
 
 

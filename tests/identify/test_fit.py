@@ -19,7 +19,8 @@ MULTIPLIERS = (0.8, 0.5)
 def plant():
     """A system with two multipliers, whose coordinates change from section to section."""
     rng = np.random.default_rng(1)
-    root = np.diag(np.array(MULTIPLIERS) ** (1 / N))
+    moduli = np.array(MULTIPLIERS)
+    root = np.diag(moduli ** (1 / N))
     draws = rng.normal(size=(N, 2, 2))
     T = draws + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
@@ -161,7 +162,8 @@ def test_a_controller_is_a_finding(plant):
         last = signals[-1][1] if signals else 0.0
         u = 0.3 * rng.normal(size=1) - 0.2 * last
         signals.append((u, y))
-        x = A[n] @ x + B[n] @ u
+        forced = B[n] @ u
+        x = A[n] @ x + forced
     u, y = np.swapaxes(signals, 0, 1)
     data = hj.experiments.SectionSeries(u, y, n_sections=N, inputs="force")
     for fit in (hj.fit_series(data, 2, check=False), hj.fit_ldtp(data, 2, check=False)):
@@ -173,7 +175,8 @@ def test_a_controller_is_a_finding(plant):
 
 def test_a_misfit_is_a_finding(plant):
     htf = uncertain(plant)
-    bold = dataclasses.replace(htf, variance=np.asarray(htf.variance) / 100)
+    smaller = np.asarray(htf.variance) / 100
+    bold = dataclasses.replace(htf, variance=smaller)
     fit = hj.fit_ldtp(bold, 2)
     assert "misfit" in causes(fit)
     assert fit.cost > 50 * fit.dof

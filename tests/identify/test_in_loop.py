@@ -50,7 +50,8 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
         k = i % N
         process = d[:, i]
         sensor = e[:, i] / 4
-        free = x @ C[k, 0] + process + sensor
+        output = x @ C[k, 0]
+        free = output + process + sensor
         answer = 0.3 * last if waits else free
         command = r[:, i] + c[:, i]
         answered = GAIN[k, 0, 0] * answer
@@ -68,7 +69,8 @@ def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
 def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
-    u, y = run(model, r, 0 * r, rng, **options)
+    still = 0 * r
+    u, y = run(model, r, still, rng, **options)
     return hj.experiments.SectionSeries(
         np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
     )
@@ -279,7 +281,8 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         None
     ]  # (a statistic of -5e-4, by rounding)
     rng = np.random.default_rng(0)
-    u, y = run(plant, r, 0 * r, rng, waits=True)
+    still = 0 * r
+    u, y = run(plant, r, still, rng, waits=True)
     data = hj.experiments.SectionSeries(
         np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
     )
@@ -299,7 +302,8 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     r, e = rng.normal(size=(2, N * 400))
     loop = plant.feedback([[0.9]])
     push = (r - 0.27 * e)[:, None]
-    x = np.asarray(loop.simulate(push))[:, 0]
+    states = np.asarray(loop.simulate(push))
+    x = states[:, 0]
     y = x + 0.3 * e
     data = hj.experiments.SectionSeries(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")

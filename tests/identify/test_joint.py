@@ -153,7 +153,8 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
 
 def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     """20 dB, at which the misfit is 1.6 times the expected one."""
-    model = hj.linearize(hopper_cycle, hj.ClockPhase(8), ("yM", "vM"))
+    sections = hj.ClockPhase(8)
+    model = hj.linearize(hopper_cycle, sections, ("yM", "vM"))
     design = (
         hj.multisine(8, periods=16, frequencies=(0, 4)).scaled(rms=0.05).realizations(4)
     )

@@ -167,7 +167,8 @@ def test_inputs_that_their_past_determines(through):
     u = np.cos(2 * np.pi / 3 * np.outer(np.arange(1200), (0.3, 1.1))).sum(
         axis=1, keepdims=True
     )
-    noise = 0.03 * np.random.default_rng(0).normal(size=u.shape)
+    draws = np.random.default_rng(0).normal(size=u.shape)
+    noise = 0.03 * draws
     data = hj.experiments.SectionSeries(
         u, np.asarray(model.simulate(u)) + noise, n_sections=3
     )
@@ -178,7 +179,8 @@ def test_inputs_that_their_past_determines(through):
 
 def test_residuals_of_exact_data_tell_nothing(small):
     """What depends on the input, but is rounding."""
-    grid = CycleGrid.from_records([record(small, 4 * 100, 0)])
+    data = record(small, 4 * 100, 0)
+    grid = CycleGrid.from_records([data])
     response = grid.u[..., :1] + 0.1 * np.random.default_rng(0).normal(
         size=grid.y.shape
     )
@@ -254,7 +256,8 @@ def test_errors_are_as_large_as_said(small):
         for seed in range(runs)
     ]
     square = [fit.distance(small.multipliers)[0] for fit in fits]
-    below = stats.chi2(2 * runs).cdf(sum(square))
+    total = sum(square)
+    below = stats.chi2(2 * runs).cdf(total)
     assert 1e-3 < below < 1 - 1e-3
     assert covered(
         sum(int(fit.contains(small.multipliers[0]).all()) for fit in fits), runs

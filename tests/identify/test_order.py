@@ -18,7 +18,8 @@ from .test_uncertainty import (
 @pytest.mark.parametrize("size", [1.0, 100.0])
 def test_two_multipliers_are_two(size, small, variance):
     _, htf = small
-    data = noisy(htf, size * variance, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    data = noisy(htf, size * variance, rng)
     found = hj.select_order(data, 4)
     assert np.all(found.deviation[:2] > 10)
     apart = np.abs(found.strength[2:] - 1)
@@ -46,7 +47,8 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
             shape = variance[1:].shape
             factors = rng.gamma(3.0, 1 / 3, shape)
             rough = variance[1:] * factors
-            data = with_variance(htf, data.H, rough, np.full(80, 3.0))
+            dof = np.full(80, 3.0)
+            data = with_variance(htf, data.H, rough, dof)
         try:
             hj.fit_multipliers(data, 3)
         except hj.errors.DefinitionError as error:
@@ -87,7 +89,8 @@ def test_a_weak_multiplier_that_was_left_out_is_named(size):
     for seed in range(6):
         rng = np.random.default_rng(seed)
         # Three sections; the states change after the last one.
-        B = rng.normal(size=(3, 3)) * [1, 1, size]
+        draws = rng.normal(size=(3, 3))
+        B = draws * [1, 1, size]
         C = rng.normal(size=(3, 2, 3))
         u = rng.normal(size=1350)
         y = np.zeros((1350, 2))
@@ -99,7 +102,8 @@ def test_a_weak_multiplier_that_was_left_out_is_named(size):
             if n == 2:
                 x = A @ x
         y += 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
-        data = hj.experiments.SectionSeries(u[:, None], y, n_sections=3)
+        inputs = u[:, None]
+        data = hj.experiments.SectionSeries(inputs, y, n_sections=3)
         fit = hj.fit_series(data, 2)
         named += "order" in [finding.cause for finding in fit.findings]
     if size:

@@ -77,7 +77,8 @@ def test_from_noisy_htfs(exact, hopper, multipliers):
     real = rng.normal(size=shape)
     imaginary = rng.normal(size=shape)
     error = real + 1j * imaginary
-    H = exact.H + np.sqrt(variance / 2) * error
+    size_of_errors = np.sqrt(variance / 2)
+    H = exact.H + size_of_errors * error
     model = realized_htf(dataclasses.replace(exact, H=H, variance=variance), order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
     difference = np.abs(model.multipliers[:2] - multipliers)

@@ -67,7 +67,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     sizes alone hold 90 % (three realizations), 92 % (four), 94 % (eight); two tell no more."""
     rng = np.random.default_rng(R)
     runs = 20_000
-    phases = 2 * np.pi * rng.random((R, runs))
+    turns = rng.random((R, runs))
+    phases = 2 * np.pi * turns
     draws = rng.normal(size=(R, runs, 2))
     parts = np.sqrt(0.5) * draws
     bias = constant * np.exp(1j * phases)
@@ -83,7 +84,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     square = (np.abs(residuals) ** 2).sum(axis=0)
     turned = (residuals**2).sum(axis=0)
     variance = square / (R - 1)
-    shape = roundness(square, turned, np.full(runs, 1.0 * R))
+    number = np.full(runs, 1.0 * R)
+    shape = roundness(square, turned, number)
     dof = np.full(runs, R - 1.0)
     variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
     for level in (0.5, 0.8, 0.95, 0.99):
@@ -104,7 +106,8 @@ def test_the_parts_of_the_variance(model):
     data = realized(model, 40, 8, noise=0.2)
     estimate = hj.estimate_htf(data, repeats=8)
     np.testing.assert_array_equal(estimate.variance_dof.dof, 39)
-    once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
+    one_block = LINES.expected_variance(0.2, repeats=8)
+    once = one_block[0, 0] / 40
     np.testing.assert_allclose(np.mean(estimate.variance), once, rtol=0.03)
     np.testing.assert_allclose(np.mean(estimate.noise_variance), once, rtol=0.03)
     alone = hj.estimate_htf(data, repeats=8, variance="noise")
@@ -211,7 +214,8 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
     rng = np.random.default_rng(0)
     weight = dof / rng.gamma(dof, size=(4000, 300))
     error = rng.normal(size=weight.shape)
-    estimate = (weight * error).sum(axis=1) / weight.sum(axis=1)
+    total = weight.sum(axis=1)
+    estimate = (weight * error).sum(axis=1) / total
     squares = (error - estimate[:, None]) ** 2
     misfit = np.mean(weight * squares) * 300 / 299
     _, deviation = estimated_noise(dof / (dof - 1), misfit)

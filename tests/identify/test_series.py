@@ -82,7 +82,8 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
         whole = record(model, length, seed + k, first_section=section, x0=x0)
         is_gap = rng.random(whole.y.shape) < 0.02
         whole.y[is_gap] = np.nan
-        whole.u[25 * N + 2, 0] = np.nan
+        missing = 25 * N + 2
+        whole.u[missing, 0] = np.nan
         records.append(whole)
     fit = hj.fit_series(records, model)
     np.testing.assert_allclose(
@@ -347,9 +348,11 @@ def test_announced_drift_is_removed(small):
     cycle = n // 4 + 0.5
     section = n % 4
     plain = record(small, 4 * T, noise=0.1, drift=50)
-    slow = np.cos(np.pi * 3 * cycle / T)
+    phase = np.pi * 3 * cycle / T
+    slow = np.cos(phase)
     wave = 5 * slow * np.cos(section) + 7
-    moved = with_outputs(plain, plain.y + wave[:, None])
+    moved_outputs = plain.y + wave[:, None]
+    moved = with_outputs(plain, moved_outputs)
     without = hj.fit_series(plain, 2)
     fit = hj.fit_series(moved, 2)
     np.testing.assert_allclose(fit.coefficients, without.coefficients, atol=1e-6)

@@ -94,11 +94,13 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance, rng)
         rough = variance * rng.gamma(2.0, 0.5, variance.shape)
-        estimated = with_variance(htf, data.H, rough, np.full(80, 2.0))
+        dof_of_each = np.full(80, 2.0)
+        estimated = with_variance(htf, data.H, rough, dof_of_each)
         fit = hj.fit_multipliers(estimated, 2)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(model.multipliers).error[0] ** 2 for f in (fit, raw)]
-    bound = hj.identify.cramer_rao(model, with_variance(htf, htf.H, variance))
+    exact = with_variance(htf, htf.H, variance)
+    bound = hj.identify.cramer_rao(model, exact)
     ratio = np.sqrt(square / 25) / bound.standard_errors[0]
     assert ratio[0] < 1.2 < ratio[1]
 
@@ -129,7 +131,8 @@ def test_the_spectrum_of_errors_is_found(small):
     colored = np.array([1e-2, 2e-3])
     gain = np.abs(chi[:, None]) ** 2
     true = white + colored / gain
-    guessed = np.linspace(1e-3, 4e-3, 160).reshape(80, 2, 1)
+    line = np.linspace(1e-3, 4e-3, 160)
+    guessed = line.reshape(80, 2, 1)
     supposed = weights_of(guessed, np.ones(2))
     supposed = np.broadcast_to(supposed, htf.H.shape)
     rng = np.random.default_rng(0)

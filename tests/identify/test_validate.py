@@ -109,7 +109,8 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     whole_cycles = (1 + np.arange(4 * 150)) // 4
     cycle = (whole_cycles + 0.5) / 151
     slow = np.cos(np.pi * 3 * cycle)
-    by_section = np.cos(np.arange(4 * 150) % 4)
+    sections = np.arange(4 * 150) % 4
+    by_section = np.cos(sections)
     wave = 9 * slow * by_section + 7
     about = dict(
         n_sections=4,

@@ -26,7 +26,8 @@ def simulate_blocks(blocks, u, x0, start=0):
         n = (start + i) % len(A)
         output = C[n] @ x + D[n] @ value
         ys.append(output)
-        x = A[n] @ x + B[n] @ value
+        forced = B[n] @ value
+        x = A[n] @ x + forced
         xs.append(x)
     return xs, np.array(ys)
 

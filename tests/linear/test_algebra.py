@@ -41,10 +41,12 @@ def lifted(ldtp, z):
     outputs = []
     for k in range(N):
         first = n + k * nu
-        u = everything[first : n + (k + 1) * nu]
+        after = n + (k + 1) * nu
+        u = everything[first:after]
         output = C[k] @ x + D[k] @ u
         outputs.append(output)
-        x = A[k] @ x + B[k] @ u
+        forced = B[k] @ u
+        x = A[k] @ x + forced
     y = np.concatenate(outputs)
     shift = z[:, None, None] * np.eye(n)
     of_state = x[:, :n]

@@ -53,7 +53,8 @@ def test_three_ways_agree(seed, shape, f):
     u[:, channel] = wave
     rest = np.zeros(dims[0])
     _, y = simulate_blocks(blocks, u, rest)
-    Y = np.fft.fft(y[transient * N :], axis=0)
+    steady_output = y[transient * N :]
+    Y = np.fft.fft(steady_output, axis=0)
     steady = u[transient * N :, channel]
     U = np.fft.fft(steady)
     line = round(f * periods)
@@ -111,7 +112,8 @@ def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     step = np.zeros(htf.H.shape)
     step[entry] = h
     H = np.asarray(htf.H)
-    change = loss(H + step) - loss(H - step)
+    higher = loss(H + step)
+    change = higher - loss(H - step)
     difference = change / (2 * h)
     assert_allclose(difference, gradient[entry].real, rtol=1e-6)
 

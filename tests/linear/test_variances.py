@@ -37,7 +37,8 @@ def test_the_radius_is_that_of_the_f_distribution(htf):
     )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
     unevenness = np.asarray(htf.variance_dof.roundness) - 1
-    level = 1 - 0.05 * (1 + 0.95**2 * unevenness)
+    larger = 1 + 0.95**2 * unevenness
+    level = 1 - 0.05 * larger
     quantile = stats.f.ppf(level, 2, 8)
     expected = np.sqrt(quantile * np.asarray(htf.variance))
     for radius in (

@@ -83,7 +83,8 @@ def test_the_hopper_on_a_compliant_ground():
     states = np.array(list(cycle.state.values()))
     scales = list(cycle.scale.values())
     found = states / scales
-    expected = state / np.array(list(cycle.scale.values()))
+    scale = np.array(list(cycle.scale.values()))
+    expected = state / scale
     assert_allclose(found, expected, atol=1e-11)
     z = -0.24885118328047069434 + 0.69922500780850327787j
     pair = [z, z.conjugate()]

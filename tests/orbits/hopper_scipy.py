@@ -22,7 +22,8 @@ def _leg(t, yM, ym):
 def _field(t, q, u):
     yM, vM = q[:2]
     if len(q) == 2:
-        acceleration = (_leg(t, yM, 0.0) + u) / 2.0 - 2.0
+        force = _leg(t, yM, 0.0) + u
+        acceleration = force / 2.0 - 2.0
         return np.array([vM, acceleration])
     ym, vm = q[2:]
     leg = _leg(t, yM, ym)

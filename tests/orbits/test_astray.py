@@ -127,5 +127,6 @@ def test_a_burst_that_meets_the_plane_through_its_guess_twice_is_found():
 def test_a_search_waits_for_a_slow_manifold_to_end():
     """The fast mode of x = 6 decays 36 times as fast as x moves."""
     system = hj.models.VanDerPol(mu=6.0)
-    far = hj.find_limit_cycle(system, hj.Guess("oscillation", (6.0, 0.3)))
+    guess = hj.Guess("oscillation", (6.0, 0.3))
+    far = hj.find_limit_cycle(system, guess)
     assert_allclose(far.period, hj.find_limit_cycle(system).period, rtol=1e-10)

@@ -329,7 +329,8 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
     cycle = hj.find_limit_cycle(IntegrateAndFire())
     branch = hj.continuation(cycle, "a", (0.3, 0.8), step=0.1)
     (fold,) = branch.points
-    mean = 1 / (1 - np.exp(-period)) - 1.5
+    charge = 1 / (1 - np.exp(-period))
+    mean = charge - 1.5
     expected = abs(mean) * np.hypot(1, rate)
     assert_allclose(fold.value, expected, rtol=1e-9)
 
@@ -422,7 +423,8 @@ def _least_current(R):
             [0, 0, 0],
         ]
     )
-    turn = expm(off * 10e-6) @ expm(on * 10e-6)
+    turn_on = expm(on * 10e-6)
+    turn = expm(off * 10e-6) @ turn_on
     unit = np.eye(2)
     back = unit - turn[:2, :2]
     return np.linalg.solve(back, turn[:2, 2])[1]

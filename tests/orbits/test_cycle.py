@@ -108,7 +108,8 @@ def test_the_two_legged_bar():
 def test_van_der_pol(mu):
     """In reversed time, mu -> -mu, the cycle is the same and its multiplier the reciprocal."""
     amplitude, period, multiplier = VANDERPOL[abs(mu)]
-    cycle = vanderpol(mu, (2.0, 0.0) if mu < 0 else None)
+    start = (2.0, 0.0) if mu < 0 else None
+    cycle = vanderpol(mu, start)
     at_rest = [amplitude, 0.0]
     assert_allclose(cycle.anchor.q[:, 0], at_rest, atol=1e-9)
     assert_allclose(cycle.period, period, atol=1e-9)

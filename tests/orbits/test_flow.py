@@ -314,7 +314,8 @@ def test_derivatives_where_states_are_small_for_a_moment():
 
     slope = jax.grad(height)(10.0)
     step = 1e-5
-    change = height(10.0 + step) - height(10.0 - step)
+    higher = height(10.0 + step)
+    change = higher - height(10.0 - step)
     difference = change / (2 * step)
     assert_allclose(slope, difference, rtol=1e-7)
 
@@ -343,7 +344,8 @@ def test_many_flows_one_of_which_fails():
         hj.flow(ball(), hj.Guess("main", states), 0.9)
 
     def height(x):
-        end = hj.flow(ball(), hj.Guess("main", x), 0.9)
+        start = hj.Guess("main", x)
+        end = hj.flow(ball(), start, 0.9)
         return end.state[0]
 
     slopes = jax.vmap(jax.grad(height))(states)
@@ -442,7 +444,8 @@ def test_a_guard_that_is_touched():
 
     @jax.jit
     def swing(a):
-        start = hj.Guess("swing", jnp.stack([-a, 0.0]))
+        state = jnp.stack([-a, 0.0])
+        start = hj.Guess("swing", state)
         return hj.flow(Wall(), start, 4.0)
 
     def end(a):

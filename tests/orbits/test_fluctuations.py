@@ -115,7 +115,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     relative = landing - slope(t)
 
     # How the next time, height and speed depend on those of this bounce.
-    time = np.array([landing, -1.0, -1.0]) / relative
+    changes = np.array([landing, -1.0, -1.0])
+    time = changes / relative
     duration = time - [1, 0, 0]
     height = slope(t) * time
     by_bend = 1.7 * bend(t) * time
@@ -142,7 +143,8 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
 
     # A duration is the difference of two times.
     once = step @ C
-    times = [C[0, 0], once[0, 0], (step @ step @ C)[0, 0]]
+    twice = step @ step @ C
+    times = [C[0, 0], once[0, 0], twice[0, 0]]
     expected = 2 * (times[0] - times[1])
     assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
     expected = 2 * times[1] - times[0] - times[2]

@@ -141,7 +141,8 @@ def test_an_event_in_the_last_step_of_a_turn_is_noticed():
     """Also if the guard is positive again where the turn ends."""
     gain = amplitude(1.0)
     quadrature = 0.4 * 1.3
-    peak = np.arctan2(quadrature, 1 - 1.3**2) / 1.3
+    in_phase = 1 - 1.3**2
+    peak = np.arctan2(quadrature, in_phase) / 1.3
     after = hj.Guess("free", (0.9, -0.1), time=peak + 0.1)
     known = hj.find_limit_cycle(Rebound(drive=0.99 / gain), after)
 
@@ -238,7 +239,8 @@ def test_programs_of_many_systems_factorize_nothing(free):
     def program(leaves, t, expected, q, ends):
         return correct(Maps(map, leaves, t, expected), plan, q, ends)
 
-    lowered = jax.jit(program).lower(leaves, *times, q, ends)
+    compiled = jax.jit(program)
+    lowered = compiled.lower(leaves, *times, q, ends)
     text = lowered.as_text()
     assert "while" in text
     assert "@lapack_" not in text
@@ -256,7 +258,8 @@ def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
 
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     """The turn ends with the tick `up`, which comes later than the turn in other systems."""
-    cycle = hj.find_limit_cycle(Pulses(rise=0.05), hj.find_limit_cycle(Pulses()))
+    known = hj.find_limit_cycle(Pulses())
+    cycle = hj.find_limit_cycle(Pulses(rise=0.05), known)
     path = cycle.trajectory()
     after = np.flatnonzero(path.event == 0)[0]
     # In closed form, the charge with which a pulse of 0.35 begins.
@@ -550,7 +553,8 @@ class Window(hj.HybridSystem):
 @pytest.mark.slow
 def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     """Not at the ends of a step, but at the zero of the guard within."""
-    cycle = hj.find_limit_cycle(Window(), hj.Guess("follows", (0.5,)))
+    guess = hj.Guess("follows", (0.5,))
+    cycle = hj.find_limit_cycle(Window(), guess)
     sizes = np.linspace(0.5, 1.1, 13)
     square = 1 + 4 * np.pi**2
     ripple = 1 / np.sqrt(square)
@@ -558,7 +562,8 @@ def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     result = jax.jit(
         jax.vmap(lambda size: hj.find_limit_cycle(Window(size), cycle).result)
     )
-    found = result(jnp.asarray(sizes)) == hj.errors.Result.OK
+    codes = result(jnp.asarray(sizes))
+    found = codes == hj.errors.Result.OK
     np.testing.assert_array_equal(found, has_no_event)
     for _ in range(4):  # (by a search, and by the known itinerary)
         beside = hj.find_limit_cycle(Window(1.0), cycle, throw=False)

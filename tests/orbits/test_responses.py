@@ -167,7 +167,8 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     cycle = hj.find_limit_cycle(system, guess, section=section)
     phase = cycle.asymptotic_phase("plane", (0.3, 0.15))
     distance = np.hypot(0.3, 0.15) / np.sqrt(0.1)
-    exact = np.arctan2(0.15, 0.3) + 0.4 * np.log(distance)
+    shear = 0.4 * np.log(distance)
+    exact = np.arctan2(0.15, 0.3) + shear
     assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
@@ -320,7 +321,8 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
     assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
-    measured = np.reshape(a.durations, (4, 2)).sum(1)
+    by_side = np.reshape(a.durations, (4, 2))
+    measured = by_side.sum(1)
     assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
     squares = [Square(a=x) for x in (0.19, 0.21)]
@@ -399,7 +401,8 @@ def test_mathieus_equation_has_the_published_continuous_htf():
     ldtp = hj.linearize(cycle, hj.ClockPhase(64), "x")
     held = ldtp.htf(0.25, (-1, 0, 1)).H
     x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
-    found = held * x / (1 - np.exp(-x))
+    decay = np.exp(-x)
+    found = held * x / (1 - decay)
     assert_allclose(found, htf.H, rtol=1e-7)
     with pytest.raises(hj.errors.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
@@ -572,7 +575,8 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
     _, forward = jax.jvp(result, (begin,), (jnp.ones(()),))
 
     def central(h):
-        change = result(begin + h) - result(begin - h)
+        later = result(begin + h)
+        change = later - result(begin - h)
         return change / (2 * h)
 
     h = 1e-3 * begin

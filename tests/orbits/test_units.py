@@ -45,7 +45,8 @@ def relaxation_in(length, time):
         x, v, nothing, rounding = q
         damping = (1 - (x / length) ** 2) * v / time
         force = damping - x / time**2
-        still = (((x + length) - x) - length - rounding) / time
+        rounded = (x + length) - x
+        still = (rounded - length - rounding) / time
         return v, force + u[0], -nothing / time, still
 
     chart = Field(("x", "v", "nothing", "rounding"), field)

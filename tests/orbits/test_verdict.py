@@ -117,7 +117,8 @@ def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
 def test_a_guess_on_the_right_side_of_the_guards_finds_the_rhythm():
     # From between the thresholds Newton's method goes to the rest point beyond one of them.
     for chart, x in (("up", 0.0), ("down", 0.0), ("up", -0.9), ("down", 0.9)):
-        cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess(chart, (x,)))
+        guess = hj.Guess(chart, (x,))
+        cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
         assert sorted(cycle.event_sequence) == [0, 1]
         assert 0.69 < cycle.multipliers[0].real < 0.70
         assert not cycle.findings
@@ -157,7 +158,8 @@ def ghost_beside(cycle):
 
 @pytest.mark.slow
 def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
-    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
     ghost = ghost_beside(cycle)
     widths = jnp.linspace(0.297, 0.303, 4)
     systems = eqx.filter_vmap(lambda w: SchmittTrigger(width=w))(widths)
@@ -180,7 +182,8 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
 
 
 def test_a_branch_does_not_begin_beyond_a_guard():
-    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
     with pytest.raises(hj.errors.DefinitionError, match="none of SchmittTrigger"):
         hj.continuation(ghost_beside(cycle), "width", (0.25, 0.35))
 
@@ -236,7 +239,8 @@ def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard(
 
 
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
-    good = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    good = hj.find_limit_cycle(SchmittTrigger(), guess)
     cycles = hj.orbits.find_limit_cycles(
         [SchmittTrigger(width=w) for w in (0.3, 0.9)], good
     )

@@ -38,7 +38,8 @@ class Hopper:
 
     def stance(self, t, q, u):
         yM, vM = q
-        acceleration = (self.leg(t, yM, 0.0) + u) / 2 - 2
+        force = self.leg(t, yM, 0.0) + u
+        acceleration = force / 2 - 2
         return vM, acceleration
 
     def flight(self, t, q, u):

@@ -94,7 +94,8 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
     t, x = motion("x")
     error = abs(motion.t[-1] - 2 * math.pi)
     assert error < 1e-8
-    error = np.abs(x - np.cos(t)).max()
+    expected_cosine = np.cos(t)
+    error = np.abs(x - expected_cosine).max()
     assert error < 1e-3
     expected_x = np.cos(motion.t)
     error = np.abs(motion.after[:, 0] - expected_x).max()
@@ -207,7 +208,8 @@ def test_errors_contain_the_stairs_of_time_steps():
         d = rng.uniform(0.3, 0.5)
         time_step = float(1 / rng.integers(100, 300))
         plant = Stairs(a, b, c, d, time_step)
-        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        sections = hj.ClockPhase(2)
+        cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
         returns = cycle.perturbed_returns("v")
         true = a + b * d
         held.append(bool(returns.contains(true).all()))
@@ -240,7 +242,8 @@ def test_errors_contain_stairs_of_steps_that_a_plant_divides():
         d = rng.uniform(0.3, 0.5)
         time_step = float(1 / rng.integers(20, 60))
         plant = FineStairs(a, b, c, d, time_step)
-        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        sections = hj.ClockPhase(2)
+        cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
         returns = cycle.perturbed_returns("v")
         off = returns.multipliers[0] - (a + b * d)
         ratios.append(abs(off) / returns.standard_errors[0])
@@ -285,7 +288,8 @@ def test_a_coordinate_of_rounding_errors_is_at_rest():
 @pytest.mark.parametrize(("size", "cause"), [(1e-6, "stairs"), (0.1, None)])
 def test_inputs_that_stay_on_one_stair_are_named(size, cause):
     plant = Stairs(0.4, 0.4, 0.3, 0.4, 0.005)
-    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+    sections = hj.ClockPhase(2)
+    cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
     rng = np.random.default_rng(0)
     u = size * rng.normal(size=(4, 60, 1))
     with warnings.catch_warnings(record=True) as said:
@@ -305,7 +309,8 @@ def test_inputs_beyond_the_linear_range_are_named():
             return super().step([u[0] + square], duration)
 
     cycle = hj.plants.find_cycle(Curved(), ANGLE, "x", cycles=20)
-    u = np.random.default_rng(0).normal(size=(4, 32, 1))
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(4, 32, 1))
     small = cycle.run_experiments(1e-3 * u, discard=0, processes=0)
     assert not small.findings
     with pytest.warns(hj.errors.FindingWarning, match="not linear"):

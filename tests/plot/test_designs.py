@@ -24,7 +24,8 @@ def test_the_spectrum_of_a_design(plan):
     above, below = axes[:, 0]
     f = np.unique(plan.frequencies)
     htf = MODEL.htf(f, 0)
-    H = np.asarray(htf.H)[0, :, 0, 0]
+    response = np.asarray(htf.H)
+    H = response[0, :, 0, 0]
     modulus = np.abs(H)
     (drawn,) = above.get_lines()
     assert_allclose(drawn.get_ydata(), modulus / modulus.max())
@@ -58,7 +59,8 @@ def test_what_strides_buy(plan):
 
     strides, errors = lines["equal amplitudes"].get_data()
     of_usual = np.log(USUAL.cycles(0))
-    log_error = np.interp(of_usual, np.log(strides), np.log(errors))
+    log_strides = np.log(strides)
+    log_error = np.interp(of_usual, log_strides, np.log(errors))
     expected = np.linalg.norm(plan.usual_standard_errors)
     assert np.exp(log_error) == pytest.approx(expected)
     with pytest.raises(hj.errors.DefinitionError, match="without a block"):

@@ -62,8 +62,10 @@ def test_the_widget_sends_pictures():
     for artist in explorer.figure.findobj():
         artist.set_animated(False)
     canvas.draw()
-    drawn = np.asarray(canvas.buffer_rgba())[..., :3]
-    error = np.mean(np.abs(sent - drawn) > 64)
+    canvas_pixels = np.asarray(canvas.buffer_rgba())
+    drawn = canvas_pixels[..., :3]
+    differs = np.abs(sent - drawn) > 64
+    error = np.mean(differs)
     assert error < 1e-3
 
 
@@ -86,7 +88,8 @@ def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
     drawn = explorer.figure.canvas.draw
 
     def draw():
-        gray = explorer.figure.axes[0].get_facecolor() == to_rgba("0.88")
+        face = explorer.figure.axes[0].get_facecolor()
+        gray = face == to_rgba("0.88")
         seen.append((explorer.figure.get_suptitle(), gray))
         drawn()
 

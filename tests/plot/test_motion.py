@@ -87,7 +87,8 @@ def test_both_halves_of_a_cycle_are_drawn():
 def test_no_input_gives_the_cycle():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     placed = hj.sections.place_sections(cycle, hj.ClockPhase(4))
-    path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
+    no_pushes = np.zeros((8, 1))
+    path = hj.experiments.perturbed_trajectory(placed, no_pushes)
     last = path.at(path.t[-1:])[1]
     end = last - path.at(path.t[:1])[1]
     assert_allclose(end, 0, atol=1e-9)

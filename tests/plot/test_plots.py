@@ -91,7 +91,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
     assert len(curves) == len(lower.get_lines()) == 2 * 4
-    fitted = rational.htf(estimate.frequencies).H[0, :, 0, 0]
+    response = rational.htf(estimate.frequencies)
+    fitted = response.H[0, :, 0, 0]
     assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
     assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
@@ -247,7 +248,8 @@ def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
 def test_the_name_of_a_single_input_is_on_the_axis(draw, two_inputs):
     output = two_inputs.outputs[0]
     first, second = two_inputs.inputs
-    label = draw(two_inputs, harmonics=[0]).figure.axes[0].get_ylabel()
+    drawn = draw(two_inputs, harmonics=[0])
+    label = drawn.figure.axes[0].get_ylabel()
     assert label.startswith(f"$|H_m|$, {output} from {first}")
     label = draw(two_inputs, harmonics=[0], input=1).figure.axes[0].get_ylabel()
     assert label.startswith(f"$|H_m|$, {output} from {second}")
@@ -330,7 +332,8 @@ def test_saved_in_several_formats(tmp_path):
 
 def test_a_crowd_of_multipliers_has_no_inset():
     ticks = np.arange(-4, 5) / 6
-    crowd = (ticks[:, None] + 1j * ticks).ravel()
+    grid = ticks[:, None] + 1j * ticks
+    crowd = grid.ravel()
     ax = hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax
     assert not ax.child_axes
 
